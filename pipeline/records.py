@@ -1,0 +1,333 @@
+"""What flows through the pipeline: immutable records. Times are integer nanoseconds, lengths metres,
+angles radians. Tables are kept as columns of equal length, never as lists of objects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry import Pose2, Pose3
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Int = NDArray[np.int64]
+Int32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+
+# --- what sources give ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One sweep of the LiDAR (Eq. 1), in the sensor's own frame (`lidar`).
+
+    Attributes:
+        stamp_ns: Time of the sweep.
+        points: float32, shape (N, 3) [m], all finite, no returns at the origin.
+        reflectance: float32, shape (N,), in the sensor's own scale, or None.
+        ring: int32, shape (N,), the laser that saw the point (0 = lowest), or None.
+        offset_ns: int32, shape (N,), time of each point relative to `stamp_ns`, or None.
+        dropped: How many returns the reader left out because they were not finite or empty.
+    """
+
+    stamp_ns: int
+    points: Float32
+    reflectance: Float32 | None = None
+    ring: Int32 | None = None
+    offset_ns: Int32 | None = None
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Where the wheels (or another source) say the base is.
+
+    Attributes:
+        stamp_ns: Time of the pose.
+        T_odom_base: The pose of the base in the odometry's own frame.
+    """
+
+    stamp_ns: int
+    T_odom_base: Pose3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imu:
+    """One reading of the inertial unit, turned into the base frame.
+
+    Attributes:
+        stamp_ns: Time of the reading.
+        angular_velocity: shape (3,) [rad/s].
+        linear_acceleration: shape (3,) [m/s^2], +9.81 along z when it stands still and level.
+        orientation: Quaternion w, x, y, z of the base in a level frame, shape (4,), or None.
+    """
+
+    stamp_ns: int
+    angular_velocity: Float
+    linear_acceleration: Float
+    orientation: Float | None = None
+
+
+Record = Scan | Odometry | Imu
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What is known of the LiDAR. It decides how far apart neighbouring returns lie.
+
+    Attributes:
+        name: For people, e.g. "VLP-16".
+        rings: Number of lasers; 1 for a planar laser; 0 when unknown or not a spinning sensor.
+        ring_step: Angle between neighbouring lasers [rad]; 0 when unknown.
+        azimuth_step: Angle between neighbouring shots [rad].
+        range_sigma: Standard deviation of a range [m].
+        range_max: Longest range that it reports [m].
+    """
+
+    name: str = "LiDAR"
+    rings: int = 0
+    ring_step: float = 0.0
+    azimuth_step: float = 0.0035
+    range_sigma: float = 0.02
+    range_max: float = 100.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthTrees:
+    """What really stands in the plot (trees and others), in the frame of the map.
+
+    Attributes:
+        x, y: shape (N,) [m].
+        dbh: Diameter at breast height [m], NaN where it is not known, shape (N,).
+        kind: One of "tree", "pole", "person", "bush", "other" each.
+    """
+
+    x: Float
+    y: Float
+    dbh: Float
+    kind: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthPath:
+    """Where the robot really was.
+
+    Attributes:
+        stamp_ns: int64, shape (N,), ascending.
+        x, y: shape (N,) [m].
+        yaw: shape (N,) [rad], NaN where only the position is known (GNSS).
+        same_frame: Whether x and y are in the frame of the map; if not, it is aligned before it is
+            compared.
+    """
+
+    stamp_ns: Int
+    x: Float
+    y: Float
+    yaw: Float
+    same_frame: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What is known for certain about a run; either part may be missing."""
+
+    trees: TruthTrees | None = None
+    path: TruthPath | None = None
+
+
+# --- what the stages hand on ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """All that the mapper needs for one scan: the scan and the motion at its time.
+
+    Attributes:
+        index: Number of the scan in the run, from 0.
+        scan: The sweep.
+        T_odom_base: Pose of the base at the scan's time in the odometry's frame, None when the
+            source has none.
+        roll, pitch: Tilt of the base against gravity [rad], 0 when not known.
+        tilt_known: Whether roll and pitch were measured.
+        warnings: What the synchroniser noticed on the way to this scan.
+    """
+
+    index: int
+    scan: Scan
+    T_odom_base: Pose2 | None
+    roll: float = 0.0
+    pitch: float = 0.0
+    tilt_known: bool = False
+    warnings: tuple[str, ...] = ()
+
+
+class Verdict(IntEnum):
+    """What a cluster is, or why it is not a tree."""
+
+    TREE = 0
+    POLE = 1
+    PERSON = 2
+    BUSH = 3
+    WALL = 4
+    OTHER = 5
+    TOO_FEW_POINTS = 6
+    TOO_ROUND = 7
+    TOO_LONG = 8
+    NOT_ROUND = 9
+    TOO_THIN = 10
+    TOO_THICK = 11
+    TOO_LOW = 12
+    NO_ARC = 13
+    AT_BORDER = 14
+    MOVING = 15
+    HIDDEN = 16
+
+    @property
+    def label(self) -> str:
+        """The verdict in words, for people and files."""
+        return self.name.lower().replace("_", " ")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clusters:
+    """The clusters of one scan as columns of length K; positions in the level sensor frame.
+
+    Attributes:
+        size: int64, number of points.
+        centroid: shape (K, 3) [m].
+        eigenvalues: shape (K, 3) [m^2], descending; the third is 0 when the plane is 2D.
+        eccentricity: lambda1 / lambda2 >= 1 (Eq. 4); inf where lambda2 is 0.
+        centre: shape (K, 2) [m], the estimate of the trunk's axis.
+        covariance: shape (K, 2, 2) [m^2], of `centre`.
+        radius: [m], of the fitted circle; NaN where no circle fits.
+        radial_std: [m], standard deviation of the distances to the axis (the cylinder check).
+        arc: Visible part of the circle [rad].
+        extent: shape (K, 3) [m], size of the bounding box along the ray, across it and up.
+        verdict: int32, see Verdict.
+    """
+
+    size: Int
+    centroid: Float
+    eigenvalues: Float
+    eccentricity: Float
+    centre: Float
+    covariance: Float
+    radius: Float
+    radial_std: Float
+    arc: Float
+    extent: Float
+    verdict: Int32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Detections:
+    """The clusters that SLAM sees as trees, in the base frame; columns of length D.
+
+    Attributes:
+        cluster: int64, row in Clusters.
+        centre: shape (D, 2) [m].
+        covariance: shape (D, 2, 2) [m^2].
+        radius: [m], NaN where unknown.
+        eccentricity: lambda1 / lambda2.
+    """
+
+    cluster: Int
+    centre: Float
+    covariance: Float
+    radius: Float
+    eccentricity: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trees:
+    """The tree map (Table 2) as columns of length T, in the frame of the map.
+
+    Attributes:
+        number: int64, from 1; a tree keeps its number for ever.
+        position: shape (T, 2) [m].
+        covariance: shape (T, 2, 2) [m^2].
+        velocity: shape (T, 2) [m/s], of the Kalman filter's state (Eq. 10).
+        dbh: Diameter at breast height [m], NaN where no arc carried one.
+        dbh_sigma: [m], NaN likewise.
+        eccentricity: Mean over the observations.
+        observations: int64, number of scans it was seen in.
+        coverage: Part of its circumference that was seen [rad].
+        first_seen_ns, last_seen_ns: int64.
+        confirmed: Whether it was seen often enough to be shown and exported.
+    """
+
+    number: Int
+    position: Float
+    covariance: Float
+    velocity: Float
+    dbh: Float
+    dbh_sigma: Float
+    eccentricity: Float
+    observations: Int
+    coverage: Float
+    first_seen_ns: Int
+    last_seen_ns: Int
+    confirmed: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseEstimate:
+    """What SLAM believes after a scan.
+
+    Attributes:
+        T_map_base: The pose.
+        covariance: shape (3, 3) of x, y, yaw [m, m, rad].
+        particles: shape (P, 3): x, y [m], yaw [rad] in the frame of the map.
+        weights: shape (P,), sum 1.
+        n_eff: Effective number of particles, 1 / sum of squared weights.
+        landmarks: shape (L, 2) [m], the landmarks of the best particle.
+        resampled: Whether the particles were resampled at this scan.
+    """
+
+    T_map_base: Pose2
+    covariance: Float
+    particles: Float
+    weights: Float
+    n_eff: float
+    landmarks: Float
+    resampled: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """All that came of one scan: the picture, and what the map knows now.
+
+    Attributes:
+        index, stamp_ns: Of the scan.
+        raw: float32, shape (N, 3) [m]: the scan in the level sensor frame.
+        filtered: float32, shape (M, 3) [m]: what passed the filters, same frame.
+        labels: int32, shape (M,): row in `clusters` of each filtered point, -1 for noise.
+        clusters, detections: Of this scan.
+        estimate: The pose.
+        T_odom_base: The pose by odometry alone.
+        sensor_offset: shape (3,) [m]: where the sensor stands in the base frame; add it to points
+            of `raw` and `filtered` to have them in the level base frame.
+        trees: The map.
+        counts: How many points each stage let pass and how many it refused, by name.
+        warnings: For people.
+    """
+
+    index: int
+    stamp_ns: int
+    raw: Float32
+    filtered: Float32
+    labels: Int32
+    clusters: Clusters
+    detections: Detections
+    estimate: PoseEstimate
+    T_odom_base: Pose2
+    sensor_offset: Float
+    trees: Trees
+    counts: Mapping[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()

@@ -1,0 +1,82 @@
+"""What a source of records is, whatever file, folder, scenario or socket stands behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from pipeline.geometry import Pose3
+from pipeline.records import Record, Sensor, Truth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SourceDescription:
+    """What is known of a source before its first scan is read.
+
+    Attributes:
+        uri: As the user wrote it.
+        kind: The format in words, e.g. "ROS 2 MCAP".
+        sensor: The LiDAR.
+        T_base_lidar: Where the LiDAR stands on the robot.
+        has_odometry, has_imu: Whether such records will come.
+        scans: Number of scans, None when it is not known before the end.
+        start_ns, end_ns: Time of the first and last scan, None when not known.
+        digest: SHA-256 (hex) of what is read: file contents, or the scenario's definition.
+        preset: The preset that suits this kind of source.
+        warnings: What a person should know, e.g. that there is no odometry.
+    """
+
+    uri: str
+    kind: str
+    sensor: Sensor
+    T_base_lidar: Pose3
+    has_odometry: bool
+    has_imu: bool
+    scans: int | None
+    start_ns: int | None
+    end_ns: int | None
+    digest: str
+    preset: str = "forest"
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SourceOptions:
+    """What the user may say about a source.
+
+    Attributes:
+        topics: Chosen topic by role ("scan", "odometry", "imu"); empty means found by type.
+        T_base_lidar: Mounting of the LiDAR; None means what the source says, else identity.
+        seed: Of simulated runs.
+    """
+
+    topics: dict[str, str] = field(default_factory=dict)
+    T_base_lidar: Pose3 | None = None
+    seed: int = 0
+
+
+class Source(Protocol):
+    """A run that can be read from the start or from any time.
+
+    Reading never raises for a single bad record: it is left out and counted in `losses`. A
+    `SourceError` is raised when opening, or while reading when nothing more can be read; what was
+    yielded before stays valid.
+    """
+
+    @property
+    def description(self) -> SourceDescription:
+        """What is known before reading."""
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was left out so far, by reason in words, e.g. {"scans without points": 3}."""
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """Yield records in the order of time, from `start_ns` on (None: all)."""
+
+    def truth(self) -> Truth | None:
+        """What is known for certain about this run, if anything."""
+
+    def close(self) -> None:
+        """Let go of files and sockets; safe to call twice."""
