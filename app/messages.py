@@ -1,0 +1,98 @@
+"""What the web process and the worker say to one another. Plain data: it travels as msgpack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgspec
+
+State = Literal["starting", "playing", "paused", "finished", "waiting", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How the run goes. Times are seconds since the run's first scan.
+
+    Attributes:
+        state: "waiting" is a live source from which nothing comes; "failed" says why in `detail`.
+        detail: What happened, what it means, what to do; empty when all is well.
+        source: The URI.
+        kind: The source's format in words.
+        time_s, end_s: Of the standing scan, and of the last scan where it is known.
+        scan_index: Of the standing scan, -1 before the first.
+        scans: Number of scans in the run, None where it is not known.
+        speed: Factor of real time.
+        scan_rate_hz, mapping_ms: Measured over the last scans.
+        stage_ms: Median time of each stage over the last scans.
+        scans_behind: Scans that wait to be mapped.
+        trees: Confirmed trees.
+        distance_m: Distance driven.
+        health: "good", "weak" or "lost".
+        warnings: The newest last, each once.
+        revision: Of the parameters in force.
+    """
+
+    state: State
+    detail: str = ""
+    source: str = ""
+    kind: str = ""
+    time_s: float = 0.0
+    end_s: float | None = None
+    scan_index: int = -1
+    scans: int | None = None
+    speed: float = 1.0
+    scan_rate_hz: float = 0.0
+    mapping_ms: float = 0.0
+    stage_ms: dict[str, float] = field(default_factory=dict)
+    scans_behind: int = 0
+    trees: int = 0
+    distance_m: float = 0.0
+    health: str = "good"
+    warnings: list[str] = field(default_factory=list)
+    revision: int = 0
+
+
+class Play(msgspec.Struct, frozen=True, tag="play"):
+    """Go on; from the start again when the run is at its end."""
+
+
+class Pause(msgspec.Struct, frozen=True, tag="pause"):
+    """Stand still at the scan that is shown."""
+
+
+class Advance(msgspec.Struct, frozen=True, tag="advance"):
+    """Pause and go some scans forward (or back, when negative)."""
+
+    scans: int = 1
+
+
+class Seek(msgspec.Struct, frozen=True, tag="seek"):
+    """Go to a time [s since the first scan]; the map becomes what it was then."""
+
+    time_s: float
+
+
+class SetSpeed(msgspec.Struct, frozen=True, tag="set_speed"):
+    """Replay faster or slower than the clock; 0 is as fast as it can."""
+
+    factor: float
+
+
+class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
+    """Parameters, already validated, as nested values; they act on the next scan, and when paused on
+    the standing scan at once."""
+
+    values: dict[str, Any]
+    revision: int
+
+
+class Open(msgspec.Struct, frozen=True, tag="open"):
+    """Leave the present run and open another source."""
+
+    uri: str
+    odometry: str = "auto"
+    seed: int = 0
+
+
+Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open

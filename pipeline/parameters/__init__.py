@@ -1,0 +1,22 @@
+"""Every tunable value, declared once: bounds, unit, title, step and one sentence.
+
+From this declaration come the sliders, the REST schema, `--set stage.name=value`, the TOML file and
+the table in README.
+"""
+
+from pipeline.parameters.model import FieldSpec, Parameters, Stage, field_specs
+from pipeline.parameters.presets import PRESETS, preset
+from pipeline.parameters.text import assign, from_toml, markdown_table, to_toml
+
+__all__ = [
+    "PRESETS",
+    "FieldSpec",
+    "Parameters",
+    "Stage",
+    "assign",
+    "field_specs",
+    "from_toml",
+    "markdown_table",
+    "preset",
+    "to_toml",
+]

@@ -1,0 +1,84 @@
+"""Named sets of parameters, each with where its numbers come from."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from pipeline.errors import ParameterError
+from pipeline.parameters.model import Parameters
+
+# Table 1 of the paper; what it does not say is set so that it changes nothing.
+_PAPER: dict[str, object] = {
+    "acquisition.level": "none",
+    "acquisition.range_min": 0.0,
+    "filters.x_min": 0.0,
+    "filters.x_max": 10.0,
+    "filters.y_min": -10.0,
+    "filters.y_max": 10.0,
+    "filters.z_min": -0.5,
+    "filters.z_max": 0.0,
+    "filters.voxel_size": 0.01,
+    "ground.method": "none",
+    "clustering.dimensions": 3,
+    "clustering.eps": 0.25,
+    "clustering.min_points": 20,
+    "shape.plane": 2,
+    "shape.centre": "centroid",
+    "detection.e_min": 1.0,
+    "detection.e_max": 20.0,
+    "detection.cylindrical_stddev_thresh": 0.1,
+    "detection.radius_min": 0.0,
+    "detection.radius_max": 5.0,
+    "detection.height_extent_min": 0.0,
+    "detection.size_max": 20.0,
+    "detection.arc_min": 0.0,
+    "slam.particles": 100,
+    "slam.sigma_range": 0.1,
+    "slam.sigma_bearing": 1.0,
+    "tracking.proximity_radius": 1.0,
+    "tracking.distance_max": 1.0,
+}
+
+# A planar laser on a car among park trees: trunks of one to ten beams, far apart, seen to 40 m.
+_LASER2D: dict[str, object] = {
+    "acquisition.level": "none",
+    "ground.method": "none",
+    "filters.voxel_size": 0.0,
+    "clustering.method": "range_jump",
+    "clustering.eps": 1.0,
+    "clustering.min_points": 1,
+    "detection.e_max": 1000.0,
+    "detection.cylindrical_stddev_thresh": 0.3,
+    "detection.radius_min": 0.0,
+    "detection.height_extent_min": 0.0,
+    "detection.size_max": 0.6,
+    "detection.arc_min": 0.0,
+    "slam.sigma_range": 1.0,
+    "slam.sigma_bearing": 3.0,
+    "slam.distance_max": 4.0,
+    "slam.update_distance": 0.5,
+    "tracking.distance_max": 3.0,
+    "tracking.proximity_radius": 1.5,
+}
+
+PRESETS: dict[str, tuple[str, dict[str, object]]] = {
+    "forest": ("The best that we know for trunks seen by a 3D LiDAR; the default", {}),
+    "paper": ("Table 1 of the paper: eccentricity below 20", _PAPER),
+    "paper-text": (
+        "The paper's text: eccentricity between 10 and 20",
+        {**_PAPER, "detection.e_min": 10.0},
+    ),
+    "laser2d": ("A planar laser, as on the car of Victoria Park", _LASER2D),
+}
+
+
+@cache
+def preset(name: str) -> Parameters:
+    """The parameters of a preset.
+
+    Raises:
+        ParameterError: There is no preset of this name.
+    """
+    if name not in PRESETS:
+        raise ParameterError(f"there is no preset {name!r}", remedy=f"Presets: {', '.join(PRESETS)}")
+    return Parameters().replace(PRESETS[name][1])
