@@ -1,0 +1,87 @@
+"""The command line: `stemmap [serve] [SOURCE]`, `stemmap map SOURCE --out DIR`, and more.
+
+Each command is a module of this package with `HELP`, `configure(parser)` and `run(arguments)`.
+Whatever is heavy is imported inside `run`, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+
+from pipeline.errors import ParameterError, StemmapError
+
+COMMANDS = ("serve", "map", "simulate", "evaluate", "params", "bench")
+
+DONE, FAILED, WRONG_USAGE, DONE_WITH_LOSSES = 0, 1, 2, 3
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what was wrong in one line, and where the help is."""
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        self.exit(WRONG_USAGE, f"{self.prog}: {message}. Help: {self.prog} --help\n")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: Words after the program's name; None takes those of this process.
+
+    Returns:
+        0 done, 1 failed with one clear line, 2 wrong usage, 3 done with losses (said on stderr).
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or (words[0] not in COMMANDS and words[0] not in ("-h", "--help", "--version")):
+        words.insert(0, "serve")  # `stemmap run.mcap` is what people type first
+    parser = _build_parser(words[0])
+    try:
+        parsed = parser.parse_args(words)
+        command = importlib.import_module(f"app.cli.{parsed.command}")
+        return int(command.run(parsed))
+    except SystemExit as stop:  # argparse has printed its line
+        return int(stop.code or 0)
+    except ParameterError as error:
+        return _complain(error, WRONG_USAGE)
+    except StemmapError as error:
+        return _complain(error, FAILED)
+    except KeyboardInterrupt:
+        return _complain("stopped", FAILED)
+    except BrokenPipeError:  # `stemmap params | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+
+
+def _build_parser(wanted: str) -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="stemmap",
+        description="Maps trees in real time from a robot's LiDAR, and shows in the browser why it decided so.",
+        epilog="Without a command: `stemmap [SOURCE]` opens the dashboard; without a SOURCE a simulated stand plays.",
+    )
+    parser.add_argument("--version", action="version", version=f"stemmap {_version()}")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name in COMMANDS:
+        module = importlib.import_module(f"app.cli.{name}")
+        subparser = subparsers.add_parser(
+            name,
+            help=module.HELP,
+            description=module.HELP,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if name == wanted:
+            module.configure(subparser)
+    return parser
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("stemmap")
+
+
+def _complain(error: object, code: int) -> int:
+    print(f"stemmap: {error}", file=sys.stderr)
+    return code
