@@ -155,6 +155,7 @@ class Step:
             source has none.
         roll, pitch: Tilt of the base against gravity [rad], 0 when not known.
         tilt_known: Whether roll and pitch were measured.
+        twist: Velocity of the base at the scan: forward, left [m/s], turn [rad/s]; zero when unknown.
         warnings: What the synchroniser noticed on the way to this scan.
     """
 
@@ -164,6 +165,7 @@ class Step:
     roll: float = 0.0
     pitch: float = 0.0
     tilt_known: bool = False
+    twist: tuple[float, float, float] = (0.0, 0.0, 0.0)
     warnings: tuple[str, ...] = ()
 
 
@@ -297,6 +299,24 @@ class PoseEstimate:
     n_eff: float
     landmarks: Float
     resampled: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """Where the robot was at each scan (Eq. 11), in the frame of the map; columns of length N.
+
+    Attributes:
+        stamp_ns: int64.
+        x, y: [m].
+        yaw: [rad].
+        sigma_xy: [m], square root of the mean of the two variances of the position.
+    """
+
+    stamp_ns: Int
+    x: Float
+    y: Float
+    yaw: Float
+    sigma_xy: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -58,8 +58,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _build_parser(wanted: str) -> argparse.ArgumentParser:
     parser = _Parser(
         prog="stemmap",
-        description="Maps trees in real time from a robot's LiDAR, and shows in the browser why it decided so.",
-        epilog="Without a command: `stemmap [SOURCE]` opens the dashboard; without a SOURCE a simulated stand plays.",
+        description="Maps trees from a robot's LiDAR as it drives, and shows in the browser why.",
+        epilog="`stemmap [SOURCE]` opens the dashboard; without a SOURCE a simulated stand plays.",
     )
     parser.add_argument("--version", action="version", version=f"stemmap {_version()}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)

@@ -10,6 +10,7 @@ from pipeline.parameters.model import Parameters
 # Table 1 of the paper; what it does not say is set so that it changes nothing.
 _PAPER: dict[str, object] = {
     "acquisition.level": "none",
+    "acquisition.deskew": False,
     "acquisition.range_min": 0.0,
     "filters.x_min": 0.0,
     "filters.x_max": 10.0,
@@ -33,6 +34,7 @@ _PAPER: dict[str, object] = {
     "detection.size_max": 20.0,
     "detection.arc_min": 0.0,
     "slam.particles": 100,
+    "slam.view_range": 0.0,
     "slam.sigma_range": 0.1,
     "slam.sigma_bearing": 1.0,
     "tracking.proximity_radius": 1.0,
@@ -56,6 +58,7 @@ _LASER2D: dict[str, object] = {
     "slam.sigma_range": 1.0,
     "slam.sigma_bearing": 3.0,
     "slam.distance_max": 4.0,
+    "slam.view_range": 20.0,
     "slam.update_distance": 0.5,
     "tracking.distance_max": 3.0,
     "tracking.proximity_radius": 1.5,

@@ -15,6 +15,9 @@ class Acquisition(Stage):
     level: Literal["none", "imu"] = choice(
         "imu", "Level the scan", "Turn the scan upright by the tilt that the IMU or the pose tells."
     )
+    deskew: bool = choice(
+        True, "De-skew", "Move each point to where it would be had the robot stood still during the sweep."
+    )
     range_min: float = number(
         0.5, "Nearest return", "m", 0.0, 10.0, 0.1, "Returns nearer than this are the robot itself."
     )
@@ -167,19 +170,31 @@ class Slam(Stage):
 
     particles: int = count(100, "Particles", "", 1, 5000, "How many hypotheses of the path are kept.")
     noise_distance: float = number(
-        0.05,
-        "Noise per distance",
-        "m/m",
+        0.03,
+        "Position noise",
+        "m/√m",
         0.0,
         1.0,
         0.005,
-        "Error of the odometry's distance per metre driven.",
+        "Error of the odometry after one metre; it grows with the root of the distance.",
     )
     noise_turn_distance: float = number(
-        0.5, "Turn noise per distance", "deg/m", 0.0, 30.0, 0.1, "Error of the heading per metre driven."
+        0.4,
+        "Heading noise",
+        "deg/√m",
+        0.0,
+        30.0,
+        0.1,
+        "Error of the heading after one metre; it grows with the root of the distance.",
     )
     noise_turn: float = number(
-        0.05, "Noise per turn", "rad/rad", 0.0, 1.0, 0.005, "Error of the heading per radian turned."
+        2.0,
+        "Turn noise",
+        "deg/√rad",
+        0.0,
+        60.0,
+        0.1,
+        "Error of the heading after turning by one radian; it grows with the root of the turn.",
     )
     sigma_range: float = number(
         0.05, "Range sigma", "m", 0.001, 5.0, 0.005, "Error of a trunk's distance, added to the fit's own."
@@ -193,6 +208,26 @@ class Slam(Stage):
     distance_max: float = number(
         1.0, "Association reach", "m", 0.05, 20.0, 0.05, "No association over more than this distance."
     )
+    hits_to_weigh: int = count(
+        3, "Hits before it weighs", "", 1, 50, "A landmark seen fewer times does not weigh particles."
+    )
+    view_range: float = number(
+        8.0,
+        "View range",
+        "m",
+        0.0,
+        100.0,
+        0.5,
+        "A landmark nearer than this, in free view and not detected, counts as missed; 0 is off.",
+    )
+    misses_per_hit: int = count(
+        3,
+        "Misses per hit",
+        "",
+        1,
+        100,
+        "So many misses undo one hit; a landmark without hits left is removed.",
+    )
     resample_below: float = number(
         0.5,
         "Resample below",
@@ -201,9 +236,6 @@ class Slam(Stage):
         1.0,
         0.05,
         "Resample when N_eff falls below this part of the particles.",
-    )
-    hits_to_weigh: int = count(
-        3, "Hits before it weighs", "", 1, 50, "A landmark seen fewer times does not weigh particles."
     )
     update_distance: float = number(
         0.0, "Update every", "m", 0.0, 10.0, 0.05, "Use a scan only after this much motion; 0 uses all."
@@ -238,4 +270,7 @@ class Evaluation(Stage):
 
     match_distance: float = number(
         0.5, "Match distance", "m", 0.05, 5.0, 0.05, "A tree farther from its truth than this is no match."
+    )
+    reach: float = number(
+        10.0, "Reach", "m", 1.0, 200.0, 0.5, "Truth farther than this from the whole path is not asked for."
     )
