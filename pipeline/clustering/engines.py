@@ -1,0 +1,67 @@
+"""DBSCAN (Ester et al. 1996) by three engines that agree on cores, noise and core clusters.
+
+A border point in reach of two clusters goes to either of them, depending on the order of points, in
+scikit-learn and Open3D; ours gives it to its nearest core.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.clustering.grid import dbscan_grid
+from pipeline.records import Bool, Float32, Int32
+
+
+class Dbscan(NamedTuple):
+    """Labels (int32, shape (N,), -1 for noise) and which points are cores (None: not told)."""
+
+    label: Int32
+    core: Bool | None
+
+
+def _grid(points: Float32, eps: float, min_points: int) -> Dbscan:
+    return Dbscan(*dbscan_grid(points.astype(np.float64), eps, min_points))
+
+
+def _sklearn(points: Float32, eps: float, min_points: int) -> Dbscan:
+    from sklearn.cluster import DBSCAN
+
+    if len(points) == 0:
+        return Dbscan(np.zeros(0, np.int32), np.zeros(0, np.bool_))
+    fitted = DBSCAN(eps=eps, min_samples=min_points).fit(points.astype(np.float64))
+    core = np.zeros(len(points), np.bool_)
+    core[fitted.core_sample_indices_] = True
+    return Dbscan(in_order_of_first_point(fitted.labels_.astype(np.int32)), core)
+
+
+def _open3d(points: Float32, eps: float, min_points: int) -> Dbscan:
+    import open3d
+
+    if len(points) == 0:
+        return Dbscan(np.zeros(0, np.int32), None)
+    space = np.zeros((len(points), 3))
+    space[:, : points.shape[1]] = points
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(space))
+    label = np.asarray(cloud.cluster_dbscan(eps, min_points), np.int32)
+    return Dbscan(in_order_of_first_point(label), None)
+
+
+ENGINES: dict[str, Callable[[Float32, float, int], Dbscan]] = {
+    "grid": _grid,
+    "sklearn": _sklearn,
+    "open3d": _open3d,
+}
+
+
+def in_order_of_first_point(label: Int32) -> Int32:
+    """The same partition with clusters numbered in the order of their first point."""
+    found, first = np.unique(label, return_index=True)
+    number = np.full(int(label.max(initial=-1)) + 2, -1, np.int32)  # the last entry serves noise, -1
+    by_first = found[np.argsort(first)]
+    by_first = by_first[by_first >= 0]
+    number[by_first] = np.arange(len(by_first), dtype=np.int32)
+    ordered: Int32 = number[label]
+    return ordered

@@ -1,0 +1,55 @@
+"""Clusters of a planar laser: runs of neighbouring beams without a jump in range."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.geometry import Float
+from pipeline.records import Bool, Float32, Int, Int32
+
+
+def range_jump(points: Float32, jump: float, min_points: int, azimuth_step: float) -> tuple[Int32, Bool]:
+    """Cut the beams, ordered by azimuth, wherever the range jumps or more than one beam is missing.
+
+    Args:
+        points: float32, shape (N, 3) [m], sensor frame.
+        jump: Largest change of range between neighbours of one cluster [m].
+        min_points: Smaller clusters are noise.
+        azimuth_step: Angle between neighbouring beams [rad].
+
+    Returns:
+        Labels, int32, shape (N,), -1 for noise, and for each cluster whether a neighbouring beam
+        that ended nearer hides one of its edges.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.int32), np.zeros(0, np.bool_)
+    x, y = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
+    azimuth = np.arctan2(y, x)
+    order = np.argsort(azimuth, kind="stable")
+    return _cut(azimuth[order], np.hypot(x, y)[order], order, jump, min_points, 2.5 * azimuth_step)
+
+
+@compiled
+def _cut(
+    azimuth: Float, distance: Float, order: Int, jump: float, min_points: int, gap: float
+) -> tuple[Int32, Bool]:
+    n = azimuth.shape[0]
+    label = np.full(n, -1, np.int32)
+    hidden = np.zeros(n, np.bool_)
+    clusters = 0
+    start = 0
+    for i in range(1, n + 1):
+        if i < n and azimuth[i] - azimuth[i - 1] <= gap and abs(distance[i] - distance[i - 1]) <= jump:
+            continue
+        if i - start >= min_points:
+            for k in range(start, i):
+                label[order[k]] = clusters
+            before = start > 0 and azimuth[start] - azimuth[start - 1] <= gap
+            after = i < n and azimuth[i] - azimuth[i - 1] <= gap
+            hidden[clusters] = (before and distance[start - 1] < distance[start]) or (
+                after and distance[i] < distance[i - 1]
+            )
+            clusters += 1
+        start = i
+    return label, hidden[:clusters].copy()

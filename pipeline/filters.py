@@ -1,0 +1,80 @@
+"""Filters: the pass-through box and the voxel grid with averaging (Eq. 2)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.parameters.stages import Filters
+from pipeline.records import Bool, Float32
+
+# Odd 64-bit constant that spreads neighbouring cells over the whole table (Fibonacci hashing).
+_SPREAD = np.uint64(0x9E3779B97F4A7C15)
+_AXIS_CELLS = 1 << 21  # three axes of 21 bits fit one 64-bit key
+
+
+def pass_through(points: Float32, parameters: Filters) -> Float32:
+    """The points inside the box; its faces belong to it. Shape (N, 3) -> (M, 3) [m]."""
+    p = parameters
+    low = np.array([p.x_min, p.y_min, p.z_min], np.float32)
+    high = np.array([p.x_max, p.y_max, p.z_max], np.float32)
+    inside: Float32 = points[_inside(points, low, high)]
+    return inside
+
+
+@compiled
+def _inside(points: Float32, low: Float32, high: Float32) -> Bool:
+    inside = np.empty(points.shape[0], np.bool_)
+    for i in range(points.shape[0]):
+        inside[i] = (
+            low[0] <= points[i, 0] <= high[0]
+            and low[1] <= points[i, 1] <= high[1]
+            and low[2] <= points[i, 2] <= high[2]
+        )
+    return inside
+
+
+def voxel_grid(points: Float32, parameters: Filters) -> Float32:
+    """Replace the points of each cube of `voxel_size` by their mean, in the order of first visit.
+
+    The cubes are fixed in the frame, so that one point more does not shift all the others' cubes.
+    Shape (N, 3) -> (M, 3) [m]; size 0 changes nothing.
+    """
+    size = parameters.voxel_size
+    if size == 0.0 or len(points) == 0 or float(np.abs(points).max()) / size >= _AXIS_CELLS // 2 - 1:
+        return points  # cubes so small against the cloud hold one point each
+    return _voxel_means(points, size)
+
+
+@compiled
+def _voxel_means(points: Float32, size: float) -> Float32:
+    n = points.shape[0]
+    slots = 2
+    while slots < 2 * n:
+        slots *= 2
+    shift = np.uint64(64 - int(np.log2(slots) + 0.5))
+    keys = np.full(slots, -1, np.int64)
+    row_of = np.empty(slots, np.int64)
+    sums = np.zeros((n, 3))
+    counts = np.zeros(n, np.int64)
+    rows = 0
+    for i in range(n):
+        key = np.int64(0)
+        for a in range(3):
+            key = (key << 21) | (np.int64(np.floor(points[i, a] / size)) + _AXIS_CELLS // 2)
+        slot = np.int64((np.uint64(key) * _SPREAD) >> shift)
+        while keys[slot] != -1 and keys[slot] != key:
+            slot = (slot + 1) & (slots - 1)
+        if keys[slot] == -1:
+            keys[slot] = key
+            row_of[slot] = rows
+            rows += 1
+        row = row_of[slot]
+        counts[row] += 1
+        for a in range(3):
+            sums[row, a] += points[i, a]
+    means = np.empty((rows, 3), np.float32)
+    for row in range(rows):
+        for a in range(3):
+            means[row, a] = sums[row, a] / counts[row]
+    return means
