@@ -207,10 +207,11 @@ class Clusters:
         eccentricity: lambda1 / lambda2 >= 1 (Eq. 4); inf where lambda2 is 0.
         centre: shape (K, 2) [m], the estimate of the trunk's axis.
         covariance: shape (K, 2, 2) [m^2], of `centre`.
-        radius: [m], of the fitted circle; NaN where no circle fits.
+        radius, radius_sigma: [m], of the fitted circle; NaN where no circle was fitted.
         radial_std: [m], standard deviation of the distances to the axis (the cylinder check).
         arc: Visible part of the circle [rad].
         extent: shape (K, 3) [m], size of the bounding box along the ray, across it and up.
+        hidden: Whether something nearer hides an edge of the cluster.
         verdict: int32, see Verdict.
     """
 
@@ -221,9 +222,11 @@ class Clusters:
     centre: Float
     covariance: Float
     radius: Float
+    radius_sigma: Float
     radial_std: Float
     arc: Float
     extent: Float
+    hidden: Bool
     verdict: Int32
 
 
@@ -235,7 +238,8 @@ class Detections:
         cluster: int64, row in Clusters.
         centre: shape (D, 2) [m].
         covariance: shape (D, 2, 2) [m^2].
-        radius: [m], NaN where unknown.
+        radius, radius_sigma: [m], NaN where unknown.
+        arc: Visible part of the circle [rad].
         eccentricity: lambda1 / lambda2.
     """
 
@@ -243,6 +247,8 @@ class Detections:
     centre: Float
     covariance: Float
     radius: Float
+    radius_sigma: Float
+    arc: Float
     eccentricity: Float
 
 

@@ -1,0 +1,80 @@
+"""Shape: covariance and eccentricity of each cluster (Eq. 3-4), and the circle of its trunk."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.clustering import Labels
+from pipeline.geometry import Float
+from pipeline.parameters.stages import Shape
+from pipeline.records import Clusters, Float32, Int, Sensor, Verdict
+from pipeline.shape.moments import gather, moments, spread_about
+from pipeline.shape.stem import COLUMNS, fit_stems
+
+
+def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape) -> Clusters:
+    """The figures of each cluster; the verdict is left open (OTHER).
+
+    Args:
+        points: float32, shape (N, 3) [m], level sensor frame.
+        labels: The cluster of each point.
+        sensor: Its range sigma and azimuth step scale the fit.
+        parameters: Of this stage.
+    """
+    order, bounds = gather(labels.label, labels.clusters)
+    members = points[order].astype(np.float64)
+    centroid, covariance, extent = moments(members, bounds)
+    eigenvalues = _eigenvalues(covariance, parameters.plane)
+    size = np.diff(bounds)
+    if parameters.centre == "circle":
+        stem = fit_stems(members, bounds, sensor.range_sigma, sensor.azimuth_step)
+    else:
+        stem = _centroids_as_stems(members, bounds, centroid, sensor.range_sigma)
+    return Clusters(
+        size=size,
+        centroid=centroid,
+        eigenvalues=eigenvalues,
+        eccentricity=eccentricity(eigenvalues),
+        centre=stem[:, 0:2],
+        covariance=np.stack([stem[:, [2, 3]], stem[:, [3, 4]]], axis=1),
+        radius=stem[:, 5],
+        radius_sigma=stem[:, 6],
+        radial_std=stem[:, 7],
+        arc=stem[:, 8],
+        extent=extent,
+        hidden=labels.hidden,
+        verdict=np.full(len(size), Verdict.OTHER, np.int32),
+    )
+
+
+def eccentricity(eigenvalues: Float) -> Float:
+    """e = lambda1 / lambda2 (Eq. 4) of descending eigenvalues, shape (K, 2 or 3); inf for a line.
+
+    This is the paper's word. The eccentricity of geometry, sqrt(1 - lambda2 / lambda1), is another.
+    """
+    first, second = eigenvalues[:, 0], eigenvalues[:, 1]
+    # Rounding leaves a tiny lambda2 to points on a line; below this it is none.
+    line = second <= 1e-12 * first
+    ratio: Float = np.where(line, np.where(first > 0, np.inf, 1.0), first / np.where(line, 1.0, second))
+    return ratio
+
+
+def _eigenvalues(covariance: Float, dimensions: int) -> Float:
+    """Descending eigenvalues of shape (K, 3); the third is 0 when only x and y are taken."""
+    values = np.zeros((len(covariance), 3))
+    if len(covariance):
+        ascending = np.linalg.eigvalsh(covariance[:, :dimensions, :dimensions])
+        values[:, :dimensions] = np.maximum(ascending[:, ::-1], 0.0)
+    return values
+
+
+def _centroids_as_stems(members: Float, bounds: Int, centroid: Float, range_sigma: float) -> Float:
+    """The paper's choice: the centroid of the visible arc stands for the trunk's centre."""
+    stem = np.full((len(centroid), COLUMNS), np.nan)
+    stem[:, 0:2] = centroid[:, :2]
+    # Which part of the arc returned changes from scan to scan; that moves a centroid by centimetres.
+    variance = range_sigma**2 / np.maximum(np.diff(bounds), 1) + 0.02**2
+    stem[:, 2], stem[:, 3], stem[:, 4] = variance, 0.0, variance
+    stem[:, 7] = spread_about(members, bounds, centroid)
+    stem[:, 8] = 0.0
+    return stem
