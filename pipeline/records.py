@@ -169,6 +169,21 @@ class Step:
     warnings: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Labels:
+    """Which cluster each point belongs to.
+
+    Attributes:
+        label: int32, shape (N,): 0..clusters-1 in the order of their first point, -1 for noise.
+        clusters: Number of clusters.
+        hidden: shape (clusters,): whether something nearer hides an edge of the cluster.
+    """
+
+    label: Int32
+    clusters: int
+    hidden: Bool
+
+
 class Verdict(IntEnum):
     """What a cluster is, or why it is not a tree."""
 

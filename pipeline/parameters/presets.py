@@ -37,6 +37,8 @@ _PAPER: dict[str, object] = {
     "slam.view_range": 0.0,
     "slam.sigma_range": 0.1,
     "slam.sigma_bearing": 1.0,
+    "tracking.velocity_sigma": 0.1,
+    "tracking.acceleration_sigma": 0.001,
     "tracking.proximity_radius": 1.0,
     "tracking.distance_max": 1.0,
 }

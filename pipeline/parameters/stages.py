@@ -248,8 +248,17 @@ class Tracking(Stage):
     engine: Literal["compiled", "filterpy"] = choice(
         "compiled", "Kalman engine", "Our compiled filter or filterpy's; both give the same numbers."
     )
+    velocity_sigma: float = number(
+        0.0,
+        "Velocity sigma",
+        "m/s",
+        0.0,
+        5.0,
+        0.01,
+        "Velocity that a new tree may have; 0 keeps trees still.",
+    )
     acceleration_sigma: float = number(
-        0.001, "Acceleration sigma", "m/s^2", 0.0, 5.0, 0.001, "How much a tree's velocity may wander."
+        0.0, "Acceleration sigma", "m/s²", 0.0, 5.0, 0.001, "How much a tree's velocity may wander."
     )
     gate: float = number(
         4.0, "Gate", "sigma", 0.5, 20.0, 0.1, "A detection farther from a tree than this starts another."
@@ -262,6 +271,9 @@ class Tracking(Stage):
     )
     hits_to_confirm: int = count(
         5, "Hits to confirm", "", 1, 200, "A tree is shown and exported when it was seen so often."
+    )
+    misses_per_hit: int = count(
+        3, "Misses per hit", "", 1, 100, "So many misses in free view undo one hit; without hits a tree goes."
     )
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.clustering import Labels
 from pipeline.geometry import Float
 from pipeline.parameters.stages import Shape
-from pipeline.records import Clusters, Float32, Int, Sensor, Verdict
+from pipeline.records import Clusters, Float32, Int, Labels, Sensor, Verdict
 from pipeline.shape.moments import gather, moments, spread_about
 from pipeline.shape.stem import COLUMNS, fit_stems
 

@@ -1,0 +1,218 @@
+"""The mapper: what becomes of one scan, from top to bottom. It reads as section 3 of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import filters, ground
+from pipeline.acquisition import acquire
+from pipeline.clustering import cluster
+from pipeline.detection import detections, judge
+from pipeline.geometry import Float, Pose2, Pose3
+from pipeline.parameters import Parameters
+from pipeline.records import Float32, Frame, Path, PoseEstimate, Sensor, Step
+from pipeline.shape import describe
+from pipeline.slam import FastSlam, SlamState
+from pipeline.tracking import Tracker
+from pipeline.tracking.table import TrackTable
+from pipeline.visibility import clear_range
+
+Watch = Callable[[str], AbstractContextManager[None]]
+
+
+def no_watch(_stage: str) -> AbstractContextManager[None]:
+    """Measures nothing; stands in where nobody asks for times."""
+    return nullcontext()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapperState:
+    """An independent copy of all that the mapper knows between two scans."""
+
+    slam: SlamState
+    tracks: TrackTable
+    next_number: int
+    odometry: Pose2 | None
+    path_length: int
+
+
+class Mapper:
+    """Maps a run scan by scan. Knows no clock, no thread and no file.
+
+    Args:
+        parameters: Of all stages; may be replaced between two scans.
+        sensor: The LiDAR.
+        T_base_lidar: Where it stands on the robot.
+        seed: Of every random number.
+        watch: Is entered around each stage with its name, so that the caller can measure it.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        *,
+        sensor: Sensor,
+        T_base_lidar: Pose3,
+        seed: int,
+        watch: Watch = no_watch,
+    ) -> None:
+        self._parameters = parameters
+        self._sensor = sensor
+        self._T_base_lidar = T_base_lidar
+        self._watch = watch
+        self._slam = FastSlam(parameters.slam, seed)
+        self._tracker = Tracker(parameters.tracking)
+        self._odometry: Pose2 | None = None
+        self._path = _PathColumns()
+
+    @property
+    def parameters(self) -> Parameters:
+        """The parameters in force; new ones act from the next scan on."""
+        return self._parameters
+
+    @parameters.setter
+    def parameters(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._slam.parameters = parameters.slam
+        self._tracker.parameters = parameters.tracking
+
+    @property
+    def path(self) -> Path:
+        """The path so far, one row a scan."""
+        return self._path.columns()
+
+    def process(self, step: Step) -> Frame:
+        """Map one scan."""
+        p, watch = self._parameters, self._watch
+
+        with watch("acquisition"):
+            raw, sensor_offset = acquire(step, self._T_base_lidar, p.acquisition)
+
+        with watch("filters"):
+            boxed = filters.pass_through(raw, p.filters)
+            voxels = filters.voxel_grid(boxed, p.filters)
+
+        with watch("ground"):
+            filtered = self._above_ground(raw, voxels)
+
+        with watch("clustering"):
+            labels = cluster(filtered, self._sensor, p.clustering)
+
+        with watch("shape"):
+            described = describe(filtered, labels, self._sensor, p.shape)
+
+        with watch("detection"):
+            judged = judge(described, p.detection)
+            found = detections(judged, sensor_offset)
+            free = clear_range(raw, filtered, sensor_offset)
+
+        with watch("slam"):
+            motion, odometry = self._motion(step)
+            estimate = self._slam.process(step.index, motion, found, free)
+
+        with watch("tracking"):
+            self._tracker.process(
+                step.scan.stamp_ns,
+                estimate.T_map_base,
+                estimate.covariance,
+                found,
+                free,
+                p.slam.view_range,
+            )
+            trees = self._tracker.trees()
+
+        self._path.append(step.scan.stamp_ns, estimate)
+        return Frame(
+            index=step.index,
+            stamp_ns=step.scan.stamp_ns,
+            raw=raw,
+            filtered=filtered,
+            labels=labels.label,
+            clusters=judged,
+            detections=found,
+            estimate=estimate,
+            T_odom_base=odometry,
+            sensor_offset=sensor_offset,
+            trees=trees,
+            counts={
+                "returns": len(step.scan.points),
+                "without a value": step.scan.dropped,
+                "out of range": len(step.scan.points) - len(raw),
+                "out of the box": len(raw) - len(boxed),
+                "averaged in voxels": len(boxed) - len(voxels),
+                "ground or too high": len(voxels) - len(filtered),
+                "clustered": int(np.count_nonzero(labels.label >= 0)),
+                "noise": int(np.count_nonzero(labels.label < 0)),
+            },
+            warnings=step.warnings,
+        )
+
+    def _above_ground(self, raw: Float32, voxels: Float32) -> Float32:
+        if self._parameters.ground.method == "none":
+            return voxels
+        terrain = ground.find_terrain(raw, self._parameters.ground)
+        return ground.in_band(voxels, ground.height_above(voxels, terrain), self._parameters.ground)
+
+    def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
+        """The odometry's step since the last scan, and its pose; no odometry is standing still."""
+        now = step.T_odom_base or self._odometry or Pose2()
+        motion = Pose2() if self._odometry is None else self._odometry.inverse() @ now
+        self._odometry = now
+        return motion, now
+
+    def snapshot(self) -> MapperState:
+        """All state, copied; parameters are not part of it."""
+        return MapperState(
+            self._slam.state.copy(),
+            self._tracker.tracks.copy(),
+            self._tracker.next_number,
+            self._odometry,
+            len(self._path),
+        )
+
+    def restore(self, state: MapperState) -> None:
+        """Go back to a snapshot of this mapper's own past; the state itself is left untouched."""
+        self._slam.state = state.slam.copy()
+        self._tracker.tracks = state.tracks.copy()
+        self._tracker.next_number = state.next_number
+        self._odometry = state.odometry
+        self._path.cut(state.path_length)
+
+
+class _PathColumns:
+    """Rows that grow by doubling: stamp, and x, y, yaw, sigma."""
+
+    def __init__(self) -> None:
+        self._stamp = np.zeros(64, np.int64)
+        self._rows: Float = np.zeros((64, 4))
+        self._length = 0
+
+    def __len__(self) -> int:
+        return self._length
+
+    def append(self, stamp_ns: int, estimate: PoseEstimate) -> None:
+        if self._length == len(self._stamp):
+            self._stamp = np.concatenate([self._stamp, np.zeros_like(self._stamp)])
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        T = estimate.T_map_base
+        sigma = float(np.sqrt(0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1])))
+        self._stamp[self._length] = stamp_ns
+        self._rows[self._length] = T.x, T.y, T.yaw, sigma
+        self._length += 1
+
+    def cut(self, length: int) -> None:
+        self._length = length
+
+    def columns(self) -> Path:
+        rows = self._rows[: self._length]
+        return Path(
+            self._stamp[: self._length].copy(),
+            rows[:, 0].copy(),
+            rows[:, 1].copy(),
+            rows[:, 2].copy(),
+            rows[:, 3].copy(),
+        )

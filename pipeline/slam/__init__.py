@@ -1,0 +1,5 @@
+"""SLAM: the path of the robot and the landmarks that it was found by (Eq. 5-7)."""
+
+from pipeline.slam.fastslam import FastSlam, SlamState
+
+__all__ = ["FastSlam", "SlamState"]

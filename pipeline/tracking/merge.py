@@ -1,0 +1,62 @@
+"""Merging: trees nearer to one another than `proximity_radius` are one tree."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.geometry import Float
+from pipeline.records import Bool
+from pipeline.tracking.table import TrackTable
+
+
+def merge_near(tracks: TrackTable, touched: Bool, radius: float) -> TrackTable:
+    """Join every touched tree with older ones within the radius; the older number stays.
+
+    Args:
+        tracks: Rows in the order of their numbers.
+        touched: shape (T,): trees that moved; two that rest cannot come nearer.
+        radius: [m].
+    """
+    if radius <= 0.0:
+        return tracks
+    alive = np.ones(len(tracks), np.bool_)
+    for row in np.flatnonzero(touched):
+        if not alive[row]:
+            continue
+        distance = np.hypot(*(tracks.x[:, :2] - tracks.x[row, :2]).T)
+        distance[row] = np.inf
+        distance[~alive] = np.inf
+        other = int(np.argmin(distance))
+        if distance[other] < radius:
+            _join(tracks, min(row, other), max(row, other))
+            alive[max(row, other)] = False
+    return tracks if alive.all() else tracks.take(alive)
+
+
+def _join(tracks: TrackTable, old: int, young: int) -> None:
+    tracks.x[old], tracks.P[old] = fuse(tracks.x[old], tracks.P[old], tracks.x[young], tracks.P[young])
+    tracks.stamp_ns[old] = max(tracks.stamp_ns[old], tracks.stamp_ns[young])
+    tracks.first_ns[old] = min(tracks.first_ns[old], tracks.first_ns[young])
+    tracks.score[old] = max(tracks.score[old], tracks.score[young])
+    tracks.sides[old] |= tracks.sides[young]
+    for column in (
+        tracks.hits,
+        tracks.eccentricity,
+        tracks.eccentricities,
+        tracks.radius,
+        tracks.radius_weight,
+        tracks.radii,
+    ):
+        column[old] += column[young]
+
+
+def fuse(x: Float, P: Float, other_x: Float, other_P: Float) -> tuple[Float, Float]:
+    """The best of two independent estimates of the measured part of the state (position).
+
+    The velocity of the first is kept: two still trees say nothing new about it.
+    """
+    x, P = x.copy(), P.copy()
+    K = P[:, :2] @ np.linalg.inv(P[:2, :2] + other_P[:2, :2])
+    I_KH = np.eye(4)
+    I_KH[:, :2] -= K
+    return x + K @ (other_x[:2] - x[:2]), I_KH @ P @ I_KH.T + K @ other_P[:2, :2] @ K.T

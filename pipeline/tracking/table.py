@@ -1,0 +1,95 @@
+"""What is kept of each tree: columns that grow, and what one more observation adds to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pipeline.geometry import Float
+from pipeline.records import Int
+
+SECTORS = 36  # of 10 degrees around a trunk, kept as bits: which sides were seen
+
+
+@dataclass(slots=True, eq=False)
+class TrackTable:
+    """Columns of length T.
+
+    Attributes:
+        number: int64, in the order of first sight, never used twice.
+        x: shape (T, 4): x, y [m], vx, vy [m/s]; P: its covariance, shape (T, 4, 4).
+        stamp_ns: int64, of `x` and of the last observation; first_ns: of the first.
+        hits: int64, observations; score: hits less misses.
+        eccentricity: Sum over the observations with a finite one; eccentricities: their number.
+        radius: Sum of radii over their variances [1/m]; radius_weight: sum of 1/variance [1/m^2];
+            radii: number of them.
+        sides: int64: bit k is set when the sector k around the trunk was seen.
+    """
+
+    number: Int
+    x: Float
+    P: Float
+    stamp_ns: Int
+    first_ns: Int
+    hits: Int
+    score: Float
+    eccentricity: Float
+    eccentricities: Int
+    radius: Float
+    radius_weight: Float
+    radii: Int
+    sides: Int
+
+    @classmethod
+    def empty(cls, rows: int = 0) -> TrackTable:
+        """Rows of zeros."""
+        floats, ints = np.zeros(rows), np.zeros(rows, np.int64)
+        return cls(
+            number=ints.copy(),
+            x=np.zeros((rows, 4)),
+            P=np.zeros((rows, 4, 4)),
+            stamp_ns=ints.copy(),
+            first_ns=ints.copy(),
+            hits=ints.copy(),
+            score=floats.copy(),
+            eccentricity=floats.copy(),
+            eccentricities=ints.copy(),
+            radius=floats.copy(),
+            radius_weight=floats.copy(),
+            radii=ints.copy(),
+            sides=ints.copy(),
+        )
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def copy(self) -> TrackTable:
+        """An independent copy."""
+        return TrackTable(*(getattr(self, f.name).copy() for f in fields(self)))
+
+    def take(self, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> TrackTable:
+        """The rows where the mask holds."""
+        return TrackTable(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+    def extended(self, more: TrackTable) -> TrackTable:
+        """These rows and then the others."""
+        return TrackTable(
+            *(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self))
+        )
+
+
+def seen_sides(from_bearing: float, arc: float) -> int:
+    """Bits of the sectors that a view from a direction shows.
+
+    Args:
+        from_bearing: Direction from the trunk to the sensor, frame of the map [rad].
+        arc: Visible arc around that direction [rad].
+    """
+    step = 2.0 * np.pi / SECTORS
+    first = int(np.ceil((from_bearing - arc / 2) / step - 1e-9))
+    last = int(np.floor((from_bearing + arc / 2) / step + 1e-9))
+    bits = 0
+    for k in range(first, min(last, first + SECTORS)):  # a sector counts when all of it was seen
+        bits |= 1 << (k % SECTORS)
+    return bits

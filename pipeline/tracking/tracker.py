@@ -1,0 +1,156 @@
+"""The tracker: which detection belongs to which tree, and what becomes of the trees (Eq. 10, 12)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.association import associate
+from pipeline.geometry import Float, Pose2
+from pipeline.parameters.stages import Tracking
+from pipeline.records import Bool, Detections, Int, Trees
+from pipeline.tracking.kalman import ENGINES
+from pipeline.tracking.merge import merge_near
+from pipeline.tracking.table import SECTORS, TrackTable, seen_sides
+from pipeline.visibility import in_free_view
+
+SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
+NANOSECONDS = 1e-9
+DBH_OBSERVATIONS = 3  # fewer radii are no diameter yet
+SHARED_RADIUS_SIGMA = 0.01  # m; bark and taper, which more scans of one side do not average out
+
+
+class Tracker:
+    """The trees of the map. A tree's number is given once and never used again."""
+
+    def __init__(self, parameters: Tracking) -> None:
+        self.parameters = parameters
+        self.tracks = TrackTable.empty()
+        self.next_number = 1
+
+    def process(
+        self,
+        stamp_ns: int,
+        T_map_base: Pose2,
+        pose_covariance: Float,
+        detections: Detections,
+        clear_range: Float,
+        view_range: float,
+    ) -> Int:
+        """Take the detections of one scan.
+
+        Args:
+            stamp_ns: Of the scan.
+            T_map_base: The pose that SLAM found (Eq. 9); pose_covariance: its covariance, (3, 3).
+            detections: In the base frame.
+            clear_range: How far the view was free by direction.
+            view_range: A tree nearer than this can be missed [m].
+
+        Returns:
+            The number of the tree that each detection went to, shape (D,).
+        """
+        p = self.parameters
+        position = T_map_base.apply(detections.centre)
+        R = _in_map(detections, T_map_base, pose_covariance)
+        row_of, _ = associate(
+            position,
+            R[:, [0, 0, 1], [0, 1, 1]],
+            self.tracks.x[:, :2],
+            self.tracks.P[:, [0, 0, 1], [0, 1, 1]],
+            p.gate,
+            p.distance_max,
+        )
+        touched = np.zeros(len(self.tracks), np.bool_)
+        for d in np.flatnonzero(row_of >= 0):
+            self._observe(int(row_of[d]), int(d), stamp_ns, position[d], R[d], T_map_base, detections)
+            touched[row_of[d]] = True
+        self._miss(touched, T_map_base, clear_range, view_range)
+        fresh = np.flatnonzero(row_of < 0)
+        row_of[fresh] = len(self.tracks) + np.arange(len(fresh))
+        self._begin(fresh, stamp_ns, position, R, T_map_base, detections)
+        number_of = self.tracks.number[row_of]
+        touched = np.concatenate([touched, np.ones(len(fresh), np.bool_)])
+        self.tracks = merge_near(self.tracks, touched, p.proximity_radius)
+        self.tracks = self.tracks.take(self.tracks.score > 0.0)
+        return number_of
+
+    def _observe(
+        self, row: int, d: int, stamp_ns: int, z: Float, R: Float, T_map_base: Pose2, seen: Detections
+    ) -> None:
+        p, t = self.parameters, self.tracks
+        dt = (stamp_ns - int(t.stamp_ns[row])) * NANOSECONDS
+        t.x[row], t.P[row] = ENGINES[p.engine](t.x[row], t.P[row], dt, p.acceleration_sigma, z, R)
+        t.stamp_ns[row] = stamp_ns
+        t.hits[row] += 1
+        t.score[row] = min(t.score[row] + 1.0, SCORE_MAX)
+        _gather(t, row, d, z, T_map_base, seen)
+
+    def _begin(
+        self, fresh: Int, stamp_ns: int, z: Float, R: Float, T_map_base: Pose2, seen: Detections
+    ) -> None:
+        new = TrackTable.empty(len(fresh))
+        new.number[:] = self.next_number + np.arange(len(fresh))
+        self.next_number += len(fresh)
+        new.x[:, :2] = z[fresh]
+        new.P[:, :2, :2] = R[fresh]
+        new.P[:, [2, 3], [2, 3]] = self.parameters.velocity_sigma**2
+        new.stamp_ns[:] = new.first_ns[:] = stamp_ns
+        new.hits[:] = 1
+        new.score[:] = 1.0
+        for row, d in enumerate(fresh):
+            _gather(new, row, int(d), z[d], T_map_base, seen)
+        self.tracks = self.tracks.extended(new)
+
+    def _miss(self, seen: Bool, T_map_base: Pose2, clear_range: Float, view_range: float) -> None:
+        pose, miss = T_map_base.as_array(), 1.0 / self.parameters.misses_per_hit
+        for row in np.flatnonzero(~seen):
+            if in_free_view(self.tracks.x[row], pose, clear_range, view_range):
+                self.tracks.score[row] -= miss
+
+    def trees(self) -> Trees:
+        """The map as it stands (Table 2)."""
+        t = self.tracks
+        enough = t.radii >= DBH_OBSERVATIONS
+        weight = np.where(enough, t.radius_weight, 1.0)
+        radius_sigma = np.sqrt(1.0 / weight + SHARED_RADIUS_SIGMA**2)
+        return Trees(
+            number=t.number.copy(),
+            position=t.x[:, :2].copy(),
+            covariance=t.P[:, :2, :2].copy(),
+            velocity=t.x[:, 2:].copy(),
+            dbh=np.where(enough, 2.0 * t.radius / weight, np.nan),
+            dbh_sigma=np.where(enough, 2.0 * radius_sigma, np.nan),
+            eccentricity=np.where(
+                t.eccentricities > 0, t.eccentricity / np.maximum(t.eccentricities, 1), np.nan
+            ),
+            observations=t.hits.copy(),
+            coverage=np.bitwise_count(t.sides) * (2.0 * np.pi / SECTORS),
+            first_seen_ns=t.first_ns.copy(),
+            last_seen_ns=t.stamp_ns.copy(),
+            confirmed=t.hits >= self.parameters.hits_to_confirm,
+        )
+
+
+def _gather(t: TrackTable, row: int, d: int, z: Float, T_map_base: Pose2, seen: Detections) -> None:
+    """Add what one detection says about the trunk itself."""
+    if np.isfinite(seen.eccentricity[d]):
+        t.eccentricity[row] += seen.eccentricity[d]
+        t.eccentricities[row] += 1
+    if np.isfinite(seen.radius[d]):
+        weight = 1.0 / float(seen.radius_sigma[d]) ** 2
+        t.radius[row] += weight * seen.radius[d]
+        t.radius_weight[row] += weight
+        t.radii[row] += 1
+    bearing = float(np.arctan2(T_map_base.y - z[1], T_map_base.x - z[0]))
+    t.sides[row] |= seen_sides(bearing, float(seen.arc[d]))
+
+
+def _in_map(detections: Detections, T_map_base: Pose2, pose_covariance: Float) -> Float:
+    """Covariance of the detections in the frame of the map, shape (D, 2, 2): their own, turned, and
+    the pose's, J Sigma J^T with J = d(position) / d(x, y, yaw)."""
+    C = T_map_base.rotation()
+    turned: Float = C @ detections.covariance @ C.T
+    arm = detections.centre @ C.T
+    J = np.zeros((len(arm), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    return turned + J @ pose_covariance @ J.transpose(0, 2, 1)
