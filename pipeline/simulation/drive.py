@@ -1,0 +1,109 @@
+"""How the robot drives: a smooth path through waypoints, with limits on speed, turning and gain of speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+
+from pipeline.records import Float
+
+RATE_HZ = 200
+_DS = 0.02
+_ACCELERATION = 0.5
+_YAW_RATE = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """The planar motion at 200 Hz; columns of length T.
+
+    Attributes:
+        t: Time since the start [s].
+        x, y: [m]; the first pose is the origin.
+        yaw: [rad], continuous, 0 at the start.
+        speed: [m/s] in the plane.
+        yaw_rate: [rad/s].
+    """
+
+    t: Float
+    x: Float
+    y: Float
+    yaw: Float
+    speed: Float
+    yaw_rate: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """The line on the ground that is driven, sampled each 2 cm; the first point is the origin, and it
+    leaves along x. `yaw` is continuous, `curvature` is in 1/m."""
+
+    s: Float
+    x: Float
+    y: Float
+    yaw: Float
+    curvature: Float
+    closed: bool
+
+
+def lay_course(waypoints: Float, closed: bool) -> Course:
+    """A smooth line through waypoints of shape (N, 2) [m], moved and turned to begin at the origin."""
+    knots = np.vstack([waypoints, waypoints[:1]]) if closed else waypoints
+    chord = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(knots, axis=0).T))])
+    spline = CubicSpline(chord, knots, bc_type="periodic" if closed else "natural")
+    u = np.linspace(0.0, chord[-1], max(int(chord[-1] / (0.25 * _DS)), 100))
+    fine = spline(u)
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(fine, axis=0).T))])
+    s = np.linspace(0.0, length[-1], round(length[-1] / _DS) + 1)
+    at = np.interp(s, length, u)
+    xy, first, second = spline(at), spline(at, 1), spline(at, 2)
+    norm = np.hypot(first[:, 0], first[:, 1])
+    yaw = np.unwrap(np.arctan2(first[:, 1], first[:, 0]))
+    curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / norm**3
+    c, sn = np.cos(yaw[0]), np.sin(yaw[0])
+    x, y = (xy - xy[0]).T
+    return Course(s, c * x + sn * y, c * y - sn * x, yaw - yaw[0], curvature, closed)
+
+
+def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
+    """Drive a course from standing still for `duration_s`: lap after lap when it is closed, else to its end.
+
+    Args:
+        course: Where to drive.
+        speed: On the straight [m/s]; turns are driven at 0.5 rad/s at most.
+        duration_s: Length of the run [s]; the table reaches a little beyond.
+    """
+    until = duration_s + 0.5
+    limit = _speed_limit(course, speed)
+    laps = max(1, int(np.ceil(until * speed / course.s[-1])) + 1) if course.closed else 1
+    v = np.concatenate([np.tile(limit[:-1], laps), limit[:1] if course.closed else limit[-1:]])
+    s = np.arange(v.size) * (course.s[1] - course.s[0])
+    v = np.minimum(v, np.sqrt(2.0 * _ACCELERATION * s))
+    if not course.closed:
+        v = np.minimum(v, np.sqrt(2.0 * _ACCELERATION * (s[-1] - s)))
+    time = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(s) / (v[1:] + v[:-1]))])
+    t = np.arange(int(np.ceil(until * RATE_HZ)) + 1) / RATE_HZ
+    along = np.interp(t, time, s)
+    lap, rest = np.divmod(along, course.s[-1]) if course.closed else (np.zeros_like(along), along)
+    yaw = np.interp(rest, course.s, course.yaw) + lap * (course.yaw[-1] - course.yaw[0])
+    v_t = np.where(along < s[-1], np.interp(along, s, v), 0.0)
+    return Drive(
+        t=t,
+        x=np.interp(rest, course.s, course.x),
+        y=np.interp(rest, course.s, course.y),
+        yaw=yaw,
+        speed=v_t,
+        yaw_rate=v_t * np.interp(rest, course.s, course.curvature),
+    )
+
+
+def _speed_limit(course: Course, speed: float) -> Float:
+    mode = "wrap" if course.closed else "nearest"
+    limit = np.minimum(speed, _YAW_RATE / np.maximum(np.abs(course.curvature), 1e-6))
+    window = int(0.6 / _DS)
+    slowest: Float = minimum_filter1d(limit, 2 * window + 1, mode=mode)
+    smooth: Float = gaussian_filter1d(slowest, window / 3.0, mode=mode)
+    return smooth

@@ -1,0 +1,136 @@
+"""A whole simulated run: every sensor at any time, each scan alone as well as in order."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry import Pose3
+from pipeline.records import Float, Imu, Int, Odometry, TruthPath
+from pipeline.simulation.drive import RATE_HZ, drive_course, lay_course
+from pipeline.simulation.inertial import IMU_HZ, Inertial, inertial_readings
+from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
+from pipeline.simulation.motion import Motion, lay_on_terrain
+from pipeline.simulation.scene import Scene, build_scene
+from pipeline.simulation.solids import Solids
+from pipeline.simulation.uri import EXACT, RunRequest
+from pipeline.simulation.wheels import ODOMETRY_HZ, QUALITIES, wheel_odometry
+
+# Raise it with every change that changes a run's bytes.
+VERSION = 1
+START_NS = 1_700_000_000_000_000_000
+MOUNTING = Pose3(np.eye(3), np.array([0.1, 0.0, 0.8]))
+_SCENE, _SHAKE, _WHEELS, _INERTIAL, _SCAN = range(5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedRun:
+    """A run that was opened; nothing in it changes.
+
+    Attributes:
+        request: What was asked for.
+        T_base_lidar: Mounting of the LiDAR on the base, which lies on the ground.
+        lidar: The sensor.
+        scene: What the robot drives through.
+        motion: Where it truly is.
+        odometry: x, y [m], yaw [rad] by the wheels at 50 Hz, shape (N, 3).
+        inertial: The inertial unit at 100 Hz.
+        scans: Number of scans.
+    """
+
+    request: RunRequest
+    T_base_lidar: Pose3
+    lidar: SpinningLidar
+    scene: Scene
+    motion: Motion
+    odometry: Float
+    inertial: Inertial
+    scans: int
+
+    def scan_stamps(self) -> Int:
+        """Stamps of all scans [ns], int64, shape (N,)."""
+        return START_NS + np.arange(self.scans, dtype=np.int64) * self.lidar.period_ns
+
+    def sweep(self, k: int) -> Sweep:
+        """Scan k (from 0), the same whether or not others were made before it."""
+        begin = k * self.lidar.period_ns
+        times = (begin + self.lidar.column_offsets_ns().astype(np.int64)) / 1e9
+        R, o = self.motion.sensor_at(times, self.T_base_lidar)
+        rng = np.random.default_rng([_SCAN, self.request.seed, k])
+        solids = self._solids(times, R, o)
+        return sweep_scene(self.lidar, solids, self.scene.terrain, R, o, START_NS + begin, rng)
+
+    def odometry_record(self, n: int) -> Odometry:
+        """Reading n of the odometry."""
+        t_ns = n * (1_000_000_000 // ODOMETRY_HZ)
+        if self.request.odometry == EXACT:
+            R, p = self.motion.at(np.array([t_ns / 1e9]))
+            return Odometry(START_NS + t_ns, Pose3(R[0], p[0]))
+        x, y, yaw = self.odometry[n]
+        return Odometry(START_NS + t_ns, Pose3.from_euler(np.array([x, y, 0.0]), 0.0, 0.0, yaw))
+
+    def imu_record(self, n: int) -> Imu:
+        """Reading n of the inertial unit."""
+        stamp = START_NS + n * (1_000_000_000 // IMU_HZ)
+        unit = self.inertial
+        return Imu(stamp, unit.angular_velocity[n], unit.linear_acceleration[n], unit.orientation(n))
+
+    def true_path(self) -> TruthPath:
+        """The true pose of the base at the stamp of each scan, in the frame of the map."""
+        rows = np.arange(self.scans) * (RATE_HZ * self.lidar.period_ns // 1_000_000_000)
+        d = self.motion.drive
+        yaw = (d.yaw[rows] + np.pi) % (2.0 * np.pi) - np.pi
+        return TruthPath(self.scan_stamps(), d.x[rows], d.y[rows], yaw, same_frame=True)
+
+    def digest(self) -> str:
+        """SHA-256 (hex) of all that decides the run's bytes."""
+        mounting = [*self.T_base_lidar.R.ravel().tolist(), *self.T_base_lidar.t.tolist()]
+        text = f"stemmap simulation {VERSION}; {self.request}; {self.request.scenario}; {mounting}"
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def _solids(self, times: Float, R: Float, o: Float) -> Solids:
+        """What stands there, each person as they stand when the beam passes them."""
+        solids = self.scene.still
+        middle = times.size // 2
+        for n, person in enumerate(self.scene.persons):
+            at, _ = person.place(float(times[middle]))
+            away = R[middle].T @ (np.array([at[0], at[1], o[middle, 2]]) - o[middle])
+            turned = (np.pi - float(np.arctan2(away[1], away[0]))) / (2.0 * np.pi)
+            column = min(int(turned * times.size), times.size - 1)
+            solids = solids.join(self.scene.person_solids(n, float(times[column])))
+        return solids
+
+
+def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> SimulatedRun:
+    """Build the scene and drive through it; no scan is made yet.
+
+    Raises:
+        SourceError: The scene has no place for so many trees.
+    """
+    scenario = request.scenario
+    lidar = SpinningLidar(range_sigma=request.sigma)
+    course = lay_course(np.array(scenario.waypoints), scenario.closed)
+    drive = drive_course(course, scenario.speed, request.duration_s)
+    scene = build_scene(scenario, course, _stream(_SCENE, request))
+    motion = lay_on_terrain(drive, scene.terrain, _stream(_SHAKE, request))
+    if request.odometry == EXACT:
+        odometry = np.stack([drive.x, drive.y, drive.yaw], axis=1)[:: RATE_HZ // ODOMETRY_HZ]
+    else:
+        odometry = wheel_odometry(motion, QUALITIES[request.odometry], _stream(_WHEELS, request))
+    return SimulatedRun(
+        request=request,
+        T_base_lidar=MOUNTING if T_base_lidar is None else T_base_lidar,
+        lidar=lidar,
+        scene=scene,
+        motion=motion,
+        odometry=odometry,
+        inertial=inertial_readings(motion, _stream(_INERTIAL, request)),
+        scans=int(request.duration_s * 1_000_000_000) // lidar.period_ns,
+    )
+
+
+def _stream(part: int, request: RunRequest) -> np.random.Generator:
+    """A generator of its own for each part, so that one does not shift the numbers of another."""
+    return np.random.default_rng([part, request.seed])

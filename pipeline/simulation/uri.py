@@ -1,0 +1,121 @@
+"""`sim:stand?seed=3&sigma=0.03`: what a person may ask of a simulated run, read strictly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from urllib.parse import parse_qsl
+
+from pipeline.errors import SourceError
+from pipeline.simulation.scenarios import SCENARIOS, Scenario
+from pipeline.simulation.wheels import QUALITIES
+
+SCHEME = "sim:"
+EXACT = "exact"
+_KEYS = {
+    "seed": "0 to 2^63 - 1",
+    "sigma": "range noise in metres, 0 to 0.2",
+    "odometry": f"one of {', '.join([*QUALITIES, EXACT])}",
+    "duration": "seconds, 1 to 3600",
+    "trees": "how many, 0 to 2000",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """A simulated run as it was asked for.
+
+    Attributes:
+        name: Of the scenario.
+        seed: Of everything random in the run.
+        sigma: Standard deviation of a range [m].
+        odometry: Quality of the wheels, or "exact".
+        duration_s: [s].
+        trees: How many stand there.
+    """
+
+    name: str
+    seed: int
+    sigma: float
+    odometry: str
+    duration_s: float
+    trees: int
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario with as many trees as were asked for."""
+        return replace(SCENARIOS[self.name], trees=self.trees)
+
+
+def parse_uri(uri: str, seed: int = 0) -> RunRequest:
+    """Read `sim:NAME?key=value&...`; "sim:" may be left out.
+
+    Args:
+        uri: As the user wrote it.
+        seed: Taken where the URI names none.
+
+    Raises:
+        SourceError: No such scenario or key, a key twice, a value that is no number or out of bounds.
+    """
+    name, _, query = uri.removeprefix(SCHEME).partition("?")
+    if name not in SCENARIOS:
+        known = ", ".join(SCHEME + scenario for scenario in SCENARIOS)
+        raise SourceError(f"there is no scenario {name!r}", where=uri, remedy=f"Scenarios: {known}")
+    values = _pairs(uri, query)
+    scenario = SCENARIOS[name]
+    odometry = values.get("odometry", "normal")
+    if odometry not in (*QUALITIES, EXACT):
+        raise _refusal(uri, "odometry", odometry)
+    most = 2000 if not scenario.placed else scenario.trees
+    return RunRequest(
+        name=name,
+        seed=_whole(uri, "seed", values.get("seed", str(seed)), 2**63 - 1),
+        sigma=_real(uri, "sigma", values.get("sigma", "0.02"), 0.0, 0.2),
+        odometry=odometry,
+        duration_s=_real(uri, "duration", values.get("duration", str(scenario.duration_s)), 1.0, 3600.0),
+        trees=_whole(uri, "trees", values.get("trees", str(scenario.trees)), most),
+    )
+
+
+def _pairs(uri: str, query: str) -> dict[str, str]:
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
+    except ValueError:
+        raise SourceError(
+            "the part after ? must be key=value, joined by &", where=uri, remedy=_allowed()
+        ) from None
+    values: dict[str, str] = {}
+    for key, value in pairs:
+        if key not in _KEYS:
+            raise SourceError(f"a simulated run has no option {key!r}", where=uri, remedy=_allowed())
+        if key in values:
+            raise SourceError(f"option {key!r} is given twice", where=uri, remedy="Give it once")
+        values[key] = value
+    return values
+
+
+def _allowed() -> str:
+    return "Options: " + "; ".join(f"{key} ({meaning})" for key, meaning in _KEYS.items())
+
+
+def _refusal(uri: str, key: str, text: str) -> SourceError:
+    return SourceError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_KEYS[key]}")
+
+
+def _whole(uri: str, key: str, text: str, most: int) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
+        refusal = _refusal(uri, key, text)
+        if key == "trees" and most < 2000:
+            refusal = SourceError(refusal.what, where=uri, remedy=f"This scenario has at most {most} trees")
+        raise refusal
+    return int(text)
+
+
+def _real(uri: str, key: str, text: str, low: float, high: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise _refusal(uri, key, text) from None
+    if not (math.isfinite(value) and low <= value <= high):
+        raise _refusal(uri, key, text)
+    return value
