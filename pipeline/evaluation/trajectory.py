@@ -1,0 +1,74 @@
+"""The error of the path against a true one (absolute trajectory error)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry import Float, Pose2
+from pipeline.records import Int, Path, TruthPath
+
+
+@dataclass(frozen=True, slots=True)
+class PathError:
+    """Distances between path and truth at the times of the truth.
+
+    Attributes:
+        rms, median, largest: [m].
+        at_end: [m], at the last common time.
+        compared: How many true positions lay within the time of the path.
+        aligned: Whether the path was moved and turned as a whole onto the truth before.
+    """
+
+    rms: float
+    median: float
+    largest: float
+    at_end: float
+    compared: int
+    aligned: bool
+
+
+def path_error(path: Path, truth: TruthPath, *, align: bool | None = None) -> PathError | None:
+    """Compare; None where the two share fewer than three times.
+
+    Args:
+        path: In the frame of the map.
+        truth: In the same frame or another.
+        align: Whether to fit a rigid motion in the plane first; None does it where the frames differ.
+    """
+    if len(path.stamp_ns) < 2:
+        return None
+    common = (truth.stamp_ns >= path.stamp_ns[0]) & (truth.stamp_ns <= path.stamp_ns[-1])
+    if np.count_nonzero(common) < 3:
+        return None
+    t = truth.stamp_ns[common]
+    ours = np.stack([_at(t, path.stamp_ns, path.x), _at(t, path.stamp_ns, path.y)], axis=1)
+    theirs = np.stack([truth.x[common], truth.y[common]], axis=1)
+    aligned = not truth.same_frame if align is None else align
+    if aligned:
+        ours = fit_rigid(ours, theirs).apply(ours)
+    distance = np.hypot(*(ours - theirs).T)
+    return PathError(
+        rms=float(np.sqrt((distance**2).mean())),
+        median=float(np.median(distance)),
+        largest=float(distance.max()),
+        at_end=float(distance[-1]),
+        compared=len(distance),
+        aligned=aligned,
+    )
+
+
+def fit_rigid(a: Float, b: Float) -> Pose2:
+    """T_b_a that brings points a nearest to points b, both of shape (N, 2) [m] (Umeyama 1991, no scale)."""
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    M = (a - mean_a).T @ (b - mean_b)
+    yaw = float(np.arctan2(M[0, 1] - M[1, 0], M[0, 0] + M[1, 1]))
+    turned = Pose2(0.0, 0.0, yaw).apply(mean_a[None, :])[0]
+    return Pose2(float(mean_b[0] - turned[0]), float(mean_b[1] - turned[1]), yaw)
+
+
+def _at(wanted_ns: Int, stamp_ns: Int, value: Float) -> Float:
+    start = stamp_ns[0]  # int64 nanoseconds since the epoch do not fit a float; differences do
+    result: Float = np.interp((wanted_ns - start) * 1e-9, (stamp_ns - start) * 1e-9, value)
+    return result
