@@ -1,0 +1,93 @@
+"""Colours by meaning, safe for colour-blind eyes (Okabe-Ito), and ramps for figures. All uint8 RGB."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.records import Verdict
+
+Colours = NDArray[np.uint8]
+Rgb = tuple[int, int, int]
+
+RAW: Rgb = (120, 126, 134)
+FILTERED: Rgb = (86, 140, 190)
+CLUSTERED: Rgb = (222, 184, 90)
+TREE: Rgb = (0, 158, 115)
+UNMEASURED: Rgb = (110, 170, 150)
+POLE: Rgb = (213, 94, 0)
+PERSON: Rgb = (204, 121, 167)
+BUSH: Rgb = (153, 153, 51)
+OTHER: Rgb = (136, 136, 136)
+UNCERTAIN: Rgb = (240, 228, 66)
+TRUTH: Rgb = (230, 159, 0)
+PATH: Rgb = (150, 156, 164)
+ODOMETRY: Rgb = (96, 101, 108)
+ROBOT: Rgb = (214, 45, 45)
+PARTICLES: Rgb = (235, 110, 110)
+SELECTION: Rgb = (86, 180, 233)
+
+_VERDICTS: dict[Verdict, Rgb] = {
+    Verdict.TREE: TREE,
+    Verdict.POLE: POLE,
+    Verdict.TOO_THIN: POLE,
+    Verdict.PERSON: PERSON,
+    Verdict.MOVING: PERSON,
+    Verdict.BUSH: BUSH,
+    Verdict.NOT_ROUND: BUSH,
+    Verdict.TOO_FEW_POINTS: UNCERTAIN,
+    Verdict.NO_ARC: UNCERTAIN,
+    Verdict.AT_BORDER: UNCERTAIN,
+    Verdict.HIDDEN: UNCERTAIN,
+}
+_BY_VERDICT: Colours = np.array([_VERDICTS.get(verdict, OTHER) for verdict in Verdict], dtype=np.uint8)
+
+# Twelve hues far apart, none of them the grey of noise.
+_CATEGORIES: Colours = np.array(
+    [
+        (86, 180, 233), (230, 159, 0), (0, 158, 115), (240, 228, 66), (213, 94, 0), (204, 121, 167),
+        (120, 120, 230), (150, 210, 110), (240, 140, 130), (70, 200, 200), (190, 150, 240), (200, 170, 120),
+    ],
+    dtype=np.uint8,
+)  # fmt: skip
+
+# Nine supports of a ramp from dark violet over green to yellow, evenly rising in lightness.
+_RAMP = np.array(
+    [
+        (68, 20, 100), (70, 50, 126), (56, 88, 140), (40, 118, 142), (31, 148, 139), (55, 178, 120),
+        (112, 206, 86), (180, 222, 44), (250, 231, 60),
+    ],
+    dtype=np.float64,
+)  # fmt: skip
+
+
+def by_verdict(verdicts: NDArray[np.integer]) -> Colours:
+    """The colour of each verdict, shape (K, 3)."""
+    chosen: Colours = _BY_VERDICT[np.clip(verdicts, 0, len(_BY_VERDICT) - 1)]
+    return chosen
+
+
+def by_category(numbers: NDArray[np.integer]) -> Colours:
+    """A hue for each number, the same for the same number, shape (K, 3)."""
+    chosen: Colours = _CATEGORIES[np.asarray(numbers) % len(_CATEGORIES)]
+    return chosen
+
+
+def ramp(values: NDArray[np.floating], low: float, high: float) -> Colours:
+    """Colours from violet (`low`) to yellow (`high`), shape (K, 3); what is not finite counts as `high`."""
+    t = (np.nan_to_num(values, nan=high, posinf=high, neginf=low) - low) / max(high - low, 1e-9)
+    place = np.clip(t, 0.0, 1.0) * (len(_RAMP) - 1)
+    rgb = np.stack([np.interp(place, np.arange(len(_RAMP)), _RAMP[:, c]) for c in range(3)], axis=-1)
+    return rgb.astype(np.uint8)
+
+
+def of_points(cluster_colours: Colours, labels: NDArray[np.integer], noise: Rgb) -> Colours:
+    """Each point in the colour of its cluster, `noise` where the label is -1, shape (M, 3)."""
+    table = np.vstack([cluster_colours.reshape(-1, 3), np.array([noise], dtype=np.uint8)])
+    chosen: Colours = table[labels]
+    return chosen
+
+
+def choose(first: NDArray[np.bool_], one: Rgb, other: Rgb) -> Colours:
+    """`one` where `first` holds, else `other`, shape (N, 3)."""
+    return np.array([other, one], dtype=np.uint8)[first.astype(np.int64)]

@@ -1,0 +1,107 @@
+"""Labels that stay where they are while what they name is measured again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+
+from pipeline.records import Frame, Verdict
+
+MOST_LABELS = 60  # more than 200 halve the frame rate of a browser, and nobody reads 60
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A text at a place in the frame of the map [m]; `key` says what it names."""
+
+    key: int
+    text: str
+    place: tuple[float, float, float]
+
+
+class Labels:
+    """A pool of label nodes. A node keeps to its key, so a text that did not change costs no message."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, scale: float = 0.9) -> None:
+        self._scene, self._name, self._scale = scene, name, scale
+        self._nodes: list[viser.LabelHandle] = []
+        self._node_of: dict[int, viser.LabelHandle] = {}
+
+    def show(self, labels: Iterable[Label]) -> None:
+        """Show these labels, at most `MOST_LABELS`, and hide all others."""
+        wanted = {label.key: label for label in list(labels)[:MOST_LABELS]}
+        for key in self._node_of.keys() - wanted.keys():
+            self._node_of.pop(key).visible = False
+        free = [node for node in self._nodes if node not in self._node_of.values()]
+        for key, label in wanted.items():
+            node = self._node_of.get(key) or (free.pop() if free else self._another())
+            self._node_of[key] = node
+            self._place(node, label)
+
+    @property
+    def texts(self) -> list[str]:
+        """What is to be read now."""
+        return [node.text for node in self._node_of.values()]
+
+    def _another(self) -> viser.LabelHandle:
+        node = self._scene.add_label(
+            f"{self._name}/{len(self._nodes)}",
+            "",
+            font_screen_scale=self._scale,
+            anchor="bottom-center",
+            visible=False,
+        )
+        self._nodes.append(node)
+        return node
+
+    @staticmethod
+    def _place(node: viser.LabelHandle, label: Label) -> None:
+        node.text = label.text
+        # A label that trembles by a few centimetres cannot be read, and each move is a message.
+        if not node.visible or np.linalg.norm(np.subtract(label.place, node.position)) > 0.15:
+            node.position = label.place
+        node.visible = True
+
+
+def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Label]:
+    """Labels for the clusters of a scan, trees first, then the nearest.
+
+    Args:
+        frame: The scan's results.
+        numbers: What each cluster is known by from scan to scan, shape (K,).
+        label_by: One of view.LABEL_BY.
+    """
+    if label_by == "none":
+        return []
+    clusters, pose = frame.clusters, frame.estimate.T_map_base
+    base = clusters.centroid + frame.sensor_offset
+    places = pose.apply(base[:, :2])
+    tops = base[:, 2] + 0.5 * clusters.extent[:, 2] + 0.1
+    order = np.lexsort((np.linalg.norm(base[:, :2], axis=1), clusters.verdict != Verdict.TREE))
+    return [
+        Label(int(numbers[k]), text, (float(places[k, 0]), float(places[k, 1]), float(tops[k])))
+        for k in order[:MOST_LABELS]
+        if (text := _cluster_text(frame, int(k), label_by))
+    ]
+
+
+def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
+    verdict = Verdict(int(frame.clusters.verdict[k])).label
+    if label_by == "verdict":
+        return verdict
+    if label_by == "DBH":
+        radius = float(frame.clusters.radius[k])
+        return f"{200 * radius:.0f} cm" if np.isfinite(radius) else ""
+    return f"e {short(float(frame.clusters.eccentricity[k]))} {verdict}"
+
+
+def short(value: float) -> str:
+    """A figure that does not tremble: two digits below 100, one above."""
+    if not np.isfinite(value):
+        return "∞"
+    if value >= 100.0:
+        return f"{float(f'{value:.1g}'):.0f}"
+    return f"{value:.1f}" if value < 10.0 else f"{value:.0f}"

@@ -1,0 +1,49 @@
+"""The few shapes of the scene, as vertices and faces."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+SIDES = 32  # of a circle
+
+Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
+
+
+def cylinder(sides: int = 20) -> Mesh:
+    """A closed cylinder of radius 1 and height 1 that stands on the origin."""
+    angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    low = np.column_stack([rim, np.zeros(sides)])
+    high = np.column_stack([rim, np.ones(sides)])
+    vertices = np.vstack([low, high, [[0, 0, 0], [0, 0, 1]]])
+    faces: list[tuple[int, int, int]] = []
+    for i in range(sides):
+        j = (i + 1) % sides
+        faces += [(i, j, sides + i), (j, sides + j, sides + i)]
+        faces += [(j, i, 2 * sides), (sides + i, sides + j, 2 * sides + 1)]
+    return vertices.astype(np.float32), np.array(faces, dtype=np.uint32)
+
+
+def circles(centres: NDArray[np.floating], radii: NDArray[np.floating], z: float) -> NDArray[np.float32]:
+    """Circles as segments, `SIDES` for each.
+
+    Args:
+        centres: shape (N, 2) [m].
+        radii: shape (N,) [m].
+        z: Height [m].
+
+    Returns:
+        shape (N * SIDES, 2, 3) [m].
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
+    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    xy = centres[:, None, :] + radii[:, None, None] * rim[None, :, :]
+    xyz = np.concatenate([xy, np.full((*xy.shape[:2], 1), z)], axis=2)
+    return np.stack([xyz[:, :-1], xyz[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
+
+
+def polyline(points: NDArray[np.floating], z: float) -> NDArray[np.float32]:
+    """Segments that join points of shape (N, 2) at height z [m], shape (N - 1, 2, 3)."""
+    xyz = np.column_stack([points, np.full(len(points), z)]).astype(np.float32)
+    return np.stack([xyz[:-1], xyz[1:]], axis=1)

@@ -1,0 +1,87 @@
+"""The robot in the scene: where it stands, where it came from, and how sure SLAM is of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from app.scene import colours
+from app.scene.cloud import Cloud
+from app.scene.lines import Line
+from app.scene.view import View
+from pipeline.geometry import Pose2
+from pipeline.records import Frame
+
+Float = NDArray[np.float64]
+
+ROBOT = "/world/robot"
+
+
+class RobotNodes:
+    """The robot's mesh and frame, its particles, its path and the path by odometry alone."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._frame = scene.add_frame(ROBOT, show_axes=False)
+        _add_body(scene)
+        self._particles = Cloud(scene, "/world/particles", 0.06, precision="float32")
+        self._path = Line(scene, "/world/path", colours.PATH, 0.05)
+        self._odometry = Line(scene, "/world/odometry", colours.ODOMETRY, 0.03)
+        self._dead_reckoning: list[tuple[float, float]] = []
+        self._start: Pose2 | None = None
+
+    def show(self, frame: Frame, path: Float, view: View) -> None:
+        """Show a new pose.
+
+        Args:
+            frame: The scan's results.
+            path: shape (N, 2) [m], all poses so far in the frame of the map.
+            view: What is to be seen.
+        """
+        pose = frame.estimate.T_map_base
+        self._frame.position = (pose.x, pose.y, 0.0)
+        self._frame.wxyz = (np.cos(pose.yaw / 2), 0.0, 0.0, np.sin(pose.yaw / 2))
+        particles = frame.estimate.particles
+        self._particles.show(
+            np.column_stack([particles[:, :2], np.full(len(particles), 0.05)]), colours.PARTICLES
+        )
+        self._path.show(path)
+        self._follow_odometry(frame, len(path))
+        self.repaint(view)
+
+    def repaint(self, view: View) -> None:
+        """Show the same pose after a choice of layers."""
+        self._particles.visible = view.layers["particles"]
+        self._path.visible = view.layers["path"]
+        self._odometry.visible = view.layers["odometry"]
+
+    def _follow_odometry(self, frame: Frame, poses: int) -> None:
+        if poses <= len(self._dead_reckoning):  # played back: the path is as long as it was then
+            del self._dead_reckoning[max(poses - 1, 0) :]
+        if not self._dead_reckoning:
+            self._start = frame.estimate.T_map_base @ frame.T_odom_base.inverse()
+        if self._start is not None:
+            at = self._start @ frame.T_odom_base
+            self._dead_reckoning.append((at.x, at.y))
+        self._odometry.show(np.array(self._dead_reckoning))
+
+
+def _add_body(scene: viser.SceneApi) -> None:
+    scene.add_box(
+        f"{ROBOT}/body", color=colours.ROBOT, dimensions=(0.6, 0.36, 0.2), position=(0.0, 0.0, 0.24)
+    )
+    for side, y in (("left", 0.22), ("right", -0.22)):
+        scene.add_cylinder(
+            f"{ROBOT}/wheel_{side}",
+            radius=0.15,
+            height=0.08,
+            color=(40, 42, 46),
+            wxyz=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
+            position=(0.0, y, 0.15),
+        )
+    scene.add_cylinder(
+        f"{ROBOT}/mast", radius=0.02, height=0.3, color=(90, 94, 100), position=(0.12, 0.0, 0.46)
+    )
+    scene.add_cylinder(
+        f"{ROBOT}/lidar", radius=0.06, height=0.08, color=(30, 32, 36), position=(0.12, 0.0, 0.62)
+    )

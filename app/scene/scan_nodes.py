@@ -1,0 +1,109 @@
+"""The standing scan in the scene: its points by stage, the fitted circles and the clusters' labels."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from app.scene import colours, meshes
+from app.scene.batch import Batch
+from app.scene.cloud import Cloud
+from app.scene.colours import Colours
+from app.scene.companions import Companions
+from app.scene.labels import Labels, cluster_labels
+from app.scene.view import View
+from pipeline.records import Frame
+
+# The lengths that the ramps span: about what trunks and ground of a stand reach.
+HEIGHT_LOW, HEIGHT_HIGH = -1.0, 3.0
+
+
+class ScanNodes:
+    """Nodes below the robot's frame, so that a scan stays in the frame of its sensor: viser sends points in
+    16 bits, which at the far end of a map would be steps of decimetres.
+
+    Args:
+        scene: Where the nodes are added.
+        robot: Name of the node that stands at T_map_base.
+    """
+
+    def __init__(self, scene: viser.SceneApi, robot: str) -> None:
+        self._sensor = scene.add_frame(f"{robot}/scan", show_axes=False)
+        self._raw = Cloud(scene, f"{robot}/scan/raw", 0.03)
+        self._filtered = Cloud(scene, f"{robot}/scan/filtered", 0.04)
+        self._clusters = Cloud(scene, f"{robot}/scan/clusters", 0.06)
+        self._fits = Batch(scene, f"{robot}/scan/fits", meshes.cylinder(), opacity=0.4, side="double")
+        self._labels = Labels(scene, "/world/labels")
+        self._companions = Companions()
+        self._numbers: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+
+    def show(self, frame: Frame, view: View) -> None:
+        """Show a new scan."""
+        centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
+        self._numbers = self._companions.follow(frame.estimate.T_map_base.apply(centroid))
+        self._sensor.position = frame.sensor_offset
+        self._show_fits(frame)
+        self.repaint(frame, view)
+
+    def repaint(self, frame: Frame, view: View) -> None:
+        """Show the same scan after a choice of colours, labels or layers."""
+        for cloud, layer in ((self._raw, "raw"), (self._filtered, "filtered"), (self._clusters, "clusters")):
+            if cloud.visible != view.layers[layer]:
+                cloud.visible = view.layers[layer]
+        self._fits.wanted = view.layers["fits"]
+        self._raw.show(frame.raw, self._ramp_or(frame.raw, view, colours.RAW))
+        self._filtered.show(frame.filtered, self._ramp_or(frame.filtered, view, colours.FILTERED))
+        member = frame.labels >= 0
+        self._clusters.show(
+            frame.filtered[member], cluster_colours(frame, self._numbers, view.colour_by)[member]
+        )
+        shown = cluster_labels(frame, self._numbers, view.label_by) if view.layers["labels"] else []
+        self._labels.show(shown)
+
+    @property
+    def texts(self) -> list[str]:
+        """The labels that are to be read now."""
+        return self._labels.texts
+
+    @staticmethod
+    def _ramp_or(points: NDArray[np.float32], view: View, plain: colours.Rgb) -> Colours | colours.Rgb:
+        if view.colour_by == "height":
+            return colours.ramp(points[:, 2], HEIGHT_LOW, HEIGHT_HIGH)
+        return plain
+
+    def _show_fits(self, frame: Frame) -> None:
+        rows = frame.detections.cluster
+        rows = rows[np.isfinite(frame.clusters.radius[rows])]
+        clusters = frame.clusters
+        height = np.maximum(clusters.extent[rows, 2], 0.2)
+        foot = clusters.centroid[rows, 2] - 0.5 * height
+        radius = clusters.radius[rows]
+        self._fits.show(
+            np.column_stack([clusters.centre[rows], foot]),
+            np.column_stack([radius, radius, height]),
+            colours.by_verdict(clusters.verdict[rows]),
+        )
+
+
+def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:
+    """Colours of the filtered points by what people chose, shape (M, 3).
+
+    Args:
+        frame: The scan's results.
+        numbers: What each cluster is known by from scan to scan, shape (K,).
+        colour_by: One of view.COLOUR_BY.
+    """
+    clusters = frame.clusters
+    if colour_by == "height":
+        return colours.ramp(frame.filtered[:, 2], HEIGHT_LOW, HEIGHT_HIGH)
+    if colour_by == "cluster":
+        table = colours.by_category(numbers)
+    elif colour_by == "eccentricity":  # 1 is round, 100 a line
+        table = colours.ramp(np.log10(np.maximum(clusters.eccentricity, 1.0)), 0.0, 2.0)
+    elif colour_by == "stage":
+        table = np.tile(np.array([colours.CLUSTERED], dtype=np.uint8), (len(clusters.size), 1))
+        table[frame.detections.cluster] = colours.TREE
+    else:
+        table = colours.by_verdict(clusters.verdict)
+    return colours.of_points(table, frame.labels, colours.FILTERED)
