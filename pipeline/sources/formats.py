@@ -1,0 +1,127 @@
+"""The formats that can be read, and how each is recognised: by contents first, by name last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.sources.base import Source, SourceOptions
+
+Opener = Callable[[str, Path, SourceOptions], Source]
+
+
+def _mcap(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.mcap_file import open_mcap
+    from pipeline.sources.ros import open_ros
+
+    return open_ros(uri, lambda: open_mcap(path), [path], options)
+
+
+def _db3(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.db3_file import open_db3
+    from pipeline.sources.ros import open_ros
+
+    return open_ros(uri, lambda: open_db3(path), [path], options)
+
+
+def _bag(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.bag_file import open_bag
+    from pipeline.sources.ros import open_ros
+
+    return open_ros(uri, lambda: open_bag(path), [path], options)
+
+
+def _bag_folder(uri: str, folder: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.bag_folder import BagFolder, bag_files
+    from pipeline.sources.ros import open_ros
+
+    files = bag_files(folder)
+    return open_ros(uri, lambda: BagFolder(files), files, options)
+
+
+def _pcap(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.pcap import PcapSource
+
+    return PcapSource(uri, path, options)
+
+
+def _victoria(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.victoria_park import VictoriaParkSource
+
+    return VictoriaParkSource(uri, path, options)
+
+
+def _kitti(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.kitti import KittiSource
+
+    return KittiSource(uri, path, options)
+
+
+def _pcd(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.pcd import PcdSource
+
+    return PcdSource(uri, path, options)
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A kind of file.
+
+    Attributes:
+        words: For people.
+        magic: What the file may begin with; () when only the name tells.
+        suffixes: Names it usually has, in lower case.
+        open: Makes the source.
+    """
+
+    words: str
+    magic: tuple[bytes, ...]
+    suffixes: tuple[str, ...]
+    open: Opener
+
+
+FILES = (
+    Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _mcap),
+    Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _db3),
+    Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _bag),
+    Format(
+        "Velodyne .pcap",
+        (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d"),
+        (".pcap",),
+        _pcap,
+    ),
+    Format("Victoria Park .zip (LASER.txt, DRS.txt)", (b"PK\x03\x04",), (".zip",), _victoria),
+    Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _pcd),
+    Format("KITTI .bin", (), (".bin",), _kitti),
+)
+
+READABLE = ", ".join(
+    [kind.words for kind in FILES]
+    + ["a folder of .bin or .pcd scans", "a rosbag2 folder", "sim:stand and the other sim: scenarios"]
+)
+
+
+def file_format(path: Path, head: bytes) -> Format | None:
+    """The format of a file by its first bytes, or by its name where the contents have no mark."""
+    for kind in FILES:
+        if any(head.startswith(mark) for mark in kind.magic):
+            return kind
+    suffix = path.suffix.lower()
+    return next((kind for kind in FILES if not kind.magic and suffix in kind.suffixes), None)
+
+
+def expected_format(path: Path) -> Format | None:
+    """The format that a file's name promises."""
+    return next((kind for kind in FILES if path.suffix.lower() in kind.suffixes), None)
+
+
+def folder_opener(folder: Path) -> Opener | None:
+    """How to open a folder, None when nothing in it can be read."""
+    suffixes = {path.suffix.lower() for path in folder.iterdir() if path.is_file()}
+    if suffixes & {".mcap", ".db3", ".zstd"}:
+        return _bag_folder
+    inside = folder / "velodyne"
+    if ".bin" in suffixes or (inside.is_dir() and any(inside.glob("*.bin"))):
+        return _kitti
+    return _pcd if ".pcd" in suffixes else None

@@ -1,0 +1,104 @@
+"""From one ROS message to one record: clouds, Velodyne packets, odometry and IMU."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import cast
+
+import numpy as np
+
+from pipeline.geometry import Pose3
+from pipeline.records import Imu, Odometry, Record, Scan
+from pipeline.sources import ros_messages
+from pipeline.sources.container import Channel, Message, count_loss
+from pipeline.sources.pointcloud2 import decode_cloud
+from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, MessageDecoder
+from pipeline.sources.stamps import SECOND_NS
+from pipeline.sources.transforms import TransformTree, frame_name, pose_of
+from pipeline.sources.velodyne import PacketDecoder, is_data_packet
+
+
+class RecordDecoder:
+    """Turns the messages of one recording into records.
+
+    Args:
+        channels: Of the recording, by number.
+        decoder: Of its messages.
+        tree: Its fixed transforms.
+
+    Attributes:
+        base: Name of the base frame, "" when there is none.
+    """
+
+    def __init__(self, channels: Mapping[int, Channel], decoder: MessageDecoder, tree: TransformTree) -> None:
+        self._channels, self._decoder, self._tree = channels, decoder, tree
+        self._packets = PacketDecoder()
+        self.base = ""
+
+    def record(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
+        """Decode a message; None when it cannot be used, which is counted in `losses`."""
+        channel = self._channels[message.channel]
+        try:
+            if channel.msgtype == ODOMETRY:
+                return self._odometry(message, stamp_ns)
+            if channel.msgtype == IMU:
+                return self._imu(message, stamp_ns)
+            scan = self.scan(message, stamp_ns, losses)[0]
+        except Exception:  # the one place that catches what the generated decoders of rosbags raise
+            named = {ODOMETRY: "odometry messages", IMU: "IMU messages"}.get(channel.msgtype, "scans")
+            count_loss(losses, f"{named} that cannot be read")
+            return None
+        if len(scan.points):
+            return scan
+        count_loss(losses, "scans without points")
+        return None
+
+    def scan(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> tuple[Scan, str, int]:
+        """A scan, the name of its frame, and the product number of the sensor (0 when not known).
+
+        Raises:
+            Exception: Of many kinds, when the message is damaged.
+        """
+        if self._channels[message.channel].msgtype == POINT_CLOUD:
+            cloud = cast(ros_messages.PointCloud2, self.message(message))
+            return decode_cloud(cloud, stamp_ns), frame_name(cloud.header.frame_id), 0
+        decoded = cast(ros_messages.VelodyneScan, self.message(message))
+        packets = [(_time_ns(p.stamp), p.data.tobytes()) for p in decoded.packets]
+        good = [packet for packet in packets if is_data_packet(packet[1])]
+        if len(good) < len(packets):
+            count_loss(losses, "packets that are no data packets", len(packets) - len(good))
+        shift = stamp_ns - _time_ns(decoded.header.stamp)
+        scan = self._packets.decode(stamp_ns, [t + shift for t, _ in good], [p for _, p in good])
+        return scan, frame_name(decoded.header.frame_id), good[0][1][-1]
+
+    def message(self, message: Message) -> object:
+        """The decoded message.
+
+        Raises:
+            Exception: Of many kinds, when it is damaged.
+        """
+        return self._decoder.decode(self._channels[message.channel], message.payload)
+
+    def _odometry(self, message: Message, stamp_ns: int) -> Odometry:
+        pose = cast(ros_messages.Odometry, self.message(message)).pose.pose
+        return Odometry(stamp_ns, pose_of(pose.position, pose.orientation))
+
+    def _imu(self, message: Message, stamp_ns: int) -> Imu:
+        """A reading, turned into the base frame when the recording says how the IMU stands in it."""
+        decoded = cast(ros_messages.Imu, self.message(message))
+        linked = self._tree.find(self.base, frame_name(decoded.header.frame_id))
+        R_base_imu = np.eye(3) if linked is None else linked.R
+        turn, pull, q = decoded.angular_velocity, decoded.linear_acceleration, decoded.orientation
+        rates = np.array([[turn.x, turn.y, turn.z], [pull.x, pull.y, pull.z]]) @ R_base_imu.T
+        if not np.isfinite(rates).all():
+            raise ValueError("the reading is not finite")
+        # REP 145: a first covariance of -1 says that there is no orientation; some drivers send zeros.
+        orientation = None
+        if decoded.orientation_covariance[0] >= 0 and abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) > 0.1:
+            R_level_imu = Pose3.from_quaternion(np.zeros(3), [q.w, q.x, q.y, q.z]).R
+            orientation = Pose3(R_level_imu @ R_base_imu.T, np.zeros(3)).quaternion()
+        return Imu(stamp_ns, rates[0], rates[1], orientation)
+
+
+def _time_ns(stamp: ros_messages.Stamp) -> int:
+    return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)

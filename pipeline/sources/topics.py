@@ -1,0 +1,109 @@
+"""Which topics of a recording are read: found by their type, the one with the most messages wins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from pipeline.errors import SourceError
+from pipeline.sources.container import Channel
+from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, ROS1_TRANSFORMS, TRANSFORMS, VELODYNE_SCAN
+
+TYPES_BY_ROLE = {"scan": (POINT_CLOUD, VELODYNE_SCAN), "odometry": (ODOMETRY,), "imu": (IMU,)}
+_READABLE = ("cdr", "ros1")
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of one type with the channels that carry it.
+
+    Attributes:
+        name, msgtype: Of the topic.
+        numbers: The channels.
+        count: Number of messages of all of them.
+    """
+
+    name: str
+    msgtype: str
+    numbers: frozenset[int]
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """The topics that are read; `fixed` and `moving` carry transforms."""
+
+    scan: Topic
+    odometry: Topic | None
+    imu: Topic | None
+    fixed: tuple[Topic, ...]
+    moving: tuple[Topic, ...]
+
+
+def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where: str) -> Topics:
+    """Choose the topics by role.
+
+    Args:
+        channels: Of the recording.
+        wanted: Topic by role ("scan", "odometry", "imu") as the user said; others are found by type.
+        where: The recording, for errors.
+
+    Raises:
+        SourceError: There is no scan, or a topic that the user named is not there or not of a type
+            for its role. The text names the topics that are there.
+    """
+    topics = _group(channels)
+    unknown = sorted(wanted.keys() - TYPES_BY_ROLE.keys())
+    if unknown:
+        raise SourceError(
+            f"there is no role {unknown[0]!r} for a topic", where=where, remedy="Use scan, odometry or imu."
+        )
+    chosen = {role: _choose(topics, role, wanted.get(role), where) for role in TYPES_BY_ROLE}
+    scan = chosen["scan"]
+    if scan is None:
+        types = " or ".join(TYPES_BY_ROLE["scan"])
+        raise SourceError(
+            f"the recording has no scans (messages of {types}); {_listing(topics)}",
+            where=where,
+            remedy="Record the topic of the LiDAR.",
+        )
+    transforms = [topic for topic in topics if topic.msgtype in (TRANSFORMS, ROS1_TRANSFORMS)]
+    fixed = tuple(topic for topic in transforms if topic.name.endswith("tf_static"))
+    moving = tuple(topic for topic in transforms if not topic.name.endswith("tf_static"))
+    return Topics(scan, chosen["odometry"], chosen["imu"], fixed, moving)
+
+
+def _group(channels: Iterable[Channel]) -> list[Topic]:
+    groups: dict[tuple[str, str], list[Channel]] = {}
+    for channel in channels:
+        if channel.encoding in _READABLE:
+            groups.setdefault((channel.topic, channel.msgtype), []).append(channel)
+        else:
+            named = f"{channel.msgtype or 'unknown type'} as {channel.encoding[:20] or 'unknown encoding'}"
+            groups.setdefault((channel.topic, named), []).append(channel)
+    return [
+        Topic(name, msgtype, frozenset(c.number for c in members), sum(c.count for c in members))
+        for (name, msgtype), members in sorted(groups.items())
+    ]
+
+
+def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Topic | None:
+    types = TYPES_BY_ROLE[role]
+    fitting = [topic for topic in topics if topic.msgtype in types and (name is None or topic.name == name)]
+    if name is not None and not fitting:
+        there = any(topic.name == name for topic in topics)
+        reason = f"the topic {name} is not of the type {' or '.join(types)}" if there else f"no topic {name}"
+        raise SourceError(
+            f"{reason}; {_listing(topics)}", where=where, remedy=f"Choose another {role} topic."
+        )
+    filled = [topic for topic in fitting if topic.count > 0] or (fitting if name is not None else [])
+    # Of equally many messages the decoded cloud is preferred to the raw packets it was made of.
+    return max(filled, key=lambda topic: (topic.count, -types.index(topic.msgtype)), default=None)
+
+
+def _listing(topics: list[Topic]) -> str:
+    if not topics:
+        return "it has no topics"
+    shown = [f"{topic.name[:80]} [{topic.msgtype[:80]}, {topic.count}]" for topic in topics[:30]]
+    more = f" and {len(topics) - 30} more" if len(topics) > 30 else ""
+    return "it has " + ", ".join(shown) + more
