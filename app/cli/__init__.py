@@ -11,6 +11,7 @@ import importlib
 import os
 import sys
 
+from app.version import version
 from pipeline.errors import ParameterError, StemmapError
 
 COMMANDS = ("serve", "map", "simulate", "evaluate", "params", "bench")
@@ -61,7 +62,7 @@ def _build_parser(wanted: str) -> argparse.ArgumentParser:
         description="Maps trees from a robot's LiDAR as it drives, and shows in the browser why.",
         epilog="`stemmap [SOURCE]` opens the dashboard; without a SOURCE a simulated stand plays.",
     )
-    parser.add_argument("--version", action="version", version=f"stemmap {_version()}")
+    parser.add_argument("--version", action="version", version=f"stemmap {version()}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name in COMMANDS:
         module = importlib.import_module(f"app.cli.{name}")
@@ -74,12 +75,6 @@ def _build_parser(wanted: str) -> argparse.ArgumentParser:
         if name == wanted:
             module.configure(subparser)
     return parser
-
-
-def _version() -> str:
-    from importlib.metadata import version
-
-    return version("stemmap")
 
 
 def _complain(error: object, code: int) -> int:

@@ -1,0 +1,83 @@
+"""Flags that several commands share: parameters, seed, odometry."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.errors import ParameterError
+
+if TYPE_CHECKING:
+    from pipeline.parameters import Parameters
+
+SOURCE_HELP = (
+    "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of .bin or .pcd scans, "
+    "or a simulated run such as sim:stand"
+)
+
+
+def add_parameter_flags(parser: argparse.ArgumentParser) -> None:
+    """--preset, --config and --set."""
+    parser.add_argument(
+        "--preset", metavar="NAME", help="parameters to start from (default: what suits the source)"
+    )
+    parser.add_argument("--config", metavar="FILE", type=Path, help="TOML file laid over the preset")
+    parser.add_argument(
+        "--set",
+        metavar="STAGE.NAME=VALUE",
+        dest="assignments",
+        action="append",
+        default=[],
+        help="one value laid over both; may be given again; `stemmap params` lists them",
+    )
+
+
+def add_run_flags(parser: argparse.ArgumentParser) -> None:
+    """--seed and --odometry."""
+    parser.add_argument(
+        "--seed", type=seed, default=0, metavar="N", help="of every random number (default: 0)"
+    )
+    parser.add_argument(
+        "--odometry",
+        choices=("auto", "wheels", "static"),
+        default="auto",
+        help="auto: what the source has; static: the robot stands still",
+    )
+
+
+def seed(text: str) -> int:
+    """A seed from a flag: a whole number that is not negative."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value < 1 << 63:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 on")
+    return value
+
+
+def chosen_parameters(arguments: argparse.Namespace, suggested: str) -> tuple[str, Parameters]:
+    """The name of the preset and the parameters that the flags ask for.
+
+    Args:
+        arguments: Parsed, with the flags of `add_parameter_flags`.
+        suggested: The preset that suits the source, where none is named.
+
+    Raises:
+        ParameterError: A name, value or file does not fit.
+    """
+    from pipeline.parameters import assign, from_toml, preset
+
+    name = arguments.preset or suggested
+    parameters = preset(name)
+    if arguments.config is not None:
+        try:
+            text = arguments.config.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "it is not text"
+            raise ParameterError(
+                f"cannot read the file of parameters: {reason}", where=str(arguments.config)
+            ) from None
+        parameters = from_toml(text, parameters, str(arguments.config))
+    return name, assign(parameters, arguments.assignments)

@@ -1,0 +1,103 @@
+"""A finished run, read back from its folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import SourceError
+from pipeline.export import PATH_COLUMNS, TREE_COLUMNS
+from pipeline.geometry import Float
+from pipeline.parameters import Parameters
+from pipeline.parameters.model import validated
+from pipeline.records import Path, Trees
+
+LARGEST_FILE = 256 << 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedRun:
+    """What `stemmap map` wrote: run.json as it is, the parameters in it, path and trees."""
+
+    record: dict[str, Any]
+    parameters: Parameters
+    path: Path
+    trees: Trees
+
+
+def read_run(folder: FilePath) -> FinishedRun:
+    """Read a run's folder.
+
+    Raises:
+        SourceError: A file is missing or is not what `stemmap map` writes.
+    """
+    try:
+        record = json.loads(_text(folder / "run.json"))
+        parameters = validated(record["parameters"])
+    except (ValueError, KeyError, TypeError):
+        raise SourceError("run.json is damaged", where=str(folder), remedy="Map the run again") from None
+    return FinishedRun(
+        record,
+        parameters,
+        _path(_columns(folder / "path.csv", PATH_COLUMNS)),
+        _trees(_columns(folder / "trees.csv", TREE_COLUMNS)),
+    )
+
+
+def _text(file: FilePath) -> str:
+    try:
+        if file.stat().st_size > LARGEST_FILE:
+            raise SourceError("the file is larger than 256 MB", where=str(file))
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SourceError(
+            f"cannot read it: {error.strerror}",
+            where=str(file),
+            remedy="Name a folder that `stemmap map` wrote",
+        ) from None
+    except UnicodeDecodeError:
+        raise SourceError("it is not text", where=str(file)) from None
+
+
+def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
+    rows = list(csv.reader(_text(file).splitlines()))
+    if not rows or tuple(rows[0]) != names:
+        raise SourceError(f"its columns are not {', '.join(names)}", where=str(file))
+    try:
+        table = np.array(
+            [[float(cell) if cell else math.nan for cell in row] for row in rows[1:]], np.float64
+        ).reshape(len(rows) - 1, len(names))
+    except ValueError:
+        raise SourceError("a row is damaged", where=str(file), remedy="Map the run again") from None
+    return dict(zip(names, table.T, strict=True))
+
+
+def _path(c: dict[str, Float]) -> Path:
+    stamp = np.round(c["t_s"] * 1e9).astype(np.int64)
+    return Path(stamp, c["x_m"], c["y_m"], c["yaw_rad"], c["sigma_xy_m"])
+
+
+def _trees(c: dict[str, Float]) -> Trees:
+    n = len(c["tree"])
+    covariance = np.zeros((n, 2, 2))
+    covariance[:, 0, 0], covariance[:, 1, 1] = c["sigma_x_m"] ** 2, c["sigma_y_m"] ** 2
+    return Trees(
+        number=c["tree"].astype(np.int64),
+        position=np.stack([c["x_m"], c["y_m"]], axis=1),
+        covariance=covariance,
+        velocity=np.zeros((n, 2)),
+        dbh=c["dbh_cm"] / 100.0,
+        dbh_sigma=c["sigma_dbh_cm"] / 100.0,
+        eccentricity=c["eccentricity"],
+        observations=c["observations"].astype(np.int64),
+        coverage=np.radians(c["coverage_deg"]),
+        first_seen_ns=np.round(c["first_seen_s"] * 1e9).astype(np.int64),
+        last_seen_ns=np.round(c["last_seen_s"] * 1e9).astype(np.int64),
+        confirmed=np.ones(n, np.bool_),
+    )

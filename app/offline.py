@@ -1,0 +1,245 @@
+"""A run mapped from its first to its last scan, in this process, into a folder."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path as FilePath
+from typing import Any, Protocol
+
+import numpy as np
+
+from app.stopwatch import Stopwatch
+from app.version import version
+from pipeline.errors import SourceError
+from pipeline.evaluation import Evaluation, PathError, Rate, evaluate, path_error
+from pipeline.export import RunFiles
+from pipeline.mapper import Mapper
+from pipeline.parameters import Parameters
+from pipeline.records import Frame, Path, Truth, TruthTrees, Verdict
+from pipeline.sources.base import Source
+from pipeline.steps import OdometryChoice, steps
+
+MEASURED_SCANS = 100_000  # of which times are kept for the medians
+
+
+class Progress(Protocol):
+    """What shows how far it is; tqdm is one."""
+
+    def update(self, n: int = 1, /) -> object:
+        """So many scans more."""
+
+    def close(self) -> None:
+        """No more will come."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OfflineRun:
+    """What to map, and how."""
+
+    source: Source
+    preset: str
+    parameters: Parameters
+    seed: int
+    odometry: OdometryChoice
+    truth_trees: TruthTrees | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Outcome:
+    """What came of it, for people.
+
+    Attributes:
+        summary: Lines to print.
+        warnings: Each once, with how often it came.
+        losses: What was left out, by reason.
+    """
+
+    summary: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    losses: dict[str, int] = field(default_factory=dict)
+
+
+def map_run(plan: OfflineRun, folder: FilePath, progress: Progress) -> Outcome:
+    """Map a run and write its files.
+
+    Raises:
+        SourceError: Nothing could be read.
+        OSError: The folder could not be written; nothing new stands in it then.
+    """
+    files = RunFiles(folder)
+    try:
+        return _map(plan, files, folder, progress)
+    except BaseException:
+        files.abandon()
+        raise
+    finally:
+        progress.close()
+
+
+def _map(plan: OfflineRun, files: RunFiles, folder: FilePath, progress: Progress) -> Outcome:
+    description = plan.source.description
+    stopwatch = Stopwatch(scans=MEASURED_SCANS)
+    mapper = Mapper(
+        plan.parameters,
+        sensor=description.sensor,
+        T_base_lidar=description.T_base_lidar,
+        seed=plan.seed,
+        watch=stopwatch,
+    )
+    tally = _Tally(Counter(_odometry_warnings(plan)))
+    start_ns, frame = 0, None
+    for frame in _frames(plan, mapper, stopwatch):
+        start_ns = frame.stamp_ns if frame.index == 0 else start_ns
+        files.add(frame, start_ns)
+        tally.add(frame)
+        progress.update(1)
+    if frame is None:
+        raise SourceError("there is no scan in it", where=description.uri)
+    path, truth = mapper.path, _truth(plan)
+    evaluation = _evaluate(frame, path, truth, plan.parameters)
+    error = path_error(path, truth.path) if truth.path else None
+    outcome = Outcome(
+        summary=_summary(description.uri, frame, path, evaluation, error),
+        warnings=tally.warnings(),
+        losses={reason: n for reason, n in plan.source.losses.items() if n},
+    )
+    files.finish(frame.trees, path, start_ns, _run_record(plan, tally, frame, path, evaluation, error))
+    (folder / "timing.json").write_text(_timing(stopwatch), encoding="utf-8")
+    return outcome
+
+
+def _frames(plan: OfflineRun, mapper: Mapper, stopwatch: Stopwatch) -> Iterator[Frame]:
+    for step in steps(plan.source.records(), odometry=plan.odometry):
+        with stopwatch.whole_scan():
+            frame = mapper.process(step)
+        yield frame
+
+
+def _odometry_warnings(plan: OfflineRun) -> list[str]:
+    if plan.odometry == "static":
+        return ["the odometry is left aside (static): the robot is mapped as standing still"]
+    if not plan.source.description.has_odometry:
+        return ["the source has no odometry: the robot is mapped as standing still"]
+    return []
+
+
+@dataclass(slots=True, eq=False)
+class _Tally:
+    """What is counted over a run."""
+
+    warned: Counter[str]
+    points: Counter[str] = field(default_factory=Counter)
+    verdicts: Counter[str] = field(default_factory=Counter)
+
+    def add(self, frame: Frame) -> None:
+        self.points.update(frame.counts)
+        self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
+        self.warned.update(frame.warnings)
+
+    def warnings(self) -> list[str]:
+        return [text if n == 1 else f"{text} ({n} times)" for text, n in self.warned.items()]
+
+
+def _truth(plan: OfflineRun) -> Truth:
+    known = plan.source.truth() or Truth()
+    return Truth(plan.truth_trees or known.trees, known.path)
+
+
+def _evaluate(frame: Frame, path: Path, truth: Truth, parameters: Parameters) -> Evaluation | None:
+    if truth.trees is None:
+        return None
+    return evaluate(frame.trees, truth.trees, parameters.evaluation, np.stack([path.x, path.y], axis=1))
+
+
+def _run_record(
+    plan: OfflineRun,
+    tally: _Tally,
+    frame: Frame,
+    path: Path,
+    evaluation: Evaluation | None,
+    error: PathError | None,
+) -> dict[str, Any]:
+    """run.json: no time of day and no time taken, so that the same run gives the same bytes."""
+    description = plan.source.description
+    return {
+        "stemmap": version(),
+        "source": {
+            "uri": description.uri,
+            "kind": description.kind,
+            "sha256": description.digest,
+            "sensor": asdict(description.sensor),
+        },
+        "seed": plan.seed,
+        "odometry": plan.odometry,
+        "preset": plan.preset,
+        "parameters": plan.parameters.model_dump(),
+        "revisions": [{"revision": 0, "from_scan": 0, "changes": {}}],
+        "scans": frame.index + 1,
+        "duration_s": round((int(path.stamp_ns[-1]) - int(path.stamp_ns[0])) * 1e-9, 6),
+        "distance_m": round(_length(path), 3),
+        "trees": int(np.count_nonzero(frame.trees.confirmed)),
+        "points": dict(tally.points),
+        "verdicts": dict(sorted(tally.verdicts.items())),
+        "evaluation": None if evaluation is None else asdict(evaluation),
+        "path_error": None if error is None else asdict(error),
+        "warnings": tally.warnings(),
+        "losses": {reason: n for reason, n in plan.source.losses.items() if n},
+    }
+
+
+def _timing(stopwatch: Stopwatch) -> str:
+    stages = {stage: round(ms, 4) for stage, ms in stopwatch.stage_ms.items()}
+    record = {"median_ms_per_scan": round(stopwatch.scan_ms, 4), "median_ms_by_stage": stages}
+    return json.dumps(record, indent=1) + "\n"
+
+
+def _summary(
+    uri: str, frame: Frame, path: Path, evaluation: Evaluation | None, error: PathError | None
+) -> list[str]:
+    seconds = (int(path.stamp_ns[-1]) - int(path.stamp_ns[0])) * 1e-9
+    trees = int(np.count_nonzero(frame.trees.confirmed))
+    lines = [f"{uri}: {frame.index + 1} scans, {seconds:.1f} s, {_length(path):.1f} m driven, {trees} trees"]
+    if evaluation is not None:
+        lines += evaluation_lines(evaluation)
+    if error is not None:
+        how = "after alignment" if error.aligned else "in the frame of the map"
+        lines.append(
+            f"path: RMS {error.rms:.3f} m, median {error.median:.3f} m, largest {error.largest:.3f} m "
+            f"({error.compared} true positions, {how})"
+        )
+    return lines
+
+
+def evaluation_lines(e: Evaluation) -> list[str]:
+    """The scores as lines for people, counts beside the rates."""
+    return [
+        f"TA {_rate(e.TA)}   FR {_rate(e.FR)}   of the trees within {e.reach:g} m of the path",
+        f"TR {_rate(e.TR)}   FA {_rate(e.FA)}   of the other things; {e.spurious} trees where nothing stands",
+        f"completeness {_percent(e.completeness)}   correctness {_percent(e.correctness)}   "
+        f"F1 {_percent(e.f1)}",
+        f"position RMSE {_metres(e.position_rmse)}   DBH RMSE {_metres(e.dbh_rmse)} ({e.dbh_count} trees)   "
+        f"mean pair error {_pair(e.mean_pair_error_percent)}",
+    ]
+
+
+def _rate(rate: Rate) -> str:
+    return f"{rate.count}/{rate.of} ({_percent(rate.rate)})"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100.0 * value:.1f} %"
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{100.0 * value:.1f} cm"
+
+
+def _pair(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f} %"
+
+
+def _length(path: Path) -> float:
+    return float(np.hypot(np.diff(path.x), np.diff(path.y)).sum())
