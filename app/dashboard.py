@@ -1,0 +1,209 @@
+"""The dashboard's state: what the worker said last, and what people asked for.
+
+Joins the worker, the parameters, the 3D scene and the browsers. Everything runs on the event loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.live import Live
+from app.live_payload import map_payload, truth_payload
+from app.messages import Advance, Open, Play, SetParameters, Status
+from app.parameter_state import ParameterState
+from app.scores import Scores
+from app.worker_mailbox import joined
+from app.worker_messages import FromWorker, Opened, Report, Shown, ToWorker
+from pipeline.parameters import Parameters
+from pipeline.parameters.model import Value
+from pipeline.records import Frame, Path, TruthTrees
+
+
+class SceneLike(Protocol):
+    """What the dashboard needs of `app.scene.Scene`."""
+
+    @property
+    def port(self) -> int: ...
+
+    secret: str
+
+    def show(self, frame: Frame, path: NDArray[np.float64], /) -> None: ...
+    def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None: ...
+    def show_truth(self, trees: TruthTrees | None, /) -> None: ...
+    def select(self, number: int | None, /) -> None: ...
+    def clear(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class WorkerLike(Protocol):
+    """What the dashboard needs of `app.worker_process.WorkerProcess`."""
+
+    restarts: int
+
+    @property
+    def pid(self) -> int | None: ...
+
+    async def start(self) -> None: ...
+    async def send(self, command: ToWorker, /) -> None: ...
+    async def close(self) -> None: ...
+
+
+class Dashboard:
+    """What is shown, and what can be done to it. `worker` and `scene` are set before `start`.
+
+    Args:
+        parameters: In force at the beginning.
+        live: Where the browsers listen.
+    """
+
+    worker: WorkerLike
+    scene: SceneLike
+
+    def __init__(self, parameters: ParameterState, live: Live) -> None:
+        self.parameters = parameters
+        self.live = live
+        self.scores = Scores(lambda score: live.tell("evaluation", score))
+        self.status = Status(state="starting", detail="Starting")
+        self.shown: Shown | None = None
+        self.path: Path | None = None
+        self.path_xy = np.zeros((0, 2))
+        self.truth: TruthTrees | None = None
+        self.selected: int | None = None
+        self._notice = ""
+        self._restarts = 0
+        self._go = False
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the run's first scan, 0 before one is shown."""
+        return 0 if self.shown is None else self.shown.frame.stamp_ns - round(self.shown.time_s * 1e9)
+
+    async def start(self, source: Open) -> None:
+        """Start the worker with a source; it plays as soon as it is open."""
+        self.live.tell("status", self.status)
+        self.live.tell("parameters", self.parameters.as_plain())
+        self.live.tell("truth", None)
+        self.live.tell("evaluation", None)
+        self.live.tell("selection", {"tree": None})
+        self.scene.show_parameters(self.parameters.parameters, self.parameters.preset)
+        await self.worker.start()
+        await self._send_parameters()
+        await self.open(source)
+
+    async def close(self) -> None:
+        """End the worker and the scene."""
+        self.scores.close()
+        await self.worker.close()
+        self.scene.close()
+
+    # --- what people do --------------------------------------------------------------------------
+
+    async def command(self, command: ToWorker) -> None:
+        """Hand a command to the worker."""
+        self._notice = ""
+        # A worker that is down comes back with the source closed; then this is still to be done.
+        self._go = isinstance(command, Play | Open) and self.worker.pid is None
+        await self.worker.send(command)
+
+    async def open(self, source: Open) -> None:
+        """Leave the run and open another source."""
+        self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
+        await self.command(source)
+
+    async def change_parameters(self, changes: dict[str, Value]) -> None:
+        """Change values by their dotted names.
+
+        Raises:
+            ParameterError: A value does not fit; nothing is changed.
+        """
+        self.parameters.change(changes)
+        await self._tell_parameters()
+
+    async def use_preset(self, name: str) -> None:
+        """Take all values of a preset.
+
+        Raises:
+            ParameterError: There is none of this name.
+        """
+        self.parameters.use_preset(name)
+        await self._tell_parameters()
+
+    async def reset_parameters(self, names: list[str]) -> None:
+        """Give parameters (none named: all) the preset's values again.
+
+        Raises:
+            ParameterError: A name is unknown.
+        """
+        self.parameters.reset(names)
+        await self._tell_parameters()
+
+    async def select_tree(self, number: int | None) -> None:
+        """Select a tree everywhere; None selects nothing."""
+        self.selected = number
+        self.scene.select(number)
+        self.live.tell("selection", {"tree": number})
+
+    async def _tell_parameters(self) -> None:
+        self.live.tell("parameters", self.parameters.as_plain())
+        self.scene.show_parameters(self.parameters.parameters, self.parameters.preset)
+        await self._send_parameters()
+        self._score()
+
+    async def _send_parameters(self) -> None:
+        state = self.parameters
+        await self.worker.send(SetParameters(state.parameters.model_dump(), state.revision))
+
+    # --- what the worker says --------------------------------------------------------------------
+
+    async def receive(self, message: FromWorker) -> None:
+        """Take a message of the worker."""
+        match message:
+            case Report(status=status):
+                self._set_status(status)
+            case Opened():
+                await self._begin(message)
+            case Shown():
+                self._show(message)
+
+    async def _begin(self, opened: Opened) -> None:
+        """A source is open and waits: parameters that suit it first, then it plays."""
+        self.shown = self.path = None
+        self.truth = opened.truth
+        self.live.forget_map()
+        self.scores.forget()
+        self.scene.clear()
+        self.scene.show_truth(opened.truth)
+        self.live.tell("truth", truth_payload(opened.truth))
+        await self.select_tree(None)
+        if self.parameters.suit(opened.preset):
+            await self._tell_parameters()
+        restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
+        if restarted and not self._go:
+            self._notice = "The mapping process ended and was started again. Press play to begin anew"
+            await self.worker.send(Advance(1))  # a first picture instead of an empty page
+        else:
+            await self.worker.send(Play())
+        self._go = False
+
+    def _show(self, shown: Shown) -> None:
+        self.path = joined(self.path, shown.path_start, shown.path)
+        self.shown = shown
+        self.path_xy = np.column_stack([self.path.x, self.path.y])
+        self.scene.show(shown.frame, self.path_xy)
+        self.live.show(map_payload(shown), self.path_xy)
+        self._score()
+
+    def _score(self) -> None:
+        if self.shown is not None and self.truth is not None:
+            evaluation = self.parameters.parameters.evaluation
+            self.scores.ask(self.shown.frame.trees, self.truth, evaluation, self.path_xy)
+
+    def _set_status(self, status: Status) -> None:
+        if self._notice and status.state == "paused":
+            status = replace(status, detail=self._notice)
+        self.status = status
+        self.live.tell("status", status)

@@ -1,0 +1,104 @@
+"""A frame as the page needs it: the map without the points."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.worker_messages import Shown
+from pipeline.records import Frame, TruthTrees, Verdict
+
+Float = NDArray[np.float64]
+
+_NS = 1_000_000_000
+# A tenth of a millimetre: finer than any sensor, and short on the wire.
+_DIGITS = 4
+
+
+def map_payload(shown: Shown) -> dict[str, Any]:
+    """The message "map" without its path."""
+    frame = shown.frame
+    estimate = frame.estimate
+    return {
+        "type": "map",
+        "index": frame.index,
+        "time_s": shown.time_s,
+        "pose": _rounded(estimate.T_map_base.as_array()),
+        "odom": _rounded(frame.T_odom_base.as_array()),
+        "sigma_xy": round(float(np.sqrt(np.mean(np.diagonal(estimate.covariance)[:2]))), _DIGITS),
+        "n_eff": round(estimate.n_eff, 1),
+        "trees": trees_payload(frame, start_ns=frame.stamp_ns - round(shown.time_s * _NS)),
+        "verdicts": verdict_counts(frame.clusters.verdict),
+        "counts": dict(frame.counts),
+    }
+
+
+def trees_payload(frame: Frame, start_ns: int) -> list[dict[str, Any]]:
+    """The confirmed trees, one dict each; what is not known is None."""
+    trees = frame.trees
+    keep = np.flatnonzero(trees.confirmed)
+    ellipses = [ellipse(trees.covariance[k]) for k in keep]
+    columns: dict[str, Sequence[Any]] = {
+        "number": trees.number[keep].tolist(),
+        "x": _rounded(trees.position[keep, 0]),
+        "y": _rounded(trees.position[keep, 1]),
+        "ellipse": ellipses,
+        "dbh_cm": _finite(100.0 * trees.dbh[keep]),
+        "sigma_dbh_cm": _finite(100.0 * trees.dbh_sigma[keep]),
+        "eccentricity": _finite(trees.eccentricity[keep]),
+        "observations": trees.observations[keep].tolist(),
+        "coverage_deg": _finite(np.degrees(trees.coverage[keep])),
+        "first_seen_s": _rounded((trees.first_seen_ns[keep] - start_ns) / _NS),
+        "last_seen_s": _rounded((trees.last_seen_ns[keep] - start_ns) / _NS),
+    }
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def ellipse(covariance: Float) -> list[float]:
+    """Half axes [m] and direction of the longer one [rad] of the 1-sigma ellipse of a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    minor, major = np.sqrt(np.maximum(values, 0.0))
+    angle = math.atan2(vectors[1, 1], vectors[0, 1])
+    return [round(float(v), _DIGITS) for v in (major, minor, angle)]
+
+
+def verdict_counts(verdicts: NDArray[np.int32]) -> dict[str, int]:
+    """How many clusters ended with each verdict, in words, the most frequent first."""
+    values, counts = np.unique(verdicts, return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    return {Verdict(int(values[k])).label: int(counts[k]) for k in order}
+
+
+def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
+    """The ground truth trees, None when there are none."""
+    if truth is None:
+        return None
+    rows = zip(_rounded(truth.x), _rounded(truth.y), _finite(100.0 * truth.dbh), truth.kind, strict=True)
+    return {"trees": [{"x": x, "y": y, "dbh_cm": dbh, "kind": kind} for x, y, dbh, kind in rows]}
+
+
+def path_points(path_xy: Float, start: int) -> dict[str, Any]:
+    """The piece of a path (N, 2) from a row on, for a page that has the rows before it."""
+    return {"start": start, "points": np.round(path_xy[start:], 3).tolist()}
+
+
+def first_difference(old: Float | None, new: Float) -> int:
+    """How many rows from the start two paths (N, 2) have in common."""
+    if old is None:
+        return 0
+    n = min(len(old), len(new))
+    differs = (old[:n] != new[:n]).any(axis=1)
+    return int(np.argmax(differs)) if differs.any() else n
+
+
+def _rounded(values: Float) -> list[float]:
+    rounded: list[float] = np.round(values, _DIGITS).tolist()
+    return rounded
+
+
+def _finite(values: Float) -> list[float | None]:
+    return [round(v, 2) if math.isfinite(v) else None for v in values.tolist()]

@@ -1,0 +1,67 @@
+"""The page, its files, and viser's page."""
+
+from __future__ import annotations
+
+import mimetypes
+from pathlib import Path, PurePosixPath
+
+from fastapi import APIRouter
+from starlette.responses import FileResponse, Response
+
+from app.replies import error_reply
+from app.static_files import page_folder, plotly_script
+from app.viser_bridge import client_page
+
+router = APIRouter()
+
+# Where the machine's own table knows it wrong or not at all, a browser refuses a module script.
+mimetypes.add_type("text/javascript", ".js")
+mimetypes.add_type("text/javascript", ".mjs")
+
+_CHECK_EACH_TIME = {"Cache-Control": "no-cache"}
+
+# Plotly writes style attributes and takes pictures through blob: and data: addresses.
+_PAGE_POLICY = (
+    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "font-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'self'"
+)
+# viser's page is one file that unpacks itself: its scripts stand in it, and it starts workers from blobs.
+_VISER_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; worker-src blob: data:; "
+    "style-src 'unsafe-inline' blob:; img-src 'self' data: blob:; font-src data: blob:; "
+    "connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
+
+
+@router.get("/")
+def page() -> Response:
+    """The dashboard."""
+    return _file(page_folder() / "index.html", _PAGE_POLICY)
+
+
+@router.get("/static/plotly.min.js")
+def plotly() -> Response:
+    """The plots' library, of the installed package."""
+    return _file(plotly_script(), _PAGE_POLICY)
+
+
+@router.get("/static/{path:path}")
+def page_file(path: str) -> Response:
+    """A file of the page."""
+    wanted = PurePosixPath(path)
+    folder = page_folder().resolve()
+    found = (folder / wanted).resolve()
+    hidden = any(part.startswith(".") for part in wanted.parts)
+    if "\0" in path or hidden or not found.is_relative_to(folder) or not found.is_file():
+        return error_reply(404, "there is no such file", where=f"/static/{path[:200]}")
+    return _file(found, _PAGE_POLICY)
+
+
+@router.get("/viser/")
+def viser_page() -> Response:
+    """The 3D scene's page, of the installed viser."""
+    return _file(client_page(), _VISER_POLICY)
+
+
+def _file(path: Path, policy: str) -> Response:
+    return FileResponse(path, headers={**_CHECK_EACH_TIME, "Content-Security-Policy": policy})

@@ -1,0 +1,67 @@
+"""The parameters: read, change, reset, download."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from fastapi import APIRouter, Request
+from msgspec import Meta
+from starlette.responses import Response
+
+from app.replies import body_of, json_reply, table_reply
+from app.routes.access import Dash
+from pipeline.parameters import to_toml
+
+router = APIRouter(prefix="/api")
+
+_Name = Annotated[str, Meta(max_length=100)]
+_Value = bool | int | float | Annotated[str, Meta(max_length=100)]
+
+
+class _Changes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    changes: Annotated[dict[_Name, _Value], Meta(min_length=1, max_length=500)]
+
+
+class _Preset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    name: _Name
+
+
+class _Reset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    names: Annotated[list[_Name], Meta(max_length=500)] = []
+
+
+@router.get("/parameters")
+async def read(dashboard: Dash) -> Response:
+    """Values, what differs from the preset, and how each parameter is declared."""
+    return json_reply(dashboard.parameters.as_plain_with_specs())
+
+
+@router.patch("/parameters")
+async def change(request: Request, dashboard: Dash) -> Response:
+    """Change values by their dotted names."""
+    wanted: _Changes = await body_of(request, _Changes)
+    await dashboard.change_parameters(wanted.changes)
+    return await read(dashboard)
+
+
+@router.post("/parameters/preset")
+async def use_preset(request: Request, dashboard: Dash) -> Response:
+    """Take all values of a preset."""
+    wanted: _Preset = await body_of(request, _Preset)
+    await dashboard.use_preset(wanted.name)
+    return await read(dashboard)
+
+
+@router.post("/parameters/reset")
+async def reset(request: Request, dashboard: Dash) -> Response:
+    """Give the named parameters (none: all) the preset's values again."""
+    wanted: _Reset = await body_of(request, _Reset)
+    await dashboard.reset_parameters(wanted.names)
+    return await read(dashboard)
+
+
+@router.get("/parameters.toml")
+async def download(dashboard: Dash) -> Response:
+    """All values as a file that `--config` takes."""
+    return table_reply(to_toml(dashboard.parameters.parameters), "parameters.toml", "application/toml")

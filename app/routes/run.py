@@ -1,0 +1,104 @@
+"""The run: how it goes, and what is to be done with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from fastapi import APIRouter, Request
+from msgspec import Meta
+from starlette.responses import Response
+
+from app.messages import Advance, Open, Pause, Play, Seek, SetSpeed
+from app.replies import BadRequestError, body_of, error_reply, json_reply
+from app.routes.access import Dash
+from app.settings import Settings
+
+router = APIRouter(prefix="/api")
+
+_MOST_RECORDINGS = 500
+_FASTEST = 1000.0
+# A path or address; far longer ones are no mistake of typing.
+_LONGEST_URI = 4096
+
+_Command = Play | Pause | Advance | Seek | SetSpeed
+
+
+class OpenRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a browser may ask to have opened."""
+
+    uri: Annotated[str, Meta(min_length=1, max_length=_LONGEST_URI)]
+    odometry: Literal["auto", "wheels", "static"] = "auto"
+    seed: Annotated[int, Meta(ge=0, lt=2**63)] = 0
+
+
+@router.get("/status")
+async def status(dashboard: Dash) -> Response:
+    """How the run goes."""
+    return json_reply(dashboard.status)
+
+
+@router.post("/command")
+async def command(request: Request, dashboard: Dash) -> Response:
+    """Play, pause, advance, seek or set the speed."""
+    wanted: _Command = await body_of(request, _Command)
+    if isinstance(wanted, SetSpeed) and not 0.0 <= wanted.factor <= _FASTEST:
+        raise BadRequestError(f"factor = {wanted.factor}: should be from 0 to {_FASTEST:g}")
+    if isinstance(wanted, Seek) and not 0.0 <= wanted.time_s < float("inf"):
+        raise BadRequestError(f"time_s = {wanted.time_s}: should be 0 or more")
+    await dashboard.command(wanted)
+    return json_reply({}, 202)
+
+
+@router.post("/open")
+async def open_source(request: Request, dashboard: Dash) -> Response:
+    """Leave the run and open another source; how that went is told by the status."""
+    wanted: OpenRequest = await body_of(request, OpenRequest)
+    settings: Settings = request.app.state.settings
+    if not _may_open(wanted.uri, settings):
+        return error_reply(
+            403,
+            "from another machine only scenarios and the recordings of the folder can be opened",
+            where=wanted.uri,
+            remedy="Put it into the folder of recordings, or open it on the machine itself",
+        )
+    await dashboard.open(Open(wanted.uri, wanted.odometry, wanted.seed))
+    return json_reply({}, 202)
+
+
+@router.get("/sources")
+def sources(request: Request) -> Response:
+    """What can be opened."""
+    from pipeline.sources.simulated import scenarios
+
+    settings: Settings = request.app.state.settings
+    return json_reply(
+        {
+            "scenarios": [{"uri": uri, "doc": doc} for uri, doc in scenarios().items()],
+            "recordings": recordings(settings.recordings),
+        }
+    )
+
+
+def recordings(folder: Path | None) -> list[str]:
+    """Paths of the files and folders in the folder of recordings, hidden ones left out."""
+    if folder is None:
+        return []
+    try:
+        names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError:
+        return []
+    return [str(folder / name) for name in names[:_MOST_RECORDINGS]]
+
+
+def _may_open(uri: str, settings: Settings) -> bool:
+    """Any file may be opened by who sits at the machine; others must not feel their way in its disk."""
+    if settings.loopback or uri.startswith("sim:"):
+        return True
+    if settings.recordings is None:
+        return False
+    try:
+        return Path(uri).resolve().is_relative_to(settings.recordings.resolve())
+    except (OSError, ValueError):
+        return False

@@ -1,0 +1,71 @@
+"""The two websockets: what the page is told, and the bridge to viser."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Annotated
+
+import msgspec
+from fastapi import APIRouter
+from msgspec import Meta
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from app.dashboard import Dashboard
+from app.live import Listener
+from app.routes.access import Dash
+from app.viser_bridge import bridge
+
+router = APIRouter()
+
+_REFUSED = 1003
+_MOST_BROWSERS = 50
+_TRY_AGAIN_LATER = 1013
+
+
+class _Select(msgspec.Struct, frozen=True, tag="select"):
+    """Select a tree everywhere; null selects nothing."""
+
+    tree: Annotated[int, Meta(ge=0, lt=2**31)] | None
+
+
+_decoder = msgspec.json.Decoder(_Select)
+
+
+@router.websocket("/api/live")
+async def live(browser: WebSocket, dashboard: Dash) -> None:
+    """States as they change, newest wins; takes selections."""
+    if dashboard.live.listeners >= _MOST_BROWSERS:
+        await browser.close(_TRY_AGAIN_LATER)
+        return
+    await browser.accept()
+    with dashboard.live.listener() as listener:
+        sending = asyncio.create_task(_send(browser, listener))
+        try:
+            await _receive(browser, dashboard)
+        finally:
+            sending.cancel()
+            with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
+                await sending
+
+
+async def _send(browser: WebSocket, listener: Listener) -> None:
+    async for message in listener.messages():
+        await browser.send_text(message.decode())
+
+
+async def _receive(browser: WebSocket, dashboard: Dashboard) -> None:
+    while (event := await browser.receive())["type"] != "websocket.disconnect":
+        try:
+            wanted = _decoder.decode(event.get("text") or b"")
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            await browser.close(_REFUSED, "not a message of the page")
+            return
+        await dashboard.select_tree(wanted.tree)
+
+
+@router.websocket("/viser")
+@router.websocket("/viser/")
+async def viser(browser: WebSocket, dashboard: Dash) -> None:
+    """The 3D scene."""
+    await bridge(browser, dashboard.scene)

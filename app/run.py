@@ -1,0 +1,138 @@
+"""One opened source with its mapper: maps scan after scan, and goes back to any scan.
+
+The picture of a scan depends on the source, the seed and the parameters that each scan up to it was
+mapped with, and on nothing else: not on pauses, jumps, or which states happen to be kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from app.cursor import Cursor, Synchroniser
+from app.history import ParameterHistory, Snapshots
+from app.stopwatch import Stopwatch
+from pipeline.parameters import Parameters
+from pipeline.records import Frame, Path, Step
+from pipeline.sources.base import Source
+
+
+class MapperLike(Protocol):
+    """What a run needs of `pipeline.mapper.Mapper`; its state is opaque here."""
+
+    parameters: Parameters
+
+    def process(self, step: Step) -> Frame: ...
+    def snapshot(self) -> Any: ...  # noqa: ANN401
+    def restore(self, state: Any) -> None: ...  # noqa: ANN401
+    @property
+    def path(self) -> Path: ...
+
+
+MakeMapper = Callable[[Source, Parameters, int, Stopwatch], MapperLike]
+
+
+class Run:
+    """A source, from its first scan to wherever it stands.
+
+    Args:
+        source: What is mapped; closed by `close`.
+        mapper: Fresh, for this source.
+        synchronise: Joins the source's records to steps.
+        parameters: In force from the first scan on.
+        stopwatch: The one that the mapper measures with.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        mapper: MapperLike,
+        synchronise: Synchroniser,
+        parameters: Parameters,
+        stopwatch: Stopwatch,
+    ) -> None:
+        self.source = source
+        self.stopwatch = stopwatch
+        self.frame: Frame | None = None
+        self.standing = -1
+        self._mapper = mapper
+        self._cursor = Cursor(source, synchronise)
+        self._history = ParameterHistory(parameters)
+        self._snapshots: Snapshots[Any] = Snapshots(mapper.snapshot())
+        self._step: Step | None = None
+        self._before: Any = None
+        self._broken = False
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the run's first scan; 0 before anything is known of it."""
+        known = self.source.description.start_ns
+        if known is not None:
+            return known
+        return self._cursor.stamp_ns(0) if self._cursor.known else 0
+
+    @property
+    def path(self) -> Path:
+        """Where the robot was, up to the standing scan."""
+        return self._mapper.path
+
+    def peek_ns(self) -> int | None:
+        """Time of the next scan, None at the end."""
+        step = self._cursor.peek()
+        return None if step is None else step.scan.stamp_ns
+
+    def map_next(self) -> Frame | None:
+        """Map the next scan; None at the end of the run."""
+        step = self._cursor.take()
+        if step is None:
+            return None
+        self._before = self._mapper.snapshot()
+        self._snapshots.offer(step.index, self._before)
+        return self._map(step)
+
+    def map_again(self) -> Frame | None:
+        """Map the standing scan once more, from the state before it; None if there is none."""
+        if self._step is None or self._broken:
+            return None
+        self._mapper.restore(self._before)
+        return self._map(self._step)
+
+    def _map(self, step: Step) -> Frame:
+        wanted = self._history.at(step.index)
+        if self._mapper.parameters is not wanted:
+            self._mapper.parameters = wanted
+        self._broken = True
+        with self.stopwatch.whole_scan():
+            self.frame = self._mapper.process(step)
+        self._broken = False
+        self._step, self.standing = step, step.index
+        return self.frame
+
+    def index_at(self, stamp_ns: int) -> int | None:
+        """The scan shown at a time; None when it was not read yet."""
+        return self._cursor.index_at(stamp_ns)
+
+    @property
+    def known(self) -> int:
+        """How many scans were read so far."""
+        return self._cursor.known
+
+    def approach(self, index: int) -> None:
+        """Stand so that mapping on leads to a scan by the shortest way; `standing` is before it
+        afterwards. `index` is at most one more than what was reached before, or is ahead."""
+        scans, state = self._snapshots.newest(min(index, self._cursor.known))
+        if not self._broken and self.standing < index and scans <= self.standing + 1:
+            return
+        self._broken = True  # until all of it has worked
+        self._cursor.go_to(scans)
+        self._mapper.restore(state)
+        self.standing, self._step, self._broken = scans - 1, None, False
+
+    def use(self, parameters: Parameters, index: int) -> None:
+        """From a scan on, map with other parameters."""
+        if self._history.set_from(index, parameters):
+            self._snapshots.forget_after(index)
+
+    def close(self) -> None:
+        """Let go of the source."""
+        self.source.close()

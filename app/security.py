@@ -1,0 +1,194 @@
+"""Who may talk to the server: the holder of the token, by a name that we know, from our own page.
+
+The link that is printed at the start carries the token once; the answer puts it in a cookie that
+scripts cannot read and other sites do not send. Host is checked against names rebound to this machine,
+Origin against pages of other servers (another port is another origin, but not another site).
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+import socket
+from collections.abc import Iterable
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qsl, urlencode, urlsplit
+
+from starlette.datastructures import Headers
+from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from app.replies import error_reply
+from pipeline.errors import StemmapError
+
+_SAFE_METHODS = frozenset({"GET", "HEAD"})
+_LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
+_ANY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - compared with, not bound to
+_COOKIE_AGE_S = 30 * 24 * 3600
+
+_LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
+<style>body{font:1.1rem/1.6 system-ui,sans-serif;max-width:36rem;margin:15vh auto;padding:0 1.5rem}</style>
+<h1>Open the link that stemmap printed</h1>
+<p>This dashboard belongs to whoever started it. In the terminal where <code>stemmap</code> runs stands a
+link that ends in <code>?token=</code> and some letters: open that one.
+It changes at every start.</p></html>"""
+
+
+def new_token() -> str:
+    """A token that nobody guesses."""
+    return secrets.token_urlsafe(24)
+
+
+def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozenset[str]:
+    """The values of the Host header by which the server may be called."""
+    names = {*_LOOPBACK_NAMES, f"[{host}]" if ":" in host else host.lower(), *further}
+    if host in _ANY_ADDRESS:
+        names.add(socket.gethostname().lower())
+    return frozenset(f"{name}:{port}" for name in names) | (frozenset(names) if port == 80 else frozenset())
+
+
+class Guard:
+    """ASGI middleware: lets through only who may, for requests and websockets alike.
+
+    Args:
+        app: What is guarded.
+        token: That must be shown.
+        host, port: Where the server listens.
+        further_hosts: Other names of it.
+        body_limit: Largest body of a request [bytes].
+    """
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        *,
+        token: str,
+        host: str,
+        port: int,
+        further_hosts: Iterable[str] = (),
+        body_limit: int,
+    ) -> None:
+        self._app = app
+        self._token = token
+        self._port = port
+        self._hosts = allowed_hosts(host, port, further_hosts)
+        self._any_address = host in _ANY_ADDRESS
+        self._body_limit = body_limit
+        self.cookie = f"stemmap_{port}"
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer with an error, or hand on."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        refusal = self._refusal(scope, headers) or self._login(scope, headers)
+        if refusal is not None:
+            await refusal(scope, receive, send)
+        elif scope["type"] == "http":
+            await self._app(scope, _limited(receive, self._body_limit), send)
+        else:
+            await self._app(scope, receive, send)
+
+    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
+        """The answer to a request that comes by a wrong name, from a wrong page, or is too large."""
+        if not self._knows_host(headers):
+            return error_reply(
+                403, "this server is not known by that name", remedy="Open the link that stemmap printed"
+            )
+        unsafe = scope["type"] == "websocket" or scope["method"] not in _SAFE_METHODS
+        if unsafe and not self._fits_origin(scope, headers):
+            return error_reply(403, "the request comes from the page of another server")
+        length = headers.get("content-length", "0")
+        if not length.isdecimal() or int(length) > self._body_limit:
+            return error_reply(413, f"a body may have {self._body_limit} bytes")
+        return None
+
+    def _login(self, scope: Scope, headers: Headers) -> Response | None:
+        """The answer to who brings the token in the link, or brings none."""
+        if scope["type"] == "http" and scope["path"] == "/" and scope["method"] in _SAFE_METHODS:
+            query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
+            given = [value for name, value in query if name == "token"]
+            if given and self._is_token(given[-1]):
+                return self._welcome([(name, value) for name, value in query if name != "token"])
+        if self._has_cookie(headers) or self._has_bearer(headers):
+            return None
+        if scope["type"] == "http" and "text/html" in headers.get("accept", ""):
+            return HTMLResponse(_LOGIN_PAGE, 401, {"Cache-Control": "no-store"})
+        return error_reply(401, "the token is missing or wrong", remedy="Open the link that stemmap printed")
+
+    def _welcome(self, query: list[tuple[str, str]]) -> Response:
+        reply = RedirectResponse("/" + (f"?{urlencode(query)}" if query else ""), 303)
+        reply.headers["Cache-Control"] = "no-store"
+        reply.headers["Referrer-Policy"] = "no-referrer"
+        reply.set_cookie(
+            self.cookie, self._token, max_age=_COOKIE_AGE_S, path="/", httponly=True, samesite="strict"
+        )
+        return reply
+
+    def _knows_host(self, headers: Headers) -> bool:
+        given = headers.getlist("host")
+        if len(given) != 1:
+            return False
+        host = given[0].lower()
+        return host in self._hosts or (self._any_address and self._is_own_address(host))
+
+    def _is_own_address(self, host: str) -> bool:
+        """Whether it is a bare address with our port: only names can be rebound to this machine."""
+        try:
+            parts = urlsplit(f"//{host}")
+            ipaddress.ip_address(parts.hostname or "")
+            return (parts.port or 80) == self._port
+        except ValueError:
+            return False
+
+    def _fits_origin(self, scope: Scope, headers: Headers) -> bool:
+        origins = headers.getlist("origin")
+        if not origins:
+            return scope["type"] == "http" or self._has_bearer(headers)
+        host = headers["host"].lower()
+        return len(origins) == 1 and origins[0].lower() in (f"http://{host}", f"https://{host}")
+
+    def _has_cookie(self, headers: Headers) -> bool:
+        # Several cookies of one name can be sent; one of another path must not hide ours.
+        return any(
+            self._is_token(value)
+            for line in headers.getlist("cookie")
+            for part in line.split(";")
+            if (value := _cookie_value(part, self.cookie)) is not None
+        )
+
+    def _has_bearer(self, headers: Headers) -> bool:
+        scheme, _, given = headers.get("authorization", "").partition(" ")
+        return scheme.lower() == "bearer" and self._is_token(given.strip())
+
+    def _is_token(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode("utf-8", "replace"), self._token.encode())
+
+
+def _cookie_value(part: str, name: str) -> str | None:
+    try:
+        morsel = SimpleCookie(part.strip()).get(name)
+    except CookieError:
+        return None
+    return None if morsel is None else morsel.value
+
+
+class BodyTooLargeError(StemmapError):
+    """A body that goes on beyond the limit."""
+
+
+def _limited(receive: Receive, limit: int) -> Receive:
+    """`receive` that counts: a body without a length in its head may not go on for ever."""
+    seen = 0
+
+    async def counted() -> dict[str, object]:
+        nonlocal seen
+        message = await receive()
+        seen += len(message.get("body", b""))
+        if seen > limit:
+            raise BodyTooLargeError(f"a body may have {limit} bytes")
+        return dict(message)
+
+    return counted

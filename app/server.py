@@ -1,0 +1,144 @@
+"""The web application: one port for the page, the API, the live messages and the 3D scene."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI, Request
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from app.dashboard import Dashboard, SceneLike, WorkerLike
+from app.live import Live
+from app.messages import Open
+from app.parameter_state import ParameterState
+from app.replies import BadRequestError, error_reply, failure_reply
+from app.routes import page, parameters, results, run, sockets
+from app.security import BodyTooLargeError, Guard
+from app.settings import Settings
+from pipeline.errors import ParameterError, StemmapError
+
+_log = logging.getLogger(__name__)
+
+MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
+MakeWorker = Callable[[Dashboard], WorkerLike]
+
+_HEADERS = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-frame-options", b"SAMEORIGIN"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+)
+_POLICY = (b"content-security-policy", b"default-src 'none'; frame-ancestors 'self'")
+
+
+def build(
+    settings: Settings,
+    *,
+    port: int,
+    token: str,
+    source: Open,
+    parameter_state: ParameterState,
+    make_scene: MakeScene | None = None,
+    make_worker: MakeWorker | None = None,
+) -> FastAPI:
+    """The application.
+
+    Args:
+        settings: Of the deployment.
+        port: On which it is served, for Host and Origin.
+        token: That browsers must show.
+        source: Opened at the start.
+        parameter_state: The parameters at the start.
+        make_scene, make_worker: Stand in for viser and for the worker's process in tests.
+    """
+    dashboard = Dashboard(parameter_state, Live())
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        dashboard.worker = (make_worker or _worker)(dashboard)
+        dashboard.scene = (make_scene or _scene)(dashboard, asyncio.get_running_loop())
+        await dashboard.start(source)
+        try:
+            yield
+        finally:
+            await dashboard.close()
+
+    guard = Middleware(
+        Guard,
+        token=token,
+        host=settings.host,
+        port=port,
+        further_hosts=settings.hosts,
+        body_limit=settings.body_limit,
+    )
+    app = FastAPI(
+        title="stemmap",
+        lifespan=lifespan,
+        middleware=[Middleware(SafeHeaders), guard],
+        docs_url=None,  # its page loads scripts from another server
+        redoc_url=None,
+        openapi_url=None,
+        redirect_slashes=False,
+    )
+    app.state.dashboard, app.state.settings = dashboard, settings
+    for module in (page, run, parameters, results, sockets):
+        app.include_router(module.router)
+    _answer_errors(app)
+    return app
+
+
+class SafeHeaders:
+    """ASGI middleware: every answer, the refusals too, carries the headers that keep browsers careful."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Add the headers to the answer."""
+
+        async def careful(message: Message) -> None:
+            if message["type"] in ("http.response.start", "websocket.http.response.start"):
+                given = list(message.get("headers", ()))
+                names = {name.lower() for name, _ in given}
+                message["headers"] = given + [h for h in (*_HEADERS, _POLICY) if h[0] not in names]
+            await send(message)
+
+        await self._app(scope, receive, careful)
+
+
+def _answer_errors(app: FastAPI) -> None:
+    statuses = {BadRequestError: 422, ParameterError: 422, BodyTooLargeError: 413, StemmapError: 409}
+
+    @app.exception_handler(StemmapError)
+    async def for_people(_: Request, error: Exception) -> Response:
+        assert isinstance(error, StemmapError)  # noqa: S101 - the handler is registered for it
+        return failure_reply(next(statuses[t] for t in type(error).__mro__ if t in statuses), error)
+
+    @app.exception_handler(HTTPException)
+    async def of_the_framework(_: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)  # noqa: S101 - the handler is registered for it
+        return error_reply(error.status_code, str(error.detail).lower())
+
+    @app.exception_handler(Exception)
+    async def unexpected(_: Request, error: Exception) -> Response:
+        _log.error("a request failed", exc_info=error)
+        return error_reply(500, "this is a fault in stemmap", remedy="The terminal shows where it happened")
+
+
+def _worker(dashboard: Dashboard) -> WorkerLike:
+    from app.worker_process import WorkerProcess
+
+    return WorkerProcess(dashboard.receive)
+
+
+def _scene(dashboard: Dashboard, loop: asyncio.AbstractEventLoop) -> SceneLike:
+    from app.scene import Scene
+
+    return Scene(dashboard, loop)

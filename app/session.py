@@ -1,0 +1,255 @@
+"""A run as a person drives it: play, pause, step, seek, tune. No thread, no socket and no clock: a
+driver asks for the `pace` and calls `work` as often as it likes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Literal
+
+from app.cursor import Synchroniser
+from app.messages import State, Status
+from app.run import MakeMapper, Run
+from app.session_status import describe
+from app.stopwatch import Stopwatch
+from app.worker_messages import Opened
+from pipeline.parameters import Parameters
+from pipeline.records import Frame, Path
+from pipeline.sources.base import Source
+
+OpenSource = Callable[[str, int], Source]
+MakeSynchroniser = Callable[[str], Synchroniser]
+Pace = Literal["idle", "replay", "hurry"]
+
+_NS = 1_000_000_000
+# Beyond any run, and well inside of an int64 of nanoseconds.
+_LONGEST_S = 1e9
+_MOST_WARNINGS = 20
+
+
+class Session:
+    """Owns the source and the mapper.
+
+    After `SourceError` or any other exception out of `open` or `work`, call `fail`; another source
+    can be opened, and play begins anew.
+
+    Args:
+        open_source: From a URI and a seed.
+        make_mapper: A fresh mapper for a source, from parameters, seed and a stopwatch.
+        make_synchroniser: From the choice of odometry.
+        parameters: In force at the beginning.
+    """
+
+    def __init__(
+        self,
+        open_source: OpenSource,
+        make_mapper: MakeMapper,
+        make_synchroniser: MakeSynchroniser,
+        parameters: Parameters,
+    ) -> None:
+        self._open_source = open_source
+        self._make_mapper = make_mapper
+        self._make_synchroniser = make_synchroniser
+        self._parameters = parameters
+        self._revision = 0
+        self._asked: tuple[str, str, int] | None = None
+        self._run: Run | None = None
+        self._state: State = "starting"
+        self._detail = ""
+        self._target_index: int | None = None
+        self._target_ns: int | None = None
+        self._warnings: dict[str, None] = {}
+
+    @property
+    def pace(self) -> Pace:
+        """Whether a scan is to be mapped at once (on the way to a sought scan), in its time, or not."""
+        if self._run is None or self._state == "failed":
+            return "idle"
+        if self._seeking:
+            return "hurry"
+        return "replay" if self._state == "playing" else "idle"
+
+    @property
+    def frame(self) -> Frame | None:
+        """The picture of the standing scan."""
+        return self._run.frame if self._run else None
+
+    @property
+    def path(self) -> Path | None:
+        """Where the robot was up to the standing scan."""
+        return self._run.path if self._run else None
+
+    @property
+    def time_s(self) -> float:
+        """Of the picture, since the run's first scan."""
+        if self._run is None or self._run.frame is None:
+            return 0.0
+        return (self._run.frame.stamp_ns - self._run.start_ns) / _NS
+
+    def next_ns(self) -> int | None:
+        """Time of the next scan; None at the end of the run."""
+        return self._run.peek_ns() if self._run else None
+
+    def open(self, uri: str, odometry: str, seed: int) -> Opened:
+        """Leave the present run and stand, paused, before the first scan of another source.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        self._leave()
+        self._asked = (uri, odometry, seed)
+        synchronise = self._make_synchroniser(odometry)
+        source = self._open_source(uri, seed)
+        stopwatch = Stopwatch()
+        mapper = self._make_mapper(source, self._parameters, seed, stopwatch)
+        self._run = Run(source, mapper, synchronise, self._parameters, stopwatch)
+        self._state, self._detail = "paused", ""
+        self._warn(source.description.warnings)
+        return _opened(self._run)
+
+    def work(self) -> Frame | None:
+        """Map one scan if one is wanted. None when there was none: the run is at its end, or the
+        sought scan was already reached."""
+        run = self._run
+        if run is None or self.pace == "idle" or self._arrived(run):
+            return None
+        frame = run.map_next()
+        if frame is None:
+            self._target_index = self._target_ns = None
+            self._state = "finished"
+            return None
+        self._arrived(run)
+        self._warn(frame.warnings)
+        return frame
+
+    def play(self) -> None:
+        """Go on; from the start when the run is at its end or has failed."""
+        if self._run is None or self._state == "failed":
+            if self._asked is None:
+                return
+            self.open(*self._asked)
+        elif self._state == "finished":
+            self._seek_index(self._run, 0)
+        self._state, self._detail = "playing", ""
+
+    def pause(self) -> None:
+        """Stand still; on the way to a sought scan, once it is reached."""
+        if self._state == "playing":
+            self._state = "paused"
+
+    def advance(self, scans: int) -> None:
+        """Pause, and stand so many scans further or back."""
+        if self._run is None:
+            return
+        here = self._run.standing if self._target_index is None else self._target_index
+        self._settle()
+        self._seek_index(self._run, max(0, here + scans))
+
+    def seek(self, time_s: float) -> None:
+        """Stand at the last scan not later than a time; the run then goes on as it did before."""
+        if self._run is None or not math.isfinite(time_s):
+            return
+        if self._state != "playing":
+            self._settle()
+        seconds = min(max(time_s, 0.0), _LONGEST_S)
+        stamp_ns = self._run.start_ns + round(seconds * _NS)
+        index = self._run.index_at(stamp_ns)
+        if index is not None:
+            self._seek_index(self._run, index)
+            return
+        self._run.approach(self._run.known)
+        self._target_index, self._target_ns = None, stamp_ns
+
+    def set_parameters(self, parameters: Parameters, revision: int) -> Frame | None:
+        """Use other parameters: from the next scan on, or from the sought or the standing scan on.
+
+        Returns:
+            The standing scan, mapped again, when the run stands still; else None.
+        """
+        self._parameters, self._revision = parameters, revision
+        run = self._run
+        if run is None:
+            return None
+        if self._target_index is not None:
+            run.use(parameters, self._target_index)
+            return None
+        stands = self._state != "playing" and self._target_ns is None and run.standing >= 0
+        run.use(parameters, run.standing + (0 if stands else 1))
+        return run.map_again() if stands and self._state != "failed" else None
+
+    def fail(self, detail: str) -> None:
+        """Say that the run cannot go on, and why."""
+        self._state, self._detail = "failed", detail
+        self._target_index = self._target_ns = None
+
+    def status(self) -> Status:
+        """How the run goes; what only a clock can tell is left at 0."""
+        return describe(
+            self._run,
+            state=self._state,
+            detail=self._detail,
+            uri=self._asked[0] if self._asked else "",
+            time_s=self.time_s,
+            warnings=tuple(self._warnings),
+            revision=self._revision,
+        )
+
+    def close(self) -> None:
+        """Let go of the source."""
+        self._leave()
+
+    @property
+    def _seeking(self) -> bool:
+        return self._target_index is not None or self._target_ns is not None
+
+    def _settle(self) -> None:
+        self._state, self._detail = "paused", ""
+
+    def _seek_index(self, run: Run, index: int) -> None:
+        if index == run.standing and not self._seeking and run.frame is not None:
+            return
+        run.use(self._parameters, index)
+        run.approach(index)
+        self._target_index, self._target_ns = index, None
+
+    def _arrived(self, run: Run) -> bool:
+        """Whether the sought scan is reached; then nothing is sought any more."""
+        at_index = self._target_index is not None and run.standing >= self._target_index
+        at_time = False
+        if self._target_ns is not None and run.standing >= 0:
+            following = run.peek_ns()
+            at_time = following is not None and following > self._target_ns
+        if at_index or at_time:
+            self._target_index = self._target_ns = None
+        return at_index or at_time
+
+    def _leave(self) -> None:
+        if self._run is not None:
+            self._run.close()
+        self._run = None
+        self._warnings.clear()
+        self._target_index = self._target_ns = None
+
+    def _warn(self, warnings: Iterable[str]) -> None:
+        for warning in warnings:
+            self._warnings.pop(warning, None)
+            self._warnings[warning] = None
+        while len(self._warnings) > _MOST_WARNINGS:
+            del self._warnings[next(iter(self._warnings))]
+
+
+def _opened(run: Run) -> Opened:
+    description = run.source.description
+    truth = run.source.truth()
+    end_s = None
+    if description.start_ns is not None and description.end_ns is not None:
+        end_s = (description.end_ns - description.start_ns) / _NS
+    return Opened(
+        uri=description.uri,
+        kind=description.kind,
+        preset=description.preset,
+        scans=description.scans,
+        end_s=end_s,
+        truth=truth.trees if truth else None,
+    )

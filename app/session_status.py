@@ -1,0 +1,62 @@
+"""The status of a run, in figures that a person can read from two metres."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from app.messages import State, Status
+from app.run import Run
+from pipeline.records import Frame, Path
+
+_NS = 1_000_000_000
+# Position sigmas [m] up to which a tree map stays usable, and beyond which trees get mixed up: a third
+# of the usual distance between neighbouring trunks, and the whole of it.
+_GOOD_SIGMA, _WEAK_SIGMA = 0.5, 1.5
+
+
+def describe(
+    run: Run | None,
+    *,
+    state: State,
+    detail: str,
+    uri: str,
+    time_s: float,
+    warnings: tuple[str, ...],
+    revision: int,
+) -> Status:
+    """The status of a run, or of none; speed, rate and lateness are the driver's to fill in."""
+    if run is None:
+        return Status(state=state, detail=detail, source=uri, warnings=list(warnings), revision=revision)
+    description = run.source.description
+    losses = tuple(f"{count} {reason}" for reason, count in run.source.losses.items() if count)
+    frame = run.frame
+    return Status(
+        state=state,
+        detail=detail,
+        source=uri,
+        kind=description.kind,
+        time_s=time_s,
+        end_s=None if description.end_ns is None else (description.end_ns - run.start_ns) / _NS,
+        scan_index=-1 if frame is None else frame.index,
+        scans=description.scans,
+        mapping_ms=run.stopwatch.scan_ms,
+        stage_ms=run.stopwatch.stage_ms,
+        trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
+        distance_m=distance_driven(run.path),
+        health="good" if frame is None else health(frame),
+        warnings=list(warnings + losses),
+        revision=revision,
+    )
+
+
+def distance_driven(path: Path) -> float:
+    """Length of a path [m]."""
+    return float(np.hypot(np.diff(path.x), np.diff(path.y)).sum())
+
+
+def health(frame: Frame) -> str:
+    """ "good", "weak" or "lost", by how well the position is known."""
+    sigma = float(np.sqrt(np.mean(np.diagonal(frame.estimate.covariance)[:2])))
+    if not np.isfinite(sigma) or sigma > _WEAK_SIGMA:
+        return "lost"
+    return "good" if sigma <= _GOOD_SIGMA else "weak"

@@ -1,0 +1,108 @@
+"""Settings of a deployment, apart from the parameters of the mapping.
+
+Each can be given in the environment; a flag of the command line wins.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import StemmapError
+
+# Name in the environment, and what it means: the table from which the help is made.
+VARIABLES: dict[str, str] = {
+    "STEMMAP_HOST": "address to listen on, a loopback one (another needs the flag --host)",
+    "STEMMAP_PORT": "port to listen on",
+    "STEMMAP_TOKEN": "token of the link, 16 characters or more; else a new one at each start",
+    "STEMMAP_HOSTS": "further host names by which browsers may call the server, with commas between",
+    "STEMMAP_RECORDINGS": "folder whose recordings the page offers",
+}
+
+DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
+_SHORTEST_TOKEN = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How the server runs.
+
+    Attributes:
+        host: Address to listen on.
+        port: To listen on, 0 for any free one, None for the default or one of the next.
+        token: Of the link; empty for a new one.
+        hosts: Further names by which browsers may call the server.
+        recordings: Folder whose recordings the page offers, or None.
+        body_limit: Largest body of a request [bytes].
+        message_limit: Largest message of a browser's websocket [bytes].
+    """
+
+    host: str = DEFAULT_HOST
+    port: int | None = None
+    token: str = ""
+    hosts: tuple[str, ...] = ()
+    recordings: Path | None = None
+    body_limit: int = 1_000_000
+    message_limit: int = 1_000_000
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this machine can connect."""
+        return is_loopback(self.host)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address or name means this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
+    """Settings from the variables STEMMAP_*.
+
+    Raises:
+        StemmapError: A variable has a value that cannot be used.
+    """
+    given = os.environ if environment is None else environment
+    host = given.get("STEMMAP_HOST", DEFAULT_HOST)
+    if not is_loopback(host):
+        raise StemmapError(
+            f"{host} is not a loopback address", where="STEMMAP_HOST", remedy="Use the flag --host for it"
+        )
+    token = given.get("STEMMAP_TOKEN", "")
+    if token and (len(token) < _SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
+        raise StemmapError(
+            "the token is too short or has odd characters",
+            where="STEMMAP_TOKEN",
+            remedy=f"Give {_SHORTEST_TOKEN} letters and digits or more",
+        )
+    recordings = given.get("STEMMAP_RECORDINGS")
+    return Settings(
+        host=host,
+        port=_port(given["STEMMAP_PORT"]) if "STEMMAP_PORT" in given else None,
+        token=token,
+        hosts=tuple(
+            name.strip().lower() for name in given.get("STEMMAP_HOSTS", "").split(",") if name.strip()
+        ),
+        recordings=_folder(recordings) if recordings else None,
+    )
+
+
+def _port(text: str) -> int:
+    if text.isdecimal() and int(text) <= 65535:
+        return int(text)
+    raise StemmapError(f"{text!r} is no port", where="STEMMAP_PORT", remedy="Give a number from 0 to 65535")
+
+
+def _folder(text: str) -> Path:
+    folder = Path(text).expanduser()
+    if folder.is_dir():
+        return folder
+    raise StemmapError(f"{text} is no folder", where="STEMMAP_RECORDINGS")

@@ -1,0 +1,39 @@
+"""Where the page's files lie: beside the source, in the installed package, and in plotly."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+
+from pipeline.errors import StemmapError
+
+
+@cache
+def page_folder() -> Path:
+    """The folder of index.html: `static/` of a checkout, or `app/static` of an installed package.
+
+    Raises:
+        StemmapError: Neither is there.
+    """
+    package = Path(str(files("app")))
+    for folder in (package.parent / "static", package / "static"):
+        if (folder / "index.html").is_file():
+            return folder
+    raise StemmapError("the page is missing", where=str(package / "static"), remedy="Install stemmap again")
+
+
+@cache
+def plotly_script() -> Path:
+    """plotly.min.js of the installed plotly, found without importing it (which takes long).
+
+    Raises:
+        StemmapError: plotly is not installed.
+    """
+    spec = find_spec("plotly")
+    for folder in spec.submodule_search_locations or () if spec else ():
+        script = Path(folder) / "package_data" / "plotly.min.js"
+        if script.is_file():
+            return script
+    raise StemmapError("plotly is not installed", remedy="Install stemmap again")

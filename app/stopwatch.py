@@ -1,0 +1,53 @@
+"""Measures what the pipeline's stages cost: the pipeline itself has no clock."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from statistics import median
+
+
+class Stopwatch:
+    """The mapper's `Watch`: remembers how long each stage took over the last scans.
+
+    Args:
+        scans: Over how many scans medians are taken.
+        clock: Seconds from any start.
+    """
+
+    def __init__(self, scans: int = 50, clock: Callable[[], float] = time.perf_counter) -> None:
+        self._clock = clock
+        self._scans = scans
+        self._stages: dict[str, deque[float]] = {}
+        self._totals: deque[float] = deque(maxlen=scans)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Measure one stage."""
+        start = self._clock()
+        try:
+            yield
+        finally:
+            times = self._stages.setdefault(stage, deque(maxlen=self._scans))
+            times.append(self._clock() - start)
+
+    @contextmanager
+    def whole_scan(self) -> Iterator[None]:
+        """Measure the mapping of one scan, all stages and what lies between them."""
+        start = self._clock()
+        try:
+            yield
+        finally:
+            self._totals.append(self._clock() - start)
+
+    @property
+    def scan_ms(self) -> float:
+        """Median time of a scan [ms], 0 before the first."""
+        return 1e3 * median(self._totals) if self._totals else 0.0
+
+    @property
+    def stage_ms(self) -> dict[str, float]:
+        """Median time of each stage [ms], in the order in which they first ran."""
+        return {stage: 1e3 * median(times) for stage, times in self._stages.items()}

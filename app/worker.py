@@ -1,0 +1,95 @@
+"""The process that owns the source and the mapper: `python -m app.worker`.
+
+Commands come on stdin, messages go to stdout; both as app.wire says. It ends when stdin ends, so it
+never outlives the web process.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import sys
+import threading
+from functools import partial
+from typing import BinaryIO
+
+from app.session import Session
+from app.stopwatch import Stopwatch
+from app.wire import WireError, to_worker
+from app.worker_driver import Driver
+from app.worker_mailbox import Mailbox
+from app.worker_messages import ToWorker
+from pipeline.parameters import Parameters
+from pipeline.sources.base import Source
+
+# A scan that is being mapped, or a large file that is being opened, may take a moment to notice.
+_GRACE_S = 1.0
+
+
+def new_session() -> Session:
+    """A session on the real pipeline, for the worker and for commands that map in process."""
+    from pipeline.mapper import Mapper
+    from pipeline.sources import SourceOptions, open_source
+    from pipeline.steps import OdometryChoice, steps
+
+    choices: dict[str, OdometryChoice] = {"auto": "auto", "wheels": "wheels", "static": "static"}
+
+    def make_mapper(source: Source, parameters: Parameters, seed: int, watch: Stopwatch) -> Mapper:
+        known = source.description
+        return Mapper(
+            parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed, watch=watch
+        )
+
+    return Session(
+        open_source=lambda uri, seed: open_source(uri, SourceOptions(seed=seed)),
+        make_mapper=make_mapper,
+        make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
+        parameters=Parameters(),
+    )
+
+
+def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
+    """Drive a session by the commands of a stream until it ends."""
+    commands: queue.Queue[ToWorker | None] = queue.Queue()
+    finished = threading.Event()
+    reader = threading.Thread(target=_read, args=(incoming, commands, finished), daemon=True)
+    reader.start()
+    mailbox = Mailbox(outgoing)
+    Driver(session, commands, mailbox.put).run()
+    mailbox.close()
+    finished.set()
+
+
+def _read(incoming: BinaryIO, commands: queue.Queue[ToWorker | None], finished: threading.Event) -> None:
+    channel = to_worker()
+    try:
+        while (command := channel.read(incoming)) is not None:
+            commands.put(command)
+    except WireError as error:
+        print(f"stemmap worker: {error}", file=sys.stderr)  # noqa: T201
+    commands.put(None)
+    if not finished.wait(_GRACE_S):
+        os._exit(0)
+
+
+def _private_streams() -> tuple[BinaryIO, BinaryIO]:
+    """The pipes of this process, moved away from where a library may read or print."""
+    incoming = os.fdopen(os.dup(0), "rb")
+    outgoing = os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nowhere, 0)
+    os.close(nowhere)
+    os.dup2(2, 1)
+    return incoming, outgoing
+
+
+def main() -> None:
+    """Run as the worker of the web process that started this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
+    incoming, outgoing = _private_streams()
+    work(new_session(), incoming, outgoing)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""The worker's loop: takes commands between two scans, keeps the time of the replay, tells the web
+process what came of it.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
+
+from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
+from app.pacer import Pacer
+from app.session import Session
+from app.worker_messages import FromWorker, Report, Shown, ToWorker
+from pipeline.errors import StemmapError
+from pipeline.parameters.model import validated
+from pipeline.records import Frame
+
+Put = Callable[[FromWorker], None]
+T = TypeVar("T")
+
+# How often figures are told while a run plays, and how often a picture is shown on the way to a scan
+# that is sought: rarely enough that a short way shows no flicker.
+_REPORT_S = 0.25
+_GLIMPSE_S = 0.5
+
+
+class Driver:
+    """Drives a session until the commands end.
+
+    Args:
+        session: Where the run is.
+        commands: Filled by another thread; None ends the loop.
+        put: Sends a message to the web process without waiting.
+        clock: Seconds from any start.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        commands: queue.Queue[ToWorker | None],
+        put: Put,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._session = session
+        self._commands = commands
+        self._put = put
+        self._clock = clock
+        self._pacer = Pacer()
+        self._run = 0
+        self._reported: tuple[Status, float] | None = None
+        self._glimpse_at = 0.0
+
+    def run(self) -> None:
+        """Work until None comes as a command."""
+        self._report()
+        while True:
+            try:
+                command = self._commands.get(timeout=self._patience())
+            except queue.Empty:
+                self._guarded(self._map)
+                continue
+            if command is None:
+                self._session.close()
+                return
+            self._obey(command)
+
+    def _patience(self) -> float | None:
+        """Seconds until the next scan is to be mapped; None when only a command can start work."""
+        pace = self._session.pace
+        if pace == "idle":
+            return None
+        if pace == "hurry":
+            return 0.0
+        stamp_ns = self._guarded(self._session.next_ns)
+        return 0.0 if stamp_ns is None else self._pacer.delay(stamp_ns, self._clock())
+
+    def _map(self) -> None:
+        hurried = self._session.pace == "hurry"
+        frame = self._session.work()
+        now = self._clock()
+        if frame is not None:
+            self._pacer.mapped(frame.stamp_ns, now)
+        if hurried and self._session.pace != "hurry":  # arrived: time counts from here
+            self._pacer.release()
+        if hurried and self._session.pace == "hurry" and now < self._glimpse_at:
+            return
+        self._glimpse_at = now + _GLIMPSE_S
+        self._show(self._session.frame)
+        standing = self._session.pace == "idle"
+        if standing or self._reported is None or now >= self._reported[1] + _REPORT_S:
+            self._report()
+
+    def _obey(self, command: ToWorker) -> None:
+        self._pacer.release()
+        self._glimpse_at = self._clock() + _GLIMPSE_S
+        self._guarded(lambda: self._carry_out(command))
+        self._report()
+
+    def _carry_out(self, command: ToWorker) -> None:
+        session = self._session
+        match command:
+            case Play():
+                session.play()
+            case Pause():
+                session.pause()
+            case Advance(scans=scans):
+                session.advance(scans)
+            case Seek(time_s=time_s):
+                session.seek(time_s)
+            case SetSpeed(factor=factor):
+                self._pacer.speed = factor
+            case SetParameters(values=values, revision=revision):
+                self._show(session.set_parameters(validated(values), revision))
+            case Open():
+                self._open(command)
+
+    def _open(self, command: Open) -> None:
+        self._run += 1
+        opening = f"Opening {command.uri}"
+        self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
+        self._put(self._session.open(command.uri, command.odometry, command.seed))
+
+    def _show(self, frame: Frame | None) -> None:
+        path = self._session.path
+        if frame is not None and path is not None:
+            self._put(Shown(self._run, self._session.time_s, frame, 0, path))
+
+    def _report(self) -> None:
+        now = self._clock()
+        playing = self._session.pace == "replay"
+        status = replace(
+            self._session.status(),
+            speed=self._pacer.speed,
+            scan_rate_hz=self._pacer.rate_hz if playing else 0.0,
+            scans_behind=self._pacer.behind(now) if playing else 0,
+        )
+        self._reported = (status, now)
+        self._put(Report(status))
+
+    def _guarded(self, work: Callable[[], T]) -> T | None:
+        """Do some work; what goes wrong becomes the state "failed", and the worker lives on."""
+        try:
+            return work()
+        except StemmapError as error:
+            self._session.fail(str(error))
+        except Exception as error:
+            traceback.print_exc(file=sys.stderr)
+            self._session.fail(
+                f"The run stopped: {type(error).__name__}: {error}. This is a fault in stemmap; "
+                "the terminal shows where. Play starts the run again"
+            )
+        self._report()
+        return None
