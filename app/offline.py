@@ -55,11 +55,14 @@ class Outcome:
         summary: Lines to print.
         warnings: Each once, with how often it came.
         losses: What was left out, by reason.
+        scan_ms, stage_ms: Median time of a scan and of each stage [ms].
     """
 
     summary: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     losses: dict[str, int] = field(default_factory=dict)
+    scan_ms: float = 0.0
+    stage_ms: dict[str, float] = field(default_factory=dict)
 
 
 def map_run(plan: OfflineRun, folder: FilePath, progress: Progress) -> Outcome:
@@ -71,7 +74,7 @@ def map_run(plan: OfflineRun, folder: FilePath, progress: Progress) -> Outcome:
     """
     files = RunFiles(folder)
     try:
-        return _map(plan, files, folder, progress)
+        return _map(plan, files, progress)
     except BaseException:
         files.abandon()
         raise
@@ -79,7 +82,7 @@ def map_run(plan: OfflineRun, folder: FilePath, progress: Progress) -> Outcome:
         progress.close()
 
 
-def _map(plan: OfflineRun, files: RunFiles, folder: FilePath, progress: Progress) -> Outcome:
+def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
     description = plan.source.description
     stopwatch = Stopwatch(scans=MEASURED_SCANS)
     mapper = Mapper(
@@ -105,9 +108,10 @@ def _map(plan: OfflineRun, files: RunFiles, folder: FilePath, progress: Progress
         summary=_summary(description.uri, frame, path, evaluation, error),
         warnings=tally.warnings(),
         losses={reason: n for reason, n in plan.source.losses.items() if n},
+        scan_ms=stopwatch.scan_ms,
+        stage_ms=stopwatch.stage_ms,
     )
     files.finish(frame.trees, path, start_ns, _run_record(plan, tally, frame, path, evaluation, error))
-    (folder / "timing.json").write_text(_timing(stopwatch), encoding="utf-8")
     return outcome
 
 
@@ -188,12 +192,6 @@ def _run_record(
         "warnings": tally.warnings(),
         "losses": {reason: n for reason, n in plan.source.losses.items() if n},
     }
-
-
-def _timing(stopwatch: Stopwatch) -> str:
-    stages = {stage: round(ms, 4) for stage, ms in stopwatch.stage_ms.items()}
-    record = {"median_ms_per_scan": round(stopwatch.scan_ms, 4), "median_ms_by_stage": stages}
-    return json.dumps(record, indent=1) + "\n"
 
 
 def _summary(

@@ -31,7 +31,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = (
         "DIR gets trees.csv, path.csv, trees.geojson, detections.csv, run.json (all the same bytes for the\n"
-        "same source, parameters and seed) and timing.json. Exit code 3 says that something was left out."
+        "same source, parameters and seed). Exit code 3 says that something was left out."
     )
 
 
@@ -60,6 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
             ) from None
     for line in outcome.summary:
         print(line)
+    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
+    print(f"median {outcome.scan_ms:.2f} ms a scan ({stages})")
     print(f"files in {arguments.out}")
     for warning in outcome.warnings:
         print(f"warning: {warning}", file=sys.stderr)
