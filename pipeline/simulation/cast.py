@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiled import compiled
-from pipeline.records import Float, Int32
+from pipeline.records import Float, Float32, Int, Int32
 from pipeline.simulation.intersect import (
     ground_incidence,
     meet_box,
@@ -17,6 +17,7 @@ from pipeline.simulation.intersect import (
     meet_ellipsoid,
     meet_ground,
     solid_incidence,
+    stand_on,
 )
 
 NOTHING, GROUND = -1, -2
@@ -81,7 +82,7 @@ def interval_of_capsule(
         for j in range(3):
             a[i] += R[j, i] * (capsule[j] - o[j])
             b[i] += R[j, i] * (capsule[3 + j] - o[j])
-    r = capsule[6]
+    r, reach = capsule[6], 0.0
     # Of a tall trunk only what lies between the lowest and highest beam matters.
     for _ in range(2):
         reach = max(np.sqrt(a[0] * a[0] + a[1] * a[1]), np.sqrt(b[0] * b[0] + b[1] * b[1])) + r
@@ -119,7 +120,6 @@ def first_returns(
     shape: Float,
     capsule: Float,
     terrain: Float,
-    roughness: float,
     R: Float,
     o: Float,
     directions: Float,
@@ -127,8 +127,11 @@ def first_returns(
     ring_step: float,
     farthest: float,
     key: int,
+    order: Int,
 ) -> tuple[Float, Int32]:
     """Range [m] and shape (or NOTHING, GROUND) of each ray of a sweep, shape (C, K) each.
+
+    `order` names the shapes, best the near ones first: what they hide is not tested.
 
     Column c looks along the azimuth pi - c 2 pi / C from the pose R[c], o[c].
     """
@@ -137,27 +140,29 @@ def first_returns(
     owner = np.full((columns, rings), NOTHING, dtype=np.int32)
     step = 2.0 * np.pi / columns
     highest = lowest + ring_step * (rings - 1)
-    slack = 0.03  # the sensor tilts a little while it spins
-    for n in range(kind.shape[0]):
+    for n in order:
         c = columns // 2
+        turned, width, low, high, nearest = 0.0, -1.0, 0.0, 0.0, 0.0
         for _ in range(2):  # where it stands in the sweep decides from which pose it is seen
             middle, width, low, high, nearest = interval_of_capsule(
-                capsule[n], R[c], o[c], lowest - slack, highest + slack
+                capsule[n], R[c], o[c], lowest - 0.03, highest + 0.03
             )
             turned = (np.pi - middle) / step
             c = int(turned) % columns
         if width < 0.0 or nearest > farthest:
             continue
-        # The robot drives 0.1 m and turns 0.1 rad during a sweep; of that, the part it takes to pass.
-        width += 0.08 * width + 2.0 * step
+        # The robot drives 0.1 m, turns and tilts during a sweep; of that, the part it takes to pass.
+        tilt = 0.004 + 0.01 * width
+        width += 0.05 * width + 1.5 * step
         if turned - width / step < 60.0 or turned + width / step > columns - 60.0:
+            tilt = 0.03
             width += 0.1 + 0.15 / max(nearest, 0.15)
         if width >= np.pi:
             first, last = 0, columns - 1
         else:
             first, last = int(np.floor(turned - width / step)), int(np.ceil(turned + width / step))
-        ring_first = max(0, int(np.floor((low - slack - lowest) / ring_step)))
-        ring_last = min(rings - 1, int(np.ceil((high + slack - lowest) / ring_step)))
+        ring_first = max(0, int(np.ceil((low - tilt - lowest) / ring_step)))
+        ring_last = min(rings - 1, int(np.floor((high + tilt - lowest) / ring_step)))
         for column in range(first, min(last, first + columns - 1) + 1):
             c = column % columns
             for k in range(ring_first, ring_last + 1):
@@ -170,9 +175,11 @@ def first_returns(
                 if t < ranges[c, k]:
                     ranges[c, k] = t
                     owner[c, k] = n
+    waves, space = np.empty((terrain.shape[0], 3)), np.empty(terrain.shape[0])
     for c in range(columns):
+        stand_on(terrain, o[c], waves)
         for k in range(rings):
-            t = meet_ground(terrain, roughness, o[c], directions[c, k], min(ranges[c, k], farthest))
+            t = meet_ground(terrain, waves, directions[c, k], min(ranges[c, k], farthest), space)
             if t < ranges[c, k]:
                 ranges[c, k] = t
                 owner[c, k] = GROUND
@@ -200,12 +207,16 @@ def echo(
     """
     columns = ranges.shape[0]
     before, after = max(c - 1, 0), min(c + 1, columns - 1)
+    t, n = ranges[c, k], hit[c, k]
+    # Written so that two misses, whose difference is not a number, are no edge.
+    if not (abs(ranges[before, k] - t) >= 0.05 or abs(ranges[after, k] - t) >= 0.05):
+        return t, n
     front = c
     if ranges[before, k] < ranges[front, k]:
         front = before
     if ranges[after, k] < ranges[front, k]:
         front = after
-    edge, t, n = hit[front, k], ranges[c, k], hit[c, k]
+    edge = hit[front, k]
     if edge < 0 or (kind[edge] == 1 and shape[edge, 8] > 0.0):
         return t, n
     behind, behind_hit = t, n
@@ -286,7 +297,7 @@ def measure(
                 if surface[n, 1] > 0.0:
                     t += surface[n, 1] * (2.0 * random_unit(n, c // 2, k) - 1.0)
             power = reflectivity * incidence * (strength / t) ** 2
-            if random_unit(key, c * rings + k, -2) > 1.0 - np.exp(-power):
+            if power < 10.0 and random_unit(key, c * rings + k, -2) > 1.0 - np.exp(-power):
                 continue
             t += noise[c, k]
             if t < range_min or t > range_max:
@@ -297,3 +308,29 @@ def measure(
             reflectance[c, k] = min(max(np.floor(shade + 0.5), 0.0), 255.0)
             source[c, k] = n
     return reported, reflectance, source
+
+
+@compiled
+def pack_returns(
+    reported: Float, reflectance: Float, source: Int32, beams: Float, offsets_ns: Int32
+) -> tuple[Float32, Float32, Int32, Int32, Int32]:
+    """The returns of a sweep as columns in the order of time, then ring: points (N, 3) [m],
+    reflectance, ring, time after the sweep's start [ns] and shape."""
+    columns, rings = reported.shape
+    count = 0
+    for c in range(columns):
+        for k in range(rings):
+            count += reported[c, k] > 0.0
+    points, shade = np.empty((count, 3), dtype=np.float32), np.empty(count, dtype=np.float32)
+    ring, offset = np.empty(count, dtype=np.int32), np.empty(count, dtype=np.int32)
+    solid = np.empty(count, dtype=np.int32)
+    n = 0
+    for c in range(columns):
+        for k in range(rings):
+            if reported[c, k] > 0.0:
+                for i in range(3):
+                    points[n, i] = beams[c, k, i] * reported[c, k]
+                shade[n], ring[n], offset[n] = reflectance[c, k], k, offsets_ns[c]
+                solid[n] = source[c, k]
+                n += 1
+    return points, shade, ring, offset, solid

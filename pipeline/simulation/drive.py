@@ -88,12 +88,13 @@ def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
     t = np.arange(int(np.ceil(until * RATE_HZ)) + 1) / RATE_HZ
     along = np.interp(t, time, s)
     lap, rest = np.divmod(along, course.s[-1]) if course.closed else (np.zeros_like(along), along)
+    x, y = (np.asarray(np.interp(rest, course.s, line)) for line in (course.x, course.y))
     yaw = np.interp(rest, course.s, course.yaw) + lap * (course.yaw[-1] - course.yaw[0])
     v_t = np.where(along < s[-1], np.interp(along, s, v), 0.0)
     return Drive(
         t=t,
-        x=np.interp(rest, course.s, course.x),
-        y=np.interp(rest, course.s, course.y),
+        x=x,
+        y=y,
         yaw=yaw,
         speed=v_t,
         yaw_rate=v_t * np.interp(rest, course.s, course.curvature),

@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.records import Float
-from pipeline.simulation.terrain import gradient_at, height_at
+from pipeline.simulation.terrain import gradient_at, sine_of_turns
 
 MISS = np.inf
 
@@ -25,7 +25,7 @@ def meet_cone(shape: Float, o: Float, d: Float) -> float:
     discriminant = b * b - a * c
     if discriminant <= 0.0 or a <= 1e-12:
         return MISS
-    t = (-b - np.sqrt(discriminant)) / a
+    t: float = (-b - np.sqrt(discriminant)) / a
     h = along + t * rate
     if t <= 0.0 or h < 0.0 or h > shape[6] or shape[7] + k * h <= 0.0:
         return MISS
@@ -73,44 +73,68 @@ def meet_box(shape: Float, o: Float, d: Float) -> float:
 
 
 @compiled
-def meet_ground(terrain: Float, roughness: float, o: Float, d: Float, farthest: float) -> float:
-    """Range at which a ray first goes under the terrain, infinite if not before `farthest`.
-
-    The waves rise no faster than `roughness` above the plane, which tells how far it is safe to jump;
-    where that is too short for progress, the steps are short against the waves instead.
-    """
-    level = np.sqrt(d[0] * d[0] + d[1] * d[1])
-    # The clearance shrinks by at most `closing` per metre of ray.
-    closing = roughness * level - (d[2] - terrain[0, 0] * d[0] - terrain[0, 1] * d[1])
-    if closing <= 1e-9:
-        return MISS
-    t, clearance = 0.0, o[2] - height_at(terrain, o[0], o[1])
-    if clearance <= 0.0:
-        return MISS
-    while t < farthest:
-        last_t, last_clearance = t, clearance
-        t = min(t + max(clearance / closing, 0.3 + 0.02 * t), farthest)
-        clearance = o[2] + t * d[2] - height_at(terrain, o[0] + t * d[0], o[1] + t * d[1])
-        if clearance <= 0.0:
-            return _bisect_ground(terrain, o, d, last_t, last_clearance, t, clearance)
-    return MISS
+def stand_on(terrain: Float, o: Float, waves: Float) -> None:
+    """What all rays from one origin share, written into `waves`, shape (W, 3): for each row of the
+    terrain its phase in turns, sine and cosine at the origin; in row 0 the height above the plane."""
+    waves[0, 0] = o[2] - terrain[0, 0] * o[0] - terrain[0, 1] * o[1] - terrain[0, 2]
+    for i in range(1, terrain.shape[0]):
+        turns = terrain[i, 1] * o[0] + terrain[i, 2] * o[1] + terrain[i, 3]
+        waves[i, 0] = turns
+        waves[i, 1] = sine_of_turns(turns)
+        waves[i, 2] = sine_of_turns(turns + 0.25)
 
 
 @compiled
-def _bisect_ground(
-    terrain: Float, o: Float, d: Float, low: float, above: float, high: float, below: float
-) -> float:
-    # Regula falsi with the Illinois rule: three or four rounds to a tenth of a millimetre.
-    t = high
-    for _ in range(20):
-        t = low + (high - low) * above / (above - below)
-        clearance = o[2] + t * d[2] - height_at(terrain, o[0] + t * d[0], o[1] + t * d[1])
-        if abs(clearance) < 1e-5:
-            break
-        if clearance > 0.0:
-            low, above, below = t, clearance, 0.5 * below
+def meet_ground(terrain: Float, waves: Float, d: Float, farthest: float, rate: Float) -> float:
+    """Range at which a ray first goes under the terrain, infinite if not before `farthest`.
+
+    Along the ray the waves rise no faster than `steepest` and bend no more than `bend`; both tell how
+    far it is safe to jump, and near the ground the second closes in as fast as Newton's method does.
+
+    Args:
+        terrain: Packed, see `Terrain`.
+        waves: Of the ray's origin, see `stand_on`.
+        d: Unit direction.
+        farthest: [m].
+        rate: Working space of shape (W,).
+    """
+    count = terrain.shape[0]
+    fall = terrain[0, 0] * d[0] + terrain[0, 1] * d[1] - d[2]
+    above_plane = waves[0, 0]
+    steepest, bend, crest = 0.0, 0.0, 0.0
+    clearance, change = above_plane, -fall
+    for i in range(1, count):
+        rate[i] = terrain[i, 1] * d[0] + terrain[i, 2] * d[1]
+        slope = 6.283185307179586 * rate[i]
+        steepest += terrain[i, 0] * abs(slope)
+        bend += terrain[i, 0] * slope * slope
+        crest += terrain[i, 0]
+        clearance -= terrain[i, 0] * waves[i, 1]
+        change -= terrain[i, 0] * slope * waves[i, 2]
+    closing = steepest + fall
+    if closing <= 1e-9 or clearance <= 0.0:
+        return MISS
+    if fall < 0.0:  # rising: above the highest crest nothing can be met any more
+        farthest = min(farthest, (crest - above_plane) / -fall)
+    t: float = 0.0
+    for _ in range(400):
+        root = np.sqrt(change * change + 2.0 * bend * clearance)
+        if change <= 0.0:
+            jump = 2.0 * clearance / (root - change)
         else:
-            high, below, above = t, clearance, 0.5 * above
+            jump = (change + root) / bend if bend > 0.0 else MISS
+        t += max(jump, clearance / closing)
+        if t > farthest:
+            return MISS
+        if bend * jump * jump < 2e-5:
+            return t
+        clearance, change = above_plane - t * fall, -fall
+        for i in range(1, count):
+            turns = waves[i, 0] + t * rate[i]
+            clearance -= terrain[i, 0] * sine_of_turns(turns)
+            change -= 6.283185307179586 * terrain[i, 0] * rate[i] * sine_of_turns(turns + 0.25)
+        if clearance < 1e-5:
+            return t
     return t
 
 
@@ -118,7 +142,8 @@ def _bisect_ground(
 def ground_incidence(terrain: Float, o: Float, d: Float, t: float) -> float:
     """Cosine of the angle between a ray and the normal of the ground that it meets at range t."""
     gx, gy = gradient_at(terrain, o[0] + t * d[0], o[1] + t * d[1])
-    return abs(gx * d[0] + gy * d[1] - d[2]) / np.sqrt(1.0 + gx * gx + gy * gy)
+    cosine: float = abs(gx * d[0] + gy * d[1] - d[2]) / np.sqrt(1.0 + gx * gx + gy * gy)
+    return cosine
 
 
 @compiled
@@ -143,6 +168,5 @@ def solid_incidence(kind: int, shape: Float, o: Float, d: Float, t: float) -> fl
         u, v, w = u / shape[3], v / shape[4], w / shape[5]
         nx, ny, nz = cos * u - sin * v, sin * u + cos * v, w
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
-    if length == 0.0:
-        return 1.0
-    return abs(nx * d[0] + ny * d[1] + nz * d[2]) / length
+    cosine: float = abs(nx * d[0] + ny * d[1] + nz * d[2]) / max(length, 1e-12)
+    return cosine

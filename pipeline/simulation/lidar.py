@@ -9,11 +9,12 @@ are in the sensor's frame at their own time; that is what a driver gives.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from pipeline.records import Float, Int32, Scan, Sensor
-from pipeline.simulation.cast import first_returns, measure, ray_directions
+from pipeline.simulation.cast import first_returns, measure, pack_returns, ray_directions
 from pipeline.simulation.solids import Solids
 from pipeline.simulation.terrain import Terrain
 
@@ -109,13 +110,14 @@ def sweep_scene(
     """
     key = int(rng.integers(0, 2**62))
     noise = lidar.range_sigma * rng.standard_normal((lidar.columns, lidar.rings))
-    directions = ray_directions(R, lidar.beams())
+    beams = _beams(lidar)
+    directions = ray_directions(R, beams)
+    away = np.hypot(*(solids.capsule[:, :2] - o[lidar.columns // 2, :2]).T)
     ranges, hit = first_returns(
         solids.kind,
         solids.shape,
         solids.capsule,
         terrain.packed,
-        terrain.roughness,
         R,
         o,
         directions,
@@ -123,6 +125,7 @@ def sweep_scene(
         lidar.ring_step,
         lidar.range_max,
         key,
+        np.argsort(away, kind="stable"),
     )
     reported, reflectance, source = measure(
         ranges,
@@ -142,19 +145,12 @@ def sweep_scene(
         noise,
         key,
     )
-    return _sweep_from_grid(lidar, reported, reflectance, source, stamp_ns)
-
-
-def _sweep_from_grid(
-    lidar: SpinningLidar, reported: Float, reflectance: Float, source: Int32, stamp_ns: int
-) -> Sweep:
-    column, ring = np.nonzero(reported)
-    points = lidar.beams()[column, ring] * reported[column, ring, None]
-    scan = Scan(
-        stamp_ns=stamp_ns,
-        points=points.astype(np.float32),
-        reflectance=reflectance[column, ring].astype(np.float32),
-        ring=ring.astype(np.int32),
-        offset_ns=lidar.column_offsets_ns()[column],
+    points, shade, ring, offset_ns, solid = pack_returns(
+        reported, reflectance, source, beams, lidar.column_offsets_ns()
     )
-    return Sweep(scan, source[column, ring])
+    return Sweep(Scan(stamp_ns, points, shade, ring, offset_ns), solid)
+
+
+@lru_cache(maxsize=4)
+def _beams(lidar: SpinningLidar) -> Float:
+    return lidar.beams()

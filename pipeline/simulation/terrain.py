@@ -14,25 +14,20 @@ TWO_PI = 2.0 * np.pi
 
 @compiled
 def sine_of_turns(turns: float) -> float:
-    """sin(2 pi turns) to 6e-8. Own polynomial: three times faster than the C library, and the same
-    bits on every machine."""
+    """sin(2 pi turns) to 4e-6. Own polynomial without a branch: several times faster than the C
+    library, and the same bits on every machine."""
     u = turns - np.floor(turns + 0.5)
-    if u > 0.25:
-        u = 0.5 - u
-    elif u < -0.25:
-        u = -0.5 - u
-    x = 6.283185307179586 * u
+    x = 6.283185307179586 * (0.25 - abs(abs(u) - 0.25))
     q = x * x
-    return x * (
-        1.0
-        + q * (-1.0 / 6.0 + q * (1.0 / 120.0 + q * (-1.0 / 5040.0 + q * (1.0 / 362880.0 - q / 39916800.0))))
-    )
+    p = 1.0 + q * (-1.0 / 6.0 + q * (1.0 / 120.0 + q * (-1.0 / 5040.0 + q / 362880.0)))
+    result: float = np.copysign(x, u) * p
+    return result
 
 
 @compiled
 def height_at(terrain: Float, x: float, y: float) -> float:
     """Height [m] of the packed terrain (see `Terrain.pack`) at one place."""
-    z = terrain[0, 0] * x + terrain[0, 1] * y + terrain[0, 2]
+    z: float = terrain[0, 0] * x + terrain[0, 1] * y + terrain[0, 2]
     for i in range(1, terrain.shape[0]):
         z += terrain[i, 0] * sine_of_turns(terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3])
     return z
@@ -92,12 +87,6 @@ class Terrain:
             packed = packed[:1]
         packed[0, 2] = -height_at(packed, 0.0, 0.0)
         return cls(packed)
-
-    @property
-    def roughness(self) -> float:
-        """No wave rises faster than this above the plane [1]."""
-        waves = self.packed[1:]
-        return float(np.sum(TWO_PI * waves[:, 0] * np.hypot(waves[:, 1], waves[:, 2])))
 
     def height(self, x: Float, y: Float) -> Float:
         """Heights [m] at places of shape (N,) [m]."""

@@ -36,8 +36,8 @@ class WheelQuality:
 
 QUALITIES = {
     "good": WheelQuality(0.003, 0.01, 0.002, 2e-4, 0.005, 0.002),
-    "normal": WheelQuality(0.01, 0.04, 0.006, 6e-4, 0.01, 0.006),
-    "poor": WheelQuality(0.03, 0.10, 0.015, 3e-3, 0.03, 0.012),
+    "normal": WheelQuality(0.01, 0.04, 0.006, 6e-4, 0.01, 0.004),
+    "poor": WheelQuality(0.03, 0.10, 0.006, 2.4e-3, 0.03, 0.006),
 }
 
 
@@ -52,8 +52,8 @@ def wheel_odometry(motion: Motion, quality: WheelQuality, rng: np.random.Generat
     x, y, z, yaw, pitch = (column[::step] for column in (d.x, d.y, motion.z, d.yaw, motion.pitch))
     distance = np.sqrt(np.diff(x) ** 2 + np.diff(y) ** 2 + np.diff(z) ** 2)
     turn = np.diff(yaw)
-    # Each fault lies within a third of its nominal size, so that "poor" is never good by chance.
-    signs = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.8, 1.2, 3)
+    # Each fault lies within 15 % of its nominal size, so that "poor" is never good by chance.
+    signs = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.85, 1.15, 3)
     uphill = -np.sin(0.5 * (pitch[1:] + pitch[:-1]))
     root = np.sqrt(distance)
     told = distance * (1.0 + signs[0] * quality.scale + quality.slip * uphill)
