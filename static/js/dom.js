@@ -1,0 +1,34 @@
+// Small words for the document. Text from outside only ever becomes textContent.
+
+export const byId = (id) => document.getElementById(id);
+
+export function el(tag, attributes = {}, ...children) {
+  const node = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name === "text") node.textContent = value;
+    else if (name === "class") node.className = value;
+    else if (name === "style") Object.assign(node.style, value);
+    else if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
+    else if (value !== null && value !== false) node.setAttribute(name, value === true ? "" : value);
+  }
+  node.append(...children);
+  return node;
+}
+
+export function setText(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+export function remember(key, value) {
+  try {
+    localStorage.setItem(`stemmap.${key}`, value);
+  } catch { /* a private window remembers nothing, and works all the same */ }
+}
+
+export function recall(key) {
+  try {
+    return localStorage.getItem(`stemmap.${key}`);
+  } catch {
+    return null;
+  }
+}

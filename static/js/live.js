@@ -1,0 +1,60 @@
+// The live connection: takes what the server tells, says when it is lost, and comes back by itself.
+
+import { state, changed } from "./state.js";
+
+const FIRST_WAIT = 500, LONGEST_WAIT = 5000;
+let socket = null;
+let wait = FIRST_WAIT;
+
+const takers = {
+  status(message) { state.status = message; },
+  map(message) { takeMap(message); },
+  parameters(message) { state.parameters = message; },
+  truth(message) { state.truth = message.trees ?? null; },
+  evaluation(message) { state.evaluation = "evaluation" in message ? message.evaluation : (message.TA ? message : null); },
+  selection(message) { state.selected = message.tree ?? null; },
+};
+
+function takeMap({ path, ...map }) {
+  state.path.length = Math.min(state.path.length, path.start);
+  state.path.push(...path.points);
+  if (!state.map || map.index === 0) state.odometry.length = 0;
+  state.map = map;
+  if (map.odom) state.odometry[map.index] = map.odom;
+}
+
+function receive(event) {
+  let message;
+  try {
+    message = JSON.parse(event.data);
+  } catch {
+    return; // not ours
+  }
+  state.heardAt = performance.now();
+  const take = takers[message.type];
+  if (!take) return;
+  take(message);
+  changed(message.type);
+}
+
+export function connect() {
+  const scheme = location.protocol === "https:" ? "wss" : "ws";
+  socket = new WebSocket(`${scheme}://${location.host}/api/live`);
+  socket.onopen = () => {
+    wait = FIRST_WAIT;
+    Object.assign(state, { connected: true, lostAt: 0, heardAt: performance.now() });
+    state.odometry.length = 0;
+    changed("connection");
+  };
+  socket.onmessage = receive;
+  socket.onclose = () => {
+    Object.assign(state, { connected: false, lostAt: state.lostAt || performance.now() });
+    changed("connection");
+    setTimeout(connect, wait);
+    wait = Math.min(2 * wait, LONGEST_WAIT);
+  };
+}
+
+export function select(tree) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ type: "select", tree }));
+}

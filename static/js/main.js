@@ -1,0 +1,21 @@
+// Starts every part of the page, then connects.
+
+import { startDrawer } from "./drawer.js";
+import { startKeys } from "./keys.js";
+import { connect } from "./live.js";
+import { startMap } from "./map.js";
+import { startPlots } from "./plots.js";
+import { startScene } from "./scene.js";
+import { startScores } from "./scores.js";
+import { startSources } from "./sources.js";
+import { startStatus } from "./status.js";
+import { startTable } from "./table.js";
+import { startTabs } from "./tabs.js";
+import { startTheme } from "./theme.js";
+import { startTimeline } from "./timeline.js";
+import { startWelcome } from "./welcome.js";
+import { startWhy } from "./why.js";
+
+for (const start of [startTheme, startStatus, startTabs, startMap, startTable, startScores, startPlots, startWhy,
+  startTimeline, startSources, startScene, startKeys, startDrawer, startWelcome]) start();
+connect();

@@ -1,0 +1,134 @@
+// The live 2D map: pan, zoom, hover and select.
+
+import { byId, setText } from "./dom.js";
+import { figure, NONE } from "./format.js";
+import { select } from "./live.js";
+import { drawMap, symbolRadius } from "./map_draw.js";
+import { MapView } from "./map_view.js";
+import { on, state } from "./state.js";
+import { colour } from "./theme.js";
+
+const NAMES = ["tree", "truth", "path", "odometry", "robot", "selection", "text", "surface", "grid", "axis", "font"];
+const canvas = byId("map");
+const view = new MapView();
+const pointers = new Map(); // fingers and mouse that are down
+let colours = {}, planned = false, travelled = 0;
+
+function redraw() {
+  if (planned) return;
+  planned = true;
+  requestAnimationFrame(() => {
+    planned = false;
+    if (!view.moved) view.fit(bounds());
+    const pen = canvas.getContext("2d");
+    pen.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
+    drawMap(pen, view, state, colours);
+    canvas.setAttribute("aria-label", `Map: ${state.map?.trees.length ?? 0} trees and the robot's path. The table below lists the trees.`);
+  });
+}
+
+function bounds() {
+  const box = [Infinity, Infinity, -Infinity, -Infinity];
+  const take = (x, y) => {
+    box[0] = Math.min(box[0], x); box[1] = Math.min(box[1], y);
+    box[2] = Math.max(box[2], x); box[3] = Math.max(box[3], y);
+  };
+  for (const [x, y] of state.path) take(x, y);
+  for (const tree of state.map?.trees ?? []) take(tree.x, tree.y);
+  return Number.isFinite(box[0]) ? box : [-3, -3, 3, 3];
+}
+
+function resize() {
+  const { clientWidth, clientHeight } = canvas.parentElement;
+  Object.assign(view, { width: clientWidth, height: clientHeight });
+  Object.assign(canvas, { width: clientWidth * devicePixelRatio, height: clientHeight * devicePixelRatio });
+  redraw();
+}
+
+function nearest(px, py) {
+  let best = null, least = 14;
+  for (const tree of state.map?.trees ?? []) {
+    const [x, y] = view.toScreen(tree.x, tree.y);
+    const gap = Math.hypot(px - x, py - y) - symbolRadius(tree, view.scale);
+    if (gap < least) [best, least] = [tree, gap];
+  }
+  return best;
+}
+
+function truthAt(px, py) {
+  return (state.truth ?? []).find((truth) => {
+    const [x, y] = view.toScreen(truth.x, truth.y);
+    return Math.hypot(px - x, py - y) < 9;
+  });
+}
+
+function describe(tree, truth) {
+  const lines = [];
+  if (tree) {
+    const dbh = tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm${tree.sigma_dbh_cm === null ? "" : ` ± ${figure(tree.sigma_dbh_cm, 2)}`}`;
+    lines.push(`Tree ${tree.number}, ${dbh}`, `seen in ${tree.observations} scans, e ${figure(tree.eccentricity)}`);
+  }
+  if (truth) lines.push(`Truth: ${truth.kind}${truth.dbh_cm === null ? "" : `, ${figure(truth.dbh_cm)} cm`}`);
+  return lines.join("\n") || NONE;
+}
+
+function hover(px, py) {
+  const tip = byId("map-tip");
+  const [tree, truth] = [nearest(px, py), truthAt(px, py)];
+  tip.hidden = !(tree || truth) || pointers.size > 0;
+  if (tip.hidden) return;
+  setText(tip, describe(tree, truth));
+  tip.style.left = `${Math.min(px + 14, view.width - tip.offsetWidth - 6)}px`;
+  tip.style.top = `${Math.min(py + 14, view.height - tip.offsetHeight - 6)}px`;
+}
+
+const place = (event) => [event.offsetX, event.offsetY];
+
+function down(event) {
+  canvas.setPointerCapture(event.pointerId);
+  pointers.set(event.pointerId, place(event));
+  if (pointers.size === 1) travelled = 0;
+  canvas.classList.add("dragging");
+}
+
+function move(event) {
+  const now = place(event);
+  const before = pointers.get(event.pointerId);
+  hover(...now);
+  if (!before) return;
+  travelled += Math.hypot(now[0] - before[0], now[1] - before[1]);
+  const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
+  if (other) {
+    const gap = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
+    view.zoom(gap(now) / Math.max(gap(before), 1), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+  } else if (travelled > 4) view.pan(now[0] - before[0], now[1] - before[1]);
+  pointers.set(event.pointerId, now);
+  redraw();
+}
+
+function up(event) {
+  if (event.type === "pointerup" && pointers.size === 1 && travelled <= 4) {
+    const tree = nearest(...place(event));
+    select(!tree || tree.number === state.selected ? null : tree.number);
+  }
+  pointers.delete(event.pointerId);
+  canvas.classList.toggle("dragging", pointers.size > 0);
+}
+
+export function startMap() {
+  const repaint = () => { colours = Object.fromEntries(NAMES.map((name) => [name, colour(name)])); redraw(); };
+  repaint();
+  new ResizeObserver(resize).observe(canvas.parentElement);
+  for (const [name, listener] of [["pointerdown", down], ["pointermove", move], ["pointerup", up], ["pointercancel", up]]) {
+    canvas.addEventListener(name, listener);
+  }
+  canvas.addEventListener("pointerleave", () => { byId("map-tip").hidden = true; });
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    view.zoom(Math.exp(-event.deltaY * 0.0015), ...place(event));
+    redraw();
+  }, { passive: false });
+  byId("map-fit").addEventListener("click", () => { view.moved = false; view.fit(bounds(), true); redraw(); });
+  on("map truth selection", redraw);
+  on("theme", repaint);
+}

@@ -1,0 +1,161 @@
+// Paints the 2D map of Fig. 5: path grey, robot a red triangle, trees as circles with their number.
+
+const TURN = 2 * Math.PI;
+
+export const symbolRadius = (tree, scale) =>
+  Math.max(tree.dbh_cm === null ? 3.5 : 3 + 0.11 * tree.dbh_cm, tree.dbh_cm === null ? 0 : (tree.dbh_cm / 200) * scale);
+
+export function drawMap(pen, view, state, colours) {
+  pen.clearRect(0, 0, view.width, view.height);
+  drawGrid(pen, view, colours);
+  drawLine(pen, view, alignedOdometry(state), colours.odometry, 1.2);
+  drawLine(pen, view, state.path, colours.path, 2);
+  for (const truth of state.truth ?? []) drawTruth(pen, view, truth, colours);
+  const trees = state.map?.trees ?? [];
+  for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected, colours);
+  drawNumbers(pen, view, trees, state.selected, colours);
+  if (state.map) drawRobot(pen, view, state.map, colours);
+  drawScaleBar(pen, view, colours);
+}
+
+function drawGrid(pen, view, colours) {
+  const step = view.step();
+  const [x0, y0] = view.toMap(0, view.height);
+  const [x1, y1] = view.toMap(view.width, 0);
+  const decimals = Math.max(0, -Math.floor(Math.log10(step)));
+  Object.assign(pen, { strokeStyle: colours.grid, lineWidth: 1, fillStyle: colours.axis, font: `10.5px ${colours.font}` });
+  pen.beginPath();
+  for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) {
+    const px = Math.round(view.toScreen(x, 0)[0]) + 0.5;
+    pen.moveTo(px, 0);
+    pen.lineTo(px, view.height);
+    pen.textAlign = "center";
+    if (px > 30 && px < view.width - 120) pen.fillText(x.toFixed(decimals), px, view.height - 6);
+  }
+  for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) {
+    const py = Math.round(view.toScreen(0, y)[1]) + 0.5;
+    pen.moveTo(0, py);
+    pen.lineTo(view.width, py);
+    pen.textAlign = "left";
+    if (py > 24 && py < view.height - 22) pen.fillText(y.toFixed(decimals), 5, py - 3);
+  }
+  pen.stroke();
+}
+
+function drawLine(pen, view, points, colour, width) {
+  Object.assign(pen, { strokeStyle: colour, lineWidth: width, lineJoin: "round" });
+  pen.beginPath();
+  let last = null;
+  for (const point of points) {
+    if (!point) continue;
+    const [px, py] = view.toScreen(point[0], point[1]);
+    if (last === null) pen.moveTo(px, py);
+    else if (Math.abs(px - last[0]) + Math.abs(py - last[1]) < 1.5) continue; // closer than can be seen
+    else pen.lineTo(px, py);
+    last = [px, py];
+  }
+  pen.stroke();
+}
+
+// Odometry starts where the path starts, so that the eye sees what drifted since.
+function alignedOdometry({ odometry, path, map }) {
+  const first = odometry.findIndex(Boolean);
+  if (first < 0 || !map || first >= path.length) return [];
+  const [ox, oy] = odometry[first];
+  const later = Math.min(first + 10, path.length - 1);
+  const there = odometry[later];
+  let turn = 0;
+  if (there && Math.hypot(there[0] - ox, there[1] - oy) > 0.2) {
+    turn = Math.atan2(path[later][1] - path[first][1], path[later][0] - path[first][0]) - Math.atan2(there[1] - oy, there[0] - ox);
+  }
+  const [c, s] = [Math.cos(turn), Math.sin(turn)];
+  return odometry.slice(0, map.index + 1).map((p) =>
+    p && [path[first][0] + c * (p[0] - ox) - s * (p[1] - oy), path[first][1] + s * (p[0] - ox) + c * (p[1] - oy)]);
+}
+
+function drawTruth(pen, view, truth, colours) {
+  const [px, py] = view.toScreen(truth.x, truth.y);
+  const radius = symbolRadius(truth, view.scale) + 3;
+  Object.assign(pen, { strokeStyle: colours.truth, lineWidth: 1.6 });
+  pen.beginPath();
+  if (truth.kind === "tree") pen.arc(px, py, radius, 0, TURN);
+  else { // a shape of its own: what is no tree is a diamond
+    pen.moveTo(px, py - 5);
+    for (const [dx, dy] of [[5, 0], [0, 5], [-5, 0], [0, -5]]) pen.lineTo(px + dx, py + dy);
+  }
+  pen.stroke();
+}
+
+function drawTree(pen, view, tree, selected, colours) {
+  const [px, py] = view.toScreen(tree.x, tree.y);
+  pen.beginPath();
+  pen.arc(px, py, symbolRadius(tree, view.scale), 0, TURN);
+  if (tree.dbh_cm === null) { // never measured: hollow
+    Object.assign(pen, { strokeStyle: colours.tree, lineWidth: 2 });
+    pen.stroke();
+  } else {
+    pen.fillStyle = colours.tree;
+    pen.fill();
+  }
+  const [major, minor, angle] = tree.ellipse;
+  if (major * view.scale > 2) {
+    Object.assign(pen, { strokeStyle: colours.text, lineWidth: 1 });
+    pen.beginPath();
+    pen.ellipse(px, py, major * view.scale, Math.max(minor * view.scale, 0.5), -angle, 0, TURN);
+    pen.stroke();
+  }
+  if (selected) {
+    Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });
+    pen.beginPath();
+    pen.arc(px, py, symbolRadius(tree, view.scale) + 5, 0, TURN);
+    pen.stroke();
+  }
+}
+
+// Numbers that would cover one another are left out; zooming brings them back.
+function drawNumbers(pen, view, trees, selected, colours) {
+  const taken = new Set();
+  Object.assign(pen, { fillStyle: colours.text, strokeStyle: colours.surface, lineWidth: 3, textAlign: "left" });
+  for (const tree of [...trees].sort((a, b) => (b.number === selected) - (a.number === selected))) {
+    const [px, py] = view.toScreen(tree.x, tree.y);
+    const at = [px + symbolRadius(tree, view.scale) + 3, py + 4];
+    const place = `${Math.round(at[0] / 22)},${Math.round(at[1] / 13)}`;
+    if (taken.has(place) && tree.number !== selected) continue;
+    taken.add(place);
+    pen.font = `${tree.number === selected ? "bold 13px" : "11px"} ${colours.font}`;
+    pen.strokeText(tree.number, ...at);
+    pen.fillText(tree.number, ...at);
+  }
+}
+
+function drawRobot(pen, view, { pose: [x, y, yaw], sigma_xy: sigma }, colours) {
+  const [px, py] = view.toScreen(x, y);
+  if (sigma * view.scale > 4) {
+    pen.strokeStyle = colours.robot;
+    pen.beginPath();
+    pen.arc(px, py, sigma * view.scale, 0, TURN);
+    pen.stroke();
+  }
+  const corner = (turn, reach) => [px + reach * Math.cos(yaw + turn), py - reach * Math.sin(yaw + turn)];
+  Object.assign(pen, { fillStyle: colours.robot, strokeStyle: colours.surface, lineWidth: 1.5 });
+  pen.beginPath();
+  pen.moveTo(...corner(0, 12));
+  pen.lineTo(...corner(2.5, 9));
+  pen.lineTo(...corner(-2.5, 9));
+  pen.closePath();
+  pen.stroke();
+  pen.fill();
+}
+
+function drawScaleBar(pen, view, colours) {
+  const step = view.step();
+  const [x, y, length] = [view.width - 14, view.height - 10, step * view.scale];
+  Object.assign(pen, { strokeStyle: colours.text, fillStyle: colours.text, lineWidth: 2, textAlign: "right", font: `11px ${colours.font}` });
+  pen.beginPath();
+  pen.moveTo(x - length, y - 4);
+  pen.lineTo(x - length, y);
+  pen.lineTo(x, y);
+  pen.lineTo(x, y - 4);
+  pen.stroke();
+  pen.fillText(`${Number(step.toPrecision(2))} m`, x, y - 8);
+}

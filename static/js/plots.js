@@ -1,0 +1,119 @@
+// Figures 6 and 7 of the paper, and how the run goes. Plotly is loaded when it is first needed.
+
+import { get } from "./api.js";
+import { byId, el, setText } from "./dom.js";
+import { select } from "./live.js";
+import { on, state } from "./state.js";
+import { visible } from "./tabs.js";
+import { colour } from "./theme.js";
+
+const EVERY = 2000; // [ms] between two drawings
+const LONGEST = 1200; // samples kept of each curve
+const history = { time: [], n_eff: [], stages: {}, stageTime: [] };
+let plotly = null, busy = false;
+
+function load() {
+  plotly ??= new Promise((resolve, reject) => {
+    document.head.append(el("script", { src: "/static/plotly.min.js", onload: () => resolve(window.Plotly),
+      onerror: () => reject(new Error("The plotting library could not be loaded.")) }));
+  });
+  return plotly;
+}
+
+function layout(extra = {}) {
+  const axis = { gridcolor: colour("line"), zerolinecolor: colour("line"), linecolor: colour("line"), ticks: "" };
+  return {
+    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: colour("text"), size: 11, family: colour("font") },
+    margin: { l: 46, r: 14, t: 8, b: 40 }, uirevision: "keep", xaxis: { ...axis }, yaxis: { ...axis }, ...extra,
+  };
+}
+
+const SCALES = {
+  distance: { colorscale: "Viridis", unit: "m" },
+  error: { colorscale: "Cividis", unit: "%" },
+};
+
+async function matrix(kind) {
+  const pairs = await get("/api/pairs");
+  const z = kind === "distance" ? pairs?.distance_m : pairs?.error_percent;
+  if (!z || z.length < 2) {
+    return kind === "distance" ? "Distances need two trees or more. Let the run play on."
+      : "The error needs ground truth and two trees that are matched to it. The simulated runs bring theirs.";
+  }
+  const labels = pairs.numbers.map(String);
+  const { colorscale, unit } = SCALES[kind];
+  const figure = layout();
+  Object.assign(figure.xaxis, { type: "category", title: { text: "tree" } });
+  Object.assign(figure.yaxis, { type: "category", title: { text: "tree" }, autorange: "reversed" });
+  return [[{ type: "heatmap", x: labels, y: labels, z, colorscale, colorbar: { title: { text: unit }, thickness: 12 }, xgap: 1, ygap: 1,
+    hovertemplate: `tree %{y} to tree %{x}<br>%{z:.3~r} ${unit}<extra></extra>` }], figure];
+}
+
+function curve(kind) {
+  if (history.time.length < 2) return "Nothing to draw yet. Press play.";
+  const figure = layout({ showlegend: kind === "time", legend: { orientation: "h", y: 1.18 } });
+  figure.xaxis.title = { text: "time in the run, s" };
+  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: kind === "time" ? "ms a scan" : "effective particles" } });
+  if (kind === "n_eff") return [[line(history.time, history.n_eff, "N_eff")], figure];
+  return [Object.entries(history.stages).map(([name, values]) => ({ ...line(history.stageTime, values, name), stackgroup: "one" })), figure];
+}
+
+const line = (x, y, name) => ({ type: "scatter", mode: "lines", x, y, name, line: { width: 1.5 }, hovertemplate: `%{y:.3~r}<extra>${name}</extra>` });
+
+async function draw() {
+  if (!visible("plots") || busy) return;
+  busy = true;
+  try {
+    const kind = byId("plot-choice").value;
+    const [Plotly, drawing] = await Promise.all([load(), kind in SCALES ? matrix(kind) : curve(kind)]);
+    const said = typeof drawing === "string";
+    byId("plot").hidden = said;
+    byId("plot-empty").hidden = !said;
+    setText(byId("plot-empty"), said ? drawing : "");
+    if (!said) await show(Plotly, ...drawing);
+  } catch (error) {
+    byId("plot-empty").hidden = false;
+    setText(byId("plot-empty"), error.message);
+  } finally {
+    busy = false;
+  }
+}
+
+async function show(Plotly, traces, figure) {
+  const plot = byId("plot");
+  const fresh = !plot.data;
+  await Plotly.react(plot, traces, figure, { displayModeBar: false, responsive: true });
+  if (fresh) plot.on("plotly_click", ({ points }) => points[0].data.type === "heatmap" && select(Number(points[0].y)));
+}
+
+function push(list, value) {
+  list.push(value);
+  if (list.length > LONGEST) list.shift();
+}
+
+function recordMap({ map }) {
+  if (history.time.length && map.time_s < history.time.at(-1)) clearHistory();
+  push(history.time, map.time_s);
+  push(history.n_eff, map.n_eff);
+}
+
+function recordStatus({ status }) {
+  if (status.scan_index < 0 || status.time_s === history.stageTime.at(-1)) return;
+  push(history.stageTime, status.time_s);
+  for (const [name, milliseconds] of Object.entries(status.stage_ms ?? {})) push((history.stages[name] ??= []), milliseconds);
+}
+
+function clearHistory() {
+  Object.assign(history, { time: [], n_eff: [], stages: {}, stageTime: [] });
+}
+
+export function startPlots() {
+  on("map", recordMap);
+  on("status", recordStatus);
+  on("tab theme", draw);
+  byId("plot-choice").addEventListener("change", () => {
+    if (byId("plot").data) window.Plotly.purge(byId("plot"));
+    draw();
+  });
+  setInterval(() => state.status?.state !== "failed" && draw(), EVERY);
+}

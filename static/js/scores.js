@@ -1,0 +1,55 @@
+// The map against the ground truth: rates never without their counts.
+
+import { byId, el } from "./dom.js";
+import { figure, NONE, percent } from "./format.js";
+import { openSources } from "./sources.js";
+import { on, state } from "./state.js";
+import { visible } from "./tabs.js";
+
+const RATES = {
+  TA: "TA  trees found", FR: "FR  trees missed", TR: "TR  others left out", FA: "FA  others taken for trees",
+};
+const first = (score, ...names) => names.map((name) => score[name]).find((value) => value !== undefined) ?? null;
+const centimetres = (metres) => (metres === null ? NONE : `${figure(100 * metres)} cm`);
+const percentOf = (value) => (value === null ? NONE : `${figure(value)} %`);
+
+const LINES = [
+  ["completeness", (s) => percent(s.completeness)],
+  ["correctness", (s) => percent(s.correctness)],
+  ["F1", (s) => figure(s.f1)],
+  ["trees where nothing stands", (s) => String(first(s, "spurious") ?? NONE)],
+  ["position RMSE", (s) => centimetres(first(s, "position_rmse_m", "position_rmse"))],
+  ["position bias", (s) => centimetres(first(s, "position_bias_m", "position_bias"))],
+  ["DBH RMSE", (s) => centimetres(first(s, "dbh_rmse_m", "dbh_rmse"))],
+  ["DBH bias", (s) => centimetres(first(s, "dbh_bias_m", "dbh_bias"))],
+  ["mean error of pair distances", (s) => percentOf(first(s, "mean_pair_error_percent"))],
+  ["largest error of pair distances", (s) => percentOf(first(s, "largest_pair_error_percent"))],
+];
+
+function show() {
+  if (!visible("scores")) return;
+  const score = state.evaluation;
+  byId("panel-scores").replaceChildren(...(score ? [rates(score), lines(score)] : [nothing()]));
+}
+
+function rates(score) {
+  return el("dl", { class: "rates" }, ...Object.entries(RATES).map(([name, title]) => {
+    const { count, of, rate } = score[name];
+    return el("div", { "data-rate": name }, el("dt", { text: title }),
+      el("dd", {}, el("b", { text: of ? percent(rate ?? count / of) : NONE }), el("small", { text: `${count} of ${of}` })));
+  }));
+}
+
+function lines(score) {
+  return el("dl", { class: "list" }, ...LINES.flatMap(([title, text]) => [el("dt", { text: title }), el("dd", { text: text(score) })]));
+}
+
+function nothing() {
+  return el("div", { class: "empty" },
+    el("p", { text: "This run brings no ground truth, so there is nothing to score the map against. The simulated runs do." }),
+    el("button", { text: "Open a simulated run", onclick: openSources }));
+}
+
+export function startScores() {
+  on("evaluation tab", show);
+}

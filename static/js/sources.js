@@ -1,0 +1,80 @@
+// The dialog that opens another run.
+
+import { get, open } from "./api.js";
+import { byId, el, setText } from "./dom.js";
+import { on, state } from "./state.js";
+
+const dialog = byId("source-dialog");
+let asked = null; // the address that was asked for and is not there yet
+let left = null; // the status that stood before
+
+export async function openSources() {
+  say("");
+  if (!dialog.open) dialog.showModal();
+  byId("source-uri").focus();
+  try {
+    list(await get("/api/sources"));
+  } catch (error) {
+    say(error.message);
+  }
+}
+
+function list({ scenarios = [], recordings = [] }) {
+  const simulated = scenarios.map(({ uri, doc }) => entry(uri, uri, doc));
+  const recorded = recordings.map((each) => {
+    const uri = each.uri ?? each;
+    return entry(uri, each.name ?? uri.split("/").pop(), each.doc ?? "");
+  });
+  byId("source-list").replaceChildren(
+    ...(recorded.length ? [el("h3", { text: "Recordings in the data folder" }), ...recorded] : []),
+    ...(simulated.length ? [el("h3", { text: "Simulated, with ground truth" }), ...simulated] : []));
+}
+
+const entry = (uri, title, doc) =>
+  el("button", { type: "button", onclick: () => ask(uri) }, el("b", { text: title }), el("span", { text: doc }));
+
+async function ask(uri) {
+  if (!uri) {
+    say("Type a path or an address first, for example sim:stand.");
+    return;
+  }
+  asked = uri;
+  left = state.status;
+  say("");
+  setText(byId("source-open"), "Opening…");
+  try {
+    await open(uri, byId("source-odometry").value);
+  } catch (error) {
+    finish(error.message);
+  }
+}
+
+function finish(message) {
+  asked = null;
+  setText(byId("source-open"), "Open");
+  if (message) say(message);
+  else dialog.close();
+}
+
+function follow({ status }) {
+  if (asked === null || status === left) return;
+  if (status.state === "failed") finish(status.detail || `${asked} could not be opened.`);
+  else if (status.source === asked && status.scan_index >= 0) finish("");
+}
+
+function say(text) {
+  const error = byId("source-error");
+  setText(error, text);
+  error.hidden = !text;
+}
+
+export function startSources() {
+  byId("source-button").addEventListener("click", openSources);
+  byId("notice-open").addEventListener("click", openSources);
+  byId("source-close").addEventListener("click", () => { asked = null; dialog.close(); setText(byId("source-open"), "Open"); });
+  byId("source-form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    ask(byId("source-uri").value.trim());
+  });
+  on("status", follow);
+}

@@ -1,0 +1,28 @@
+// What the page knows, and who wants to be told when a part of it changes.
+
+export const state = {
+  status: null,      // the newest status message
+  map: null,         // the newest map message, without its path
+  path: [],          // [[x, y], ...] one for each scan, frame of the map
+  odometry: [],      // [x, y] by index of the scan, holes where the page was not looking
+  truth: null,
+  evaluation: null,
+  parameters: null,
+  selected: null,    // number of a tree
+  connected: false,
+  lostAt: 0,         // when the connection was lost [ms], 0 if it stands
+  heardAt: 0,        // when the server was last heard [ms]
+};
+
+const listeners = new Map();
+
+export function on(parts, listener) {
+  for (const part of parts.split(" ")) {
+    if (!listeners.has(part)) listeners.set(part, []);
+    listeners.get(part).push(listener);
+  }
+}
+
+export function changed(part) {
+  for (const listener of listeners.get(part) ?? []) listener(state);
+}

@@ -1,0 +1,83 @@
+// The strip that is read from two metres, and the notice below it.
+
+import { byId, el, setText } from "./dom.js";
+import { NONE, figure } from "./format.js";
+import { on, state } from "./state.js";
+
+const WORDS = {
+  starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
+};
+const OLD_AFTER = 3000; // [ms] without a word while a run plays
+
+// name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
+const FIGURES = {
+  trees: ["trees", "", (s) => [String(s.trees)]],
+  health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health]]],
+  rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
+  mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE], "minor"],
+  behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
+  driven: ["driven", "m", (s) => [figure(s.distance_m)]],
+  sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
+  f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE]],
+};
+const cells = {};
+
+function build() {
+  const list = byId("figures");
+  for (const [name, [title, unit, , rank]] of Object.entries(FIGURES)) {
+    const value = el("span", { text: NONE });
+    const cell = el("div", { class: rank ?? "", "data-figure": name }, el("dt", { text: title }),
+      el("dd", {}, value, unit ? el("small", { text: unit }) : ""));
+    cells[name] = { cell, value, rank: rank ?? "" };
+    list.append(cell);
+  }
+}
+
+function show() {
+  const status = state.status;
+  if (!status) return;
+  for (const [name, [, , read]] of Object.entries(FIGURES)) {
+    const [text, meaning] = read(status);
+    setText(cells[name].value, text);
+    cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
+  }
+  cells.f1.cell.hidden = !state.evaluation;
+  setText(byId("source-name"), shortSource(status.source) || NONE);
+  byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
+  document.title = `${shortSource(status.source)} · stemmap`;
+}
+
+const shortSource = (uri) => (uri ?? "").split("/").filter(Boolean).pop() ?? "";
+
+function showState() {
+  const box = byId("state");
+  const name = state.connected ? (state.status?.state ?? "starting") : "lost";
+  if (box.dataset.state !== name) box.dataset.state = name;
+  setText(box.querySelector("b"), state.connected ? (WORDS[name] ?? name) : state.lostAt ? "No connection" : "Connecting");
+  document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
+  const quiet = state.status?.state === "playing" && performance.now() - state.heardAt > OLD_AFTER;
+  byId("figures").classList.toggle("old", quiet);
+  showNotice(quiet);
+}
+
+function showNotice(quiet) {
+  const notice = byId("notice");
+  const status = state.status;
+  const text = !state.connected && state.lostAt
+    ? `No connection for ${seconds(state.lostAt)} s. This is the last picture; it goes on by itself when stemmap answers again.`
+    : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
+    : ["failed", "waiting"].includes(status?.state) ? status.detail : "";
+  notice.hidden = !text;
+  notice.classList.toggle("wait", status?.state !== "failed" || !state.connected);
+  setText(notice.querySelector("span"), text || "");
+  byId("notice-open").hidden = !(state.connected && status?.state === "failed");
+}
+
+const seconds = (since) => Math.floor((performance.now() - since) / 1000);
+
+export function startStatus() {
+  build();
+  on("status map evaluation", show);
+  on("status connection", showState);
+  setInterval(showState, 1000);
+}

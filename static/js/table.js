@@ -1,0 +1,109 @@
+// The table of trees (Table 2): sorted by any column, with a box to find one.
+
+import { byId, el, setText } from "./dom.js";
+import { count, figure, fixed, NONE } from "./format.js";
+import { select } from "./live.js";
+import { on, state } from "./state.js";
+import { visible } from "./tabs.js";
+
+const EVERY = 400; // [ms] between two fillings; nobody reads faster
+const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2));
+
+// key, title, tooltip, text, what it is sorted by
+const COLUMNS = [
+  ["number", "tree", "Number of the tree", (t) => String(t.number), (t) => t.number],
+  ["x", "x m", "East of the start", (t) => fixed(t.x, 2), (t) => t.x],
+  ["y", "y m", "North of the start", (t) => fixed(t.y, 2), (t) => t.y],
+  ["sigma", "± cm", "Standard deviation of the position", (t) => figure(sigma(t), 2), sigma],
+  ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm ?? -1],
+  ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity],
+  ["seen", "seen", "Number of scans it was seen in", (t) => String(t.observations), (t) => t.observations],
+];
+const rows = new Map();
+let order = { key: "number", descending: false };
+let filledAt = 0, planned = 0;
+
+function dbh(tree) {
+  if (tree.dbh_cm === null) return NONE;
+  return tree.sigma_dbh_cm === null ? figure(tree.dbh_cm) : `${figure(tree.dbh_cm)} ± ${figure(tree.sigma_dbh_cm, 2)}`;
+}
+
+function head() {
+  const cells = COLUMNS.map(([key, title, hint]) => el("th", { scope: "col", "data-key": key },
+    el("button", { text: title, title: hint, onclick: () => sortBy(key) })));
+  byId("trees").tHead.replaceChildren(el("tr", {}, ...cells));
+  markOrder();
+}
+
+function sortBy(key) {
+  order = { key, descending: order.key === key && !order.descending };
+  markOrder();
+  fill();
+}
+
+function markOrder() {
+  for (const cell of byId("trees").tHead.querySelectorAll("th")) {
+    const mine = cell.dataset.key === order.key;
+    cell.setAttribute("aria-sort", mine ? (order.descending ? "descending" : "ascending") : "none");
+  }
+}
+
+function sorted(trees) {
+  const of = COLUMNS.find(([key]) => key === order.key)[4];
+  const sign = order.descending ? -1 : 1;
+  return [...trees].sort((a, b) => sign * (of(a) - of(b)) || a.number - b.number);
+}
+
+function rowOf(tree) {
+  if (!rows.has(tree.number)) {
+    const row = el("tr", { tabindex: "0", "data-tree": tree.number, onclick: () => toggle(tree.number),
+      onkeydown: (event) => event.key === "Enter" && toggle(tree.number) }, ...COLUMNS.map(() => el("td")));
+    rows.set(tree.number, row);
+  }
+  const row = rows.get(tree.number);
+  COLUMNS.forEach(([, , , text], place) => setText(row.cells[place], text(tree)));
+  row.setAttribute("aria-selected", String(tree.number === state.selected));
+  return row;
+}
+
+const toggle = (number) => select(number === state.selected ? null : number);
+
+function fill() {
+  planned = 0;
+  filledAt = performance.now();
+  if (!visible("trees")) return;
+  const all = state.map?.trees ?? [];
+  const wanted = byId("find").value.trim();
+  const trees = sorted(wanted ? all.filter((tree) => String(tree.number).startsWith(wanted)) : all);
+  const body = byId("trees").tBodies[0];
+  trees.forEach((tree, place) => {
+    const row = rowOf(tree);
+    if (body.rows[place] !== row) body.insertBefore(row, body.rows[place] ?? null);
+  });
+  while (body.rows.length > trees.length) body.lastChild.remove();
+  setText(byId("tree-count"), wanted ? `${trees.length} of ${all.length}` : count(all.length, "tree"));
+  byId("trees").hidden = !trees.length;
+  setText(byId("trees-empty"), trees.length ? "" : emptyText(all.length, wanted));
+}
+
+function emptyText(all, wanted) {
+  if (all) return `No tree number begins with “${wanted}”.`;
+  return state.map ? "No tree yet. A tree is listed when it was seen in enough scans; the tab Why tells what became of the clusters."
+    : "Nothing mapped yet. Press play, or open a run.";
+}
+
+function later() {
+  planned ||= setTimeout(fill, Math.max(0, EVERY - (performance.now() - filledAt)));
+}
+
+export function startTable() {
+  head();
+  byId("find").addEventListener("input", fill);
+  on("map", later);
+  on("tab", fill);
+  on("selection", () => {
+    fill();
+    rows.get(state.selected)?.scrollIntoView({ block: "nearest" });
+  });
+  fill();
+}
