@@ -1,0 +1,104 @@
+"""`stemmap simulate SCENARIO --out run.mcap`: a simulated run as a recording, with its ground truth."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.records import Record
+    from pipeline.sources.simulated import SimulatedSource
+
+HELP = "Write a simulated run as an MCAP of ROS 2 messages, with its ground truth"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Declare the words of the command."""
+    parser.add_argument(
+        "scenario",
+        metavar="SCENARIO",
+        help="stand, paper, slope, dense or long, with options as in 'stand?odometry=poor&sigma=0.03' "
+        "(seed, sigma, odometry = good, normal, poor or exact, duration, trees)",
+    )
+    parser.add_argument("--out", required=True, type=_mcap, metavar="RUN.mcap", help="the file to write")
+    parser.add_argument(
+        "--seed", type=int, metavar="N", help="of everything random in the run; 0 if not given"
+    )
+    parser.add_argument("--duration", type=float, metavar="S", help="length of the run in seconds")
+    parser.add_argument("--force", action="store_true", help="overwrite files that are there already")
+    parser.epilog = "The ground truth is attached to the recording, and written beside it as RUN.trees.csv."
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the recording and the table of trees beside it."""
+    from pipeline.recording import write_recording
+    from pipeline.sources.simulated import open_simulated
+
+    out: Path = arguments.out
+    table = out.with_suffix(".trees.csv")
+    _refuse_to_overwrite([out, table], arguments.force)
+    source = open_simulated(_uri(arguments))
+    description = source.description
+    truth = source.truth()
+    write_recording(
+        out,
+        _with_progress(source),
+        sensor=description.sensor,
+        T_base_lidar=description.T_base_lidar,
+        truth=truth,
+    )
+    _write_trees(table, source)
+    print(f"{out}: {description.scans} scans; its ground truth is attached, and in {table}")
+    return 0
+
+
+def _mcap(text: str) -> Path:
+    path = Path(text)
+    if path.suffix.lower() != ".mcap":
+        raise argparse.ArgumentTypeError(f"{text} must end in .mcap")
+    return path
+
+
+def _uri(arguments: argparse.Namespace) -> str:
+    """The scenario with the flags as options, so that one place checks them all."""
+    uri: str = arguments.scenario if arguments.scenario.startswith("sim:") else f"sim:{arguments.scenario}"
+    for key in ("seed", "duration"):
+        value = getattr(arguments, key)
+        if value is not None:
+            uri += f"{'&' if '?' in uri else '?'}{key}={value}"
+    return uri
+
+
+def _refuse_to_overwrite(paths: list[Path], force: bool) -> None:
+    from pipeline.errors import StemmapError
+
+    for path in paths:
+        if path.exists() and not force:
+            raise StemmapError(
+                "the file is there already", where=str(path), remedy="Name another, or add --force"
+            )
+
+
+def _with_progress(source: SimulatedSource) -> Iterator[Record]:
+    from tqdm import tqdm
+
+    from pipeline.records import Scan
+
+    # disable=None: a bar on a terminal only, nothing in a log.
+    with tqdm(total=source.description.scans, unit=" scans", disable=None) as bar:
+        for record in source.records():
+            yield record
+            bar.update(isinstance(record, Scan))
+
+
+def _write_trees(path: Path, source: SimulatedSource) -> None:
+    from pipeline.files import write_beside
+
+    trees = source.run.scene.truth
+    with write_beside(path) as partial, partial.open("w", encoding="utf-8", newline="\n") as file:
+        file.write("x_m,y_m,dbh_cm,class\n")
+        for x, y, dbh, kind in zip(trees.x, trees.y, trees.dbh, trees.kind, strict=True):
+            diameter = f"{100.0 * dbh:.2f}" if dbh == dbh else ""
+            file.write(f"{x:.4f},{y:.4f},{diameter},{kind}\n")

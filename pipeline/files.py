@@ -1,0 +1,50 @@
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pipeline.errors import StemmapError
+
+
+@contextmanager
+def write_beside(path: Path) -> Iterator[Path]:
+    """Write a file beside its place and move it there when it is whole.
+
+    Yields a path in the same folder; write and close that file. When the block ends it is flushed to
+    the disk and takes the place of `path`, at once and in one step; when the block raises it is removed
+    and `path` stays as it was.
+
+    Raises:
+        StemmapError: The folder does not exist, `path` is a folder, or the disk refuses.
+    """
+    if not path.parent.is_dir():
+        raise StemmapError(
+            "there is no such folder to write to", where=str(path.parent), remedy="Create it or name another"
+        )
+    if path.is_dir():
+        raise StemmapError("this is a folder, not a file", where=str(path), remedy="Name a file in it")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        _to_disk(partial)
+        partial.replace(path)
+        _to_disk(path.parent)
+    except OSError as error:
+        raise StemmapError(f"cannot write the file: {error.strerror or error}", where=str(path)) from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _to_disk(path: Path) -> None:
+    """Wait until a file or folder is on the disk, so that a power cut leaves the old or the new one."""
+    if path.is_dir() and os.name == "nt":
+        return  # Windows cannot open folders
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

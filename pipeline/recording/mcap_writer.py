@@ -1,0 +1,108 @@
+"""Writes records into one MCAP file with the profile of ROS 2."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.writer import CompressionType, Writer
+
+from pipeline.files import write_beside
+from pipeline.geometry import Pose3
+from pipeline.recording import messages
+from pipeline.recording.truth_json import MEDIA_TYPE, NAME, truth_json
+from pipeline.records import Odometry, Record, Scan, Sensor, Truth
+
+CHUNK_SIZE = 1 << 20
+TOPICS = {
+    "/velodyne_points": "sensor_msgs/msg/PointCloud2",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/imu/data": "sensor_msgs/msg/Imu",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+}
+
+
+def write_recording(
+    path: Path,
+    records: Iterable[Record],
+    *,
+    sensor: Sensor,
+    T_base_lidar: Pose3,
+    truth: Truth | None = None,
+) -> int:
+    """Write a run; the file appears when it is whole.
+
+    The frames are odom -> base_link -> velodyne. Every message is logged at the time of its record.
+    The same records give the same bytes.
+
+    Args:
+        path: Of the file.
+        records: In the order of time.
+        sensor: Goes into the attachment with the truth.
+        T_base_lidar: Where the LiDAR stands on the robot.
+        truth: What is known for certain, attached as `stemmap_truth.json`.
+
+    Returns:
+        Number of messages.
+
+    Raises:
+        StemmapError: A time that ROS cannot hold, or the disk refuses.
+    """
+    with write_beside(path) as partial, partial.open("wb") as stream:
+        run = _Run(stream, truth_json(sensor, truth), T_base_lidar)
+        for record in records:
+            run.add(record)
+        run.finish()
+        return run.count
+
+
+class _Run:
+    """One MCAP while it is written."""
+
+    def __init__(self, stream: BinaryIO, truth: bytes, T_base_lidar: Pose3) -> None:
+        self.count = 0
+        self._T_base_lidar: Pose3 | None = T_base_lidar
+        self._writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.LZ4)
+        # The library would write its own version, and the bytes would change with every release of it.
+        self._writer.start(profile="ros2", library="stemmap")
+        # At the front, so that a file that is cut short still has it.
+        self._writer.add_attachment(0, 0, NAME, MEDIA_TYPE, truth)
+        schemas = {name: self._register(name) for name in dict.fromkeys(TOPICS.values())}
+        self._channels = {
+            topic: self._writer.register_channel(topic, "cdr", schemas[name])
+            for topic, name in TOPICS.items()
+        }
+        self._sequence = dict.fromkeys(TOPICS, 0)
+
+    def add(self, record: Record) -> None:
+        """Write one record, before the first the mounting of the LiDAR."""
+        stamp = record.stamp_ns
+        if self._T_base_lidar is not None:
+            mounting = messages.transform(stamp, messages.BASE, messages.LIDAR, self._T_base_lidar)
+            self._write("/tf_static", stamp, mounting)
+            self._T_base_lidar = None
+        if isinstance(record, Scan):
+            self._write("/velodyne_points", stamp, messages.point_cloud(record))
+        elif isinstance(record, Odometry):
+            self._write("/odom", stamp, messages.odometry(record))
+            moved = messages.transform(stamp, messages.ODOM, messages.BASE, record.T_odom_base)
+            self._write("/tf", stamp, moved)
+        else:
+            self._write("/imu/data", stamp, messages.imu(record))
+
+    def finish(self) -> None:
+        """Write the index."""
+        self._writer.finish()
+
+    def _register(self, type_name: str) -> int:
+        text = messages.definition(type_name).encode()
+        return int(self._writer.register_schema(type_name, "ros2msg", text))
+
+    def _write(self, topic: str, stamp_ns: int, message: messages.Message) -> None:
+        self._writer.add_message(
+            self._channels[topic], stamp_ns, messages.encode(message), stamp_ns, self._sequence[topic]
+        )
+        self._sequence[topic] += 1
+        self.count += 1
