@@ -61,7 +61,11 @@ def _take(
         w = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
         if offset_ns.shape[0] > 0:
             dt = offset_ns[i] * 1e-9
-            c, s = np.cos(twist[2] * dt), np.sin(twist[2] * dt)
+            # A robot turns by less than half a radian within a sweep, where these series are exact
+            # to a tenth of a millimetre at 100 m; the library's sine would cost more than all else.
+            a = twist[2] * dt
+            c = 1.0 - a * a * (0.5 - a * a * (1.0 / 24.0 - a * a / 720.0))
+            s = a * (1.0 - a * a * (1.0 / 6.0 - a * a * (1.0 / 120.0 - a * a / 5040.0)))
             bx, by = u + sensor[0], v + sensor[1]
             u = c * bx - s * by + twist[0] * dt - sensor[0]
             v = s * bx + c * by + twist[1] * dt - sensor[1]

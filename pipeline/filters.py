@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.parameters.stages import Filters
-from pipeline.records import Bool, Float32
+from pipeline.records import Float32
 
 # Odd 64-bit constant that spreads neighbouring cells over the whole table (Fibonacci hashing).
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
@@ -18,20 +18,19 @@ def pass_through(points: Float32, parameters: Filters) -> Float32:
     p = parameters
     low = np.array([p.x_min, p.y_min, p.z_min], np.float32)
     high = np.array([p.x_max, p.y_max, p.z_max], np.float32)
-    inside: Float32 = points[_inside(points, low, high)]
-    return inside
+    return _box(points, low, high)
 
 
 @compiled
-def _inside(points: Float32, low: Float32, high: Float32) -> Bool:
-    inside = np.empty(points.shape[0], np.bool_)
+def _box(points: Float32, low: Float32, high: Float32) -> Float32:
+    inside = np.empty_like(points)
+    n = 0
     for i in range(points.shape[0]):
-        inside[i] = (
-            low[0] <= points[i, 0] <= high[0]
-            and low[1] <= points[i, 1] <= high[1]
-            and low[2] <= points[i, 2] <= high[2]
-        )
-    return inside
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]:
+            inside[n, 0], inside[n, 1], inside[n, 2] = x, y, z
+            n += 1
+    return inside[:n].copy()
 
 
 def voxel_grid(points: Float32, parameters: Filters) -> Float32:

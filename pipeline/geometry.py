@@ -51,7 +51,8 @@ class Pose2:
 
     def apply(self, points: Float) -> Float:
         """Transform points of shape (N, 2) [m] from frame b to frame a."""
-        return points @ self.rotation().T + np.array([self.x, self.y])
+        moved: Float = points @ self.rotation().T + np.array([self.x, self.y])
+        return moved
 
     def rotation(self) -> Float:
         """The rotation matrix, shape (2, 2)."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.compiled import compiled
+from pipeline.direction import direction_bin
 from pipeline.geometry import Float
 from pipeline.parameters.stages import Ground
 from pipeline.records import Float32
@@ -38,8 +39,7 @@ def find_terrain(points: Float32, parameters: Ground) -> Terrain:
         points: float32, shape (N, 3) [m], level sensor frame, the whole scan.
         parameters: Of this stage.
     """
-    reach = float(np.sqrt((points[:, :2].astype(np.float64) ** 2).sum(axis=1).max())) if len(points) else 0.0
-    lowest = _lowest(points, int(reach / BIN) + 1)
+    lowest = _lowest(points, int(_reach(points) / BIN) + 1)
     start = _start_height(lowest)
     return Terrain(*_walk_outwards(lowest, start, float(np.tan(np.radians(parameters.slope_max)))))
 
@@ -51,7 +51,8 @@ def height_above(points: Float32, terrain: Terrain) -> Float32:
 
 def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
     """The points whose height above the ground lies in the band. Shape (N, 3) -> (M, 3)."""
-    return points[(height >= parameters.height_min) & (height <= parameters.height_max)]
+    inside: Float32 = points[(height >= parameters.height_min) & (height <= parameters.height_max)]
+    return inside
 
 
 def _start_height(lowest: Float) -> float:
@@ -63,17 +64,20 @@ def _start_height(lowest: Float) -> float:
 
 
 @compiled
-def _cell(x: float, y: float, sectors: int) -> tuple[int, float]:
-    sector = int((np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * sectors)
-    return min(sector, sectors - 1), np.sqrt(x * x + y * y) / BIN
+def _reach(points: Float32) -> float:
+    square = 0.0
+    for i in range(points.shape[0]):
+        square = max(square, points[i, 0] * points[i, 0] + points[i, 1] * points[i, 1])
+    return float(np.sqrt(square))
 
 
 @compiled
 def _lowest(points: Float32, bins: int) -> Float:
     lowest = np.full((SECTORS, bins), np.inf)
     for i in range(points.shape[0]):
-        sector, position = _cell(points[i, 0], points[i, 1], SECTORS)
-        k = min(int(position), bins - 1)
+        x, y = points[i, 0], points[i, 1]
+        sector = direction_bin(x, y, SECTORS)
+        k = min(int(np.sqrt(x * x + y * y) / BIN), bins - 1)
         lowest[sector, k] = min(lowest[sector, k], points[i, 2])
     return lowest
 
@@ -106,7 +110,8 @@ def _height_above(points: Float32, height: Float) -> Float32:
     above = np.empty(points.shape[0], np.float32)
     bins = height.shape[1]
     for i in range(points.shape[0]):
-        sector, position = _cell(points[i, 0], points[i, 1], SECTORS)
+        x, y = points[i, 0], points[i, 1]
+        sector, position = direction_bin(x, y, SECTORS), np.sqrt(x * x + y * y) / BIN
         # A cell's lowest return lies anywhere in it; interpolating between the centres of two
         # cells keeps a slope from becoming a staircase.
         k = min(max(int(position - 0.5), 0), bins - 1)

@@ -92,12 +92,14 @@ class Mapper:
         with watch("acquisition"):
             raw, sensor_offset = acquire(step, self._T_base_lidar, p.acquisition)
 
-        with watch("filters"):
+        with watch("pass-through"):
             boxed = filters.pass_through(raw, p.filters)
-            voxels = filters.voxel_grid(boxed, p.filters)
 
         with watch("ground"):
-            filtered = self._above_ground(raw, voxels)
+            band = self._above_ground(raw, boxed)
+
+        with watch("voxel grid"):
+            filtered = filters.voxel_grid(band, p.filters)
 
         with watch("clustering"):
             labels = cluster(filtered, self._sensor, p.clustering)
@@ -143,19 +145,19 @@ class Mapper:
                 "without a value": step.scan.dropped,
                 "out of range": len(step.scan.points) - len(raw),
                 "out of the box": len(raw) - len(boxed),
-                "averaged in voxels": len(boxed) - len(voxels),
-                "ground or too high": len(voxels) - len(filtered),
+                "ground or too high": len(boxed) - len(band),
+                "averaged in voxels": len(band) - len(filtered),
                 "clustered": int(np.count_nonzero(labels.label >= 0)),
                 "noise": int(np.count_nonzero(labels.label < 0)),
             },
             warnings=step.warnings,
         )
 
-    def _above_ground(self, raw: Float32, voxels: Float32) -> Float32:
+    def _above_ground(self, raw: Float32, boxed: Float32) -> Float32:
         if self._parameters.ground.method == "none":
-            return voxels
+            return boxed
         terrain = ground.find_terrain(raw, self._parameters.ground)
-        return ground.in_band(voxels, ground.height_above(voxels, terrain), self._parameters.ground)
+        return ground.in_band(boxed, ground.height_above(boxed, terrain), self._parameters.ground)
 
     def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
         """The odometry's step since the last scan, and its pose; no odometry is standing still."""

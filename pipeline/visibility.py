@@ -6,17 +6,18 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiled import compiled
+from pipeline.direction import direction_bin
 from pipeline.geometry import Float
-from pipeline.records import Float32
+from pipeline.records import Bool, Float32
 
-BINS = 360
+BINS = 360  # of about a degree each
 BEHIND = 1.0  # m; what is seen this far behind a tree's place proves that nothing stands there
 FIELD = 10  # bins; a direction is looked at when any return of the scan lies this near to it
 
 
 @compiled
 def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
-    """Free distance by direction of the base frame, shape (BINS,), from -pi on [m].
+    """Free distance by direction of the base frame, shape (BINS,), in the order of `direction_bin` [m].
 
     It is the distance to the nearest filtered point; infinite where none is; and 0 where the scan
     has no return at all in the neighbourhood, because there the sensor may not look.
@@ -27,12 +28,12 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
     """
     looked = np.zeros(BINS, np.bool_)
     for i in range(raw.shape[0]):
-        looked[_bin(raw[i, 0] + sensor_offset[0], raw[i, 1] + sensor_offset[1])] = True
+        looked[direction_bin(raw[i, 0] + sensor_offset[0], raw[i, 1] + sensor_offset[1], BINS)] = True
     free = np.full(BINS, np.inf)
     for i in range(filtered.shape[0]):
         x, y = filtered[i, 0] + sensor_offset[0], filtered[i, 1] + sensor_offset[1]
-        k = _bin(x, y)
-        free[k] = min(free[k], np.hypot(x, y))
+        k = direction_bin(x, y, BINS)
+        free[k] = min(free[k], np.sqrt(x * x + y * y))
     for k in range(BINS):
         near = False
         for j in range(-FIELD, FIELD + 1):
@@ -47,23 +48,20 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
 
 
 @compiled
-def _bin(x: float, y: float) -> int:
-    return min(int((np.arctan2(y, x) + np.pi) / (2.0 * np.pi) * BINS), BINS - 1)
-
-
-@compiled
-def in_free_view(place: Float, pose: Float, clear_range: Float, view_range: float) -> bool:
-    """Whether the scan saw past a place, so that a tree there would have been seen.
+def in_free_view(place: Float, pose: Float, clear_range: Float, view_range: float) -> Bool:
+    """Whether the scan saw past each place, so that a tree there would have been seen, shape (N,).
 
     Args:
-        place: shape (2,) [m]; pose: x, y [m], yaw [rad], shape (3,), both in the frame of the map.
+        place: shape (N, 2) [m]; pose: x, y [m], yaw [rad], shape (3,), both in the frame of the map.
         clear_range: As `clear_range` gives it.
         view_range: Places farther than this are never asked for [m].
     """
-    dx, dy = place[0] - pose[0], place[1] - pose[1]
-    reach = np.hypot(dx, dy)
-    if reach > view_range:
-        return False
-    turn = (np.arctan2(dy, dx) - pose[2] + np.pi) % (2.0 * np.pi)
-    k = min(int(turn / (2.0 * np.pi) * BINS), BINS - 1)
-    return bool(clear_range[k] > reach + BEHIND)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    free = np.zeros(place.shape[0], np.bool_)
+    for i in range(place.shape[0]):
+        dx, dy = place[i, 0] - pose[0], place[i, 1] - pose[1]
+        reach = np.sqrt(dx * dx + dy * dy)
+        if reach <= view_range:
+            k = direction_bin(c * dx + s * dy, c * dy - s * dx, BINS)
+            free[i] = clear_range[k] > reach + BEHIND
+    return free

@@ -7,6 +7,8 @@ trunks are dense, which is where the others are slow.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -55,6 +57,7 @@ def dbscan_grid(points: Float, eps: float, min_points: int) -> tuple[Int32, Bool
     return label, core
 
 
+@cache
 def _neighbour_offsets(dimensions: int) -> Int:
     """Key differences of the cells that can hold a neighbour, nearest first, the cell itself left out."""
     reach = np.arange(-2, 3)

@@ -17,6 +17,7 @@ HUBER = 1.5  # sigma
 PRIOR_RADIUS, PRIOR_RADIUS_SIGMA = 0.15, 0.15  # m; half of the stems of a stand lie within
 PRIOR_LEAN_SIGMA = 0.05  # 3 degrees
 ITERATIONS = 12
+CONVERGED = 1e-4  # m; a hundredth of what the noise allows
 COLUMNS = 9  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc
 
 
@@ -91,7 +92,7 @@ def _fit(points: Float, sigma: float, stem: Float) -> None:
             step *= limit / longest
         p += step
         p[4] = max(p[4], 0.005)
-        if longest < 1e-5:
+        if longest < CONVERGED:
             break
     _normal_equations(points, z0, p, sigma, H)
     C = np.linalg.inv(H)
@@ -112,7 +113,7 @@ def _fit(points: Float, sigma: float, stem: Float) -> None:
 def _residual(points: Float, i: int, z0: float, p: Float) -> float:
     h = points[i, 2] - z0
     dx, dy = points[i, 0] - p[0] - p[2] * h, points[i, 1] - p[1] - p[3] * h
-    return float(np.hypot(dx, dy) - p[4])
+    return float(np.sqrt(dx * dx + dy * dy) - p[4])
 
 
 @compiled
@@ -124,7 +125,7 @@ def _normal_equations(points: Float, z0: float, p: Float, sigma: float, H: Float
     for i in range(points.shape[0]):
         h = points[i, 2] - z0
         dx, dy = points[i, 0] - p[0] - p[2] * h, points[i, 1] - p[1] - p[3] * h
-        d = max(np.hypot(dx, dy), 1e-9)
+        d = max(np.sqrt(dx * dx + dy * dy), 1e-9)
         r = d - p[4]
         w = 1.0 / (sigma * sigma)
         if abs(r) > HUBER * sigma:
@@ -133,8 +134,11 @@ def _normal_equations(points: Float, z0: float, p: Float, sigma: float, H: Float
         J[2], J[3], J[4] = J[0] * h, J[1] * h, -1.0
         for a in range(5):
             g[a] += w * J[a] * r
-            for b in range(5):
+            for b in range(a, 5):
                 H[a, b] += w * J[a] * J[b]
+    for a in range(5):
+        for b in range(a):
+            H[a, b] = H[b, a]
     lean, radius = 1.0 / PRIOR_LEAN_SIGMA**2, 1.0 / PRIOR_RADIUS_SIGMA**2
     for a in (2, 3):
         H[a, a] += lean

@@ -121,8 +121,7 @@ class FastSlam:
             index: Number of the scan.
             motion: T_base(t-1)_base(t) by the odometry.
             detections: Trees in the base frame.
-            clear_range: shape (bins,) [m]: how far the view is free in each direction of the base
-                frame, from -pi on; 0 where the sensor does not look.
+            clear_range: shape (bins,) [m]: how far the view is free by direction (see visibility).
         """
         p = self.parameters
         rng = np.random.default_rng([self._seed, index])

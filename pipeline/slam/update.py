@@ -81,8 +81,9 @@ def observe(
                 hits[p, n] = 1
                 score[p, n] = 1.0
                 count[p] = n + 1
+        free = in_free_view(mean[p, :known], pose[p], clear_range, view_range)
         for j in range(known):
-            if not seen[j] and in_free_view(mean[p, j], pose[p], clear_range, view_range):
+            if free[j] and not seen[j]:
                 score[p, j] -= miss
         _remove_gone(mean[p], covariance[p], hits[p], score[p], count, p, known)
 

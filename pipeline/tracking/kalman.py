@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
+from pipeline.records import Int
 
 H = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
 
@@ -52,15 +53,27 @@ def _update_compiled(
     return x, P
 
 
-def _update_filterpy(
-    x: Float, P: Float, dt: float, acceleration_sigma: float, z: Float, R: Float
-) -> tuple[Float, Float]:
+@compiled
+def _update_rows_compiled(
+    x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
+) -> None:
+    for k in range(rows.shape[0]):
+        row = rows[k]
+        x[row], P[row] = _update_compiled(x[row], P[row], dt[k], acceleration_sigma, z[k], R[k])
+
+
+def _update_rows_filterpy(
+    x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
+) -> None:
     from filterpy.kalman import predict, update
 
-    x, P = predict(x, P, F=transition(dt), Q=process_noise(dt, acceleration_sigma))
-    x, P = update(x, P, z, R=R, H=H)
-    return np.asarray(x), np.asarray(P)
+    for k, row in enumerate(rows):
+        x_row, P_row = predict(
+            x[row], P[row], F=transition(dt[k]), Q=process_noise(dt[k], acceleration_sigma)
+        )
+        x[row], P[row] = update(x_row, P_row, z[k], R=R[k], H=H)
 
 
-Update = Callable[[Float, Float, float, float, Float, Float], tuple[Float, Float]]
-ENGINES: dict[str, Update] = {"compiled": _update_compiled, "filterpy": _update_filterpy}
+# x (T, 4), P (T, 4, 4), rows (D,), dt (D,) [s], acceleration sigma [m/s^2], z (D, 2) [m], R (D, 2, 2)
+UpdateRows = Callable[[Float, Float, Int, Float, float, Float, Float], None]
+ENGINES: dict[str, UpdateRows] = {"compiled": _update_rows_compiled, "filterpy": _update_rows_filterpy}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Bool
 from pipeline.tracking.table import TrackTable
@@ -20,17 +21,26 @@ def merge_near(tracks: TrackTable, touched: Bool, radius: float) -> TrackTable:
     if radius <= 0.0:
         return tracks
     alive = np.ones(len(tracks), np.bool_)
-    for row in np.flatnonzero(touched):
-        if not alive[row]:
+    while True:
+        old, young = _first_pair(tracks.x, touched, alive, radius)
+        if old < 0:
+            return tracks if alive.all() else tracks.take(alive)
+        _join(tracks, old, young)
+        alive[young] = False
+        touched[old] = True
+
+
+@compiled
+def _first_pair(x: Float, touched: Bool, alive: Bool, radius: float) -> tuple[int, int]:
+    """Rows of two trees nearer than the radius, one of which was touched; -1, -1 for none."""
+    for i in range(x.shape[0]):
+        if not (touched[i] and alive[i]):
             continue
-        distance = np.hypot(*(tracks.x[:, :2] - tracks.x[row, :2]).T)
-        distance[row] = np.inf
-        distance[~alive] = np.inf
-        other = int(np.argmin(distance))
-        if distance[other] < radius:
-            _join(tracks, min(row, other), max(row, other))
-            alive[max(row, other)] = False
-    return tracks if alive.all() else tracks.take(alive)
+        for j in range(x.shape[0]):
+            dx, dy = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1]
+            if j != i and alive[j] and dx * dx + dy * dy < radius * radius:
+                return min(i, j), max(i, j)
+    return -1, -1
 
 
 def _join(tracks: TrackTable, old: int, young: int) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int
 
@@ -79,17 +80,19 @@ class TrackTable:
         )
 
 
-def seen_sides(from_bearing: float, arc: float) -> int:
-    """Bits of the sectors that a view from a direction shows.
+@compiled
+def seen_sides(from_bearing: Float, arc: Float) -> Int:
+    """Bits of the sectors around each trunk that a view from a direction shows, int64, shape (D,).
 
     Args:
-        from_bearing: Direction from the trunk to the sensor, frame of the map [rad].
-        arc: Visible arc around that direction [rad].
+        from_bearing: Direction from the trunk to the sensor, frame of the map, shape (D,) [rad].
+        arc: Visible arc around that direction, shape (D,) [rad].
     """
     step = 2.0 * np.pi / SECTORS
-    first = int(np.ceil((from_bearing - arc / 2) / step - 1e-9))
-    last = int(np.floor((from_bearing + arc / 2) / step + 1e-9))
-    bits = 0
-    for k in range(first, min(last, first + SECTORS)):  # a sector counts when all of it was seen
-        bits |= 1 << (k % SECTORS)
+    bits = np.zeros(from_bearing.shape[0], np.int64)
+    for d in range(from_bearing.shape[0]):
+        first = int(np.ceil((from_bearing[d] - arc[d] / 2) / step - 1e-9))
+        last = int(np.floor((from_bearing[d] + arc[d] / 2) / step + 1e-9))
+        for k in range(first, min(last, first + SECTORS)):  # a sector counts when all of it was seen
+            bits[d] |= np.int64(1) << (k % SECTORS)
     return bits

@@ -59,52 +59,41 @@ class Tracker:
             p.gate,
             p.distance_max,
         )
+        old, fresh = np.flatnonzero(row_of >= 0), np.flatnonzero(row_of < 0)
         touched = np.zeros(len(self.tracks), np.bool_)
-        for d in np.flatnonzero(row_of >= 0):
-            self._observe(int(row_of[d]), int(d), stamp_ns, position[d], R[d], T_map_base, detections)
-            touched[row_of[d]] = True
-        self._miss(touched, T_map_base, clear_range, view_range)
-        fresh = np.flatnonzero(row_of < 0)
+        touched[row_of[old]] = True
+        self._miss(~touched, T_map_base, clear_range, view_range)
+        self._update(row_of[old], stamp_ns, position[old], R[old])
         row_of[fresh] = len(self.tracks) + np.arange(len(fresh))
-        self._begin(fresh, stamp_ns, position, R, T_map_base, detections)
-        number_of = self.tracks.number[row_of]
+        self._begin(stamp_ns, position[fresh], R[fresh])
+        _gather(self.tracks, row_of, position, T_map_base, detections)
+        number_of: Int = self.tracks.number[row_of]
         touched = np.concatenate([touched, np.ones(len(fresh), np.bool_)])
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius)
         self.tracks = self.tracks.take(self.tracks.score > 0.0)
         return number_of
 
-    def _observe(
-        self, row: int, d: int, stamp_ns: int, z: Float, R: Float, T_map_base: Pose2, seen: Detections
-    ) -> None:
+    def _update(self, rows: Int, stamp_ns: int, z: Float, R: Float) -> None:
         p, t = self.parameters, self.tracks
-        dt = (stamp_ns - int(t.stamp_ns[row])) * NANOSECONDS
-        t.x[row], t.P[row] = ENGINES[p.engine](t.x[row], t.P[row], dt, p.acceleration_sigma, z, R)
-        t.stamp_ns[row] = stamp_ns
-        t.hits[row] += 1
-        t.score[row] = min(t.score[row] + 1.0, SCORE_MAX)
-        _gather(t, row, d, z, T_map_base, seen)
+        dt = (stamp_ns - t.stamp_ns[rows]).astype(np.float64) * NANOSECONDS
+        ENGINES[p.engine](t.x, t.P, rows, dt, p.acceleration_sigma, z, R)
+        t.stamp_ns[rows] = stamp_ns
+        t.score[rows] = np.minimum(t.score[rows] + 1.0, SCORE_MAX)
 
-    def _begin(
-        self, fresh: Int, stamp_ns: int, z: Float, R: Float, T_map_base: Pose2, seen: Detections
-    ) -> None:
-        new = TrackTable.empty(len(fresh))
-        new.number[:] = self.next_number + np.arange(len(fresh))
-        self.next_number += len(fresh)
-        new.x[:, :2] = z[fresh]
-        new.P[:, :2, :2] = R[fresh]
+    def _begin(self, stamp_ns: int, z: Float, R: Float) -> None:
+        new = TrackTable.empty(len(z))
+        new.number[:] = self.next_number + np.arange(len(z))
+        self.next_number += len(z)
+        new.x[:, :2] = z
+        new.P[:, :2, :2] = R
         new.P[:, [2, 3], [2, 3]] = self.parameters.velocity_sigma**2
         new.stamp_ns[:] = new.first_ns[:] = stamp_ns
-        new.hits[:] = 1
         new.score[:] = 1.0
-        for row, d in enumerate(fresh):
-            _gather(new, row, int(d), z[d], T_map_base, seen)
         self.tracks = self.tracks.extended(new)
 
-    def _miss(self, seen: Bool, T_map_base: Pose2, clear_range: Float, view_range: float) -> None:
-        pose, miss = T_map_base.as_array(), 1.0 / self.parameters.misses_per_hit
-        for row in np.flatnonzero(~seen):
-            if in_free_view(self.tracks.x[row], pose, clear_range, view_range):
-                self.tracks.score[row] -= miss
+    def _miss(self, unseen: Bool, T_map_base: Pose2, clear_range: Float, view_range: float) -> None:
+        missed = unseen & in_free_view(self.tracks.x[:, :2], T_map_base.as_array(), clear_range, view_range)
+        self.tracks.score[missed] -= 1.0 / self.parameters.misses_per_hit
 
     def trees(self) -> Trees:
         """The map as it stands (Table 2)."""
@@ -130,18 +119,19 @@ class Tracker:
         )
 
 
-def _gather(t: TrackTable, row: int, d: int, z: Float, T_map_base: Pose2, seen: Detections) -> None:
-    """Add what one detection says about the trunk itself."""
-    if np.isfinite(seen.eccentricity[d]):
-        t.eccentricity[row] += seen.eccentricity[d]
-        t.eccentricities[row] += 1
-    if np.isfinite(seen.radius[d]):
-        weight = 1.0 / float(seen.radius_sigma[d]) ** 2
-        t.radius[row] += weight * seen.radius[d]
-        t.radius_weight[row] += weight
-        t.radii[row] += 1
-    bearing = float(np.arctan2(T_map_base.y - z[1], T_map_base.x - z[0]))
-    t.sides[row] |= seen_sides(bearing, float(seen.arc[d]))
+def _gather(t: TrackTable, rows: Int, z: Float, T_map_base: Pose2, seen: Detections) -> None:
+    """Add what one scan's detections say about their trunks; no two are of the same trunk."""
+    t.hits[rows] += 1
+    finite = np.isfinite(seen.eccentricity)
+    t.eccentricity[rows[finite]] += seen.eccentricity[finite]
+    t.eccentricities[rows[finite]] += 1
+    round_ones = np.isfinite(seen.radius)
+    weight = 1.0 / seen.radius_sigma[round_ones] ** 2
+    t.radius[rows[round_ones]] += weight * seen.radius[round_ones]
+    t.radius_weight[rows[round_ones]] += weight
+    t.radii[rows[round_ones]] += 1
+    bearing = np.arctan2(T_map_base.y - z[:, 1], T_map_base.x - z[:, 0])
+    t.sides[rows] |= seen_sides(bearing, seen.arc)
 
 
 def _in_map(detections: Detections, T_map_base: Pose2, pose_covariance: Float) -> Float:
