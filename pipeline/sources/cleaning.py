@@ -11,6 +11,8 @@ from pipeline.records import Float32, Int32, Scan
 POINT_LIMIT = 16_000_000
 #: No LiDAR sees farther; such a number is a damaged one, and it would overflow in the stages.
 RANGE_LIMIT = 10_000.0
+#: Drivers write (0, 0, 0) for a beam without a return; nothing real is seen at 1 mm.
+NEAR_LIMIT = 1e-3
 
 
 def clean_scan(
@@ -24,13 +26,13 @@ def clean_scan(
 ) -> Scan:
     """Make a Scan of points of shape (N, 3) [m] and their columns of shape (N,).
 
-    Rows that are not finite, beyond 10 km, or exactly (0, 0, 0) are no returns: they are left out
-    and added to `dropped`.
+    Rows that are not finite, beyond 10 km, or at the origin are no returns: they are left out and
+    added to `dropped`.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         xyz = np.ascontiguousarray(points, dtype=np.float32)
         reach = np.abs(xyz).max(axis=1) if len(xyz) else np.zeros(0, np.float32)
-        keep = (reach > 0.0) & (reach < RANGE_LIMIT)
+        keep = (reach > NEAR_LIMIT) & (reach < RANGE_LIMIT)
     refused = int(len(keep) - np.count_nonzero(keep))
     if refused:
         xyz = xyz[keep]

@@ -53,15 +53,15 @@ def _victoria(uri: str, path: Path, options: SourceOptions) -> Source:
 
 
 def _kitti(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.sources.kitti import KittiSource
+    from pipeline.sources.kitti import open_kitti
 
-    return KittiSource(uri, path, options)
+    return open_kitti(uri, path, options)
 
 
 def _pcd(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.sources.pcd import PcdSource
+    from pipeline.sources.pcd import open_pcd
 
-    return PcdSource(uri, path, options)
+    return open_pcd(uri, path, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,13 @@ FILES = (
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _bag),
     Format(
         "Velodyne .pcap",
-        (b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d"),
+        (
+            b"\xd4\xc3\xb2\xa1",
+            b"\xa1\xb2\xc3\xd4",
+            b"\x4d\x3c\xb2\xa1",
+            b"\xa1\xb2\x3c\x4d",
+            b"\x0a\x0d\x0d\x0a",
+        ),
         (".pcap",),
         _pcap,
     ),

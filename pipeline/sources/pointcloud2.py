@@ -7,15 +7,11 @@ from numpy.typing import NDArray
 
 from pipeline.records import Scan
 from pipeline.sources.cleaning import POINT_LIMIT, clean_scan
+from pipeline.sources.point_fields import REFLECTANCE, RING, TIME, first_of, is_ring, point_offsets
 from pipeline.sources.ros_messages import PointCloud2
 
 #: NumPy's code by the number of a PointField's datatype.
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-REFLECTANCE = ("intensity", "intensities", "reflectivity", "reflectance", "i")
-RING = ("ring", "channel", "laser_id", "line")
-TIME = ("t", "time", "timestamp", "time_offset", "offset_time", "time_stamp")
-RING_LIMIT = 1024
-OFFSET_LIMIT_NS = 2_000_000_000
 
 
 class LayoutError(Exception):
@@ -36,10 +32,11 @@ def decode_cloud(cloud: PointCloud2, stamp_ns: int) -> Scan:
     points = np.empty((len(table), 3), dtype=np.float64 if table["x"].dtype.itemsize > 4 else np.float32)
     for axis, name in enumerate("xyz"):
         points[:, axis] = table[name]
-    reflectance, ring, time = (_first(table, names) for names in (REFLECTANCE, RING, TIME))
-    if ring is not None and not _is_ring(ring):
+    columns = {name: table[name] for name in table.dtype.names or ()}
+    reflectance, ring, time = (first_of(columns, names) for names in (REFLECTANCE, RING, TIME))
+    if ring is not None and not is_ring(ring):
         ring = None
-    offset_ns = None if time is None else _offsets(time, stamp_ns)
+    offset_ns = None if time is None else point_offsets(time, stamp_ns)
     return clean_scan(stamp_ns, points, reflectance=reflectance, ring=ring, offset_ns=offset_ns)
 
 
@@ -82,42 +79,3 @@ def _dtype(cloud: PointCloud2, step: int) -> np.dtype[np.void]:
     if lacking:
         raise LayoutError(f"the cloud has no field {', '.join(lacking)} of floating numbers")
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
-
-
-def _first(table: NDArray[np.void], names: tuple[str, ...]) -> NDArray[np.generic] | None:
-    present = table.dtype.names or ()
-    return next((table[name] for name in names if name in present), None)
-
-
-def _is_ring(ring: NDArray[np.generic]) -> bool:
-    if ring.dtype.kind not in "iu" or not len(ring):
-        return False
-    return int(ring.min()) >= 0 and int(ring.max()) < RING_LIMIT
-
-
-def _offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | None:
-    """Times relative to the stamp [ns], or None when they make no sense."""
-    if not len(time):
-        return None
-    if time.dtype.kind in "iu":
-        ns = time.astype(np.int64)
-        ns = ns - stamp_ns if abs(int(ns[0])) > 10**15 else ns
-    else:
-        seconds = np.nan_to_num(time.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-        unit = _unit(float(np.abs(seconds).max()))
-        since = stamp_ns if unit is not None else 0
-        # Subtract the whole second first: a double cannot hold nanoseconds since 1970.
-        whole = since // 1_000_000_000
-        scale = unit or 1.0
-        with np.errstate(over="ignore"):
-            seconds = (seconds - whole / scale) * scale
-            ns = np.clip(seconds * 1e9, -1e18, 1e18).astype(np.int64) - (since - whole * 10**9)
-    return ns if int(np.abs(ns).max()) <= OFFSET_LIMIT_NS else None
-
-
-def _unit(largest: float) -> float | None:
-    """Seconds in one unit of times since 1970, None when they are relative."""
-    for limit, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
-        if largest > limit:
-            return unit
-    return None

@@ -8,15 +8,18 @@ from pipeline.records import Float, Int, Scan, Sensor
 
 #: Fewer points than this in a ring say nothing about its elevation.
 _RING_POINTS = 8
+VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.03, 100.0)
 
 
 def sensor_of(scan: Scan) -> Sensor:
     """Rings, their step and the step of the azimuth as the scan shows them.
 
-    Without a ring column, or with rings that show no steps of elevation, `rings` is 0.
+    Without a ring column only a VLP-16 is recognised, by its elevations; else `rings` is 0.
     """
-    if scan.ring is None or len(scan.points) < 100:
+    if len(scan.points) < 100:
         return Sensor(range_sigma=0.03)
+    if scan.ring is None:
+        return VLP_16 if _in_steps_of_vlp_16(scan) else Sensor(range_sigma=0.03)
     rings = int(scan.ring.max()) + 1
     elevation = _elevations(scan)
     steps = np.abs(np.diff(elevation[np.isfinite(elevation)]))
@@ -26,6 +29,19 @@ def sensor_of(scan: Scan) -> Sensor:
     return Sensor(
         name.get(rings, "LiDAR"), rings, ring_step, azimuth_step or Sensor().azimuth_step, range_sigma=0.03
     )
+
+
+def _in_steps_of_vlp_16(scan: Scan) -> bool:
+    """Whether nearly all returns lie at odd degrees of elevation from -15 to 15, in four rings or more."""
+    points = scan.points.astype(np.float64)
+    reach = np.hypot(points[:, 0], points[:, 1])
+    # The lasers stand up to 11 mm above and below the centre, which blurs the angles near by.
+    degrees = np.degrees(np.arctan2(points[:, 2], reach))[reach > 3.0]
+    if len(degrees) < 100:
+        return False
+    nearest = 2.0 * np.floor(degrees / 2.0) + 1.0
+    fitting = (np.abs(degrees - nearest) < 0.2) & (np.abs(nearest) <= 15.0)
+    return float(np.mean(fitting)) > 0.95 and len(np.unique(nearest[fitting])) >= 4
 
 
 def rings_descend(scan: Scan) -> bool:
