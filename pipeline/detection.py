@@ -33,15 +33,33 @@ def judge(clusters: Clusters, parameters: Detection) -> Clusters:
     return replace(clusters, verdict=verdict)
 
 
-def detections(clusters: Clusters, sensor_offset: Float) -> Detections:
+def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) -> Detections:
     """The clusters judged to be trees, in the base frame (Eq. 8: p_base = T_base_lidar p_lidar)."""
     rows = np.flatnonzero(clusters.verdict == Verdict.TREE)
     return Detections(
         cluster=rows,
         centre=clusters.centre[rows] + sensor_offset[:2],
-        covariance=clusters.covariance[rows],
+        covariance=clusters.covariance[rows] + _sensor_covariance(clusters.centre[rows], parameters),
         radius=np.where(np.isfinite(clusters.radius_sigma[rows]), clusters.radius[rows], np.nan),
         radius_sigma=clusters.radius_sigma[rows],
         arc=clusters.arc[rows],
         eccentricity=clusters.eccentricity[rows],
     )
+
+
+def _sensor_covariance(centre: Float, p: Detection) -> Float:
+    """What the fit does not know of: an error along and across the ray, shape (D, 2, 2) [m^2].
+
+    Args:
+        centre: shape (D, 2) [m], seen from the sensor.
+        p: sigma_range along the ray, sigma_bearing times the distance across it.
+    """
+    reach = np.maximum(np.hypot(centre[:, 0], centre[:, 1]), 1e-6)
+    ux, uy = centre[:, 0] / reach, centre[:, 1] / reach
+    along = p.sigma_range**2
+    across = (reach * np.radians(p.sigma_bearing)) ** 2
+    R = np.empty((len(centre), 2, 2))
+    R[:, 0, 0] = along * ux * ux + across * uy * uy
+    R[:, 0, 1] = R[:, 1, 0] = (along - across) * ux * uy
+    R[:, 1, 1] = along * uy * uy + across * ux * ux
+    return R

@@ -109,7 +109,7 @@ class Mapper:
 
         with watch("detection"):
             judged = judge(described, p.detection)
-            found = detections(judged, sensor_offset)
+            found = detections(judged, sensor_offset, p.detection)
             free = clear_range(raw, filtered, sensor_offset)
 
         with watch("slam"):

@@ -154,6 +154,13 @@ class Detection(Stage):
         40.0, "Visible arc min", "deg", 0.0, 360.0, 5.0, "A circle is trusted from this much of an arc on."
     )
 
+    sigma_range: float = number(
+        0.05, "Range sigma", "m", 0.001, 5.0, 0.005, "Error of a trunk's distance, added to the fit's own."
+    )
+    sigma_bearing: float = number(
+        0.4, "Bearing sigma", "deg", 0.01, 20.0, 0.05, "Error of a trunk's direction, added to the fit's own."
+    )
+
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         for name in ("e", "radius"):
@@ -196,12 +203,6 @@ class Slam(Stage):
         0.1,
         "Error of the heading after turning by one radian; it grows with the root of the turn.",
     )
-    sigma_range: float = number(
-        0.05, "Range sigma", "m", 0.001, 5.0, 0.005, "Error of a trunk's distance, added to the fit's own."
-    )
-    sigma_bearing: float = number(
-        0.4, "Bearing sigma", "deg", 0.01, 20.0, 0.05, "Error of a trunk's direction, added to the fit's own."
-    )
     gate: float = number(
         3.5, "Gate", "sigma", 0.5, 20.0, 0.1, "A detection farther from a landmark than this is another tree."
     )
@@ -212,7 +213,7 @@ class Slam(Stage):
         3, "Hits before it weighs", "", 1, 50, "A landmark seen fewer times does not weigh particles."
     )
     view_range: float = number(
-        8.0,
+        15.0,
         "View range",
         "m",
         0.0,
@@ -273,7 +274,7 @@ class Tracking(Stage):
         5, "Hits to confirm", "", 1, 200, "A tree is shown and exported when it was seen so often."
     )
     misses_per_hit: int = count(
-        3, "Misses per hit", "", 1, 100, "So many misses in free view undo one hit; without hits a tree goes."
+        1, "Misses per hit", "", 1, 100, "So many misses in free view undo one hit; without hits a tree goes."
     )
 
 

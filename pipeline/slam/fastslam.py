@@ -158,7 +158,7 @@ class FastSlam:
             state.score,
             state.count,
             detections.centre,
-            _measurement_covariance(detections, p),
+            detections.covariance,
             clear_range,
             p.gate,
             p.distance_max,
@@ -183,21 +183,6 @@ def _move(pose: Float, motion: Pose2, noise: Float, p: Slam) -> None:
     pose[:, 0] += c * dx - s * dy
     pose[:, 1] += s * dx + c * dy
     pose[:, 2] = wrap_angle(pose[:, 2] + motion.yaw + sigma_yaw * noise[:, 2])
-
-
-def _measurement_covariance(detections: Detections, p: Slam) -> Float:
-    """Covariance of each detection in the base frame, shape (D, 2, 2): the fit's plus the sensor's."""
-    x, y = detections.centre[:, 0], detections.centre[:, 1]
-    reach = np.maximum(np.hypot(x, y), 1e-6)
-    ux, uy = x / reach, y / reach
-    along = p.sigma_range**2
-    across = (reach * np.radians(p.sigma_bearing)) ** 2
-    R: Float = detections.covariance.copy()
-    R[:, 0, 0] += along * ux * ux + across * uy * uy
-    R[:, 0, 1] += (along - across) * ux * uy
-    R[:, 1, 0] += (along - across) * ux * uy
-    R[:, 1, 1] += along * uy * uy + across * ux * ux
-    return R
 
 
 def _estimate(state: SlamState, weights: Float, n_eff: float, hits_to_show: int) -> PoseEstimate:
