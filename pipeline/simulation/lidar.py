@@ -56,7 +56,8 @@ class SpinningLidar:
             rings=self.rings,
             ring_step=self.ring_step,
             azimuth_step=2.0 * np.pi / self.columns,
-            range_sigma=self.range_sigma,
+            # No sensor is perfect, and the pipeline divides by it.
+            range_sigma=max(self.range_sigma, 0.001),
             range_max=self.range_max,
         )
 

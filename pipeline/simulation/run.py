@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +59,7 @@ class SimulatedRun:
         begin = k * self.lidar.period_ns
         times = (begin + self.lidar.column_offsets_ns().astype(np.int64)) / 1e9
         R, o = self.motion.sensor_at(times, self.T_base_lidar)
-        rng = np.random.default_rng([_SCAN, self.request.seed, k])
+        rng = _stream(_SCAN, self.request, k)
         solids = self._solids(times, R, o)
         return sweep_scene(self.lidar, solids, self.scene.terrain, R, o, START_NS + begin, rng)
 
@@ -131,6 +132,6 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
     )
 
 
-def _stream(part: int, request: RunRequest) -> np.random.Generator:
-    """A generator of its own for each part, so that one does not shift the numbers of another."""
-    return np.random.default_rng([part, request.seed])
+def _stream(part: int, request: RunRequest, k: int = 0) -> np.random.Generator:
+    """A generator of its own for each part and scan, so that none shifts the numbers of another."""
+    return np.random.default_rng([part, zlib.crc32(request.name.encode()), request.seed, k])
