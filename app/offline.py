@@ -93,7 +93,8 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
     )
     tally = _Tally(Counter(_odometry_warnings(plan)))
     start_ns, frame = 0, None
-    for frame in _frames(plan, mapper, stopwatch):
+    left_out = Counter[str]()
+    for frame in _frames(plan, mapper, stopwatch, left_out):
         start_ns = frame.stamp_ns if frame.index == 0 else start_ns
         files.add(frame, start_ns)
         tally.add(frame)
@@ -103,19 +104,24 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
     path, truth = mapper.path, _truth(plan)
     evaluation = _evaluate(frame, path, truth, plan.parameters)
     error = path_error(path, truth.path) if truth.path else None
+    losses = {reason: n for reason, n in (left_out + Counter(plan.source.losses)).items() if n}
     outcome = Outcome(
         summary=_summary(description.uri, frame, path, evaluation, error),
         warnings=tally.warnings(),
-        losses={reason: n for reason, n in plan.source.losses.items() if n},
+        losses=losses,
         scan_ms=stopwatch.scan_ms,
         stage_ms=stopwatch.stage_ms,
     )
-    files.finish(frame.trees, path, start_ns, _run_record(plan, tally, frame, path, evaluation, error))
+    files.finish(
+        frame.trees, path, start_ns, _run_record(plan, tally, frame, path, evaluation, error, losses)
+    )
     return outcome
 
 
-def _frames(plan: OfflineRun, mapper: Mapper, stopwatch: Stopwatch) -> Iterator[Frame]:
-    for step in steps(plan.source.records(), odometry=plan.odometry):
+def _frames(
+    plan: OfflineRun, mapper: Mapper, stopwatch: Stopwatch, left_out: Counter[str]
+) -> Iterator[Frame]:
+    for step in steps(plan.source.records(), odometry=plan.odometry, losses=left_out):
         with stopwatch.whole_scan():
             frame = mapper.process(step)
         yield frame
@@ -164,6 +170,7 @@ def _run_record(
     path: Path,
     evaluation: Evaluation | None,
     error: PathError | None,
+    losses: dict[str, int],
 ) -> dict[str, Any]:
     """run.json: no time of day and no time taken, so that the same run gives the same bytes."""
     description = plan.source.description
@@ -189,7 +196,7 @@ def _run_record(
         "evaluation": None if evaluation is None else asdict(evaluation),
         "path_error": None if error is None else asdict(error),
         "warnings": tally.warnings(),
-        "losses": {reason: n for reason, n in plan.source.losses.items() if n},
+        "losses": losses,
     }
 
 

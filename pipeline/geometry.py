@@ -16,7 +16,9 @@ Float = NDArray[np.float64]
 
 def wrap_angle(angle: ArrayLike) -> Float:
     """Bring angles [rad] into [-pi, pi)."""
-    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+    wrapped = (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+    # The remainder of an angle just below -pi rounds up to the whole turn.
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)
 
 
 def mean_angle(angles: Float, weights: Float | None = None) -> float:

@@ -160,11 +160,13 @@ class Mapper:
         return ground.in_band(boxed, ground.height_above(boxed, terrain), self._parameters.ground)
 
     def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
-        """The odometry's step since the last scan, and its pose; no odometry is standing still."""
-        now = step.T_odom_base or self._odometry or Pose2()
-        motion = Pose2() if self._odometry is None else self._odometry.inverse() @ now
+        """The odometry's step since the last scan that had one, and its pose; without any the robot
+        stands still."""
+        before, now = self._odometry, step.T_odom_base
+        if now is None:
+            return Pose2(), before or Pose2()
         self._odometry = now
-        return motion, now
+        return Pose2() if before is None else before.inverse() @ now, now
 
     def snapshot(self) -> MapperState:
         """All state, copied; parameters are not part of it."""

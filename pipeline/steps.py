@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from typing import Literal
 
@@ -18,20 +18,26 @@ JUMP_SPEED = 15.0  # m/s; no forestry robot drives this fast
 
 
 def steps(
-    records: Iterable[Record], *, odometry: OdometryChoice = "auto", first_index: int = 0
+    records: Iterable[Record],
+    *,
+    odometry: OdometryChoice = "auto",
+    first_index: int = 0,
+    losses: Counter[str] | None = None,
 ) -> Iterator[Step]:
     """Join scans with the pose by odometry, interpolated to their time, and the tilt.
 
     A scan is held back until the first odometry at or after its stamp has come, or until five
     scans wait; then the last pose stands for it. A scan that is not later than the one before it
-    is left out and said in the warnings of the next.
+    is left out, counted in `losses` and said in the warnings of the next step.
 
     Args:
         records: In the order in which they came.
         odometry: "static" leaves poses aside: the robot stands still.
         first_index: Number of the first step.
+        losses: Counts what was left out, by reason.
     """
-    joiner = _Joiner(use_odometry=odometry != "static", index=first_index)
+    counted = Counter[str]() if losses is None else losses
+    joiner = _Joiner(use_odometry=odometry != "static", index=first_index, losses=counted)
     for record in records:
         if isinstance(record, Scan):
             joiner.add_scan(record)
@@ -44,7 +50,8 @@ def steps(
 
 
 class _Joiner:
-    def __init__(self, *, use_odometry: bool, index: int) -> None:
+    def __init__(self, *, use_odometry: bool, index: int, losses: Counter[str]) -> None:
+        self._losses = losses
         self._use_odometry = use_odometry
         self._index = index
         self._scans: deque[Scan] = deque()
@@ -55,7 +62,7 @@ class _Joiner:
 
     def add_scan(self, scan: Scan) -> None:
         if self._last_stamp is not None and scan.stamp_ns <= self._last_stamp:
-            self._warn("scans that were not later than the one before were left out")
+            self._leave_out("scans that were not later than the one before")
             return
         self._last_stamp = scan.stamp_ns
         self._scans.append(scan)
@@ -63,9 +70,9 @@ class _Joiner:
     def add_odometry(self, odometry: Odometry) -> None:
         T = odometry.T_odom_base
         if not (np.all(np.isfinite(T.t)) and np.all(np.isfinite(T.R))):
-            self._warn("odometry without finite numbers was left out")
+            self._leave_out("odometry readings without finite numbers")
         elif self._odometry and odometry.stamp_ns <= self._odometry[-1].stamp_ns:
-            self._warn("odometry that was not later than the one before was left out")
+            self._leave_out("odometry readings that were not later than the one before")
         elif self._use_odometry:
             self._odometry.append(odometry)
             self._forget(self._odometry, odometry.stamp_ns)
@@ -141,6 +148,10 @@ class _Joiner:
         except ValueError:
             return None
         return roll, pitch
+
+    def _leave_out(self, reason: str) -> None:
+        self._losses[reason] += 1
+        self._warn(f"left out: {reason}")
 
     def _warn(self, text: str) -> None:
         if text not in self._warnings:

@@ -45,7 +45,9 @@ def _open3d(points: Float32, eps: float, min_points: int) -> Dbscan:
     space = np.zeros((len(points), 3))
     space[:, : points.shape[1]] = points
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(space))
-    label = np.asarray(cloud.cluster_dbscan(eps, min_points), np.int32)
+    # Its neighbours are nearer than the radius, those of the others at most as far away.
+    radius = float(np.nextafter(eps, np.inf))
+    label = np.asarray(cloud.cluster_dbscan(radius, min_points), np.int32)
     return Dbscan(in_order_of_first_point(label), None)
 
 

@@ -63,7 +63,7 @@ def _neighbour_offsets(dimensions: int) -> Int:
     reach = np.arange(-2, 3)
     grid = np.stack(np.meshgrid(*([reach] * dimensions), indexing="ij"), axis=-1).reshape(-1, dimensions)
     gap = np.maximum(np.abs(grid) - 1, 0)
-    near = ((gap**2).sum(axis=1) < dimensions) & (np.abs(grid).sum(axis=1) > 0)
+    near = ((gap**2).sum(axis=1) <= dimensions) & (np.abs(grid).sum(axis=1) > 0)
     grid = grid[near][np.argsort((grid[near] ** 2).sum(axis=1), kind="stable")]
     weights = np.array([1 << (_AXIS_BITS * (dimensions - 1 - axis)) for axis in range(dimensions)], np.int64)
     offsets: Int = grid @ weights

@@ -81,8 +81,10 @@ def evaluate(
     matched = truth_of >= 0
     hit = np.zeros(len(position), np.bool_)
     hit[truth_of[matched]] = True
-    counted = np.where(matched, asked[truth_of], _within(found, path, parameters.reach))
-    right = matched & counted & is_tree[truth_of] if len(position) else matched
+    counted = _within(found, path, parameters.reach)
+    counted[matched] = asked[truth_of[matched]]
+    right = matched & counted
+    right[matched] &= is_tree[truth_of[matched]]
     spurious = int(np.count_nonzero(counted & ~matched))
     completeness = Rate(_count(hit & asked & is_tree), _count(asked & is_tree))
     correctness = Rate(_count(right), _count(counted)).rate

@@ -4,7 +4,8 @@ From this declaration come the sliders, the REST schema, `--set stage.name=value
 the table in README.
 """
 
-from pipeline.parameters.model import FieldSpec, Parameters, Stage, field_specs
+from pipeline.parameters.declare import Stage
+from pipeline.parameters.model import FieldSpec, Parameters, field_specs
 from pipeline.parameters.presets import PRESETS, preset
 from pipeline.parameters.text import assign, from_toml, markdown_table, to_toml
 

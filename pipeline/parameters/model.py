@@ -122,7 +122,7 @@ def field_specs() -> tuple[FieldSpec, ...]:
     return tuple(
         _spec(stage_name, stage_model, name)
         for stage_name, stage_field in Parameters.model_fields.items()
-        if (stage_model := stage_field.annotation) is not None and issubclass(stage_model, Stage)
+        if isinstance(stage_model := stage_field.annotation, type) and issubclass(stage_model, Stage)
         for name in stage_model.model_fields
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from typing import Any
 
@@ -59,7 +60,7 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
     """
     try:
         given = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError
         raise ParameterError(f"not a TOML file: {error}", where=where) from None
     tree: dict[str, Any] = base.model_dump()
     for stage, values in given.items():
@@ -74,12 +75,19 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
         }
         # TOML tells 1 from 1.0; a person who writes 1 for a length means 1.0.
         tree.setdefault(stage, {}).update(
-            {k: float(v) if k in floats and type(v) is int else v for k, v in values.items()}
+            {k: _as_float(v) if k in floats and type(v) is int else v for k, v in values.items()}
         )
     try:
         return validated(tree)
     except ParameterError as error:
         raise ParameterError(error.what, where=where) from None
+
+
+def _as_float(value: int) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf  # which every bound refuses
 
 
 def markdown_table(presets: dict[str, Parameters]) -> str:

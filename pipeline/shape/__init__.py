@@ -10,6 +10,8 @@ from pipeline.records import Clusters, Float32, Int, Labels, Sensor, Verdict
 from pipeline.shape.moments import gather, moments, spread_about
 from pipeline.shape.stem import COLUMNS, fit_stems
 
+FLAT = 1e-12  # m^2; rounding of 32-bit coordinates leaves such a variance to what has none
+
 
 def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape) -> Clusters:
     """The figures of each cluster; the verdict is left open (OTHER).
@@ -47,14 +49,16 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
 
 
 def eccentricity(eigenvalues: Float) -> Float:
-    """e = lambda1 / lambda2 (Eq. 4) of descending eigenvalues, shape (K, 2 or 3); inf for a line.
+    """e = lambda1 / lambda2 (Eq. 4) of descending eigenvalues, shape (K, 2 or 3) [m^2].
+
+    It is inf for points on a line and 1 for points in one place.
 
     This is the paper's word. The eccentricity of geometry, sqrt(1 - lambda2 / lambda1), is another.
     """
     first, second = eigenvalues[:, 0], eigenvalues[:, 1]
-    # Rounding leaves a tiny lambda2 to points on a line; below this it is none.
-    line = second <= 1e-12 * first
-    ratio: Float = np.where(line, np.where(first > 0, np.inf, 1.0), first / np.where(line, 1.0, second))
+    line = second <= FLAT * np.maximum(first, 1.0)
+    one_place = first <= FLAT
+    ratio: Float = np.where(line, np.where(one_place, 1.0, np.inf), first / np.where(line, 1.0, second))
     return ratio
 
 

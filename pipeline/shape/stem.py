@@ -16,6 +16,7 @@ from pipeline.records import Int
 HUBER = 1.5  # sigma
 PRIOR_RADIUS, PRIOR_RADIUS_SIGMA = 0.15, 0.15  # m; half of the stems of a stand lie within
 PRIOR_LEAN_SIGMA = 0.05  # 3 degrees
+SIGMA_MIN = 0.001  # m; no range is better than that, and weights must stay finite
 ITERATIONS = 12
 CONVERGED = 1e-4  # m; a hundredth of what the noise allows
 COLUMNS = 9  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc
@@ -33,8 +34,8 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
 
     Returns:
         Shape (K, 9): centre x, y; its variances xx, xy, yy; radius; its sigma; standard deviation of
-        the residuals; visible arc [rad]. Radius and its sigma are NaN below five points, where the
-        centre is the nearest return pushed back by the radius that the angular width tells.
+        the residuals; visible arc [rad]. Below five points the radius is the one that the angular
+        width tells, its sigma NaN, and the centre lies so far behind the points.
     """
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
@@ -48,25 +49,24 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
 
 @compiled
 def _start_from_width(points: Float, azimuth_step: float, stem: Float) -> None:
-    """r = R sin w / (1 - sin w), with w half the angle that the cluster fills, R its nearest range."""
+    """r = R sin w / (1 - sin w), with w half the angle that the cluster fills, R its mean range."""
     n = points.shape[0]
     mean_x, mean_y = points[:, 0].mean(), points[:, 1].mean()
     middle = np.arctan2(mean_y, mean_x)
     cosine, sine = np.cos(middle), np.sin(middle)
-    left, right, mean_range = -np.inf, np.inf, 0.0
+    left, right, distance = -np.inf, np.inf, 0.0
     for i in range(n):
         along = cosine * points[i, 0] + sine * points[i, 1]
         across = cosine * points[i, 1] - sine * points[i, 0]
         turn = np.arctan2(across, along)
         left, right = max(left, turn), min(right, turn)
-        mean_range += np.hypot(points[i, 0], points[i, 1]) / n
-    nearest = mean_range
+        distance += np.hypot(points[i, 0], points[i, 1]) / n
     w = min(0.5 * (left - right) + 0.5 * azimuth_step, 1.0)
-    r = min(nearest * np.sin(w) / (1.0 - np.sin(w)), 1.0)
+    r = min(distance * np.sin(w) / (1.0 - np.sin(w)), 1.0)
     turn = middle + 0.5 * (left + right)
     # The mean range of an arc lies about a fifth of the radius behind its nearest point.
-    reach = nearest + 0.8 * r
-    sigma_along, sigma_across = 0.05 + 0.3 * r, 0.02 + 0.5 * azimuth_step * nearest
+    reach = distance + 0.8 * r
+    sigma_along, sigma_across = 0.05 + 0.3 * r, 0.02 + 0.5 * azimuth_step * distance
     c, s = np.cos(turn), np.sin(turn)
     stem[0], stem[1] = reach * c, reach * s
     stem[2] = (c * sigma_along) ** 2 + (s * sigma_across) ** 2
@@ -77,8 +77,9 @@ def _start_from_width(points: Float, azimuth_step: float, stem: Float) -> None:
 
 
 @compiled
-def _fit(points: Float, sigma: float, stem: Float) -> None:
+def _fit(points: Float, range_sigma: float, stem: Float) -> None:
     n = points.shape[0]
+    sigma = max(range_sigma, SIGMA_MIN)
     z0 = points[:, 2].mean()
     p = np.array([stem[0], stem[1], 0.0, 0.0, min(max(stem[5], 0.03), 0.6)])
     H = np.empty((5, 5))

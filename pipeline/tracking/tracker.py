@@ -35,7 +35,7 @@ class Tracker:
         detections: Detections,
         clear_range: Float,
         view_range: float,
-    ) -> Int:
+    ) -> None:
         """Take the detections of one scan.
 
         Args:
@@ -44,9 +44,6 @@ class Tracker:
             detections: In the base frame.
             clear_range: How far the view was free by direction.
             view_range: A tree nearer than this can be missed [m].
-
-        Returns:
-            The number of the tree that each detection went to, shape (D,).
         """
         p = self.parameters
         position = T_map_base.apply(detections.centre)
@@ -67,11 +64,9 @@ class Tracker:
         row_of[fresh] = len(self.tracks) + np.arange(len(fresh))
         self._begin(stamp_ns, position[fresh], R[fresh])
         _gather(self.tracks, row_of, position, T_map_base, detections)
-        number_of: Int = self.tracks.number[row_of]
         touched = np.concatenate([touched, np.ones(len(fresh), np.bool_)])
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius)
         self.tracks = self.tracks.take(self.tracks.score > 0.0)
-        return number_of
 
     def _update(self, rows: Int, stamp_ns: int, z: Float, R: Float) -> None:
         p, t = self.parameters, self.tracks
