@@ -51,7 +51,7 @@ class Mailbox:
                 self._messages.append(message)
             self._changed.notify()
 
-    def close(self, timeout_s: float = 1.0) -> None:
+    def close(self, timeout_s: float = 0.3) -> None:
         """Send what waits, then end the thread."""
         with self._changed:
             self._closing = True

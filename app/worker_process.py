@@ -22,7 +22,7 @@ _log = logging.getLogger(__name__)
 
 _PAUSES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
 _FORGIVEN_AFTER_S = 60.0
-_GRACE_S = 1.2
+_GRACE_S = 0.7
 _BUFFER = 8 * 1024 * 1024
 
 

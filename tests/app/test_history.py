@@ -1,0 +1,44 @@
+"""What is remembered of a run stays small and true."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.history import ParameterHistory, Snapshots
+from pipeline.parameters import Parameters
+
+SETS = [Parameters().replace({"clustering.eps": eps}) for eps in (0.1, 0.2, 0.3)]
+
+
+def test_states_stay_few_and_evenly_spread_however_long_the_run() -> None:
+    kept: Snapshots[int] = Snapshots(0)
+    for scans in range(20_001):
+        kept.offer(scans, scans)
+    held = {kept.newest(scans)[0] for scans in range(20_001)}
+    assert len(held) <= 40
+    gaps = {b - a for a, b in zip(sorted(held), sorted(held)[1:], strict=False)}
+    assert len(gaps) == 1
+    assert gaps.pop() <= 20_000 / 15
+
+
+@given(st.integers(0, 500), st.integers(0, 500))
+def test_the_newest_state_is_not_newer_than_asked_for(scans: int, forgotten: int) -> None:
+    kept: Snapshots[int] = Snapshots(0)
+    for n in range(401):
+        kept.offer(n, n)
+    kept.forget_after(forgotten)
+    held, state = kept.newest(scans)
+    assert held == state <= min(scans, forgotten)
+    assert held == min(scans, forgotten, 400) // 50 * 50
+
+
+@given(st.lists(st.tuples(st.integers(0, 20), st.sampled_from(SETS)), max_size=8))
+def test_history_is_what_was_set_last_from_each_scan_on(changes: list[tuple[int, Parameters]]) -> None:
+    history = ParameterHistory(SETS[0])
+    plain = [SETS[0]] * 30
+    for index, parameters in changes:
+        wanted = plain[:index] + [parameters] * (30 - index)
+        assert history.set_from(index, parameters) == (wanted != plain)
+        plain = wanted
+        assert [history.at(k) for k in range(30)] == plain

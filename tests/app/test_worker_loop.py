@@ -1,0 +1,181 @@
+"""The worker's loop and its mailbox, in process: no scan is lost, statuses are kept, newest picture wins."""
+
+from __future__ import annotations
+
+import io
+import os
+import queue
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed
+from app.wire import from_worker
+from app.worker_driver import Driver
+from app.worker_mailbox import Mailbox, joined, rows_in_common
+from app.worker_messages import FromWorker, Opened, Report, Shown, ToWorker
+from pipeline.parameters import Parameters
+from pipeline.records import Path
+from tests.app.fakes import FakeSource, frame, make_session, opened, path
+
+
+def driven(source: FakeSource, *commands: ToWorker) -> list[FromWorker]:
+    """All that a driver says to commands that follow one another at once, until it stands still."""
+    waiting: queue.Queue[ToWorker | None] = queue.Queue()
+    said: list[FromWorker] = []
+    pending = list(commands)
+    session = make_session(source)
+
+    def put(message: FromWorker) -> None:
+        said.append(message)
+        if isinstance(message, Report) and session.pace == "idle" and waiting.empty():
+            waiting.put(pending.pop(0) if pending else None)
+
+    now = [0.0]
+
+    def clock() -> float:
+        now[0] += 0.001
+        return now[0]
+
+    thread = threading.Thread(target=Driver(session, waiting, put, clock).run, daemon=True)
+    thread.start()
+    thread.join(20)
+    assert not thread.is_alive()
+    return said
+
+
+def shown(said: list[FromWorker]) -> list[int]:
+    return [message.frame.index for message in said if isinstance(message, Shown)]
+
+
+def last_status(said: list[FromWorker]) -> Any:
+    return [message.status for message in said if isinstance(message, Report)][-1]
+
+
+def test_playing_shows_every_scan_and_ends_finished() -> None:
+    said = driven(FakeSource(30), Open("fake:"), SetSpeed(0.0), Play())
+    assert sorted(set(shown(said))) == list(range(30))
+    assert last_status(said).state == "finished"
+    assert last_status(said).speed == 0.0
+    assert any(isinstance(message, Opened) for message in said)
+
+
+def test_a_sought_scan_is_shown() -> None:
+    said = driven(FakeSource(80), Open("fake:"), Seek(5.0), Advance(-3), Pause())
+    assert shown(said)[-1] == 47
+    assert {47, 50} <= set(shown(said))
+    assert last_status(said).state == "paused"
+
+
+def test_a_change_shows_the_standing_scan_again() -> None:
+    other = Parameters().replace({"clustering.eps": 0.9})
+    said = driven(FakeSource(9), Open("fake:"), Advance(2), SetParameters(other.model_dump(), 8))
+    pictures = [message for message in said if isinstance(message, Shown)]
+    assert [p.frame.index for p in pictures[-2:]] == [1, 1]
+    assert pictures[-1].frame.estimate.T_map_base != pictures[-2].frame.estimate.T_map_base
+    assert last_status(said).revision == 8
+
+
+@pytest.mark.parametrize(
+    ("source", "uri", "words"),
+    [
+        (FakeSource(5), "missing:", "there is no such file (missing:)"),
+        (FakeSource(5, fails_at=2), "fake:", "the file ends here (scan 2)"),
+    ],
+)
+def test_a_failure_is_a_state_and_another_source_can_be_opened(
+    source: FakeSource, uri: str, words: str
+) -> None:
+    said = driven(source, Open(uri), Advance(5), Open("fake:"), Advance(1))
+    failed = [m.status for m in said if isinstance(m, Report) and m.status.state == "failed"]
+    assert words in failed[-1].detail
+    assert last_status(said).state == "paused"
+    assert shown(said)[-1] == 0
+
+
+def test_a_fault_is_logged_and_survived(capsys: pytest.CaptureFixture[str]) -> None:
+    broken = Parameters().replace({"clustering.eps": 5.0})
+    said = driven(
+        FakeSource(5),
+        Open("fake:"),
+        SetParameters(broken.model_dump(), 1),
+        Advance(1),
+        SetParameters(Parameters().model_dump(), 2),
+        Advance(3),
+    )
+    assert "ZeroDivisionError: a fault on purpose" in capsys.readouterr().err
+    assert shown(said)[-1] == 2
+    assert last_status(said).state == "paused"
+
+
+def test_values_that_are_no_parameters_are_refused() -> None:
+    said = driven(FakeSource(5), Open("fake:"), SetParameters({"clustering": {"eps": "wide"}}, 1))
+    assert "clustering.eps" in last_status(said).detail
+
+
+def received(stream: io.BytesIO) -> list[FromWorker]:
+    stream.seek(0)
+    messages = []
+    while (message := from_worker().read(stream)) is not None:
+        messages.append(message)
+    return messages
+
+
+def test_the_newest_picture_wins_and_other_messages_are_all_sent() -> None:
+    incoming, outgoing = os.pipe()
+    with os.fdopen(incoming, "rb") as reading, os.fdopen(outgoing, "wb") as writing:
+        mailbox = Mailbox(writing)
+        xs: list[float] = []
+        for k in range(300):
+            xs.append(float(k))
+            mailbox.put(Shown(1, 0.1 * k, frame(k, k), 0, path(xs)))
+            if k % 10 == 0:
+                mailbox.put(Report(make_session(FakeSource(1)).status()))
+        collected: list[FromWorker] = []
+        known: Path | None = None
+        while not collected or not isinstance(collected[-1], Shown) or collected[-1].frame.index < 299:
+            message = from_worker().read(reading)
+            assert message is not None
+            collected.append(message)
+            if isinstance(message, Shown):
+                known = joined(known, message.path_start, message.path)
+                assert known.x.tolist() == xs[: message.frame.index + 1]
+        mailbox.close()
+    assert sum(isinstance(message, Report) for message in collected) == 30
+    assert shown(collected) == sorted(set(shown(collected)))
+    assert len(shown(collected)) < 300
+
+
+def test_no_picture_of_the_run_before_follows_an_opening() -> None:
+    stream = io.BytesIO()
+    mailbox = Mailbox(stream)
+    for k in range(5):
+        mailbox.put(Shown(1, 0.0, frame(k, k), 0, path([1.0])))
+    mailbox.put(opened())
+    mailbox.put(Shown(2, 0.0, frame(9, 9), 0, path([5.0, 6.0])))
+    mailbox.close(5.0)
+    messages = received(stream)
+    at = next(k for k, message in enumerate(messages) if isinstance(message, Opened))
+    after = [message for message in messages[at:] if isinstance(message, Shown)]
+    assert [(message.run, message.path_start) for message in after] == [(2, 0)]
+
+
+def test_a_path_that_was_rewritten_is_sent_from_where_it_differs() -> None:
+    old, new = path([0.0, 1.0, 2.0]), path([0.0, 1.5, 2.0, 3.0])
+    start = rows_in_common(old, new)
+    assert start == 1
+    tail = Path(*(getattr(new, name)[start:] for name in ("stamp_ns", "x", "y", "yaw", "sigma_xy")))
+    np.testing.assert_array_equal(joined(old, start, tail).x, new.x)
+    assert rows_in_common(new, path([0.0])) == 1
+
+
+def test_a_reader_that_is_gone_does_not_stop_the_loop() -> None:
+    incoming, outgoing = os.pipe()
+    os.close(incoming)
+    with pytest.raises(BrokenPipeError), os.fdopen(outgoing, "wb") as writing:
+        mailbox = Mailbox(writing)
+        mailbox.put(Shown(1, 0.0, frame(0, 0), 0, path([0.0])))
+        mailbox.close(5.0)
+        assert not mailbox._thread.is_alive()
