@@ -105,6 +105,7 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
     evaluation = _evaluate(frame, path, truth, plan.parameters)
     error = path_error(path, truth.path) if truth.path else None
     losses = {reason: n for reason, n in (left_out + Counter(plan.source.losses)).items() if n}
+    tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     outcome = Outcome(
         summary=_summary(description.uri, frame, path, evaluation, error),
         warnings=tally.warnings(),
@@ -147,6 +148,14 @@ class _Tally:
         self.points.update(frame.counts)
         self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
         self.warned.update(frame.warnings)
+
+    def tell_of_unconfirmed(self, frame: Frame, hits: int) -> None:
+        tentative = int(np.count_nonzero(~frame.trees.confirmed))
+        if tentative:
+            self.warned[
+                f"{tentative} trees were seen fewer than {hits} times and are not in the map; "
+                "--set tracking.hits_to_confirm=1 takes them too"
+            ] += 1
 
     def warnings(self) -> list[str]:
         return [text if n == 1 else f"{text} ({n} times)" for text, n in self.warned.items()]

@@ -271,7 +271,7 @@ class Tracking(Stage):
         0.4, "Proximity radius", "m", 0.0, 10.0, 0.05, "Trees nearer to one another than this are one tree."
     )
     hits_to_confirm: int = count(
-        5, "Hits to confirm", "", 1, 200, "A tree is shown and exported when it was seen so often."
+        3, "Hits to confirm", "", 1, 200, "A tree is shown and exported when it was seen so often."
     )
     misses_per_hit: int = count(
         1, "Misses per hit", "", 1, 100, "So many misses in free view undo one hit; without hits a tree goes."

@@ -17,6 +17,7 @@ HUBER = 1.5  # sigma
 PRIOR_RADIUS, PRIOR_RADIUS_SIGMA = 0.15, 0.15  # m; half of the stems of a stand lie within
 PRIOR_LEAN_SIGMA = 0.05  # 3 degrees
 SIGMA_MIN = 0.001  # m; no range is better than that, and weights must stay finite
+MOST_POINTS = 500  # of a cluster enter its fit; more would sharpen what bark and lean blur anyway
 ITERATIONS = 12
 CONVERGED = 1e-4  # m; a hundredth of what the noise allows
 COLUMNS = 9  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc
@@ -40,7 +41,8 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
     for k in range(clusters):
-        members = points[bounds[k] : bounds[k + 1]]
+        stride = 1 + (bounds[k + 1] - bounds[k]) // MOST_POINTS
+        members = points[bounds[k] : bounds[k + 1] : stride]
         _start_from_width(members, azimuth_step, stems[k])
         if members.shape[0] >= 5:
             _fit(members, range_sigma, stems[k])
