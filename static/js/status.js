@@ -66,7 +66,7 @@ function showNotice(quiet) {
   const text = !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. This is the last picture; it goes on by itself when stemmap answers again.`
     : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
-    : ["failed", "waiting"].includes(status?.state) ? status.detail : "";
+    : status?.detail ?? "";
   notice.hidden = !text;
   notice.classList.toggle("wait", status?.state !== "failed" || !state.connected);
   setText(notice.querySelector("span"), text || "");
