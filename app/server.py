@@ -25,6 +25,8 @@ from pipeline.errors import ParameterError, StemmapError
 
 _log = logging.getLogger(__name__)
 
+ROUTERS = tuple(module.router for module in (page, run, parameters, results, sockets))
+
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
 MakeWorker = Callable[[Dashboard], WorkerLike]
 
@@ -88,8 +90,8 @@ def build(
         redirect_slashes=False,
     )
     app.state.dashboard, app.state.settings = dashboard, settings
-    for module in (page, run, parameters, results, sockets):
-        app.include_router(module.router)
+    for router in ROUTERS:
+        app.include_router(router)
     _answer_errors(app)
     return app
 

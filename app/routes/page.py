@@ -48,11 +48,8 @@ def plotly() -> Response:
 @router.get("/static/{path:path}")
 def page_file(path: str) -> Response:
     """A file of the page."""
-    wanted = PurePosixPath(path)
-    folder = page_folder().resolve()
-    found = (folder / wanted).resolve()
-    hidden = any(part.startswith(".") for part in wanted.parts)
-    if "\0" in path or hidden or not found.is_relative_to(folder) or not found.is_file():
+    found = _page_path(path)
+    if found is None:
         return error_reply(404, "there is no such file", where=f"/static/{path[:200]}")
     return _file(found, _PAGE_POLICY)
 
@@ -65,3 +62,13 @@ def viser_page() -> Response:
 
 def _file(path: Path, policy: str) -> Response:
     return FileResponse(path, headers={**_CHECK_EACH_TIME, "Content-Security-Policy": policy})
+
+
+def _page_path(path: str) -> Path | None:
+    """The file of a path below /static/, None if there is none or it is hidden or outside."""
+    wanted = PurePosixPath(path)
+    if "\0" in path or any(part.startswith(".") for part in wanted.parts):
+        return None
+    folder = page_folder().resolve()
+    found = (folder / wanted).resolve()
+    return found if found.is_relative_to(folder) and found.is_file() else None
