@@ -110,8 +110,11 @@ class McapFile:
     # --- the walk over the records ---------------------------------------------------------------
 
     def _read(self, offset: int, size: int) -> bytes:
-        self._file.seek(offset)
-        return self._file.read(size)
+        try:
+            self._file.seek(offset)
+            return self._file.read(size)
+        except OSError as error:
+            raise damaged(f"cannot read on: {error.strerror}", self._path) from error
 
     def _walk(self) -> None:
         end = self._file.seek(0, 2)

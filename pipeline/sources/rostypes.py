@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -89,6 +90,7 @@ class MessageDecoder:
         self._stores[channel.msgtype] = store
 
 
+@cache
 def standard_types(encoding: str) -> Typestore:
     """The definitions that come with ROS ("cdr": ROS 2, "ros1"), with those of Velodyne and tf."""
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_JAZZY)
