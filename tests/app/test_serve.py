@@ -9,7 +9,7 @@ import re
 import signal
 import socket
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,18 +33,16 @@ class Server:
     url: str
     token: str
 
-    async def cookie(self) -> httpx.AsyncClient:
+    @asynccontextmanager
+    async def browser(self) -> AsyncIterator[tuple[httpx.AsyncClient, Page]]:
         """A browser that has opened the link."""
-        client = httpx.AsyncClient(base_url=self.url, trust_env=False, timeout=30)
-        answer = await client.get(f"/?token={self.token}")
-        assert answer.status_code == 303
-        return client
-
-    def live(self, client: httpx.AsyncClient) -> connect:
-        cookies = "; ".join(f"{name}={value}" for name, value in client.cookies.items())
-        headers = {"Cookie": cookies, "Origin": self.url.rstrip("/")}
-        url = self.url.replace("http", "ws") + "api/live"
-        return connect(url, additional_headers=headers, proxy=None, max_size=None)
+        async with httpx.AsyncClient(base_url=self.url, trust_env=False, timeout=30) as client:
+            assert (await client.get(f"/?token={self.token}")).status_code == 303
+            cookies = "; ".join(f"{name}={value}" for name, value in client.cookies.items())
+            headers = {"Cookie": cookies, "Origin": self.url.rstrip("/")}
+            url = self.url.replace("http", "ws") + "api/live"
+            async with connect(url, additional_headers=headers, proxy=None, max_size=None) as live:
+                yield client, Page(live)
 
 
 async def start(*words: str) -> asyncio.subprocess.Process:
@@ -77,78 +75,93 @@ async def serving(*words: str) -> AsyncIterator[Server]:
         await process.communicate()
 
 
-async def until(live: ClientConnection, kind: str, **wanted: Any) -> dict[str, Any]:
-    """The first message of a kind with these values."""
-    async with asyncio.timeout(90):
-        while True:
-            message: dict[str, Any] = json.loads(await live.recv())
-            if message["type"] == kind and all(message.get(k) == v for k, v in wanted.items()):
-                return message
+class Page:
+    """What a browser knows: the newest message of each kind, and the whole path."""
+
+    def __init__(self, live: ClientConnection) -> None:
+        self._live = live
+        self.known: dict[str, dict[str, Any]] = {}
+        self.path: list[list[float]] = []
+
+    async def until(self, kind: str, is_wanted: Callable[[Any], bool] = lambda _: True) -> Any:
+        """The newest message of a kind, once it is as wanted."""
+        async with asyncio.timeout(90):
+            while kind not in self.known or not is_wanted(self.known[kind]):
+                message = json.loads(await self._live.recv())
+                self.known[message["type"]] = message
+                if message["type"] == "map":
+                    assert message["path"]["start"] <= len(self.path)
+                    self.path[message["path"]["start"] :] = message["path"]["points"]
+        return self.known[kind]
+
+    async def state(self, state: str) -> Any:
+        return await self.until("status", lambda status: status["state"] == state)
+
+    async def scan(self, index: int) -> Any:
+        return await self.until("map", lambda shown: shown["index"] == index)
+
+    async def passed(self, index: int) -> Any:
+        return await self.until("map", lambda shown: shown["index"] >= index)
+
+
+def children(server: Server) -> list[int]:
+    pid = server.process.pid
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 async def test_a_whole_session_over_sockets() -> None:
-    async with serving("sim:stand?duration=20") as server:
-        client = await server.cookie()
+    async with serving("sim:stand?duration=20") as server, server.browser() as (client, page):
         assert (await client.get("/")).status_code == 200
-        async with server.live(client) as live:
-            await until(live, "map")
-            assert (await until(live, "truth"))["trees"]
-            await client.post("/api/command", json={"type": "pause"})
-            await until(live, "status", state="paused")
-            await client.post("/api/command", json={"type": "seek", "time_s": 6.0})
-            shown = await until(live, "map", index=60)
-            assert shown["trees"]
-            assert shown["path"]["start"] + len(shown["path"]["points"]) == 61
-            changed = await client.patch("/api/parameters", json={"changes": {"clustering.eps": 0.9}})
-            assert changed.status_code == 200
-            again = await until(live, "map", index=60)
-            assert again["verdicts"] != shown["verdicts"]
-            assert (await until(live, "parameters"))["changed"] == ["clustering.eps"]
-            await client.post("/api/open", json={"uri": "no/such/file.mcap"})
-            assert "no/such/file.mcap" in (await until(live, "status", state="failed"))["detail"]
-            await client.post("/api/open", json={"uri": "sim:paper", "seed": 2})
-            await until(live, "map")
-            assert (await client.get("/api/status")).json()["source"] == "sim:paper"
-        await client.aclose()
+        await page.until("map")
+        assert (await page.until("truth"))["trees"]
+        await client.post("/api/command", json={"type": "pause"})
+        await page.state("paused")
+        await client.post("/api/command", json={"type": "seek", "time_s": 6.0})
+        before = (await page.scan(60))["verdicts"]
+        assert len(page.path) == 61
+        changed = await client.patch("/api/parameters", json={"changes": {"clustering.eps": 0.9}})
+        assert changed.status_code == 200
+        assert (await page.until("map", lambda shown: shown["verdicts"] != before))["index"] == 60
+        assert (await page.until("parameters"))["changed"] == ["clustering.eps"]
+        await client.post("/api/open", json={"uri": "no/such/file.mcap"})
+        assert "no/such/file.mcap" in (await page.state("failed"))["detail"]
+        await client.post("/api/open", json={"uri": "sim:paper", "seed": 2})
+        await page.until("status", lambda s: s["source"] == "sim:paper" and s["state"] == "playing")
+        await page.passed(2)
 
 
 async def test_a_killed_worker_is_replaced_under_the_page() -> None:
-    async with serving("sim:stand?duration=20") as server:
-        client = await server.cookie()
-        async with server.live(client) as live:
-            await until(live, "map")
-            children = (
-                Path(f"/proc/{server.process.pid}/task/{server.process.pid}/children").read_text().split()
-            )
-            os.kill(int(children[0]), signal.SIGKILL)
-            assert "SIGKILL" in (await until(live, "status", state="failed"))["detail"]
-            standing = await until(live, "map", index=0)
-            assert standing["path"]["start"] == 0
-            assert "started again" in (await until(live, "status", state="paused"))["detail"]
-            await client.post("/api/command", json={"type": "play"})
-            await until(live, "map", index=3)
-        await client.aclose()
+    async with serving("sim:stand?duration=20") as server, server.browser() as (client, page):
+        await page.passed(5)
+        os.kill(children(server)[0], signal.SIGKILL)
+        assert "SIGKILL" in (await page.state("failed"))["detail"]
+        assert "started again" in (await page.state("paused"))["detail"]
+        await page.scan(0)
+        assert len(page.path) == 1
+        await client.post("/api/command", json={"type": "play"})
+        await page.passed(3)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 async def test_a_signal_ends_all_of_it_quietly(number: signal.Signals) -> None:
-    async with serving("sim:stand?duration=20") as server:
-        client = await server.cookie()
-        async with server.live(client) as live:
-            await until(live, "map")
-            children = (
-                Path(f"/proc/{server.process.pid}/task/{server.process.pid}/children").read_text().split()
-            )
-            server.process.send_signal(number)
-            async with asyncio.timeout(20):
-                _, errors = await server.process.communicate()
-        await client.aclose()
+    async with serving("sim:stand?duration=20") as server, server.browser() as (_, page):
+        await page.until("map")
+        workers = children(server)
+        server.process.send_signal(number)
+        async with asyncio.timeout(20):
+            _, errors = await server.process.communicate()
         assert server.process.returncode == 0
         assert errors.decode() == ""
-        for child in children:
-            assert (
-                not Path(f"/proc/{child}/cmdline").exists() or not Path(f"/proc/{child}/cmdline").read_bytes()
-            )
+        assert len(workers) == 1
+        assert not runs(workers[0])
+
+
+def runs(pid: int) -> bool:
+    """Whether a process is there and more than a corpse that nobody has fetched yet."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes() != b""
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 async def ended(*words: str) -> tuple[int | None, str]:

@@ -240,9 +240,10 @@ def test_seeking_to_the_time_that_is_shown_stays_there() -> None:
 def test_a_failing_source_says_so_and_what_came_before_can_be_seen() -> None:
     session = opened(fails_at=70)
     session.play()
+    for _ in range(70):
+        session.work()
     with pytest.raises(SourceError, match="ends here"):
-        for _ in range(SCANS):
-            session.work()
+        session.work()
     session.fail("the file ends here (scan 70)")
     assert session.status().state == "failed"
     assert session.status().scan_index == 69
@@ -302,7 +303,6 @@ def test_a_source_that_gives_other_scans_the_second_time_cannot_go_back() -> Non
     settle(session)
     with pytest.raises(SourceError, match="same scans again"):
         session.advance(-20)
-        settle(session)
 
 
 def test_reading_again_starts_a_second_before() -> None:
@@ -321,7 +321,8 @@ def test_status_tells_the_figures_of_the_run() -> None:
     session.advance(3)
     settle(session)
     status = session.status()
-    assert (status.kind, status.scans, status.end_s) == ("fake run", SCANS, pytest.approx(12.9))
+    assert (status.kind, status.scans) == ("fake run", SCANS)
+    assert status.end_s == pytest.approx(12.9)
     assert status.time_s == pytest.approx(0.2)
     assert status.health == "good"
     assert "chain" in status.stage_ms
