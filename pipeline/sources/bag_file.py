@@ -21,6 +21,8 @@ from pipeline.sources.unpack import BLOCK_LIMIT, UnpackError, unpack
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_ENTRY, CONNECTION = 2, 3, 4, 5, 6, 7
 HEADER_LIMIT = 1 << 20
+#: A file with more damaged records is something else, and would take long to walk over.
+STRANGE_LIMIT = 1000
 LENGTH = struct.Struct("<I")
 Header = dict[bytes, bytes]
 
@@ -91,7 +93,7 @@ class BagFile:
         end = self._file.seek(0, 2)
         if self._read(0, len(MAGIC)) != MAGIC:
             raise damaged("not a ROS 1 bag of version 2.0", self._path)
-        at = len(MAGIC)
+        at, strange = len(MAGIC), 0
         while at + 8 <= end:
             (header_size,) = LENGTH.unpack(self._read(at, 4))
             body = at + 4 + header_size + 4
@@ -99,12 +101,13 @@ class BagFile:
                 break
             record = self._read(at + 4, header_size + 4)
             (length,) = LENGTH.unpack_from(record, header_size)
-            if body + length > end:
+            if body + length > end or strange > STRANGE_LIMIT:
                 break
             try:
                 self._take(_fields(record[:header_size]), body, length)
             except (struct.error, ValueError, KeyError):
                 count_loss(self.damage, "damaged records of the recording")
+                strange += 1
             at = body + length
         if at < end:
             count_loss(self.damage, "bytes at the end of a recording that was cut", end - at)
@@ -160,7 +163,7 @@ class BagFile:
                 header = _fields(raw[at + 4 : body - 4])
             except (struct.error, ValueError) as error:
                 raise BrokenChunkError from error
-            if body + length > len(raw):
+            if body + length > len(raw) or not header:
                 raise BrokenChunkError
             yield header, raw[body : body + length]
             at = body + length

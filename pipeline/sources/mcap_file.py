@@ -24,6 +24,8 @@ RECORD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 CHUNK_HEAD = struct.Struct("<QQQI")
 LOOSE_RUN = 4 << 20
+#: A file with more records of no known kind is something else, and would take long to walk over.
+STRANGE_LIMIT = 1000
 DEFINITION_LIMIT = 1 << 20
 
 
@@ -123,10 +125,11 @@ class McapFile:
         at = 8
         loose: list[int] = []
         whole = False
+        strange = 0
         while at + RECORD.size <= end:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
             body, after = at + RECORD.size, at + RECORD.size + length
-            if after > end or opcode == 0:
+            if after > end or opcode == 0 or strange > STRANGE_LIMIT:
                 break
             if loose and (opcode != MESSAGE or at - loose[0] > LOOSE_RUN):
                 self._close_run(loose.pop(), at)
@@ -137,14 +140,15 @@ class McapFile:
                 if opcode == FOOTER:
                     break
             else:
-                self._take(opcode, body, length)
+                strange += not self._take(opcode, body, length)
             at = after
         if loose:
             self._close_run(loose.pop(), at)
         if not whole:
             count_loss(self.damage, "bytes at the end of a recording that was cut", max(end - at, 1))
 
-    def _take(self, opcode: int, body: int, length: int) -> None:
+    def _take(self, opcode: int, body: int, length: int) -> bool:
+        """Keep what a record says; False when it is damaged or of no known kind."""
         try:
             if opcode in (SCHEMA, CHANNEL):
                 self._define(opcode, self._read(body, min(length, DEFINITION_LIMIT)))
@@ -156,6 +160,8 @@ class McapFile:
                 self._attachments.append((body, length))
         except (struct.error, ValueError):
             count_loss(self.damage, "damaged records of the recording")
+            return False
+        return 0 < opcode <= DATA_END
 
     def _define(self, opcode: int, record: bytes) -> None:
         (number,) = struct.unpack_from("<H", record)
@@ -209,7 +215,7 @@ class McapFile:
                 raise BrokenChunkError
             opcode, length = RECORD.unpack_from(raw, at)
             at += RECORD.size
-            if at + length > len(raw):
+            if at + length > len(raw) or opcode == 0:
                 raise BrokenChunkError
             yield opcode, view[at : at + length]
             at += length

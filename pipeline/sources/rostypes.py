@@ -129,7 +129,7 @@ def _closed(found: dict[str, Fields], root: str, standard: Typestore) -> dict[st
     return closed
 
 
-def _parts(kind: Any) -> list[str]:
+def _parts(kind: tuple[Any, Any]) -> list[str]:
     """The names of types in the description of a field."""
     nodetype, detail = kind
     if nodetype == Nodetype.NAME:
