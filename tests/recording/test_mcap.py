@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from ruamel.yaml import YAML
 
 from pipeline.errors import StemmapError
 from pipeline.geometry import Pose3
@@ -134,6 +135,17 @@ def test_the_file_is_what_foxglove_and_ros_expect(recording):
         cloud = next(s for s in summary.schemas.values() if s.name == "sensor_msgs/msg/PointCloud2")
         assert b"MSG: sensor_msgs/PointField" in cloud.data
         assert b"MSG: std_msgs/Header" in cloud.data
+
+
+def test_the_mounting_is_latched_and_nothing_else(recording):
+    with recording.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    for channel in summary.channels.values():
+        (profile,) = YAML(typ="safe").load(channel.metadata["offered_qos_profiles"])
+        assert len(profile) == 9
+        assert (profile["durability"] == 1) == (channel.topic == "/tf_static")
+        assert profile["deadline"] == {"sec": 9223372036, "nsec": 854775807}
 
 
 def test_the_types_are_those_of_ros(recording):
