@@ -99,7 +99,9 @@ async def test_a_picture_goes_to_scene_and_browsers_with_its_whole_path(dashboar
     await dashboard.receive(opened())
     await dashboard.receive(Shown(1, 0.0, frame(0, 1), 0, path([0.0])))
     await dashboard.receive(Shown(1, 0.1, frame(1, 2, n_trees=3), 1, path([1.0])))
-    assert scene_calls(dashboard)[-1] == ("show", 1)
+    async with asyncio.timeout(10):
+        while scene_calls(dashboard)[-1] != ("show", 1):
+            await asyncio.sleep(0)
     shown = dashboard.live.map_after(0)
     assert shown is not None
     _, payload, path_xy = shown

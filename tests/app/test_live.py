@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.live import Live
-from app.live_payload import ellipse, first_difference
+from app.live_payload import ellipses, first_difference
 
 
 async def following(stream: Any, n: int) -> list[dict[str, Any]]:
@@ -86,7 +86,7 @@ def test_the_ellipse_gives_the_covariance_back(a: float, b: float, angle: float)
     major, minor = max(a, b), min(a, b)
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     covariance = R @ np.diag([major**2, minor**2]) @ R.T
-    big, small, direction = ellipse(covariance)
+    ((big, small, direction),) = ellipses(covariance[None])
     R = np.array([[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]])
     np.testing.assert_allclose(R @ np.diag([big**2, small**2]) @ R.T, covariance, atol=2e-3)
     assert big >= small
