@@ -64,7 +64,12 @@ class Plot:
                 x, y = (float(value) for value in places[int(np.argmax(good))])
                 self.take(x, y, radius)
                 return x, y
-        raise SourceError(
+        raise self.full(what)
+
+    @staticmethod
+    def full(what: str) -> SourceError:
+        """The error that says that nothing more fits."""
+        return SourceError(
             f"no place is left for another {what} in the simulated stand",
             remedy="Ask for fewer trees with trees=N",
         )

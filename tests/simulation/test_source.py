@@ -50,6 +50,11 @@ def test_records_come_in_the_order_of_time_at_their_rates():
     source.close()
 
 
+@pytest.mark.parametrize(("seconds", "scans"), [("1", 10), ("2.3", 23), ("4.35", 43), ("33", 330)])
+def test_a_run_has_ten_scans_a_second(seconds, scans):
+    assert open_simulated(f"sim:paper?duration={seconds}").description.scans == scans
+
+
 def test_the_first_odometry_is_the_identity():
     for options in ("", "&odometry=exact"):
         record = open_simulated(SHORT + options).run.odometry_record(0)
