@@ -38,15 +38,16 @@ def run(arguments: argparse.Namespace) -> int:
         StemmapError: This is not the source tree, a name is unknown, or a benchmark failed.
     """
     _find_benchmarks(_ROOT)
-    from tests.benchmarks import runner
+    from tests.benchmarks.runner import descriptions
+    from tests.benchmarks.runner import run as run_benchmarks
 
     if arguments.list:
-        for name, line in runner.descriptions().items():
+        for name, line in descriptions().items():
             print(f"{name:10}{line}")
         return 0
     out = arguments.out or _ROOT / "docs" / "benchmarks.md"
     day = arguments.date or date.today()
-    failed = runner.run(arguments.names, root=_ROOT, out=out, json_file=arguments.json, day=day)
+    failed = run_benchmarks(arguments.names, out=out, json_file=arguments.json, day=day)
     return 1 if failed else 0
 
 

@@ -60,10 +60,15 @@ def _sweep(stand: Float, random: np.random.Generator) -> NDArray[np.float32]:
     reach = flat / np.cos(elevation) + random.normal(0.0, NOISE, flat.shape)
     seen = np.isfinite(reach) & (reach < 60.0)
     ray = np.stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth],
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation) + 0 * azimuth,
+        ],
         axis=2,
     )
-    return (ray * np.where(seen, reach, 0.0)[:, :, None])[seen].astype(np.float32)
+    returns: NDArray[np.float32] = (ray * np.where(seen, reach, 0.0)[:, :, None])[seen].astype(np.float32)
+    return returns
 
 
 def _to_trunks(azimuth: Float, stand: Float) -> Float:

@@ -110,7 +110,7 @@ def write(uri: str, folder: Path, *, stride: int, scans: int) -> None:
     (folder / "run.json").write_text(json.dumps(run), encoding="utf-8")
 
 
-def _described(k: int, step: Any) -> dict[str, Any]:  # noqa: ANN401 - the record is imported late
+def _described(k: int, step: Any) -> dict[str, Any]:
     T = step.T_odom_base
     return {
         "index": k,

@@ -32,12 +32,11 @@ def descriptions() -> dict[str, str]:
     return {module.NAME: module.LINE for module in modules}
 
 
-def run(names: Sequence[str], *, root: Path, out: Path, json_file: Path | None, day: date) -> list[str]:
+def run(names: Sequence[str], *, out: Path, json_file: Path | None, day: date) -> list[str]:
     """Run benchmarks one after the other and write the files; the names of those that failed.
 
     Args:
         names: None given means all.
-        root: The source tree.
         out: Markdown; sections of benchmarks that were not run, or failed, are kept.
         json_file: The figures of this run alone.
         day: Written beside the figures.
@@ -48,9 +47,7 @@ def run(names: Sequence[str], *, root: Path, out: Path, json_file: Path | None, 
     known = descriptions()
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise StemmapError(
-            f"there is no benchmark {unknown[0]!r}", remedy=f"Benchmarks: {', '.join(known)}"
-        )
+        raise StemmapError(f"there is no benchmark {unknown[0]!r}", remedy=f"Benchmarks: {', '.join(known)}")
     for path in (out, json_file):
         if path is not None and not path.parent.is_dir():
             raise StemmapError("there is no such folder to write to", where=str(path.parent))

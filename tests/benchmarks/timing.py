@@ -9,10 +9,14 @@ from statistics import median
 
 
 def in_turns(
-    sides: Mapping[str, Callable[[], object]], rounds: int, clock: Callable[[], float] = time.perf_counter
+    sides: Mapping[str, Callable[[], object]],
+    rounds: int,
+    *,
+    warm: bool = True,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, list[float]]:
-    """Time each side once a round, A B A B, in milliseconds; call each once before for warmth."""
-    for work in sides.values():
+    """Time each side once a round, A B A B, in milliseconds; if `warm`, call each once before."""
+    for work in sides.values() if warm else ():
         work()
     times: dict[str, list[float]] = {name: [] for name in sides}
     for _ in range(rounds):

@@ -32,9 +32,9 @@ _WIDE: dict[str, object] = {
     "clustering.min_points": 8,
 }
 NOTES = (
-    "The peer: Open3D's voxel_down_sample and cluster_dbscan, a NumPy PCA for each cluster, FastSLAM in Python "
-    "loops over particles and landmarks (Probabilistic Robotics, table 13.1: every landmark is asked), a "
-    "filterpy KalmanFilter for each tree. Same scans, same parameters, other random numbers.",
+    "The peer: Open3D's voxel_down_sample and cluster_dbscan, a NumPy PCA for each cluster, FastSLAM in "
+    "Python loops over particles and landmarks (Probabilistic Robotics, table 13.1: every landmark is "
+    "asked), a filterpy KalmanFilter for each tree. Same scans, same parameters, other random numbers.",
     "Peak memory is that of the whole process with its interpreter and libraries; neither side simulates.",
 )
 
@@ -54,7 +54,12 @@ class Comparison:
 COMPARISONS = (
     Comparison("sim:paper", 3, 110, "paper", {}, "preset paper"),
     Comparison(
-        "sim:stand", 5, 150, "paper", _WIDE, "preset paper, box all around, 2D clustering (eps 0.15 m, 8 points)"
+        "sim:stand",
+        5,
+        150,
+        "paper",
+        _WIDE,
+        "preset paper, box all around, 2D clustering (eps 0.15 m, 8 points)",
     ),
 )
 
@@ -120,12 +125,22 @@ def _time_rows(
     return rows
 
 
-_MAP_COLUMNS = ("side", "TA", "TR", "FA", "FR", "spurious", "position RMSE m", "mean pair error %", "landmarks")
+_MAP_COLUMNS = (
+    "side",
+    "TA",
+    "TR",
+    "FA",
+    "FR",
+    "spurious",
+    "position RMSE m",
+    "mean pair error %",
+    "landmarks",
+)
 
 
 def _map_rows(
     comparison: Comparison,
-    parameters: Any,  # noqa: ANN401 - imported late
+    parameters: Any,
     results: dict[str, dict[str, Any]],
 ) -> list[tuple[Cell, ...]]:
     rows: list[tuple[Cell, ...]] = []
@@ -138,7 +153,7 @@ def _map_rows(
     return rows
 
 
-def _judged(uri: str, parameters: Any, result: dict[str, Any]) -> Evaluation:  # noqa: ANN401
+def _judged(uri: str, parameters: Any, result: dict[str, Any]) -> Evaluation:
     import numpy as np
 
     from pipeline.evaluation import evaluate

@@ -59,9 +59,7 @@ def run() -> list[Table]:
         parameters, sensor=described.sensor, T_base_lidar=described.T_base_lidar, seed=0, watch=stand_watch
     )
     stand = measure(mapper, steps(source.records()), WARM_SCANS, STAND_SCANS)
-    mapper = Mapper(
-        parameters, sensor=lane.VLP16, T_base_lidar=lane.MOUNTING, seed=0, watch=lane_watch
-    )
+    mapper = Mapper(parameters, sensor=lane.VLP16, T_base_lidar=lane.MOUNTING, seed=0, watch=lane_watch)
     driven = measure(mapper, lane.steps(), lane.half(), 2 * lane.half())
     return [
         Table(

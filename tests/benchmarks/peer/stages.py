@@ -27,7 +27,8 @@ def acquire(points: Float, rotation: Float, p: Parameters) -> Float:
     """Returns within range, turned into the axes of the base."""
     distance = np.linalg.norm(points, axis=1)
     kept = (distance >= p["acquisition.range_min"]) & (distance <= p["acquisition.range_max"])
-    return points[kept] @ rotation.T
+    turned: Float = points[kept] @ rotation.T
+    return turned
 
 
 def pass_through(points: Float, p: Parameters) -> Float:
@@ -56,7 +57,9 @@ def cluster(points: Float, p: Parameters) -> NDArray[np.int32]:
     return np.asarray(cloud.cluster_dbscan(p["clustering.eps"], p["clustering.min_points"]))
 
 
-def detect(points: Float, labels: NDArray[np.int32], offset: Float, sigma: float, p: Parameters) -> list[Detection]:
+def detect(
+    points: Float, labels: NDArray[np.int32], offset: Float, sigma: float, p: Parameters
+) -> list[Detection]:
     """Eccentricity (Eq. 3-4) and the cylinder check of each cluster; those that pass."""
     found = []
     for k in range(labels.max(initial=-1) + 1):
@@ -89,4 +92,6 @@ def _covariance(place: Float, size: int, sigma: float, p: Parameters) -> Float:
     along = p["detection.sigma_range"] ** 2
     across = (distance * np.radians(p["detection.sigma_bearing"])) ** 2
     turn = np.array([[c, -s], [s, c]])
-    return turn @ np.diag([along, across]) @ turn.T + (sigma**2 / size + 0.02**2) * np.eye(2)
+    wandering = (sigma**2 / size + 0.02**2) * np.eye(2)
+    R: Float = turn @ np.diag([along, across]) @ turn.T + wandering
+    return R

@@ -27,7 +27,9 @@ class TreeMap:
         self.p = p
         self.trees: list[Tree] = []
 
-    def process(self, stamp_ns: int, pose: Float, pose_covariance: Float, detections: list[Detection]) -> None:
+    def process(
+        self, stamp_ns: int, pose: Float, pose_covariance: Float, detections: list[Detection]
+    ) -> None:
         """Put each detection to the likeliest tree or begin one (Eq. 9), then merge."""
         c, s = math.cos(pose[2]), math.sin(pose[2])
         turn = np.array([[c, -s], [s, c]])
