@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import SourceError
-from pipeline.sources.chunks import BrokenChunkError, Chunk, in_order, tail_ns
+from pipeline.sources.chunks import BrokenChunkError, Chunk, LastChunk, in_order, tail_ns
 from pipeline.sources.container import Channel, Message, count_loss, damaged, ros2_type_name
-from pipeline.sources.unpack import BLOCK_LIMIT, UnpackError, unpack
+from pipeline.sources.unpack import UnpackError
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_ENTRY, CONNECTION = 2, 3, 4, 5, 6, 7
@@ -42,6 +42,7 @@ class BagFile:
         self.damage: dict[str, int] = {}
         self._connections: dict[int, tuple[str, str, str]] = {}
         self._chunks: list[Chunk] = []
+        self._last = LastChunk()
         try:
             self._walk()
             self._learn_connections()
@@ -151,9 +152,7 @@ class BagFile:
 
     def _records(self, chunk: Chunk) -> Iterator[tuple[Header, bytes]]:
         """The records inside of a chunk as (header, content)."""
-        if chunk.length > BLOCK_LIMIT:
-            raise BrokenChunkError
-        raw = unpack(self._read(chunk.offset, chunk.length), chunk.compression, chunk.size)
+        raw = self._last.unpacked(chunk, self._read)
         at = 0
         while at < len(raw):
             try:

@@ -13,9 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import SourceError
-from pipeline.sources.chunks import BrokenChunkError, Chunk, in_order, tail_ns
+from pipeline.sources.chunks import BrokenChunkError, Chunk, LastChunk, in_order, tail_ns
 from pipeline.sources.container import Channel, Message, count_loss, damaged, ros2_type_name
-from pipeline.sources.unpack import BLOCK_LIMIT, UnpackError, unpack
+from pipeline.sources.unpack import UnpackError
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT = 0x03, 0x04, 0x05, 0x06, 0x07, 0x09
@@ -46,6 +46,7 @@ class McapFile:
         self._channels: dict[int, tuple[int, str, str]] = {}
         self._chunks: list[Chunk] = []
         self._attachments: list[tuple[int, int]] = []
+        self._last = LastChunk()
         try:
             self._walk()
             self._learn_channels()
@@ -204,11 +205,7 @@ class McapFile:
 
     def _records(self, chunk: Chunk) -> Iterator[tuple[int, memoryview]]:
         """The records inside of a chunk as (opcode, content)."""
-        if chunk.length > BLOCK_LIMIT:
-            raise BrokenChunkError
-        raw = unpack(self._read(chunk.offset, chunk.length), chunk.compression, chunk.size)
-        if chunk.crc and zlib.crc32(raw) != chunk.crc:
-            raise BrokenChunkError
+        raw = self._last.unpacked(chunk, self._read)
         view, at = memoryview(raw), 0
         while at < len(raw):
             if at + RECORD.size > len(raw):

@@ -40,7 +40,8 @@ def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64]
         ns = time.astype(np.int64)
         ns = ns - stamp_ns if abs(int(ns[0])) > 10**15 else ns
     else:
-        seconds = time.astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            seconds = time.astype(np.float64)
         finite = np.isfinite(seconds)
         if not finite.all():
             seconds[~finite] = 0.0

@@ -158,7 +158,8 @@ class RosSource:
         reason = "the topic has no messages that can be read"
         for arrival in islice(self._scan_arrivals(None), _TRIES):
             try:
-                found = self._records.scan(arrival.content, arrival.stamp_ns, {})
+                with np.errstate(all="ignore"):
+                    found = self._records.scan(arrival.content, arrival.stamp_ns, {})
             except Exception as error:  # as in RecordDecoder.record
                 reason = f"the first scans cannot be read: {str(error)[:200] or type(error).__name__}"
                 continue
