@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from hypothesis import settings
@@ -56,7 +57,7 @@ def scan(stamp_ns, points=(), offset_ns=None):
     return Scan(stamp_ns, rows, offset_ns=None if offset_ns is None else np.asarray(offset_ns, np.int32))
 
 
-def step(index, points=(), pose=None, **rest):
+def step(index, points=(), pose=None, **rest: Any):
     """A step at 10 Hz."""
     return Step(index, scan(1 + index * 100_000_000, points), pose, **rest)
 
@@ -76,7 +77,7 @@ def detections(centre, *, sigma=0.03, radius=0.15, arc=1.0):
     )
 
 
-def clusters(**columns):
+def clusters(**columns: Any):
     """One cluster that is a tree by every rule of the preset forest, but for the columns given."""
     good = Clusters(
         size=np.array([60]),
@@ -119,9 +120,7 @@ def trees(position, *, dbh=0.3, confirmed=True):
 def truth_trees(position, kinds=None, *, dbh=0.3):
     """True trees (or other things) at rows of x, y."""
     rows = np.asarray(position, np.float64).reshape(-1, 2)
-    return TruthTrees(
-        rows[:, 0], rows[:, 1], np.full(len(rows), dbh), tuple(kinds or ("tree",) * len(rows))
-    )
+    return TruthTrees(rows[:, 0], rows[:, 1], np.full(len(rows), dbh), tuple(kinds or ("tree",) * len(rows)))
 
 
 def simulated_cloud(duration=1, scan_index=3):

@@ -26,10 +26,7 @@ def _world(seed, n=40):
 def _seen(world, T_world_base):
     """The points of the world as the LiDAR sees them, each from the base's pose at its time."""
     return np.array(
-        [
-            (T @ MOUNTING).inverse().apply(p[None])[0]
-            for p, T in zip(world, T_world_base, strict=True)
-        ]
+        [(T @ MOUNTING).inverse().apply(p[None])[0] for p, T in zip(world, T_world_base, strict=True)]
     )
 
 

@@ -57,9 +57,7 @@ def test_clear_cases_are_joined_as_the_best_of_all_assignments(seed, n):
 
 def test_the_likelier_landmark_is_the_surer_of_two_as_far():
     P = np.array([[0.1, 0.0, 0.1], [0.001, 0.0, 0.001]])
-    row, _ = associate(
-        np.zeros((1, 2)), SMALL, np.array([[0.05, 0.0], [-0.05, 0.0]]), P, 3.0, 1.0
-    )
+    row, _ = associate(np.zeros((1, 2)), SMALL, np.array([[0.05, 0.0], [-0.05, 0.0]]), P, 3.0, 1.0)
     assert row.tolist() == [1]
 
 

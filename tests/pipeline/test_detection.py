@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from tests.pipeline.strategies import clusters
 FOREST = preset("forest").detection
 PAPER = preset("paper").detection
 
-REASONS = [
+REASONS: list[tuple[Verdict, dict[str, Any]]] = [
     (Verdict.TREE, {}),
     (Verdict.HIDDEN, {"hidden": [True]}),
     (Verdict.TOO_THICK, {"extent": [[0.2, 1.3, 1.0]]}),
@@ -114,7 +116,7 @@ def test_the_error_of_the_sensor_lies_along_and_across_the_ray(bearing):
 
 
 def test_a_tree_without_a_circle_gives_no_radius():
-    judged = judge(clusters(radius=[0.3], radius_sigma=[np.nan]), FOREST)
+    judged = judge(clusters(radius=[np.nan], radius_sigma=[np.nan]), FOREST)
     assert np.isnan(detections(judged, np.zeros(3), FOREST).radius).all()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.evaluation import (
+    PathError,
     evaluate,
     match,
     matched_rows,
@@ -183,6 +185,13 @@ def path_of(x, y, stamp=T):
     return Path(stamp, x, y, np.zeros_like(x), np.zeros_like(x))
 
 
+def error_of(*words: Any, **rest: Any) -> PathError:
+    """The error of a path that has one."""
+    told = path_error(*words, **rest)
+    assert told is not None
+    return told
+
+
 def truth_of(x, y, stamp=T, same_frame=True):
     """A true path through x, y."""
     return TruthPath(stamp, x, y, np.full(len(x), np.nan), same_frame)
@@ -192,10 +201,10 @@ def truth_of(x, y, stamp=T, same_frame=True):
 @given(poses2)
 def test_a_path_in_another_frame_is_aligned_to_nothing(motion):
     moved = motion.apply(np.stack([X, Y], axis=1))
-    told = path_error(path_of(X, Y), truth_of(*moved.T, same_frame=False))
+    told = error_of(path_of(X, Y), truth_of(moved[:, 0], moved[:, 1], same_frame=False))
     assert told.aligned
     assert told.rms < 1e-6
-    inside = path_error(path_of(X, Y), truth_of(*moved.T, same_frame=True))
+    inside = error_of(path_of(X, Y), truth_of(moved[:, 0], moved[:, 1]))
     wanted = np.hypot(*(moved - np.stack([X, Y], axis=1)).T)
     assert inside.rms == pytest.approx(np.sqrt((wanted**2).mean()), abs=1e-9)
     assert inside.at_end == pytest.approx(wanted[-1], abs=1e-9)
@@ -217,19 +226,19 @@ def test_the_fit_is_the_motion_that_was_made_and_no_nudge_betters_it(seed, motio
 
 
 def test_a_mirrored_path_is_not_turned_into_a_match():
-    told = path_error(path_of(X, Y), truth_of(X, -Y, same_frame=False))
+    told = error_of(path_of(X, Y), truth_of(X, -Y, same_frame=False))
     assert told.rms > 0.3
 
 
 def test_the_path_is_interpolated_to_the_times_of_the_truth():
     between = T[:-1] + 50_000_000
-    told = path_error(path_of(X, 2 * X), truth_of(X[:-1] + 10 / 98, 2 * X[:-1] + 20 / 98, between))
+    told = error_of(path_of(X, 2 * X), truth_of(X[:-1] + 10 / 98, 2 * X[:-1] + 20 / 98, between))
     assert told.rms < 1e-7
     assert told.compared == 49
 
 
 def test_times_outside_the_path_are_not_compared():
-    told = path_error(path_of(X[10:20], Y[10:20], T[10:20]), truth_of(X, Y))
+    told = error_of(path_of(X[10:20], Y[10:20], T[10:20]), truth_of(X, Y))
     assert told.compared == 10
 
 

@@ -20,7 +20,7 @@ clouds = arrays.arrays(
 
 def _means_of_cubes(points, size):
     """The mean of each cube, cubes in the order of their first point."""
-    cubes = {}
+    cubes: dict[tuple[int, ...], list[int]] = {}
     for row, point in enumerate(points):
         cubes.setdefault(tuple(np.floor(point.astype(np.float64) / size).astype(int)), []).append(row)
     return np.array([points[rows].astype(np.float64).mean(axis=0) for rows in cubes.values()]).reshape(-1, 3)

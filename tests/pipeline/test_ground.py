@@ -94,7 +94,9 @@ def test_a_return_from_below_the_ground_does_not_dig_a_hole():
 
 
 def test_the_terrain_never_rises_steeper_than_it_may():
-    wall = np.array([[x, y, z] for x in (5.0,) for y in np.arange(-2, 2, 0.1) for z in np.arange(0.5, 3, 0.1)])
+    wall = np.array(
+        [[x, y, z] for x in (5.0,) for y in np.arange(-2, 2, 0.1) for z in np.arange(0.5, 3, 0.1)]
+    )
     points = np.concatenate([_rings(0.0, 0.0), wall.astype(np.float32)])
     terrain = find_terrain(points, FOREST)
     assert terrain.height.max() < -SENSOR_HEIGHT + 0.2

@@ -99,7 +99,7 @@ def test_extents_are_measured_along_the_ray_across_it_and_up():
     bearing = 0.8
     box = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.3, 0.3) for z in (-0.5, 0.5)])
     c, s = np.cos(bearing), np.sin(bearing)
-    points = (box + [5, 0, 0]) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    points = (box + np.array([5, 0, 0])) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     _, _, extent = moments(points, np.array([0, len(points)]))
     np.testing.assert_allclose(extent, [[0.2, 0.6, 1.0]], atol=1e-9)
 

@@ -49,7 +49,8 @@ def test_on_average_each_particle_is_drawn_by_its_weight():
     rng = np.random.default_rng(0)
     weights = normalised(rng.normal(0, 1, 20))
     drawn = np.mean(
-        [np.bincount(low_variance_ancestors(weights, rng.random()), minlength=20) for _ in range(4000)], axis=0
+        [np.bincount(low_variance_ancestors(weights, rng.random()), minlength=20) for _ in range(4000)],
+        axis=0,
     )
     np.testing.assert_allclose(drawn, 20 * weights, atol=0.04)
 
