@@ -200,9 +200,9 @@ class Dashboard:
         self.path = joined(self.path, shown.path_start, shown.path)
         self.shown = shown
         self.path_xy = np.column_stack([self.path.x, self.path.y])
-        self._show_scene(shown.frame, self.path_xy)
         self.live.show(map_payload(shown), self.path_xy)
         self._score()
+        self._show_scene(shown.frame, self.path_xy)
 
     def _score(self) -> None:
         if self.shown is not None and self.truth is not None:

@@ -78,6 +78,23 @@ def test_a_change_shows_the_standing_scan_again() -> None:
     assert last_status(said).revision == 8
 
 
+def test_of_a_slider_that_moves_only_the_last_value_is_mapped() -> None:
+    commands: queue.Queue[ToWorker | None] = queue.Queue()
+    session = make_session(FakeSource(9))
+    said: list[FromWorker] = []
+    session.open("fake:", "auto", 0)
+    session.advance(1)
+    while session.pace == "hurry":
+        session.work()
+    for k in range(1, 40):
+        values = Parameters().replace({"clustering.eps": 0.1 * k}).model_dump()
+        commands.put(SetParameters(values, k))
+    commands.put(None)
+    Driver(session, commands, said.append).run()
+    assert shown(said) == [0]
+    assert last_status(said).revision == 39
+
+
 @pytest.mark.parametrize(
     ("source", "uri", "words"),
     [
