@@ -49,7 +49,10 @@ class Dashboard:
 
     def pause(self) -> None:
         """Stand still, wherever the run is."""
-        if self.state in ("playing", "starting", "waiting"):
+        self.until(
+            "() => ['playing', 'paused', 'finished'].includes(document.querySelector('#state').dataset.state)"
+        )
+        if self.state == "playing":
             self.page.locator("#play").click()
         self.until("() => ['paused', 'finished'].includes(document.querySelector('#state').dataset.state)")
 

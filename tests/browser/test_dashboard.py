@@ -16,7 +16,9 @@ def _calm(dashboard: Dashboard):
     """Each test begins on a standing scan in the middle of the run, with the parameters of the preset."""
     dashboard.pause()
     dashboard.seek(0.3)
-    dashboard.until_server("/api/status", "it.state === 'paused' && it.scan_index > 100")
+    dashboard.until_server(
+        "/api/status", "it.state === 'paused' && Math.abs(it.time_s - 0.3 * it.end_s) < 1.5"
+    )
     yield
     for dialog in dashboard.page.locator("dialog[open]").all():
         dialog.press("Escape")
@@ -42,9 +44,9 @@ def test_the_eps_slider_changes_the_clusters_of_the_standing_scan(dashboard: Das
     before = dashboard.clusters()
     assert before > 3
     box = dashboard.row("Radius eps").locator("input[type=text]")
-    box.fill("2")
+    box.fill("5")  # all stems in one
     box.press("Tab")
-    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 2")
+    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
     dashboard.until("was => Number(document.querySelector('[data-clusters]').dataset.clusters) < was", before)
     expect(dashboard.scene.get_by_text("● Radius eps")).to_be_visible()
     expect(dashboard.page.locator("#preset")).to_have_text("● forest, 1 changed")
