@@ -160,7 +160,7 @@ class Driver:
         status = replace(
             self._session.status(),
             speed=self._pacer.speed,
-            scan_rate_hz=self._pacer.rate_hz if playing else 0.0,
+            scan_rate_hz=round(self._pacer.rate_hz, 2) if playing else 0.0,
             scans_behind=self._pacer.behind(now) if playing else 0,
         )
         self._reported = (status, now)

@@ -291,6 +291,15 @@ async def test_the_page_and_its_libraries_are_served(both: Running) -> None:
     assert viser.headers["cache-control"] == "no-cache"
 
 
+async def test_what_a_browser_has_already_is_not_sent_again(both: Running) -> None:
+    client, _ = both
+    first = await client.get("/static/plotly.min.js")
+    headers = {"If-None-Match": f'"other", W/{first.headers["etag"]}'}
+    again = await client.get("/static/plotly.min.js", headers=headers)
+    assert (again.status_code, again.content) == (304, b"")
+    assert (await client.get("/", headers=headers)).status_code == 200
+
+
 async def test_a_fault_is_an_answer_and_stands_in_the_log(
     both: Running, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
