@@ -35,6 +35,14 @@ class Dashboard:
         answer = self.page.evaluate("path => fetch(path).then(answer => answer.json())", path)
         return cast(dict[str, Any], answer)
 
+    def command(self, command: dict[str, Any]) -> None:
+        """Send a command as the page does."""
+        self.page.evaluate(
+            "body => fetch('/api/command', { method: 'POST', body: JSON.stringify(body),"
+            " headers: { 'Content-Type': 'application/json' } })",
+            command,
+        )
+
     def until(self, function: str, argument: object = None) -> None:
         """Wait until a function of JavaScript holds in the page; it may be async."""
         self.page.wait_for_function(function, arg=argument, polling=200)
@@ -76,8 +84,11 @@ class Dashboard:
     def clusters(self) -> int:
         """How many clusters the standing scan has, as the tab Why says."""
         panel = self.tab("Why")
-        index = self.ask("/api/status")["scan_index"]  # the status comes before the picture of the scan
-        return int(panel.locator(f"[data-scan='{index}']").get_attribute("data-clusters") or -1)
+        # The status comes before the picture of the scan.
+        self.until_server(
+            "/api/status", "it.scan_index === Number(document.querySelector('[data-scan]').dataset.scan)"
+        )
+        return int(panel.locator("[data-clusters]").get_attribute("data-clusters") or -1)
 
     # --- the scene -------------------------------------------------------------------------------
 
