@@ -28,10 +28,18 @@ PATIENCE_MS = 60_000
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Everything in this folder drives a browser."""
+    """Mark what drives a browser, and let it come last: while Playwright runs, its event loop is the running
+    one of this thread, and a test that is a coroutine could not start.
+    """
     for item in items:
-        if Path(__file__).parent in item.path.parents:
+        if drives_browser(item):
             item.add_marker(pytest.mark.browser)
+    items.sort(key=drives_browser)
+
+
+def drives_browser(item: pytest.Item) -> bool:
+    """Whether a test stands in this folder."""
+    return Path(__file__).parent in item.path.parents
 
 
 @pytest.fixture(scope="session")
