@@ -42,7 +42,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         "--odometry",
         choices=("auto", "wheels", "static"),
         default="auto",
-        help="auto: what the source has; static: the robot stands still",
+        help="auto: what the source has; wheels: it must have some; static: the robot stands still",
     )
 
 
