@@ -137,15 +137,24 @@ class Session:
             return self._arrive(run)
         return frame
 
-    def play(self) -> None:
-        """Go on; from the start when the run is at its end or has failed."""
+    def play(self) -> Opened | None:
+        """Go on; from the start when the run is at its end. A run that has failed is opened again.
+
+        Returns:
+            What was opened again, if so.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        opened = None
         if self._run is None or self._state == "failed":
             if self._asked is None:
-                return
-            self.open(*self._asked)
+                return None
+            opened = self.open(*self._asked)
         elif self._state == "finished":
             self._seek_index(0)
         self._state, self._detail = "playing", ""
+        return opened
 
     def pause(self) -> None:
         """Stand still; on the way to a sought scan, once it is reached."""

@@ -15,7 +15,7 @@ from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpe
 from app.wire import from_worker
 from app.worker_driver import Driver
 from app.worker_mailbox import Mailbox, joined, rows_in_common
-from app.worker_messages import FromWorker, Opened, Report, Shown, ToWorker
+from app.worker_messages import Begin, FromWorker, Opened, Report, Shown, ToWorker
 from pipeline.parameters import Parameters
 from pipeline.records import Path
 from tests.app.fakes import FakeSource, frame, make_session, opened, path
@@ -60,6 +60,47 @@ def test_playing_shows_every_scan_and_ends_finished() -> None:
     assert last_status(said).state == "finished"
     assert last_status(said).speed == 0.0
     assert any(isinstance(message, Opened) for message in said)
+
+
+def begin(run: int, eps: float = 0.15, *, play: bool = True) -> Begin:
+    return Begin(run, Parameters().replace({"clustering.eps": eps}).model_dump(), 4, play)
+
+
+def test_the_answer_to_an_opening_begins_that_run_only() -> None:
+    said = driven(FakeSource(5), Open("first:"), Open("second:"), begin(1, 0.9), begin(2, 0.3), Pause())
+    assert [message.run for message in said if isinstance(message, Opened)] == [1, 2]
+    assert last_status(said).source == "second:"
+    assert not [
+        m for m in said if isinstance(m, Report) and m.status.source == "first:" and m.status.revision
+    ]
+    expected = driven(FakeSource(5), SetParameters(begin(1, 0.3).values, 4), Open("second:"), Play())
+    assert pictures(said) == pictures(expected)
+
+
+def test_a_late_answer_alone_plays_nothing() -> None:
+    said = driven(FakeSource(5), Open("first:"), Open("second:"), begin(1))
+    assert shown(said) == []
+    assert last_status(said).state == "paused"
+
+
+def test_a_pause_while_opening_is_kept_and_without_play_the_first_scan_is_shown() -> None:
+    said = driven(FakeSource(5), Open("fake:"), Pause(), begin(1))
+    assert (shown(said), last_status(said).state) == ([], "paused")
+    assert last_status(said).revision == 4
+    said = driven(FakeSource(5), Open("fake:"), begin(1, play=False))
+    assert set(shown(said)) == {0}
+    assert last_status(said).state == "paused"
+
+
+def test_a_run_that_is_opened_again_by_play_is_a_run_of_its_own() -> None:
+    said = driven(FakeSource(5, fails_at=2), Open("fake:"), SetSpeed(0.0), Play(), Play())
+    runs = [message.run for message in said if isinstance(message, Opened)]
+    assert runs == [1, 2]
+    assert [m.run for m in said if isinstance(m, Shown)] == [1, 1, 2, 2]
+
+
+def pictures(said: list[FromWorker]) -> dict[int, float]:
+    return {m.frame.index: m.frame.estimate.T_map_base.x for m in said if isinstance(m, Shown)}
 
 
 def test_a_sought_scan_is_shown() -> None:
