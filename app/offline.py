@@ -152,8 +152,9 @@ class _Tally:
     def tell_of_unconfirmed(self, frame: Frame, hits: int) -> None:
         tentative = int(np.count_nonzero(~frame.trees.confirmed))
         if tentative:
+            them = "1 tree was" if tentative == 1 else f"{tentative} trees were"
             self.warned[
-                f"{tentative} trees were seen fewer than {hits} times and are not in the map; "
+                f"{them} seen fewer than {hits} times and left out of the map; "
                 "--set tracking.hits_to_confirm=1 takes them too"
             ] += 1
 

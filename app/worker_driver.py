@@ -4,10 +4,12 @@ process what came of it.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import sys
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
@@ -50,8 +52,10 @@ class Driver:
         self._commands = commands
         self._put = put
         self._clock = clock
+        self._taken: deque[ToWorker | None] = deque()
         self._pacer = Pacer()
         self._run = 0
+        self._prepared = False
         self._reported: tuple[Status, float] | None = None
         self._glimpse_at = 0.0
 
@@ -60,7 +64,7 @@ class Driver:
         self._report()
         while True:
             try:
-                command = self._commands.get(timeout=self._patience())
+                command = self._next_command()
             except queue.Empty:
                 self._guarded(self._map)
                 continue
@@ -68,6 +72,20 @@ class Driver:
                 self._session.close()
                 return
             self._obey(command)
+
+    def _next_command(self) -> ToWorker | None:
+        """The next command; of parameters that follow one another (a slider that moves) the last."""
+        if not self._taken:
+            self._taken.append(self._commands.get(timeout=self._patience()))
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._taken.append(self._commands.get_nowait())
+        command = self._taken.popleft()
+        while (
+            isinstance(command, SetParameters) and self._taken and isinstance(self._taken[0], SetParameters)
+        ):
+            command = self._taken.popleft()
+        return command
 
     def _patience(self) -> float | None:
         """Seconds until the next scan is to be mapped; None when only a command can start work."""
@@ -80,6 +98,9 @@ class Driver:
         return 0.0 if stamp_ns is None else self._pacer.delay(stamp_ns, self._clock())
 
     def _map(self) -> None:
+        if not self._prepared:
+            self._prepare()
+            return
         hurried = self._session.pace == "hurry"
         frame = self._session.work()
         now = self._clock()
@@ -123,7 +144,18 @@ class Driver:
         self._run += 1
         opening = f"Opening {command.uri}"
         self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
-        self._put(self._session.open(command.uri, command.odometry, command.seed))
+        opened = self._session.open(command.uri, command.odometry, command.seed)
+        self._prepared = False
+        self._put(opened)
+
+    def _prepare(self) -> None:
+        """Before the first scan, and not when opening: only now are the parameters those of the run."""
+        self._prepared = True
+        detail = "Preparing the mapper; the first time on a machine this takes up to a minute"
+        self._put(Report(replace(self._session.status(), state="starting", detail=detail)))
+        self._session.prepare()
+        self._pacer.release()
+        self._report()
 
     def _show(self, frame: Frame | None) -> None:
         path = self._session.path
@@ -136,7 +168,7 @@ class Driver:
         status = replace(
             self._session.status(),
             speed=self._pacer.speed,
-            scan_rate_hz=self._pacer.rate_hz if playing else 0.0,
+            scan_rate_hz=round(self._pacer.rate_hz, 2) if playing else 0.0,
             scans_behind=self._pacer.behind(now) if playing else 0,
         )
         self._reported = (status, now)

@@ -222,8 +222,7 @@ class Clusters:
         eccentricity: lambda1 / lambda2 >= 1 (Eq. 4); inf for points on a line.
         centre: shape (K, 2) [m], the estimate of the trunk's axis.
         covariance: shape (K, 2, 2) [m^2], of `centre`.
-        radius: [m], of the circle, fitted or told by the angular width; NaN where none was asked for.
-        radius_sigma: [m], NaN where the radius was not fitted.
+        radius, radius_sigma: [m], of the fitted circle; NaN where none was fitted.
         radial_std: [m], standard deviation of the distances to the axis (the cylinder check).
         arc: Visible part of the circle [rad].
         extent: shape (K, 3) [m], size of the bounding box along the ray, across it and up.
@@ -280,7 +279,7 @@ class Trees:
         dbh: Diameter at breast height [m], NaN where no arc carried one.
         dbh_sigma: [m], NaN likewise.
         eccentricity: Mean over the observations.
-        observations: int64, number of detections that went into it.
+        observations: int64, number of scans it was seen in.
         coverage: Part of its circumference that was seen [rad].
         first_seen_ns, last_seen_ns: int64.
         confirmed: Whether it was seen often enough to be shown and exported.

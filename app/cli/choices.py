@@ -46,6 +46,13 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def source(text: str) -> str:
+    """A source from the command line; an empty word is a slip of a script, not the current folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the source is empty")
+    return text
+
+
 def seed(text: str) -> int:
     """A seed from a flag: a whole number that is not negative."""
     try:

@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.choices import SOURCE_HELP, add_parameter_flags, add_run_flags, chosen_parameters
+from app.cli.choices import SOURCE_HELP, add_parameter_flags, add_run_flags, chosen_parameters, source
 from pipeline.errors import StemmapError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ HELP = "map a run without a browser and write its files"
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    parser.add_argument("source", metavar="SOURCE", type=source, help=SOURCE_HELP)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the files")
     add_parameter_flags(parser)
     add_run_flags(parser)

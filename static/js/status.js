@@ -7,6 +7,7 @@ import { on, state } from "./state.js";
 const WORDS = {
   starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
 };
+const NO_FIGURES = ["starting", "failed"];
 const OLD_AFTER = 3000; // [ms] without a word while a run plays
 
 // name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
@@ -37,11 +38,11 @@ function show() {
   const status = state.status;
   if (!status) return;
   for (const [name, [, , read]] of Object.entries(FIGURES)) {
-    const [text, meaning] = read(status);
+    const [text, meaning] = NO_FIGURES.includes(status.state) ? [NONE] : read(status);
     setText(cells[name].value, text);
     cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
   }
-  cells.f1.cell.hidden = !state.evaluation;
+  cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   setText(byId("source-name"), shortSource(status.source) || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
   document.title = `${shortSource(status.source)} · stemmap`;
@@ -68,11 +69,15 @@ function showNotice(quiet) {
     : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
     : status?.detail ?? "";
   notice.hidden = !text;
-  notice.classList.toggle("wait", status?.state !== "failed" || !state.connected);
-  setText(notice.querySelector("span"), text || "");
-  byId("notice-open").hidden = !(state.connected && status?.state === "failed");
+  const failed = state.connected && status?.state === "failed";
+  notice.classList.toggle("failed", failed);
+  notice.classList.toggle("wait", !failed);
+  document.body.classList.toggle("failed", failed);
+  setText(notice.querySelector("span"), sentence(text));
+  byId("notice-open").hidden = !failed;
 }
 
+const sentence = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 const seconds = (since) => Math.floor((performance.now() - since) / 1000);
 
 export function startStatus() {

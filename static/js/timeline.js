@@ -44,6 +44,7 @@ function show() {
     button.setAttribute("aria-label", name === "pause" ? "Pause" : "Play");
     button.querySelector("path").setAttribute("d", ICONS[name]);
   }
+  for (const each of document.querySelectorAll(".buttons button")) each.disabled = status.state === "failed";
   const line = byId("timeline");
   line.disabled = !(status.end_s > 0);
   if (!dragging && !seeking) {
@@ -52,7 +53,7 @@ function show() {
     setText(byId("time-now"), clock(status.time_s));
   }
   line.setAttribute("aria-valuetext", clock(Number(line.value)));
-  setText(byId("time-end"), status.end_s === null ? "open end" : clock(status.end_s));
+  setText(byId("time-end"), status.end_s === null && status.scan_index >= 0 ? "open end" : clock(status.end_s));
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(status.speed);
   showWarnings(status.warnings ?? []);

@@ -1,8 +1,5 @@
 """Recordings of known content, written with rosbags, which shares no code with our readers."""
 
-# The message classes are made at run time and have no types.
-# ruff: noqa: ANN401
-
 from __future__ import annotations
 
 from collections.abc import Callable

@@ -93,7 +93,9 @@ def real_file(kind: str, shared_data: Path, folder: Path) -> Path:
         case "pcap":
             return velodyne / "vlp16.pcap"
         case "bin":
-            return shared_data / "kitti" / "000000.bin"
+            part = folder / "000000.bin"
+            part.write_bytes((shared_data / "kitti" / "000000.bin").read_bytes()[: 16 * 20_000])
+            return part
         case "pcd binary":
             return velodyne / "vlp16_reference.pcd"
         case "pcd ascii":

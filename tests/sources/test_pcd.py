@@ -135,6 +135,7 @@ ROWS = [(1.0, 2.0, 3.0, 4), (5.0, 6.0, 7.0, 8), (float("nan"), 0.0, 1.0, 2)]
         {"SIZE": "4 4 4 4 3"},
         {"TYPE": "F F F F X"},
         {"COUNT": "1 1 1 999999999 1"},
+        {"COUNT": "1 2 1 1 1"},
         {"FIELDS": "a b c d e"},
         {"FIELDS": ""},
         {"DATA": "binary_zipped"},
