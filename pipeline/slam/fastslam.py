@@ -31,7 +31,6 @@ class FastSlam:
         self.parameters = parameters
         self._seed = seed
         self.state = SlamState.at_origin(parameters.particles)
-        self.ancestors: Int | None = None
 
     def process(self, index: int, motion: Pose2, detections: Detections, clear_range: Float) -> PoseEstimate:
         """Move with the odometry, weigh by the detections, and resample when it is due.
@@ -47,32 +46,30 @@ class FastSlam:
         noise = rng.standard_normal((p.particles, 3))
         offset = float(rng.random())
         state = self._moved(self.state.with_particles(p.particles), motion)
-        self.ancestors = None
-        resampled = False
-        if index == 0 or state.since_update >= p.update_distance:
+        used = index == 0 or state.since_update >= p.update_distance
+        if used:
             state = self._observed(state, detections, clear_range, noise)
-            weights = normalised(state.log_weight)
-            n_eff = float(1.0 / np.sum(weights**2))
-            estimate = _estimate(state, weights, n_eff, p.hits_to_weigh)
-            if n_eff < p.resample_below * p.particles:
-                self.ancestors = low_variance_ancestors(weights, offset)
-                take_ancestors(
-                    self.ancestors,
-                    state.pose,
-                    state.mean,
-                    state.covariance,
-                    state.hits,
-                    state.score,
-                    state.birth,
-                    state.count,
-                )
-                state.log_weight[:] = 0.0
-                resampled = True
-        else:
-            weights = normalised(state.log_weight)
-            estimate = _estimate(state, weights, float(1.0 / np.sum(weights**2)), p.hits_to_weigh)
-        self.state = state
-        return replace(estimate, resampled=resampled)
+        weights = normalised(state.log_weight)
+        state = replace(state, best=int(np.argmax(weights))) if used else state
+        estimate = _estimate(state, weights, p.hits_to_weigh)
+        ancestors = None
+        if used and estimate.n_eff < p.resample_below * p.particles:
+            ancestors = low_variance_ancestors(weights, offset)
+            _resample(state, ancestors)
+            estimate = replace(estimate, resampled=True)
+        genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
+        self.state = replace(state, genealogy=genealogy)
+        return estimate
+
+    def path(self) -> Float:
+        """x, y [m], yaw [rad] at every scan as the best particle has it behind it, shape (N, 3)."""
+        return self.state.genealogy.path(self.state.best)
+
+    def landmarks(self) -> tuple[Float, Float]:
+        """All landmarks of the best particle: positions, shape (L, 2) [m], and covariances xx, xy, yy,
+        shape (L, 3) [m^2]."""
+        best, count = self.state.best, self.state.count[self.state.best]
+        return self.state.mean[best, :count], self.state.covariance[best, :count]
 
     def _moved(self, state: SlamState, step: Pose2) -> SlamState:
         motion, covariance = compound(
@@ -124,13 +121,27 @@ class FastSlam:
         )
 
 
-def _estimate(state: SlamState, weights: Float, n_eff: float, hits_to_show: int) -> PoseEstimate:
+def _resample(state: SlamState, ancestors: Int) -> None:
+    take_ancestors(
+        ancestors,
+        state.pose,
+        state.mean,
+        state.covariance,
+        state.hits,
+        state.score,
+        state.birth,
+        state.count,
+    )
+    state.log_weight[:] = 0.0
+
+
+def _estimate(state: SlamState, weights: Float, hits_to_show: int) -> PoseEstimate:
     pose = moved_poses(state.pose, state.motion)
     yaw = mean_angle(pose[:, 2], weights)
     mean = np.array([weights @ pose[:, 0], weights @ pose[:, 1], yaw])
     deviation = pose - mean
     deviation[:, 2] = wrap_angle(deviation[:, 2])
-    best = int(np.argmax(weights))
+    best = state.best
     known = state.hits[best, : state.count[best]] >= hits_to_show
     heading = yaw - state.motion[2]  # of the frame in which the covariance of the motion is
     C = np.eye(3)
@@ -140,7 +151,7 @@ def _estimate(state: SlamState, weights: Float, n_eff: float, hits_to_show: int)
         covariance=(deviation * weights[:, None]).T @ deviation + C @ state.motion_covariance @ C.T,
         particles=pose,
         weights=weights,
-        n_eff=n_eff,
+        n_eff=float(1.0 / np.sum(weights**2)),
         landmarks=state.mean[best, : state.count[best]][known],
         resampled=False,
     )

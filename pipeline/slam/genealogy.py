@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.geometry import Float
 from pipeline.records import Float32, Int
 
-RECENT = 2048  # scans whose particles are all kept: the time in which a loop can still choose
+RECENT_POSES = 300_000  # of all particles that are kept: the time in which a loop can still choose
 BLOCK = 512  # scans that are settled at once
 
 
@@ -52,10 +52,18 @@ class Genealogy:
             leaf: The best particle after it; its path is taken where the past has to be settled.
         """
         recent = (*self.recent, Generation(pose.astype(np.float32), ancestors))
-        if len(recent) < RECENT + BLOCK:
+        if len(recent) < BLOCK + max(BLOCK, RECENT_POSES // len(pose)):
             return Genealogy(self.settled, recent)
         rows = _walk(recent, leaf)[:BLOCK]
         return Genealogy((*self.settled, rows), recent[BLOCK:])
+
+    def redrawn(self, rows: Int) -> Genealogy:
+        """The same past of particles drawn anew: each one comes from the particle in its row."""
+        if not self.recent:
+            return self
+        last = self.recent[-1]
+        ancestors = rows if last.ancestors is None else last.ancestors[rows]
+        return Genealogy(self.settled, (*self.recent[:-1], Generation(last.pose, ancestors)))
 
     def path(self, leaf: int) -> Float:
         """x, y [m], yaw [rad] of every scan as the particle `leaf` of the last one has it behind it,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pipeline.geometry import Float
 from pipeline.records import Float32, Int, Int32
+from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.resampling import normalised
 
 FIRST_CAPACITY = 32
@@ -29,6 +30,8 @@ class SlamState:
         motion_covariance: shape (3, 3), of `motion`.
         since_update: Distance driven, and a metre per radian turned, since then [m].
         detections: How many detections were seen so far.
+        best: The particle that explained the last scans best; its map and past are shown.
+        genealogy: Where the particles came from.
     """
 
     pose: Float
@@ -43,6 +46,8 @@ class SlamState:
     motion_covariance: Float
     since_update: float
     detections: int
+    best: int = 0
+    genealogy: Genealogy = field(default_factory=Genealogy)
 
     @classmethod
     def at_origin(cls, particles: int) -> SlamState:
@@ -101,10 +106,7 @@ class SlamState:
             return self
         weights = normalised(self.log_weight)
         rows = np.searchsorted(np.cumsum(weights), (np.arange(particles) + 0.5) / particles)
-        return self.drawn(np.minimum(rows, len(weights) - 1))
-
-    def drawn(self, rows: Int) -> SlamState:
-        """New particles of equal weight, each a copy of the particle in its row."""
+        rows = np.minimum(rows, len(weights) - 1)
         return replace(
             self,
             pose=self.pose[rows],
@@ -115,4 +117,6 @@ class SlamState:
             score=self.score[rows],
             birth=self.birth[rows],
             count=self.count[rows],
+            best=min(int(np.searchsorted(rows, self.best)), particles - 1),
+            genealogy=self.genealogy.redrawn(rows),
         )
