@@ -250,7 +250,7 @@ class Slam(Stage):
         0.0,
         10.0,
         0.1,
-        "Two landmarks nearer than this, never seen in one scan, become one; 0 is off.",
+        "Two landmarks nearer than this, of which a scan sees one alone, become one; 0 is off.",
     )
     resample_below: float = number(
         0.5,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
@@ -30,17 +28,28 @@ def kalman_update(m: Float, Sigma: Float, z: Float, R: Float, looks: float) -> N
     xx = k00 * R[0] + k01 * R[1]
     xy = 0.5 * (k00 * R[1] + k01 * R[2] + k10 * R[0] + k11 * R[1])
     yy = k10 * R[1] + k11 * R[2]
-    Sigma[0], Sigma[1], Sigma[2] = max(xx, VARIANCE_MIN, R[0] / looks), xy, max(yy, VARIANCE_MIN, R[2] / looks)
+    Sigma[0], Sigma[1], Sigma[2] = (
+        max(xx, VARIANCE_MIN, R[0] / looks),
+        xy,
+        max(yy, VARIANCE_MIN, R[2] / looks),
+    )
 
 
 @compiled
 def merge_duplicates(
-    mean: Float, covariance: Float, hits: Int32, score: Float32, birth: Int, near: Int, seen: Bool, gate: float
+    mean: Float,
+    covariance: Float,
+    hits: Int32,
+    score: Float32,
+    birth: Int,
+    near: Int,
+    seen: Bool,
+    gate: float,
 ) -> None:
     """Join each landmark that was seen with those nearby that were not, where both may be one tree.
 
-    Two that were seen in one scan are two. Of two that are one the older keeps its birth; the other
-    one is left without score, to be removed.
+    Two that this scan sees are two. Of two that are one the older keeps its birth; the other one is
+    left without score, to be removed.
     """
     for j in near:
         if not seen[j]:
