@@ -66,6 +66,8 @@ _LASER2D: dict[str, object] = {
     "slam.noise_turn": 0.7,
     "slam.distance_max": 4.0,
     "slam.view_range": 35.0,
+    "slam.miss_weight": 1.0,
+    "tracking.hits_to_confirm": 5,
     "slam.update_distance": 0.5,
     "tracking.distance_max": 3.0,
     "tracking.proximity_radius": 1.5,

@@ -234,6 +234,15 @@ class Slam(Stage):
         100,
         "So many misses undo one hit; a landmark without hits left is removed.",
     )
+    miss_weight: float = number(
+        0.0,
+        "Weight of a miss",
+        "",
+        0.0,
+        5.0,
+        0.05,
+        "What a well known landmark in free view that is not detected takes from a particle's log weight.",
+    )
     looks: float = number(
         100.0,
         "Independent looks",

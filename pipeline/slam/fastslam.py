@@ -110,6 +110,7 @@ class FastSlam:
             1.0 / p.misses_per_hit,
             p.looks,
             p.merge_gate,
+            p.miss_weight,
         )
         state.log_weight[:] -= state.log_weight.max()
         return replace(

@@ -39,6 +39,7 @@ def observe(
     miss: float,
     looks: float,
     merge_gate: float,
+    miss_weight: float,
 ) -> None:
     """Update every particle in place; shapes as in SlamState.
 
@@ -56,6 +57,7 @@ def observe(
         miss: What one miss takes from the score.
         looks: A landmark is never known better than by so many independent looks.
         merge_gate: Two landmarks nearer than this are one [sigma].
+        miss_weight: What one miss takes from the log weight.
     """
     detections = centre.shape[0]
     reach = view_range
@@ -101,6 +103,8 @@ def observe(
         for j in near:
             if not seen[j] and is_in_free_view(mean[p, j], pose[p], c, s, clear_range, view_range):
                 score[p, j] -= miss
+                if hits[p, j] >= hits_to_weigh:
+                    log_weight[p] -= miss_weight
         merge_duplicates(mean[p], covariance[p], hits[p], score[p], birth[p], near, seen, merge_gate)
         remove_gone(mean[p], covariance[p], hits[p], score[p], birth[p], count, p, near)
 
