@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import Float32, Int, Int32
+from pipeline.records import Bool, Float32, Int, Int32
 from pipeline.slam.landmarks import kalman_update, merge_duplicates, remove_gone
 from pipeline.slam.proposal import draw, recognise, rotated
 from pipeline.visibility import is_in_free_view
@@ -67,7 +67,6 @@ def observe(
     near_room = np.empty(mean.shape[1], np.int64)
     mu = np.empty(3)
     P = np.empty((3, 3))
-    z, R_map = np.empty(2), np.empty(3)
     for p in range(pose.shape[0]):
         _predict(pose[p], motion, motion_covariance, mu, P)
         if not use_proposal:
@@ -82,24 +81,23 @@ def observe(
         )  # fmt: skip
         if use_proposal:
             draw(mu, P, noise[p], pose[p])
-        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
         seen = np.zeros(known, np.bool_)
-        for d in range(detections):
-            z[0] = pose[p, 0] + c * centre[d, 0] - s * centre[d, 1]
-            z[1] = pose[p, 1] + s * centre[d, 0] + c * centre[d, 1]
-            rotated(R[d], c, s, R_map)
-            j = landmark_of[d]
-            if j >= 0:
-                seen[j] = True
-                kalman_update(mean[p, j], covariance[p, j], z, R_map, looks)
-                hits[p, j] += 1
-                score[p, j] = min(score[p, j] + 1.0, SCORE_MAX)
-            else:
-                n = count[p]
-                mean[p, n], covariance[p, n] = z, R_map
-                hits[p, n], score[p, n] = 1, 1.0
-                birth[p, n] = first_birth + d
-                count[p] = n + 1
+        count[p] = _learn(
+            pose[p],
+            mean[p],
+            covariance[p],
+            hits[p],
+            score[p],
+            birth[p],
+            known,
+            landmark_of,
+            centre,
+            R,
+            first_birth,
+            looks,
+            seen,
+        )
+        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
         for j in near:
             if not seen[j] and is_in_free_view(mean[p, j], pose[p], c, s, clear_range, view_range):
                 score[p, j] -= miss
@@ -107,6 +105,45 @@ def observe(
                     log_weight[p] -= miss_weight
         merge_duplicates(mean[p], covariance[p], hits[p], score[p], birth[p], near, seen, merge_gate)
         remove_gone(mean[p], covariance[p], hits[p], score[p], birth[p], count, p, near)
+
+
+@compiled
+def _learn(
+    pose: Float,
+    mean: Float,
+    covariance: Float,
+    hits: Int32,
+    score: Float32,
+    birth: Int,
+    known: int,
+    landmark_of: Int,
+    centre: Float,
+    R: Float,
+    first_birth: int,
+    looks: float,
+    seen: Bool,
+) -> int:
+    """Sharpen the landmarks of one particle that were seen, marking them, and begin new ones; returns
+    how many there are then."""
+    z, R_map = np.empty(2), np.empty(3)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    n = known
+    for d in range(centre.shape[0]):
+        z[0] = pose[0] + c * centre[d, 0] - s * centre[d, 1]
+        z[1] = pose[1] + s * centre[d, 0] + c * centre[d, 1]
+        rotated(R[d], c, s, R_map)
+        j = landmark_of[d]
+        if j >= 0:
+            seen[j] = True
+            kalman_update(mean[j], covariance[j], z, R_map, looks)
+            hits[j] += 1
+            score[j] = min(score[j] + 1.0, SCORE_MAX)
+        else:
+            mean[n], covariance[n] = z, R_map
+            hits[n], score[n] = 1, 1.0
+            birth[n] = first_birth + d
+            n += 1
+    return n
 
 
 @compiled
