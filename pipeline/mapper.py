@@ -82,8 +82,9 @@ class Mapper:
 
     @property
     def path(self) -> Path:
-        """The path so far, one row a scan."""
-        return self._path.columns()
+        """The path so far, one row a scan. A scan may change its past: it is that of the particle which
+        explains the scans best now, as the trees are."""
+        return self._path.columns(self._slam.path())
 
     def process(self, step: Step) -> Frame:
         """Map one scan."""
@@ -125,6 +126,7 @@ class Mapper:
                 free,
                 p.slam.view_range,
             )
+            self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
             trees = self._tracker.trees()
 
         self._path.append(step.scan.stamp_ns, estimate)
@@ -188,11 +190,11 @@ class Mapper:
 
 
 class _PathColumns:
-    """Rows that grow by doubling: stamp, and x, y, yaw, sigma."""
+    """Stamps and sigmas of a path that grows by doubling."""
 
     def __init__(self) -> None:
         self._stamp = np.zeros(64, np.int64)
-        self._rows: Float = np.zeros((64, 4))
+        self._sigma: Float = np.zeros(64)
         self._length = 0
 
     def __len__(self) -> int:
@@ -201,22 +203,21 @@ class _PathColumns:
     def append(self, stamp_ns: int, estimate: PoseEstimate) -> None:
         if self._length == len(self._stamp):
             self._stamp = np.concatenate([self._stamp, np.zeros_like(self._stamp)])
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-        T = estimate.T_map_base
-        sigma = float(np.sqrt(0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1])))
+            self._sigma = np.concatenate([self._sigma, np.zeros_like(self._sigma)])
         self._stamp[self._length] = stamp_ns
-        self._rows[self._length] = T.x, T.y, T.yaw, sigma
+        self._sigma[self._length] = np.sqrt(0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]))
         self._length += 1
 
     def cut(self, length: int) -> None:
         self._length = length
 
-    def columns(self) -> Path:
-        rows = self._rows[: self._length]
+    def columns(self, poses: Float) -> Path:
+        """With the poses, shape (N, 3): x, y [m], yaw [rad]."""
+        n = self._length
         return Path(
-            self._stamp[: self._length].copy(),
-            rows[:, 0].copy(),
-            rows[:, 1].copy(),
-            rows[:, 2].copy(),
-            rows[:, 3].copy(),
+            self._stamp[:n].copy(),
+            poses[:, 0].copy(),
+            poses[:, 1].copy(),
+            poses[:, 2].copy(),
+            self._sigma[:n].copy(),
         )

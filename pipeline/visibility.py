@@ -59,9 +59,18 @@ def in_free_view(place: Float, pose: Float, clear_range: Float, view_range: floa
     c, s = np.cos(pose[2]), np.sin(pose[2])
     free = np.zeros(place.shape[0], np.bool_)
     for i in range(place.shape[0]):
-        dx, dy = place[i, 0] - pose[0], place[i, 1] - pose[1]
-        reach = np.sqrt(dx * dx + dy * dy)
-        if reach <= view_range:
-            k = direction_bin(c * dx + s * dy, c * dy - s * dx, BINS)
-            free[i] = clear_range[k] > reach + BEHIND
+        free[i] = is_in_free_view(place[i], pose, c, s, clear_range, view_range)
     return free
+
+
+@compiled
+def is_in_free_view(
+    place: Float, pose: Float, c: float, s: float, clear_range: Float, view_range: float
+) -> bool:
+    """The same for one place; c and s are the cosine and sine of the yaw."""
+    dx, dy = place[0] - pose[0], place[1] - pose[1]
+    reach = np.sqrt(dx * dx + dy * dy)
+    if reach > view_range:
+        return False
+    k = direction_bin(c * dx + s * dy, c * dy - s * dx, BINS)
+    return bool(clear_range[k] > reach + BEHIND)

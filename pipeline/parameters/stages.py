@@ -175,6 +175,11 @@ class Detection(Stage):
 class Slam(Stage):
     """SLAM: FastSLAM with a map per particle (Eq. 5-7)."""
 
+    method: Literal["fastslam1", "fastslam2"] = choice(
+        "fastslam2",
+        "Method",
+        "FastSLAM 1.0 draws the pose from the odometry alone, 2.0 from odometry and scan together.",
+    )
     particles: int = count(100, "Particles", "", 1, 5000, "How many hypotheses of the path are kept.")
     noise_distance: float = number(
         0.03,
@@ -228,6 +233,33 @@ class Slam(Stage):
         1,
         100,
         "So many misses undo one hit; a landmark without hits left is removed.",
+    )
+    miss_weight: float = number(
+        0.0,
+        "Weight of a miss",
+        "",
+        0.0,
+        5.0,
+        0.05,
+        "What a well known landmark in free view that is not detected takes from a particle's log weight.",
+    )
+    looks: float = number(
+        100.0,
+        "Independent looks",
+        "",
+        1.0,
+        10000.0,
+        1.0,
+        "Views of a trunk share their error: a landmark is never known better than by so many of them.",
+    )
+    merge_gate: float = number(
+        1.0,
+        "Merge gate",
+        "sigma",
+        0.0,
+        10.0,
+        0.1,
+        "Two landmarks nearer than this, of which a scan sees one alone, become one; 0 is off.",
     )
     resample_below: float = number(
         0.5,

@@ -53,7 +53,14 @@ def low_variance_ancestors(weights: Float, offset: float) -> Int:
 
 @compiled
 def take_ancestors(
-    ancestors: Int, pose: Float, mean: Float, covariance: Float, hits: Int32, score: Float32, count: Int32
+    ancestors: Int,
+    pose: Float,
+    mean: Float,
+    covariance: Float,
+    hits: Int32,
+    score: Float32,
+    birth: Int,
+    count: Int32,
 ) -> None:
     """Make each particle a copy of its ancestor. Needs ancestors[ancestors] == ancestors, so that no
     particle is read after it was overwritten."""
@@ -68,3 +75,4 @@ def take_ancestors(
         covariance[i, :n] = covariance[a, :n]
         hits[i, :n] = hits[a, :n]
         score[i, :n] = score[a, :n]
+        birth[i, :n] = birth[a, :n]

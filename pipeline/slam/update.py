@@ -1,17 +1,17 @@
-"""What one particle learns from the detections of one scan: association, landmarks, weight (Eq. 7)."""
+"""What every particle learns from the detections of one scan: pose, landmarks, weight (Eq. 7)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from pipeline.association import associate
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import Float32, Int32
-from pipeline.visibility import in_free_view
+from pipeline.records import Bool, Float32, Int, Int32
+from pipeline.slam.landmarks import kalman_update, merge_duplicates, remove_gone
+from pipeline.slam.proposal import draw, recognise, rotated
+from pipeline.visibility import is_in_free_view
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
-VARIANCE_MIN = 1e-4  # m^2; views of one trunk share an error of about a centimetre
 
 
 @compiled
@@ -22,98 +22,148 @@ def observe(
     covariance: Float,
     hits: Int32,
     score: Float32,
+    birth: Int,
     count: Int32,
+    motion: Float,
+    motion_covariance: Float,
+    noise: Float,
     centre: Float,
     R: Float,
     clear_range: Float,
+    first_birth: int,
+    use_proposal: bool,
     gate: float,
     distance_max: float,
     hits_to_weigh: int,
     view_range: float,
     miss: float,
+    looks: float,
+    merge_gate: float,
+    miss_weight: float,
 ) -> None:
     """Update every particle in place; shapes as in SlamState.
 
     Args:
+        motion, motion_covariance: Since the last observation, in the frame of each particle.
+        noise: Standard normal numbers, shape (P, 3).
         centre: Detections in the base frame, shape (D, 2) [m]; R: their covariance, (D, 2, 2).
         clear_range: See FastSlam.process.
+        first_birth: Serial number of the first of the detections.
+        use_proposal: FastSLAM 2.0; else the pose is drawn before the scan is looked at.
         gate: Largest Mahalanobis distance of an association [sigma].
         distance_max: Largest distance of an association [m].
         hits_to_weigh: Landmarks seen fewer times do not weigh.
         view_range: Landmarks nearer than this can be missed [m].
         miss: What one miss takes from the score.
+        looks: A landmark is never known better than by so many independent looks.
+        merge_gate: Two landmarks nearer than this are one [sigma].
+        miss_weight: What one miss takes from the log weight.
     """
     detections = centre.shape[0]
-    world = np.empty((detections, 2))
-    world_R = np.empty((detections, 3))
+    reach = view_range
+    for d in range(detections):
+        reach = max(reach, np.hypot(centre[d, 0], centre[d, 1]) + distance_max)
+    landmark_of = np.empty(detections, np.int64)
+    near_room = np.empty(mean.shape[1], np.int64)
+    mu = np.empty(3)
+    P = np.empty((3, 3))
     for p in range(pose.shape[0]):
-        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
-        for d in range(detections):
-            x, y = centre[d, 0], centre[d, 1]
-            world[d, 0], world[d, 1] = pose[p, 0] + c * x - s * y, pose[p, 1] + s * x + c * y
-            xx, xy, yy = R[d, 0, 0], R[d, 0, 1], R[d, 1, 1]
-            world_R[d, 0] = c * c * xx - 2 * c * s * xy + s * s * yy
-            world_R[d, 1] = c * s * (xx - yy) + (c * c - s * s) * xy
-            world_R[d, 2] = s * s * xx + 2 * c * s * xy + c * c * yy
+        _predict(pose[p], motion, motion_covariance, mu, P)
+        if not use_proposal:
+            draw(mu, P, noise[p], pose[p])
+            mu[:] = pose[p]
+            P[:] = 0.0
         known = count[p]
-        landmark_of, distance2 = associate(
-            world, world_R, mean[p, :known], covariance[p, :known], gate, distance_max
-        )
+        near = _in_reach(mean[p, :known], mu, reach, near_room)
+        log_weight[p] += recognise(
+            mu, P, centre, R, near, mean[p, :known], covariance[p, :known], hits[p, :known],
+            gate, distance_max, hits_to_weigh, landmark_of,
+        )  # fmt: skip
+        if use_proposal:
+            draw(mu, P, noise[p], pose[p])
         seen = np.zeros(known, np.bool_)
-        for d in range(detections):
-            j = landmark_of[d]
-            if j >= 0 and hits[p, j] >= hits_to_weigh:
-                S = covariance[p, j] + world_R[d]
-                log_weight[p] -= 0.5 * (distance2[d] + np.log(S[0] * S[2] - S[1] * S[1]))
-            else:
-                # A new tree is as likely as one at the gate, else particles that recognise nothing win.
-                det = world_R[d, 0] * world_R[d, 2] - world_R[d, 1] ** 2
-                log_weight[p] -= 0.5 * (gate * gate + np.log(det))
-            if j >= 0:
-                seen[j] = True
-                kalman_update(mean[p, j], covariance[p, j], world[d], world_R[d])
-                hits[p, j] += 1
-                score[p, j] = min(score[p, j] + 1.0, SCORE_MAX)
-            else:
-                n = count[p]
-                mean[p, n] = world[d]
-                covariance[p, n] = world_R[d]
-                hits[p, n] = 1
-                score[p, n] = 1.0
-                count[p] = n + 1
-        free = in_free_view(mean[p, :known], pose[p], clear_range, view_range)
-        for j in range(known):
-            if free[j] and not seen[j]:
+        count[p] = _learn(
+            pose[p],
+            mean[p],
+            covariance[p],
+            hits[p],
+            score[p],
+            birth[p],
+            known,
+            landmark_of,
+            centre,
+            R,
+            first_birth,
+            looks,
+            seen,
+        )
+        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+        for j in near:
+            if not seen[j] and is_in_free_view(mean[p, j], pose[p], c, s, clear_range, view_range):
                 score[p, j] -= miss
-        _remove_gone(mean[p], covariance[p], hits[p], score[p], count, p, known)
+                if hits[p, j] >= hits_to_weigh:
+                    log_weight[p] -= miss_weight
+        merge_duplicates(mean[p], covariance[p], hits[p], score[p], birth[p], near, seen, merge_gate)
+        remove_gone(mean[p], covariance[p], hits[p], score[p], birth[p], count, p, near)
 
 
 @compiled
-def kalman_update(m: Float, Sigma: Float, z: Float, R: Float) -> None:
-    """m, Sigma of a resting landmark after measuring its position z with covariance R (xx, xy, yy)."""
-    a, b, d = Sigma[0] + R[0], Sigma[1] + R[1], Sigma[2] + R[2]  # S = Sigma + R, H = I
-    det = a * d - b * b
-    k00 = (Sigma[0] * d - Sigma[1] * b) / det  # K = Sigma S^-1
-    k01 = (Sigma[1] * a - Sigma[0] * b) / det
-    k10 = (Sigma[1] * d - Sigma[2] * b) / det
-    k11 = (Sigma[2] * a - Sigma[1] * b) / det
-    y0, y1 = z[0] - m[0], z[1] - m[1]
-    m[0] += k00 * y0 + k01 * y1
-    m[1] += k10 * y0 + k11 * y1
-    # K R is (I - K) Sigma for K = Sigma S^-1, and stays positive in floating point.
-    xx = k00 * R[0] + k01 * R[1]
-    xy = 0.5 * (k00 * R[1] + k01 * R[2] + k10 * R[0] + k11 * R[1])
-    yy = k10 * R[1] + k11 * R[2]
-    Sigma[0], Sigma[1], Sigma[2] = max(xx, VARIANCE_MIN), xy, max(yy, VARIANCE_MIN)
+def _learn(
+    pose: Float,
+    mean: Float,
+    covariance: Float,
+    hits: Int32,
+    score: Float32,
+    birth: Int,
+    known: int,
+    landmark_of: Int,
+    centre: Float,
+    R: Float,
+    first_birth: int,
+    looks: float,
+    seen: Bool,
+) -> int:
+    """Sharpen the landmarks of one particle that were seen, marking them, and begin new ones; returns
+    how many there are then."""
+    z, R_map = np.empty(2), np.empty(3)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    n = known
+    for d in range(centre.shape[0]):
+        z[0] = pose[0] + c * centre[d, 0] - s * centre[d, 1]
+        z[1] = pose[1] + s * centre[d, 0] + c * centre[d, 1]
+        rotated(R[d], c, s, R_map)
+        j = landmark_of[d]
+        if j >= 0:
+            seen[j] = True
+            kalman_update(mean[j], covariance[j], z, R_map, looks)
+            hits[j] += 1
+            score[j] = min(score[j] + 1.0, SCORE_MAX)
+        else:
+            mean[n], covariance[n] = z, R_map
+            hits[n], score[n] = 1, 1.0
+            birth[n] = first_birth + d
+            n += 1
+    return n
 
 
 @compiled
-def _remove_gone(
-    mean: Float, covariance: Float, hits: Int32, score: Float32, count: Int32, p: int, known: int
-) -> None:
-    for j in range(known - 1, -1, -1):
-        if score[j] <= 0.0:
-            last = count[p] - 1
-            mean[j], covariance[j] = mean[last], covariance[last]
-            hits[j], score[j] = hits[last], score[last]
-            count[p] = last
+def _predict(pose: Float, motion: Float, covariance: Float, mu: Float, P: Float) -> None:
+    """The pose after the motion, and its covariance in the frame of the map."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    mu[0] = pose[0] + c * motion[0] - s * motion[1]
+    mu[1] = pose[1] + s * motion[0] + c * motion[1]
+    mu[2] = pose[2] + motion[2]
+    C = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    P[:] = C @ covariance @ C.T
+
+
+@compiled
+def _in_reach(mean: Float, mu: Float, reach: float, room: Int) -> Int:
+    """Rows of the landmarks nearer than `reach`, ascending."""
+    n = 0
+    for j in range(mean.shape[0]):
+        dx, dy = mean[j, 0] - mu[0], mean[j, 1] - mu[1]
+        if dx * dx + dy * dy <= reach * reach:
+            room[n] = j
+            n += 1
+    return room[:n]

@@ -8,6 +8,7 @@ from pipeline.association import associate
 from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Tracking
 from pipeline.records import Bool, Detections, Int, Trees
+from pipeline.tracking.anchor import anchor
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.merge import merge_near
 from pipeline.tracking.table import SECTORS, TrackTable, seen_sides
@@ -80,6 +81,13 @@ class Tracker:
         spread = P[:, :2, :2] + dt * cross + dt**2 * P[:, 2:, 2:] + noise
         expected: Float = t.x[:, :2] + dt[:, :, 0] * t.x[:, 2:]
         return expected, spread[:, [0, 0, 1], [0, 1, 1]]
+
+    def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
+        """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.anchor`)."""
+        p = self.parameters
+        anchor(self.tracks, landmarks, covariance, T_map_base, reach, p.distance_max, 1.0 / p.misses_per_hit)
+        self.tracks = merge_near(self.tracks, np.ones(len(self.tracks), np.bool_), p.proximity_radius)
+        self.tracks = self.tracks.take(self.tracks.score > 0.0)
 
     def _update(self, rows: Int, stamp_ns: int, z: Float, R: Float) -> None:
         p, t = self.parameters, self.tracks

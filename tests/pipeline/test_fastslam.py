@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from pipeline.geometry import Pose2, wrap_angle
 from pipeline.parameters import preset
 from pipeline.slam import FastSlam
-from pipeline.slam.fastslam import SlamState, _move
-from pipeline.slam.update import VARIANCE_MIN, kalman_update
+from pipeline.slam.landmarks import VARIANCE_MIN, kalman_update
+from pipeline.slam.motion import compound, moved_poses, step_covariance
+from pipeline.slam.state import SlamState
 from tests.pipeline.strategies import ALL_FREE, FEW, LAW, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam
@@ -36,45 +37,62 @@ def seen_from(pose, world=TREES, rng=None, sigma=0.0, reach=8.0):
 # --- motion ---------------------------------------------------------------------------------------
 
 
+def moved_in(parts, step, p=FOREST):
+    """A motion of equal parts, with its covariance."""
+    motion, covariance = np.zeros(3), np.zeros((3, 3))
+    for _ in range(parts):
+        motion, covariance = compound(motion, covariance, step, step_covariance(step, p))
+    return motion, covariance
+
+
 @pytest.mark.parametrize("parts", [1, 4, 25])
 def test_the_scatter_does_not_depend_on_how_often_the_odometry_is_read(parts):
-    rng = np.random.default_rng(0)
-    pose = np.zeros((20_000, 3))
-    step = Pose2(2.0 / parts, 0.0, 0.0)
-    for _ in range(parts):
-        _move(pose, step, rng.standard_normal(pose.shape), FOREST)
-    turn = np.radians(FOREST.noise_turn_distance) * np.sqrt(2.0)
-    assert pose[:, 0].std() == pytest.approx(FOREST.noise_distance * np.sqrt(2.0), rel=0.05)
-    assert pose[:, 2].std() == pytest.approx(turn, rel=0.05)
-    assert abs(pose[:, 0].mean() - 2.0) < 2e-3
+    motion, covariance = moved_in(parts, Pose2(2.0 / parts, 0.0, 0.0))
+    turn = np.radians(FOREST.noise_turn_distance) ** 2 * 2.0
+    np.testing.assert_allclose(motion, [2.0, 0.0, 0.0], atol=1e-12)
+    assert covariance[0, 0] == pytest.approx(FOREST.noise_distance**2 * 2.0)
+    assert covariance[2, 2] == pytest.approx(turn)
 
 
 @pytest.mark.parametrize("parts", [1, 10])
 def test_the_scatter_of_a_turn_on_the_spot_grows_with_the_turn(parts):
+    _, covariance = moved_in(parts, Pose2(0.0, 0.0, 1.5 / parts))
+    assert covariance[2, 2] == pytest.approx(np.radians(FOREST.noise_turn) ** 2 * 1.5)
+    assert np.all(covariance[:2] == 0.0)
+
+
+def test_the_covariance_of_a_motion_is_the_scatter_of_drawn_motions():
     rng = np.random.default_rng(0)
-    pose = np.zeros((20_000, 3))
-    for _ in range(parts):
-        _move(pose, Pose2(0.0, 0.0, 1.5 / parts), rng.standard_normal(pose.shape), FOREST)
-    assert pose[:, 2].std() == pytest.approx(np.radians(FOREST.noise_turn) * np.sqrt(1.5), rel=0.05)
-    assert np.all(pose[:, :2] == 0.0)
+    step = Pose2(0.3, 0.05, 0.2)
+    p = FOREST.model_copy(update={"noise_turn_distance": 3.0})
+    sigma = np.sqrt(np.diag(step_covariance(step, p)))
+    drawn = np.zeros((40_000, 3))
+    for _ in range(6):
+        noisy = np.array([step.x, step.y, step.yaw]) + sigma * rng.standard_normal(drawn.shape)
+        c, s = np.cos(drawn[:, 2]), np.sin(drawn[:, 2])
+        drawn += np.stack(
+            [c * noisy[:, 0] - s * noisy[:, 1], s * noisy[:, 0] + c * noisy[:, 1], noisy[:, 2]], 1
+        )
+    motion, covariance = moved_in(6, step, p)
+    np.testing.assert_allclose(drawn.mean(axis=0), motion, atol=0.01)
+    np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.05 * covariance.max())
 
 
 @LAW
 @given(st.floats(-3, 3), st.floats(-2, 2), st.floats(-2, 2), st.floats(-1, 1))
-def test_without_noise_the_motion_is_the_composition_of_poses(yaw, x, y, turn):
-    p = FOREST.model_copy(update={"noise_distance": 0.0, "noise_turn": 0.0, "noise_turn_distance": 0.0})
-    start, motion = Pose2(1.0, -2.0, yaw), Pose2(x, y, turn)
-    pose = start.as_array()[None].copy()
-    _move(pose, motion, np.ones((1, 3)), p)
-    wanted = (start @ motion).as_array()
-    np.testing.assert_allclose(pose[0, :2], wanted[:2], atol=1e-12)
-    assert abs(float(wrap_angle(pose[0, 2] - wanted[2] + 1.0)) - 1.0) < 1e-12
+def test_the_motion_is_the_composition_of_poses(yaw, x, y, turn):
+    start, step = Pose2(1.0, -2.0, yaw), Pose2(x, y, turn)
+    motion, _ = moved_in(1, step)
+    wanted = (start @ step).as_array()
+    pose = moved_poses(start.as_array()[None], motion)[0]
+    np.testing.assert_allclose(pose[:2], wanted[:2], atol=1e-12)
+    assert abs(float(wrap_angle(pose[2] - wanted[2] + 1.0)) - 1.0) < 1e-12
 
 
 def test_standing_still_scatters_nothing():
-    pose = np.zeros((50, 3))
-    _move(pose, Pose2(), np.ones((50, 3)), FOREST)
-    assert np.all(pose == 0.0)
+    motion, covariance = moved_in(5, Pose2())
+    assert np.all(motion == 0.0)
+    assert np.all(covariance == 0.0)
 
 
 # --- landmarks ------------------------------------------------------------------------------------
@@ -98,7 +116,7 @@ def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
     wanted_m, wanted_P = update(m.copy(), _full(Sigma), z, R=_full(R), H=np.eye(2))
     precision = np.linalg.inv(np.linalg.inv(_full(Sigma)) + np.linalg.inv(_full(R)))
     told_m, told = m.copy(), Sigma.copy()
-    kalman_update(told_m, told, z, R)
+    kalman_update(told_m, told, z, R, 1e9)
     np.testing.assert_allclose(told_m, wanted_m, atol=1e-9)
     wanted = np.array([max(wanted_P[0, 0], VARIANCE_MIN), wanted_P[0, 1], max(wanted_P[1, 1], VARIANCE_MIN)])
     np.testing.assert_allclose(told, wanted, atol=1e-9)
@@ -110,7 +128,7 @@ def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
 def test_a_landmark_s_covariance_stays_positive(Sigma, R, times):
     m, P = np.zeros(2), Sigma.copy()
     for _ in range(times):
-        kalman_update(m, P, np.zeros(2), R)
+        kalman_update(m, P, np.zeros(2), R, 1e9)
     assert np.all(np.linalg.eigvalsh(_full(P)) > 0)
     assert min(P[0], P[2]) >= VARIANCE_MIN
 
@@ -158,12 +176,24 @@ def test_what_could_not_be_seen_is_not_missed(hidden):
 # --- weights --------------------------------------------------------------------------------------
 
 
-def test_particles_that_agree_with_the_trees_win():
-    slam = fresh(particles=400, resample_below=0.0, view_range=0.0, noise_distance=0.2)
+def a_step_on(method):
+    """400 particles that know the trees well, after a step of a metre with poor odometry."""
+    slam = fresh(method=method, particles=400, resample_below=0.0, view_range=0.0, noise_distance=0.2)
     for k in range(5):
         slam.process(k, Pose2(), detections(TREES), NOTHING_SEEN)
     motion = Pose2(1.0, 0.0, 0.0)
-    estimate = slam.process(5, motion, detections(motion.inverse().apply(TREES)), NOTHING_SEEN)
+    return slam.process(5, motion, detections(motion.inverse().apply(TREES)), NOTHING_SEEN)
+
+
+def test_particles_drawn_from_odometry_and_scan_all_stand_where_both_agree():
+    poor, good = a_step_on("fastslam1"), a_step_on("fastslam2")
+    assert np.hypot(good.particles[:, 0] - 1.0, good.particles[:, 1]).max() < 0.15
+    assert np.hypot(poor.particles[:, 0] - 1.0, poor.particles[:, 1]).max() > 0.3
+    assert good.n_eff > 3 * poor.n_eff
+
+
+def test_particles_that_agree_with_the_trees_win():
+    estimate = a_step_on("fastslam1")
     error = np.hypot(estimate.particles[:, 0] - 1.0, estimate.particles[:, 1])
     heavy = np.argsort(estimate.weights)[-20:]
     assert error[heavy].mean() < 0.5 * error.mean()
@@ -204,7 +234,9 @@ def test_the_estimate_is_the_weighted_mean_and_its_spread():
 
 
 def _columns(state):
-    return {f.name: getattr(state, f.name) for f in fields(SlamState) if f.name != "since_update"}
+    """What each particle has of its own."""
+    arrays = {f.name: getattr(state, f.name) for f in fields(SlamState)}
+    return {name: a for name, a in arrays.items() if isinstance(a, np.ndarray) and "motion" not in name}
 
 
 @pytest.mark.parametrize("how", ["process", "with_particles", "copy", "with_room"])
@@ -329,3 +361,30 @@ def test_no_detection_at_all_is_no_harm():
     told = [slam.process(k, Pose2(1.0), detections([]), NOTHING_SEEN) for k in range(5)]
     assert np.isfinite(told[-1].covariance).all()
     assert told[-1].landmarks.shape == (0, 2)
+
+
+def test_two_landmarks_that_are_one_tree_become_one():
+    """A tree was begun twice; both lie within each other's uncertainty and only one is seen now."""
+    slam = fresh(particles=3, view_range=0.0, merge_gate=1.0)
+    slam.process(0, Pose2(), detections([[4.0, 1.0], [4.04, 1.0]], sigma=0.05), NOTHING_SEEN)
+    assert slam.state.count.tolist() == [2, 2, 2]
+    slam.process(1, Pose2(), detections([[4.0, 1.0]], sigma=0.05), NOTHING_SEEN)
+    assert slam.state.count.tolist() == [1, 1, 1]
+    assert slam.state.birth[:, 0].tolist() == [0, 0, 0], "the older one stays"
+
+
+def test_two_trees_seen_in_one_scan_stay_two():
+    slam = fresh(particles=3, view_range=0.0, merge_gate=5.0)
+    for k in range(9):
+        slam.process(k, Pose2(), detections([[4.0, 1.0], [4.1, 1.0]]), NOTHING_SEEN)
+    assert slam.state.count.tolist() == [2, 2, 2]
+
+
+def test_the_path_goes_back_through_the_particles_that_were_chosen():
+    slam = fresh(particles=30)
+    told = [e for e, _, _ in _drive(slam, scans=120)]
+    path = slam.path()
+    assert path.shape == (120, 3)
+    np.testing.assert_allclose(path[-1], told[-1].particles[slam.state.best], atol=1e-5)
+    for row, estimate in zip(path, told, strict=True):
+        assert np.abs(estimate.particles - row).max(axis=1).min() < 1e-5, "one of that scan's particles"

@@ -78,6 +78,7 @@ def _belief(rng, particles, room):
         rng.normal(size=(particles, room, 3)),
         rng.integers(1, 9, (particles, room)).astype(np.int32),
         rng.normal(size=(particles, room)).astype(np.float32),
+        rng.integers(0, 99, (particles, room)),
         rng.integers(0, room + 1, particles).astype(np.int32),
     )
 

@@ -1,0 +1,80 @@
+"""Where the particles of today were before: the path that one of them has behind it.
+
+Each scan leaves the poses of all particles and, where it resampled, who came from whom. Walking
+back from a particle gives its own path, which the scans after a loop have chosen, while the means of
+the past only knew the scans up to then. As soon as the past is long enough it is settled: the rows of
+one particle are kept of it, so that memory stays bounded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry import Float
+from pipeline.records import Float32, Int
+
+RECENT_POSES = 300_000  # of all particles that are kept: the time in which a loop can still choose
+BLOCK = 512  # scans that are settled at once
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Generation:
+    """One scan: `pose`, float32, shape (P, 3), of its particles, and `ancestors`, int64, shape (Q,):
+    which of them each particle after it comes from; None where each comes from itself."""
+
+    pose: Float32
+    ancestors: Int | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Genealogy:
+    """Immutable, so that it may be kept with every state: growing it makes another.
+
+    Attributes:
+        settled: Blocks of float64, shape (BLOCK, 3): x, y [m], yaw [rad], the far past.
+        recent: The generations since then, oldest first.
+    """
+
+    settled: tuple[Float, ...] = ()
+    recent: tuple[Generation, ...] = ()
+
+    def __len__(self) -> int:
+        return BLOCK * len(self.settled) + len(self.recent)
+
+    def with_scan(self, pose: Float, ancestors: Int | None, leaf: int) -> Genealogy:
+        """One scan more.
+
+        Args:
+            pose: shape (P, 3), before the scan resampled.
+            ancestors: Who comes from whom after it, shape (Q,).
+            leaf: The best particle after it; its path is taken where the past has to be settled.
+        """
+        recent = (*self.recent, Generation(pose.astype(np.float32), ancestors))
+        if len(recent) < BLOCK + max(BLOCK, RECENT_POSES // len(pose)):
+            return Genealogy(self.settled, recent)
+        rows = _walk(recent, leaf)[:BLOCK]
+        return Genealogy((*self.settled, rows), recent[BLOCK:])
+
+    def redrawn(self, rows: Int) -> Genealogy:
+        """The same past of particles drawn anew: each one comes from the particle in its row."""
+        if not self.recent:
+            return self
+        last = self.recent[-1]
+        ancestors = rows if last.ancestors is None else last.ancestors[rows]
+        return Genealogy(self.settled, (*self.recent[:-1], Generation(last.pose, ancestors)))
+
+    def path(self, leaf: int) -> Float:
+        """x, y [m], yaw [rad] of every scan as the particle `leaf` of the last one has it behind it,
+        shape (N, 3)."""
+        return np.concatenate([*self.settled, _walk(self.recent, leaf)])
+
+
+def _walk(generations: tuple[Generation, ...], leaf: int) -> Float:
+    rows = np.empty((len(generations), 3))
+    for i in range(len(generations) - 1, -1, -1):
+        ancestors = generations[i].ancestors
+        leaf = leaf if ancestors is None else int(ancestors[leaf])
+        rows[i] = generations[i].pose[leaf]
+    return rows

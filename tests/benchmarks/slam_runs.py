@@ -1,0 +1,121 @@
+"""Runs for SLAM alone: what was detected in each scan is made once and kept, so that ten seeds cost ten
+runs of SLAM and tracking and not ten of the whole pipeline. The order of calls is the mapper's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import filters, ground
+from pipeline.acquisition import acquire
+from pipeline.clustering import cluster
+from pipeline.detection import detections, judge
+from pipeline.evaluation import path_error
+from pipeline.geometry import Pose2
+from pipeline.parameters import Parameters, preset
+from pipeline.records import Detections, Float, Path, Trees, Truth
+from pipeline.shape import describe
+from pipeline.slam import FastSlam
+from pipeline.sources import open_source
+from pipeline.steps import steps
+from pipeline.tracking import Tracker
+from pipeline.visibility import clear_range
+from tests.benchmarks.table import Cell
+
+DUPLICATE = 1.0  # m; two trees of the map nearer than this in a stand of wider spacing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """One scan as SLAM and tracking take it."""
+
+    stamp_ns: int
+    odometry: Pose2
+    detections: Detections
+    clear: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mapped:
+    """What came of a run: error of the path without and with SLAM [m], trees, and pairs of them that
+    stand nearer than a metre."""
+
+    seed: int
+    rms: float
+    median: float
+    largest: float
+    trees: int
+    duplicates: int
+    path: Path
+    tree_table: Trees
+
+    def row(self) -> tuple[Cell, ...]:
+        """As in a table."""
+        return (self.seed, self.rms, self.median, self.largest, self.trees, self.duplicates)
+
+
+COLUMNS = ("seed", "RMS [m]", "median [m]", "largest [m]", "trees", "duplicates")
+
+
+def seen_in(uri: str, parameters: Parameters | None = None) -> tuple[list[Seen], Truth, Parameters]:
+    """All scans of a source through the stages before SLAM."""
+    source = open_source(uri)
+    known = source.description
+    p = preset(known.preset) if parameters is None else parameters
+    rows = []
+    for step in steps(source.records()):
+        raw, offset = acquire(step, known.T_base_lidar, p.acquisition)
+        band = filters.pass_through(raw, p.filters)
+        if p.ground.method != "none":
+            height = ground.height_above(band, ground.find_terrain(raw, p.ground))
+            band = ground.in_band(band, height, p.ground)
+        filtered = filters.voxel_grid(band, p.filters)
+        described = describe(filtered, cluster(filtered, known.sensor, p.clustering), known.sensor, p.shape)
+        found = detections(judge(described, p.detection), offset, p.detection)
+        odometry = step.T_odom_base or Pose2()
+        rows.append(Seen(step.scan.stamp_ns, odometry, found, clear_range(raw, filtered, offset)))
+    return rows, source.truth() or Truth(), p
+
+
+def mapped(rows: Sequence[Seen], truth: Truth, parameters: Parameters, seed: int) -> Mapped:
+    """SLAM and tracking over a run."""
+    slam, tracker = FastSlam(parameters.slam, seed), Tracker(parameters.tracking)
+    reach = parameters.slam.view_range
+    before: Pose2 | None = None
+    sigma = np.zeros(len(rows))
+    for k, seen in enumerate(rows):
+        motion = Pose2() if before is None else before.inverse() @ seen.odometry
+        before = seen.odometry
+        at = slam.process(k, motion, seen.detections, seen.clear)
+        tracker.process(seen.stamp_ns, at.T_map_base, at.covariance, seen.detections, seen.clear, reach)
+        tracker.anchor(*slam.landmarks(), at.T_map_base, reach)
+        sigma[k] = np.sqrt(0.5 * (at.covariance[0, 0] + at.covariance[1, 1]))
+    poses = slam.path()
+    path = Path(np.array([s.stamp_ns for s in rows]), poses[:, 0], poses[:, 1], poses[:, 2], sigma)
+    error = path_error(path, truth.path, align=True) if truth.path else None
+    trees = tracker.trees()
+    return Mapped(
+        seed=seed,
+        rms=error.rms if error else float("nan"),
+        median=error.median if error else float("nan"),
+        largest=error.largest if error else float("nan"),
+        trees=int(np.count_nonzero(trees.confirmed)),
+        duplicates=duplicates(trees.position[trees.confirmed]),
+        path=path,
+        tree_table=trees,
+    )
+
+
+def duplicates(position: Float) -> int:
+    """Pairs of trees nearer than a metre, positions of shape (T, 2) [m]."""
+    from scipy.spatial import cKDTree
+
+    return len(cKDTree(position).query_pairs(DUPLICATE)) if len(position) else 0
+
+
+def summary(runs: Sequence[Mapped]) -> str:
+    """Median and worst of the RMS over the seeds."""
+    rms = [run.rms for run in runs]
+    return f"RMS over {len(rms)} seeds: median {np.median(rms):.3f} m, worst {max(rms):.3f} m"

@@ -1,0 +1,47 @@
+"""Trees stand where the best particle has them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.geometry import Pose2
+from pipeline.tracking.anchor import anchor
+from pipeline.tracking.table import TrackTable
+
+COVARIANCE = np.array([[0.01, 0.0, 0.01]])
+
+
+def tracks(rows):
+    table = TrackTable.empty(len(rows))
+    table.x[:, :2] = rows
+    table.P[:, :2, :2] = 0.01 * np.eye(2)
+    table.score[:] = 5.0
+    return table
+
+
+def held(table, landmarks, reach=20.0):
+    landmarks = np.asarray(landmarks, np.float64).reshape(-1, 2)
+    anchor(table, landmarks, np.repeat(COVARIANCE, len(landmarks), 0), Pose2(), reach, 2.0, 1.0)
+    return table
+
+
+def test_a_tree_that_disagrees_with_its_landmark_is_moved_there():
+    table = held(tracks([[5.0, 0.0], [0.0, 5.0]]), [[6.0, 0.0], [0.1, 5.0]])
+    np.testing.assert_array_equal(table.x[:, :2], [[6.0, 0.0], [0.0, 5.0]])
+    np.testing.assert_array_equal(table.score, 5.0)
+
+
+def test_a_tree_that_slam_does_not_know_is_missed():
+    table = held(tracks([[5.0, 0.0], [5.5, 0.0]]), [[5.0, 0.0]])
+    np.testing.assert_array_equal(table.score, [5.0, 4.0])
+
+
+def test_trees_out_of_reach_are_left_alone():
+    table = held(tracks([[50.0, 0.0]]), [[51.0, 0.0]])
+    np.testing.assert_array_equal(table.x[0, :2], [50.0, 0.0])
+    assert table.score[0] == 5.0
+
+
+def test_no_tree_and_no_landmark_are_no_harm():
+    held(tracks(np.zeros((0, 2))), [[1.0, 1.0]])
+    assert held(tracks([[1.0, 1.0]]), []).score[0] == 4.0
