@@ -15,6 +15,7 @@ from pipeline.records import Float32
 SECTORS = 72
 BIN = 0.5  # m
 NEAR = 8.0  # m; here the sensor surely sees the ground it stands on
+GHOST = 0.4  # m; ground returns of one cell lie nearer to one another than this
 TOLERANCE = 0.15  # m; grass and noise over the steepest slope
 
 
@@ -40,8 +41,9 @@ def find_terrain(points: Float32, parameters: Ground) -> Terrain:
         parameters: Of this stage.
     """
     lowest = _lowest(points, int(_reach(points) / BIN) + 1)
-    start = _start_height(lowest)
-    return Terrain(*_walk_outwards(lowest, start, float(np.tan(np.radians(parameters.slope_max)))))
+    slope = float(np.tan(np.radians(parameters.slope_max)))
+    _forget_what_overhangs(lowest, slope)
+    return Terrain(*_walk_outwards(lowest, _start_height(lowest), slope))
 
 
 def height_above(points: Float32, terrain: Terrain) -> Float32:
@@ -73,13 +75,50 @@ def _reach(points: Float32) -> float:
 
 @compiled
 def _lowest(points: Float32, bins: int) -> Float:
+    """The lowest return of each cell; one that lies alone far below the next is an echo's ghost."""
     lowest = np.full((SECTORS, bins), np.inf)
+    second = np.full((SECTORS, bins), np.inf)
     for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        sector = direction_bin(x, y, SECTORS)
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        s = direction_bin(x, y, SECTORS)
         k = min(int(np.sqrt(x * x + y * y) / BIN), bins - 1)
-        lowest[sector, k] = min(lowest[sector, k], points[i, 2])
+        if z < lowest[s, k]:
+            second[s, k] = lowest[s, k]
+            lowest[s, k] = z
+        elif z < second[s, k]:
+            second[s, k] = z
+    for s in range(SECTORS):
+        for k in range(bins):
+            if lowest[s, k] + GHOST < second[s, k] < np.inf:
+                lowest[s, k] = second[s, k]
     return lowest
+
+
+@compiled
+def _forget_what_overhangs(lowest: Float, slope: float) -> None:
+    """Take away cells that rise steeper than `slope` above a lower cell near by: hedges and crowns.
+
+    Two sweeps there and back carry each cell's cone of the steepest slope over the whole grid.
+    """
+    sectors, bins = lowest.shape
+    cone = lowest.copy()
+    rise = slope * BIN
+    for _ in range(2):
+        for s in range(sectors):
+            for k in range(1, bins):
+                cone[s, k] = min(cone[s, k], cone[s, k - 1] + rise)
+            for k in range(bins - 2, -1, -1):
+                cone[s, k] = min(cone[s, k], cone[s, k + 1] + rise)
+        for k in range(bins):
+            turn = slope * BIN * (k + 0.5) * (2.0 * np.pi / sectors)
+            for s in range(2 * sectors):
+                cone[s % sectors, k] = min(cone[s % sectors, k], cone[(s - 1) % sectors, k] + turn)
+            for s in range(2 * sectors, 0, -1):
+                cone[s % sectors, k] = min(cone[s % sectors, k], cone[(s + 1) % sectors, k] + turn)
+    for s in range(sectors):
+        for k in range(bins):
+            if lowest[s, k] > cone[s, k] + TOLERANCE:
+                lowest[s, k] = np.inf
 
 
 @compiled
@@ -106,16 +145,20 @@ def _walk_outwards(
 
 
 @compiled
+def ground_at(height: Float, x: float, y: float) -> float:
+    """Height of the ground at a place [m] of the level sensor frame; `height` is a Terrain's."""
+    sector, position = direction_bin(x, y, SECTORS), np.sqrt(x * x + y * y) / BIN
+    # A cell's lowest return lies anywhere in it; interpolating between the centres of two
+    # cells keeps a slope from becoming a staircase.
+    bins = height.shape[1]
+    k = min(max(int(position - 0.5), 0), bins - 1)
+    f = min(max(position - 0.5 - k, 0.0), 1.0)
+    return float((1.0 - f) * height[sector, k] + f * height[sector, min(k + 1, bins - 1)])
+
+
+@compiled
 def _height_above(points: Float32, height: Float) -> Float32:
     above = np.empty(points.shape[0], np.float32)
-    bins = height.shape[1]
     for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        sector, position = direction_bin(x, y, SECTORS), np.sqrt(x * x + y * y) / BIN
-        # A cell's lowest return lies anywhere in it; interpolating between the centres of two
-        # cells keeps a slope from becoming a staircase.
-        k = min(max(int(position - 0.5), 0), bins - 1)
-        f = min(max(position - 0.5 - k, 0.0), 1.0)
-        ground = (1.0 - f) * height[sector, k] + f * height[sector, min(k + 1, bins - 1)]
-        above[i] = points[i, 2] - ground
+        above[i] = points[i, 2] - ground_at(height, points[i, 0], points[i, 1])
     return above
