@@ -1,64 +1,52 @@
-"""Gathering: what all scans together say of each place where a stem may stand."""
+"""Gathering: voxels of all scans, the columns in them, and what each column is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.compiled import compiled
-from pipeline.direction import direction_bin
 from pipeline.gathering.columns import MARGIN, find_columns, profile, straighten
 from pipeline.gathering.features import COUNT, features
+from pipeline.gathering.forest import CLASSES, Forest, standard_forest, vote
 from pipeline.gathering.memory import SLICE, SLICES, TILE, Memory
+from pipeline.gathering.sight import look
 from pipeline.geometry import Float, Pose2
-from pipeline.ground import ground_at
-from pipeline.records import Float32, Int
-from pipeline.visibility import BEHIND, BINS
+from pipeline.parameters.stages import Gathering as GatheringParameters
+from pipeline.records import Bool, Columns, Float32, Int, Verdict
 
 GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
-NEAR = 0.6  # m; what is seen so near to a column is the column
 SAME = 0.35  # m; a column found again so near is the one of before
 FOLD = 100  # scans after which a snapshot no longer repeats them one by one
+GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Columns:
-    """The columns that were found, as columns of a table of length K.
+class GatheringState:
+    """What is known between two scans: a memory that nobody changes any more, the scans since, and the
+    columns. It shares all of that with the gathering, so that taking it costs nothing."""
 
-    Attributes:
-        tile: int64, shape (K, 2): in which tile the foot stands.
-        axis: shape (K, 5): see `find_columns`.
-        viewed: How high above the ground any scan looked there [m].
-        present, absent: In how many scans something, or nothing, stood there in free view.
-        figures: shape (K, COUNT): see `features`.
-    """
-
-    tile: Int
-    axis: Float
-    viewed: Float
-    present: Float
-    absent: Float
-    figures: Float
-
-    @classmethod
-    def empty(cls, rows: int = 0) -> Columns:
-        """Rows of zeros."""
-        zero = np.zeros(rows)
-        tile, axis = np.zeros((rows, 2), np.int64), np.zeros((rows, 5))
-        return cls(tile, axis, zero, zero.copy(), zero.copy(), np.zeros((rows, COUNT)))
-
-    def __len__(self) -> int:
-        return len(self.tile)
+    base: Memory
+    since: tuple[tuple[Float32, int, int], ...]
+    columns: Columns
 
 
 class Gathering:
-    """All that is remembered of places, and the columns in it."""
+    """All that is remembered of places, and the columns in it.
 
-    def __init__(self, most: int, range_max: float) -> None:
+    Args:
+        parameters: Of this stage.
+        forest: Votes on the columns; None takes the one that comes with the package.
+    """
+
+    def __init__(self, parameters: GatheringParameters, forest: Forest | None = None) -> None:
+        self.parameters = parameters
+        self._forest = forest
         self.memory = Memory.empty()
-        self.columns = Columns.empty()
-        self.most, self.range_max = most, range_max
+        self.columns = _rows(np.zeros((0, 5)), np.zeros((0, 2), np.int64))
+        self._base = self.memory.copy()
+        self._since: list[tuple[Float32, int, int]] = []
 
     def add(
         self,
@@ -70,8 +58,8 @@ class Gathering:
         clear_range: Float,
         steepest: Float,
         terrain: Float,
-    ) -> Int:
-        """Take one scan; returns the rows of `columns` that were judged anew.
+    ) -> None:
+        """Take one scan.
 
         Args:
             points: Level sensor frame, float32, shape (N, 3) [m]; height: above the ground, (N,) [m].
@@ -81,23 +69,44 @@ class Gathering:
             steepest: Tangent of the steepest elevation of a return by direction, shape (BINS,).
             terrain: The ground under this scan, as `Terrain.height`.
         """
-        pose = T_map_base.as_array()
-        self.memory.add(_to_map(points, height, pose, sensor_offset, self.range_max), scan, self.most)
-        tiles = self.memory.judge_anew(GROWN)
+        p, pose = self.parameters, T_map_base.as_array()
+        here = _to_map(points, height, pose, sensor_offset, p.range_max)
+        tiles = self._remember(here, scan, 1 << p.voxels_log2)
         profiles = self._find_again(tiles)
         c = self.columns
-        here = len(c) - len(profiles)
-        _look(c.axis, c.viewed, c.present, c.absent, pose, clear_range, steepest, sensor_offset, terrain, self.range_max)
-        for k, rows in enumerate(profiles):
-            row = here + k
-            c.figures[row] = features(c.axis[row], rows, c.viewed[row], c.present[row], c.absent[row])
-        return np.arange(here, len(c))
+        first = len(c.verdict) - len(profiles)
+        look(
+            c.axis, c.viewed, c.present, c.absent, pose, clear_range, steepest, sensor_offset, terrain, p.range_max
+        )  # fmt: skip
+        for k, rows in enumerate(profiles, first):
+            c.figures[k] = features(c.axis[k], rows, c.viewed[k], c.present[k], c.absent[k])
+        self._judge(first)
+
+    def snapshot(self) -> GatheringState:
+        """All state; parameters are not part of it."""
+        return GatheringState(self._base, tuple(self._since), self.columns)
+
+    def restore(self, state: GatheringState) -> None:
+        """Go back to a snapshot; the state itself is left untouched."""
+        self._base, self._since = state.base, list(state.since)
+        self.memory = state.base.copy()
+        for points, scan, most in state.since:
+            self.memory.add(points, scan, most)
+            self.memory.judge_anew(GROWN)
+        self.columns = state.columns
+
+    def _remember(self, points: Float32, scan: int, most: int) -> Int:
+        if len(self._since) >= FOLD:
+            self._base, self._since = self.memory.copy(), []
+        self._since.append((points, scan, most))
+        self.memory.add(points, scan, most)
+        return self.memory.judge_anew(GROWN)
 
     def _find_again(self, tiles: Int) -> list[Float]:
-        """Find the columns of tiles anew, at the end of the table; returns their profiles."""
+        """Find the columns of tiles anew, at the end of a new table; returns their profiles."""
         old = self.columns
-        replaced = _among(old.tile, tiles)
-        axes, homes, profiles = [old.axis[~replaced]], [old.tile[~replaced]], []
+        kept = ~_among(old.tile, tiles)
+        axes, homes, profiles = [old.axis[kept]], [old.tile[kept]], []
         for tile in tiles:
             mean, returns = self.memory.around(tile, MARGIN)
             found = find_columns(mean, returns, tile * TILE, TILE)
@@ -106,28 +115,52 @@ class Gathering:
             axes.append(found)
             homes.append(np.broadcast_to(tile, (len(found), 2)))
             profiles += [profile(axis, mean, returns) for axis in found]
-        axis, home = np.concatenate(axes), np.concatenate(homes)
-        self.columns = fresh = _with_axes(axis, home)
-        kept = len(axes[0])
-        for f in ("viewed", "present", "absent", "figures"):
-            getattr(fresh, f)[:kept] = getattr(old, f)[~replaced]
-        _inherit(old.axis, old.viewed, old.present, old.absent, fresh.axis, fresh.viewed, fresh.present, fresh.absent, kept)
+        fresh = _rows(np.concatenate(axes), np.concatenate(homes))
+        n = len(axes[0])
+        for name in ("viewed", "present", "absent", "figures", "share", "verdict"):
+            getattr(fresh, name)[:n] = getattr(old, name)[kept]
+        _inherit(old.axis, old.viewed, old.present, old.absent, fresh.axis, fresh.viewed, fresh.present, fresh.absent, n)  # fmt: skip
+        self.columns = fresh
         return profiles
 
+    def _judge(self, first: int) -> None:
+        """Give the columns from a row on their verdict; who walked away is told at any time."""
+        c = self.columns
+        c.share[first:] = vote(c.figures[first:], self._forest or standard_forest())
+        kind = np.array(CLASSES, np.int32)
+        verdict = kind[c.share.argmax(axis=1)] if len(c.share) else np.zeros(0, np.int32)
+        tree = c.share[:, 0] >= self.parameters.tree_share
+        verdict[~tree & (verdict == Verdict.TREE)] = Verdict.OTHER
+        verdict[tree] = Verdict.TREE
+        gone = (c.absent >= GONE_SCANS) & (c.absent > GONE * (c.present + c.absent))
+        verdict[gone] = Verdict.MOVING
+        self.columns = replace(c, verdict=verdict.astype(np.int32))
 
-def _with_axes(axis: Float, tile: Int) -> Columns:
-    zero = np.zeros(len(axis))
-    return Columns(tile, axis, zero, zero.copy(), zero.copy(), np.zeros((len(axis), COUNT)))
+
+def _rows(axis: Float, tile: Int) -> Columns:
+    n = len(axis)
+    zero = np.zeros(n)
+    return Columns(
+        tile=tile,
+        axis=axis,
+        viewed=zero,
+        present=zero.copy(),
+        absent=zero.copy(),
+        figures=np.zeros((n, COUNT)),
+        share=np.zeros((n, len(CLASSES))),
+        verdict=np.full(n, Verdict.OTHER, np.int32),
+    )
 
 
-def _inside(found: Float, tile: Int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def _inside(found: Float, tile: Int) -> Bool:
     foot = found[:, :2]
-    return np.all((foot >= tile * TILE) & (foot < (tile + 1) * TILE), axis=1)
+    inside: Bool = np.all((foot >= tile * TILE) & (foot < (tile + 1) * TILE), axis=1)
+    return inside
 
 
-def _among(home: Int, tiles: Int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    key = (home[:, 0] << 32) + home[:, 1]
-    return np.isin(key, (tiles[:, 0] << 32) + tiles[:, 1])
+def _among(home: Int, tiles: Int) -> Bool:
+    there: Bool = np.isin((home[:, 0] << 32) + home[:, 1], (tiles[:, 0] << 32) + tiles[:, 1])
+    return there
 
 
 @compiled
@@ -165,54 +198,3 @@ def _inherit(
             if dx * dx + dy * dy < best:
                 best = dx * dx + dy * dy
                 viewed[k], present[k], absent[k] = old_viewed[o], old_present[o], old_absent[o]
-
-
-@compiled
-def _look(
-    axis: Float,
-    viewed: Float,
-    present: Float,
-    absent: Float,
-    pose: Float,
-    clear_range: Float,
-    steepest: Float,
-    offset: Float,
-    terrain: Float,
-    range_max: float,
-) -> None:
-    """Count for each column in view whether something stood there, and how high the scan looked."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    for k in range(axis.shape[0]):
-        dx, dy = axis[k, 0] - pose[0], axis[k, 1] - pose[1]
-        reach = np.sqrt(dx * dx + dy * dy)
-        if reach > range_max:
-            continue
-        x, y = c * dx + s * dy, c * dy - s * dx
-        b = direction_bin(x, y, BINS)
-        x, y = x - offset[0], y - offset[1]
-        up = np.sqrt(x * x + y * y) * steepest[b] - ground_at(terrain, x, y)
-        viewed[k] = max(viewed[k], min(up, SLICES * SLICE))
-        if clear_range[b] > reach + BEHIND:
-            absent[k] += 1.0
-        elif abs(clear_range[b] - reach) < NEAR:
-            present[k] += 1.0
-
-
-@compiled
-def steepest_by_direction(points: Float32, offset: Float, all_around: bool) -> Float:
-    """Tangent of the steepest elevation seen in each direction of the base frame, shape (BINS,).
-
-    Args:
-        points: Level sensor frame, shape (N, 3) [m]; offset: the sensor in the base frame, shape (3,).
-        all_around: Whether the sensor looks equally high in all directions, so that one tells for all.
-    """
-    steepest = np.full(BINS, -1.0)
-    for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        rho = np.sqrt(x * x + y * y)
-        if rho > 1.0:
-            b = direction_bin(x + offset[0], y + offset[1], BINS)
-            steepest[b] = max(steepest[b], points[i, 2] / rho)
-    if all_around:
-        steepest[:] = steepest.max()
-    return steepest

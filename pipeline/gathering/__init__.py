@@ -1,0 +1,6 @@
+"""Gathering: the second level of evidence, what all scans together say of each place."""
+
+from pipeline.gathering.gathering import Gathering, GatheringState
+from pipeline.gathering.sight import steepest_by_direction
+
+__all__ = ["Gathering", "GatheringState", "steepest_by_direction"]
