@@ -16,11 +16,15 @@ from app.live_payload import map_payload, truth_payload
 from app.messages import Advance, Open, Play, SetParameters, Status
 from app.parameter_state import ParameterState
 from app.scores import Scores
+from app.throttle import Throttle
 from app.worker_mailbox import joined
 from app.worker_messages import FromWorker, Opened, Report, Shown, ToWorker
 from pipeline.parameters import Parameters
 from pipeline.parameters.model import Value
 from pipeline.records import Frame, Path, TruthTrees
+
+# A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
+_SCENE_PAUSE_S = 0.09
 
 
 class SceneLike(Protocol):
@@ -76,6 +80,7 @@ class Dashboard:
         self._notice = ""
         self._restarts = 0
         self._go = False
+        self._show_scene = Throttle(lambda f, xy: self.scene.show(f, xy), pause_s=_SCENE_PAUSE_S)
 
     @property
     def start_ns(self) -> int:
@@ -97,6 +102,7 @@ class Dashboard:
     async def close(self) -> None:
         """End the worker and the scene."""
         self.scores.close()
+        self._show_scene.cancel()
         await self.worker.close()
         self.scene.close()
 
@@ -175,6 +181,7 @@ class Dashboard:
         self.truth = opened.truth
         self.live.forget_map()
         self.scores.forget()
+        self._show_scene.cancel()
         self.scene.clear()
         self.scene.show_truth(opened.truth)
         self.live.tell("truth", truth_payload(opened.truth))
@@ -193,9 +200,9 @@ class Dashboard:
         self.path = joined(self.path, shown.path_start, shown.path)
         self.shown = shown
         self.path_xy = np.column_stack([self.path.x, self.path.y])
-        self.scene.show(shown.frame, self.path_xy)
         self.live.show(map_payload(shown), self.path_xy)
         self._score()
+        self._show_scene(shown.frame, self.path_xy)
 
     def _score(self) -> None:
         if self.shown is not None and self.truth is not None:

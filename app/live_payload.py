@@ -41,12 +41,11 @@ def trees_payload(frame: Frame, start_ns: int) -> list[dict[str, Any]]:
     """The confirmed trees, one dict each; what is not known is None."""
     trees = frame.trees
     keep = np.flatnonzero(trees.confirmed)
-    ellipses = [ellipse(trees.covariance[k]) for k in keep]
     columns: dict[str, Sequence[Any]] = {
         "number": trees.number[keep].tolist(),
         "x": _rounded(trees.position[keep, 0]),
         "y": _rounded(trees.position[keep, 1]),
-        "ellipse": ellipses,
+        "ellipse": ellipses(trees.covariance[keep]),
         "dbh_cm": _finite(100.0 * trees.dbh[keep]),
         "sigma_dbh_cm": _finite(100.0 * trees.dbh_sigma[keep]),
         "eccentricity": _finite(trees.eccentricity[keep]),
@@ -58,12 +57,13 @@ def trees_payload(frame: Frame, start_ns: int) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def ellipse(covariance: Float) -> list[float]:
-    """Half axes [m] and direction of the longer one [rad] of the 1-sigma ellipse of a covariance."""
+def ellipses(covariance: Float) -> list[list[float]]:
+    """Half axes [m] and direction of the longer one [rad] of the 1-sigma ellipses of (T, 2, 2)."""
     values, vectors = np.linalg.eigh(covariance)
-    minor, major = np.sqrt(np.maximum(values, 0.0))
-    angle = math.atan2(vectors[1, 1], vectors[0, 1])
-    return [round(float(v), _DIGITS) for v in (major, minor, angle)]
+    minor, major = np.sqrt(np.maximum(values, 0.0)).T
+    angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    rows: list[list[float]] = np.round(np.stack([major, minor, angle], axis=1), _DIGITS).tolist()
+    return rows
 
 
 def verdict_counts(verdicts: NDArray[np.int32]) -> dict[str, int]:

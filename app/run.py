@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from app.cursor import Cursor, Synchroniser
 from app.history import ParameterHistory, Snapshots
 from app.stopwatch import Stopwatch
+from pipeline.errors import SourceError
 from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path, Step
 from pipeline.sources.base import Source
@@ -108,6 +109,21 @@ class Run:
         self._step, self.standing = step, step.index
         return self.frame
 
+    def prepare(self) -> None:
+        """Map the first scan and forget it again: what is compiled at its first use is ready then.
+
+        Raises:
+            SourceError: There is no scan, or it cannot be read.
+        """
+        step = self._cursor.peek()
+        if step is None:
+            uri = self.source.description.uri
+            raise SourceError("there is no scan in it", where=uri, remedy="Choose another source")
+        before = self._mapper.snapshot()
+        self._mapper.process(step)
+        self._mapper.restore(before)
+        self.stopwatch.clear()
+
     def index_at(self, stamp_ns: int) -> int | None:
         """The scan shown at a time; None when it was not read yet."""
         return self._cursor.index_at(stamp_ns)
@@ -116,6 +132,11 @@ class Run:
     def known(self) -> int:
         """How many scans were read so far."""
         return self._cursor.known
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the mapper is where `standing` says, and can map that scan again."""
+        return self._step is not None and not self._broken
 
     def approach(self, index: int) -> None:
         """Stand so that mapping on leads to a scan by the shortest way; `standing` is before it
@@ -128,10 +149,12 @@ class Run:
         self._mapper.restore(state)
         self.standing, self._step, self._broken = scans - 1, None, False
 
-    def use(self, parameters: Parameters, index: int) -> None:
-        """From a scan on, map with other parameters."""
-        if self._history.set_from(index, parameters):
+    def use(self, parameters: Parameters, index: int) -> bool:
+        """From a scan on, map with other parameters. Returns whether that changes anything."""
+        changes = self._history.set_from(index, parameters)
+        if changes:
             self._snapshots.forget_after(index)
+        return changes
 
     def close(self) -> None:
         """Let go of the source."""

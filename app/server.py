@@ -25,6 +25,8 @@ from pipeline.errors import ParameterError, StemmapError
 
 _log = logging.getLogger(__name__)
 
+ROUTERS = tuple(module.router for module in (page, run, parameters, results, sockets))
+
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
 MakeWorker = Callable[[Dashboard], WorkerLike]
 
@@ -33,7 +35,6 @@ _HEADERS = (
     (b"referrer-policy", b"no-referrer"),
     (b"x-frame-options", b"SAMEORIGIN"),
     (b"cross-origin-resource-policy", b"same-origin"),
-    (b"cross-origin-opener-policy", b"same-origin"),
 )
 _POLICY = (b"content-security-policy", b"default-src 'none'; frame-ancestors 'self'")
 
@@ -88,8 +89,8 @@ def build(
         redirect_slashes=False,
     )
     app.state.dashboard, app.state.settings = dashboard, settings
-    for module in (page, run, parameters, results, sockets):
-        app.include_router(module.router)
+    for router in ROUTERS:
+        app.include_router(router)
     _answer_errors(app)
     return app
 

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator
 
 import uvicorn
+from starlette.types import ASGIApp
 
 from app.messages import Open
 from app.parameter_state import ParameterState
@@ -36,7 +37,16 @@ def serve(settings: Settings, *, source: Open, parameter_state: ParameterState, 
     port = listening.getsockname()[1]
     token = settings.token or new_token()
     app = build(settings, port=port, token=token, source=source, parameter_state=parameter_state)
-    config = uvicorn.Config(
+    link = f"http://{_name(settings.host)}:{port}/?token={token}"
+    server = _Server(uvicorn_config(app, settings), settings, link, open_browser=open_browser)
+    with contextlib.closing(listening):
+        asyncio.run(server.serve(sockets=[listening]))
+    return 0 if server.started else 1
+
+
+def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
+    """How the application is served."""
+    return uvicorn.Config(
         app,
         ws="websockets-sansio",
         ws_max_size=settings.message_limit,
@@ -47,11 +57,6 @@ def serve(settings: Settings, *, source: Open, parameter_state: ParameterState, 
         access_log=False,  # the token is in the first address
         lifespan="on",
     )
-    link = f"http://{_name(settings.host)}:{port}/?token={token}"
-    server = _Server(config, settings, link, open_browser=open_browser)
-    with contextlib.closing(listening):
-        asyncio.run(server.serve(sockets=[listening]))
-    return 0 if server.started else 1
 
 
 def bind(settings: Settings) -> socket.socket:

@@ -59,6 +59,7 @@ class Session:
         self._detail = ""
         self._target_index: int | None = None
         self._target_ns: int | None = None
+        self._under_way = False
         self._warnings: dict[str, None] = {}
 
     @property
@@ -108,19 +109,32 @@ class Session:
         self._warn(source.description.warnings)
         return _opened(self._run)
 
+    def prepare(self) -> None:
+        """Have all ready for the first scan, which can take a minute the first time on a machine.
+
+        Raises:
+            SourceError: There is no scan.
+        """
+        if self._run is not None:
+            self._run.prepare()
+
     def work(self) -> Frame | None:
         """Map one scan if one is wanted. None when there was none: the run is at its end, or the
         sought scan was already reached."""
         run = self._run
-        if run is None or self.pace == "idle" or self._arrived(run):
+        if run is None or self.pace == "idle":
             return None
+        if self._seeking and not self._under_way:
+            self._set_out(run)
+        if self._has_arrived(run):
+            return self._arrive(run)
         frame = run.map_next()
         if frame is None:
-            self._target_index = self._target_ns = None
             self._state = "finished"
-            return None
-        self._arrived(run)
-        self._warn(frame.warnings)
+        else:
+            self._warn(frame.warnings)
+        if self._has_arrived(run) or (frame is None and self._seeking):
+            return self._arrive(run)
         return frame
 
     def play(self) -> None:
@@ -130,7 +144,7 @@ class Session:
                 return
             self.open(*self._asked)
         elif self._state == "finished":
-            self._seek_index(self._run, 0)
+            self._seek_index(0)
         self._state, self._detail = "playing", ""
 
     def pause(self) -> None:
@@ -144,7 +158,7 @@ class Session:
             return
         here = self._run.standing if self._target_index is None else self._target_index
         self._settle()
-        self._seek_index(self._run, max(0, here + scans))
+        self._seek_index(max(0, here + scans))
 
     def seek(self, time_s: float) -> None:
         """Stand at the last scan not later than a time; the run then goes on as it did before."""
@@ -156,10 +170,9 @@ class Session:
         stamp_ns = self._run.start_ns + round(seconds * _NS)
         index = self._run.index_at(stamp_ns)
         if index is not None:
-            self._seek_index(self._run, index)
-            return
-        self._run.approach(self._run.known)
-        self._target_index, self._target_ns = None, stamp_ns
+            self._seek_index(index)
+        else:
+            self._target_index, self._target_ns, self._under_way = None, stamp_ns, False
 
     def set_parameters(self, parameters: Parameters, revision: int) -> Frame | None:
         """Use other parameters: from the next scan on, or from the sought or the standing scan on.
@@ -171,17 +184,16 @@ class Session:
         run = self._run
         if run is None:
             return None
-        if self._target_index is not None:
-            run.use(parameters, self._target_index)
+        if self._seeking:  # see `_arrive`
             return None
-        stands = self._state != "playing" and self._target_ns is None and run.standing >= 0
+        stands = self._state != "playing" and run.standing >= 0
         run.use(parameters, run.standing + (0 if stands else 1))
         return run.map_again() if stands and self._state != "failed" else None
 
     def fail(self, detail: str) -> None:
         """Say that the run cannot go on, and why."""
         self._state, self._detail = "failed", detail
-        self._target_index = self._target_ns = None
+        self._forget_target()
 
     def status(self) -> Status:
         """How the run goes; what only a clock can tell is left at 0."""
@@ -206,30 +218,42 @@ class Session:
     def _settle(self) -> None:
         self._state, self._detail = "paused", ""
 
-    def _seek_index(self, run: Run, index: int) -> None:
-        if index == run.standing and not self._seeking and run.frame is not None:
-            return
-        run.use(self._parameters, index)
-        run.approach(index)
-        self._target_index, self._target_ns = index, None
+    def _seek_index(self, index: int) -> None:
+        self._target_index, self._target_ns, self._under_way = index, None, False
 
-    def _arrived(self, run: Run) -> bool:
-        """Whether the sought scan is reached; then nothing is sought any more."""
-        at_index = self._target_index is not None and run.standing >= self._target_index
-        at_time = False
-        if self._target_ns is not None and run.standing >= 0:
-            following = run.peek_ns()
-            at_time = following is not None and following > self._target_ns
-        if at_index or at_time:
-            self._target_index = self._target_ns = None
-        return at_index or at_time
+    def _set_out(self, run: Run) -> None:
+        """Begin the way to the sought scan: not before work begins, so that targets that are
+        overtaken by another while a person drags the timeline cost nothing and leave no trace."""
+        self._under_way = True
+        if self._target_index is None:
+            run.approach(run.known)
+        elif self._target_index != run.standing or not run.is_whole:
+            run.approach(self._target_index)
+
+    def _has_arrived(self, run: Run) -> bool:
+        if self._target_index is not None:
+            return run.standing >= self._target_index
+        if self._target_ns is None or run.standing < 0:
+            return False
+        following = run.peek_ns()
+        return following is not None and following > self._target_ns
+
+    def _arrive(self, run: Run) -> Frame | None:
+        """Stand at the sought scan. The map before it is as it was; the parameters in force now act
+        from this scan on, whenever on the way they came."""
+        self._forget_target()
+        return run.map_again() if run.use(self._parameters, run.standing) else run.frame
+
+    def _forget_target(self) -> None:
+        self._target_index = self._target_ns = None
+        self._under_way = False
 
     def _leave(self) -> None:
         if self._run is not None:
             self._run.close()
         self._run = None
         self._warnings.clear()
-        self._target_index = self._target_ns = None
+        self._forget_target()
 
     def _warn(self, warnings: Iterable[str]) -> None:
         for warning in warnings:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ VARIABLES: dict[str, str] = {
 }
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
-_SHORTEST_TOKEN = 16
+_TOKEN = re.compile(r"[A-Za-z0-9_-]{16,200}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +78,11 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
             f"{host} is not a loopback address", where="STEMMAP_HOST", remedy="Use the flag --host for it"
         )
     token = given.get("STEMMAP_TOKEN", "")
-    if token and (len(token) < _SHORTEST_TOKEN or not token.isascii() or not token.isprintable()):
+    if token and not _TOKEN.fullmatch(token):
         raise StemmapError(
             "the token is too short or has odd characters",
             where="STEMMAP_TOKEN",
-            remedy=f"Give {_SHORTEST_TOKEN} letters and digits or more",
+            remedy="Give 16 or more letters, digits, - and _",
         )
     recordings = given.get("STEMMAP_RECORDINGS")
     return Settings(

@@ -12,13 +12,13 @@ from pipeline.errors import StemmapError
 
 @cache
 def page_folder() -> Path:
-    """The folder of index.html: `static/` of a checkout, or `app/static` of an installed package.
+    """The folder of index.html: `app/static` of an installed package, or `static/` of a checkout.
 
     Raises:
         StemmapError: Neither is there.
     """
     package = Path(str(files("app")))
-    for folder in (package.parent / "static", package / "static"):
+    for folder in (package / "static", package.parent / "static"):
         if (folder / "index.html").is_file():
             return folder
     raise StemmapError("the page is missing", where=str(package / "static"), remedy="Install stemmap again")

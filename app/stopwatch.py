@@ -42,6 +42,11 @@ class Stopwatch:
         finally:
             self._totals.append(self._clock() - start)
 
+    def clear(self) -> None:
+        """Forget what was measured."""
+        self._stages.clear()
+        self._totals.clear()
+
     @property
     def scan_ms(self) -> float:
         """Median time of a scan [ms], 0 before the first."""

@@ -84,12 +84,14 @@ def _private_streams() -> tuple[BinaryIO, BinaryIO]:
     return incoming, outgoing
 
 
-def main() -> None:
-    """Run as the worker of the web process that started this one."""
+def run_as_worker(session: Session) -> None:
+    """Be the worker of the web process that started this one, until it closes our input."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
     incoming, outgoing = _private_streams()
-    work(new_session(), incoming, outgoing)
+    work(session, incoming, outgoing)
+    sys.stderr.flush()
+    os._exit(0)  # nothing is left to be saved, and waiting for the threads of libraries takes seconds
 
 
 if __name__ == "__main__":
-    main()
+    run_as_worker(new_session())

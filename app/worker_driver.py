@@ -4,10 +4,12 @@ process what came of it.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import sys
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
@@ -50,6 +52,7 @@ class Driver:
         self._commands = commands
         self._put = put
         self._clock = clock
+        self._taken: deque[ToWorker | None] = deque()
         self._pacer = Pacer()
         self._run = 0
         self._reported: tuple[Status, float] | None = None
@@ -60,7 +63,7 @@ class Driver:
         self._report()
         while True:
             try:
-                command = self._commands.get(timeout=self._patience())
+                command = self._next_command()
             except queue.Empty:
                 self._guarded(self._map)
                 continue
@@ -68,6 +71,20 @@ class Driver:
                 self._session.close()
                 return
             self._obey(command)
+
+    def _next_command(self) -> ToWorker | None:
+        """The next command; of parameters that follow one another (a slider that moves) the last."""
+        if not self._taken:
+            self._taken.append(self._commands.get(timeout=self._patience()))
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._taken.append(self._commands.get_nowait())
+        command = self._taken.popleft()
+        while (
+            isinstance(command, SetParameters) and self._taken and isinstance(self._taken[0], SetParameters)
+        ):
+            command = self._taken.popleft()
+        return command
 
     def _patience(self) -> float | None:
         """Seconds until the next scan is to be mapped; None when only a command can start work."""
@@ -121,9 +138,16 @@ class Driver:
 
     def _open(self, command: Open) -> None:
         self._run += 1
-        opening = f"Opening {command.uri}"
-        self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
-        self._put(self._session.open(command.uri, command.odometry, command.seed))
+        self._starting(command.uri, f"Opening {command.uri}")
+        opened = self._session.open(command.uri, command.odometry, command.seed)
+        self._starting(
+            command.uri, "Preparing the mapper; the first time on a machine this takes up to a minute"
+        )
+        self._session.prepare()
+        self._put(opened)
+
+    def _starting(self, uri: str, detail: str) -> None:
+        self._put(Report(Status(state="starting", detail=detail, source=uri)))
 
     def _show(self, frame: Frame | None) -> None:
         path = self._session.path
@@ -136,7 +160,7 @@ class Driver:
         status = replace(
             self._session.status(),
             speed=self._pacer.speed,
-            scan_rate_hz=self._pacer.rate_hz if playing else 0.0,
+            scan_rate_hz=round(self._pacer.rate_hz, 2) if playing else 0.0,
             scans_behind=self._pacer.behind(now) if playing else 0,
         )
         self._reported = (status, now)

@@ -54,6 +54,7 @@ class WorkerProcess:
         self._closing = False
         self._open: Open | None = None
         self._settings: dict[type, ToWorker] = {}
+        self._pauses_s = _PAUSES_S
         self._deaths: deque[float] = deque(maxlen=len(_PAUSES_S))
         self._wanted = asyncio.Event()
         self.restarts = 0
@@ -145,9 +146,9 @@ class WorkerProcess:
         """Wait before the next start, longer each time; forever when it dies again and again."""
         what = f"The mapping process ended ({reason})"
         recent = [t for t in self._deaths if self._clock() - t < _FORGIVEN_AFTER_S]
-        if len(recent) < len(_PAUSES_S):
+        if len(recent) < len(self._pauses_s):
             await self._tell(f"{what}; it is being started again")
-            await asyncio.sleep(_PAUSES_S[len(recent) - 1])
+            await asyncio.sleep(self._pauses_s[len(recent) - 1])
             return
         await self._tell(
             f"{what}, {len(recent)} times within a minute. Press play to try again, or open another run"

@@ -160,6 +160,7 @@ class RunFiles:
 
     def __init__(self, folder: FilePath) -> None:
         self._folder = folder
+        self._made_folder = not folder.exists()
         self._staging = folder / ".unfinished"
         self._staging.mkdir(parents=True, exist_ok=True)
         self._detections = (self._staging / "detections.csv").open("w", encoding="utf-8", newline="")
@@ -191,7 +192,7 @@ class RunFiles:
         for file in self._staging.iterdir():
             file.unlink()
         self._staging.rmdir()
-        if not any(self._folder.iterdir()):
+        if self._made_folder:
             self._folder.rmdir()
 
 

@@ -280,7 +280,7 @@ class Trees:
         dbh: Diameter at breast height [m], NaN where no arc carried one.
         dbh_sigma: [m], NaN likewise.
         eccentricity: Mean over the observations.
-        observations: int64, number of detections that went into it.
+        observations: int64, number of scans it was seen in.
         coverage: Part of its circumference that was seen [rad].
         first_seen_ns, last_seen_ns: int64.
         confirmed: Whether it was seen often enough to be shown and exported.

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import SourceError
+from pipeline.geometry import Float
 from pipeline.records import TruthTrees
 
 KINDS = ("tree", "pole", "person", "bush", "other")
@@ -40,18 +41,18 @@ def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
     Raises:
         SourceError: It is no such table; the message names line and column.
     """
-    rows = _read_rows(path)
-    header = [name.strip().lower().lstrip("\ufeff") for name in rows[0]] if rows else []
+    lines, rows = _read_rows(path)
+    header = [name.strip().lower() for name in rows[0]] if rows else []
     column = {name: k for k, name in reversed(list(enumerate(header)))}
-    table = _Table(path, rows[1:], column)
+    table = _Table(path, lines[1:], rows[1:], column)
     x, y = _positions(table)
     dbh = _diameters(table, dbh_unit)
     return TruthTrees(x, y, dbh, _kinds(table))
 
 
 class _Table:
-    def __init__(self, path: Path, rows: list[list[str]], column: dict[str, int]) -> None:
-        self.path, self.rows, self.column = path, rows, column
+    def __init__(self, path: Path, lines: list[int], rows: list[list[str]], column: dict[str, int]) -> None:
+        self.path, self.lines, self.rows, self.column = path, lines, rows, column
 
     def find(self, names: Iterable[str]) -> str | None:
         return next((name for name in names if name in self.column), None)
@@ -60,7 +61,7 @@ class _Table:
         k = self.column[name]
         return [row[k].strip() if k < len(row) else "" for row in self.rows]
 
-    def numbers(self, name: str, *, required: bool) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    def numbers(self, name: str, *, required: bool) -> Float:
         return np.array(
             [self._number(text, name, k, required) for k, text in enumerate(self.text(name))], np.float64
         )
@@ -73,11 +74,14 @@ class _Table:
         except ValueError:
             value = math.nan
         if not math.isfinite(value) and (required or text.lower() not in ("nan", "na")):
-            raise SourceError(f"line {row + 2}: {name} = {text!r} is not a number", where=str(self.path))
+            raise SourceError(
+                f"line {self.lines[row]}: {name} = {text!r} is not a number", where=str(self.path)
+            )
         return value
 
 
-def _read_rows(path: Path) -> list[list[str]]:
+def _read_rows(path: Path) -> tuple[list[int], list[list[str]]]:
+    """The line number and the cells of every row that is not empty."""
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise SourceError("the table of trees is larger than 64 MB", where=str(path))
@@ -89,12 +93,14 @@ def _read_rows(path: Path) -> list[list[str]]:
     first = text.partition("\n")[0]
     delimiter = max(",;\t", key=first.count)
     try:
-        return [row for row in csv.reader(text.splitlines(), delimiter=delimiter) if any(row)]
+        reader = csv.reader(text.splitlines(), delimiter=delimiter)
+        numbered = [(reader.line_num, row) for row in reader if any(row)]
     except csv.Error as error:
         raise SourceError(f"the table of trees is not a CSV: {error}", where=str(path)) from None
+    return [line for line, _ in numbered], [row for _, row in numbered]
 
 
-def _positions(table: _Table) -> tuple[np.ndarray[tuple[int], np.dtype[np.float64]], ...]:
+def _positions(table: _Table) -> tuple[Float, ...]:
     x, y = table.find(_X), table.find(_Y)
     if x is not None and y is not None:
         return table.numbers(x, required=True), table.numbers(y, required=True)
@@ -111,11 +117,11 @@ def _positions(table: _Table) -> tuple[np.ndarray[tuple[int], np.dtype[np.float6
     return reach * np.sin(angle), reach * np.cos(angle)
 
 
-def _diameters(table: _Table, dbh_unit: str | None) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _diameters(table: _Table, dbh_unit: str | None) -> Float:
     for names, unit in ((_DBH_CM, "cm"), (_DBH_M, "m"), (_DBH_MM, "mm")):
         name = table.find(names)
         if name is not None:
-            return table.numbers(name, required=False) * _UNITS[unit]
+            return _measured(table.numbers(name, required=False)) * _UNITS[unit]
     name = table.find(_DBH_OF_UNKNOWN_UNIT)
     if name is None:
         return np.full(len(table.rows), np.nan)
@@ -125,7 +131,12 @@ def _diameters(table: _Table, dbh_unit: str | None) -> np.ndarray[tuple[int], np
             where=str(table.path),
             remedy="Give --dbh-unit m, cm or mm",
         )
-    return table.numbers(name, required=False) * _UNITS[dbh_unit]
+    return _measured(table.numbers(name, required=False)) * _UNITS[dbh_unit]
+
+
+def _measured(diameter: Float) -> Float:
+    """Other tools write 0 or a negative number for a diameter that was not measured."""
+    return np.where(diameter > 0.0, diameter, np.nan)
 
 
 def _kinds(table: _Table) -> tuple[str, ...]:
@@ -136,6 +147,7 @@ def _kinds(table: _Table) -> tuple[str, ...]:
     for row, kind in enumerate(kinds):
         if kind not in KINDS:
             raise SourceError(
-                f"line {row + 2}: class {kind!r} is none of {', '.join(KINDS)}", where=str(table.path)
+                f"line {table.lines[row]}: class {kind!r} is none of {', '.join(KINDS)}",
+                where=str(table.path),
             )
     return kinds

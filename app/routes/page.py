@@ -5,7 +5,7 @@ from __future__ import annotations
 import mimetypes
 from pathlib import Path, PurePosixPath
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
 from starlette.responses import FileResponse, Response
 
 from app.replies import error_reply
@@ -34,34 +34,47 @@ _VISER_POLICY = (
 
 
 @router.get("/")
-def page() -> Response:
+def page(request: Request) -> Response:
     """The dashboard."""
-    return _file(page_folder() / "index.html", _PAGE_POLICY)
+    return _file(request, page_folder() / "index.html", _PAGE_POLICY)
 
 
 @router.get("/static/plotly.min.js")
-def plotly() -> Response:
+def plotly(request: Request) -> Response:
     """The plots' library, of the installed package."""
-    return _file(plotly_script(), _PAGE_POLICY)
+    return _file(request, plotly_script(), _PAGE_POLICY)
 
 
 @router.get("/static/{path:path}")
-def page_file(path: str) -> Response:
+def page_file(request: Request, path: str) -> Response:
     """A file of the page."""
-    wanted = PurePosixPath(path)
-    folder = page_folder().resolve()
-    found = (folder / wanted).resolve()
-    hidden = any(part.startswith(".") for part in wanted.parts)
-    if "\0" in path or hidden or not found.is_relative_to(folder) or not found.is_file():
+    found = _page_path(path)
+    if found is None:
         return error_reply(404, "there is no such file", where=f"/static/{path[:200]}")
-    return _file(found, _PAGE_POLICY)
+    return _file(request, found, _PAGE_POLICY)
 
 
 @router.get("/viser/")
-def viser_page() -> Response:
+def viser_page(request: Request) -> Response:
     """The 3D scene's page, of the installed viser."""
-    return _file(client_page(), _VISER_POLICY)
+    return _file(request, client_page(), _VISER_POLICY)
 
 
-def _file(path: Path, policy: str) -> Response:
-    return FileResponse(path, headers={**_CHECK_EACH_TIME, "Content-Security-Policy": policy})
+def _file(request: Request, path: Path, policy: str) -> Response:
+    """The file, or word that the browser has it already."""
+    headers = {**_CHECK_EACH_TIME, "Content-Security-Policy": policy}
+    answer = FileResponse(path, headers=headers, stat_result=path.stat())
+    known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
+    if answer.headers["etag"] in known:
+        return Response(status_code=304, headers={**headers, "ETag": answer.headers["etag"]})
+    return answer
+
+
+def _page_path(path: str) -> Path | None:
+    """The file of a path below /static/, None if there is none or it is hidden or outside."""
+    wanted = PurePosixPath(path)
+    if "\0" in path or any(part.startswith(".") for part in wanted.parts):
+        return None
+    folder = page_folder().resolve()
+    found = (folder / wanted).resolve()
+    return found if found.is_relative_to(folder) and found.is_file() else None

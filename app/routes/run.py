@@ -30,7 +30,7 @@ class OpenRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     uri: Annotated[str, Meta(min_length=1, max_length=_LONGEST_URI)]
     odometry: Literal["auto", "wheels", "static"] = "auto"
-    seed: Annotated[int, Meta(ge=0, lt=2**63)] = 0
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
 
 
 @router.get("/status")

@@ -91,3 +91,11 @@ def of_points(cluster_colours: Colours, labels: NDArray[np.integer], noise: Rgb)
 def choose(first: NDArray[np.bool_], one: Rgb, other: Rgb) -> Colours:
     """`one` where `first` holds, else `other`, shape (N, 3)."""
     return np.array([other, one], dtype=np.uint8)[first.astype(np.int64)]
+
+
+def of_lines(each: NDArray[np.uint8]) -> Colours:
+    """What viser must be given so that a line is seen in these colours: its client takes the colours of lines
+    for linear light, and brightens them once more."""
+    c = each / 255.0
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return np.round(255.0 * linear).astype(np.uint8)

@@ -17,7 +17,8 @@ class Line:
     """A growing line in chunks: only the chunks that changed are sent."""
 
     def __init__(self, scene: viser.SceneApi, name: str, colour: colours.Rgb, height: float) -> None:
-        self._scene, self._name, self._colour, self._height = scene, name, colour, height
+        self._scene, self._name, self._height = scene, name, height
+        self._colour = colours.of_lines(np.array(colour, dtype=np.uint8))
         self._chunks: list[viser.LineSegmentsHandle] = []
         self._sent: Float = np.zeros((0, 2))
         self._visible = True
@@ -87,7 +88,7 @@ class Circles:
         self._count = len(centres)
         if self._count:
             self._node.points = meshes.circles(centres, radii, self._height)
-            self._node.colors = np.repeat(each, 2 * meshes.SIDES, axis=0).reshape(-1, 2, 3)
+            self._node.colors = np.repeat(colours.of_lines(each), 2 * meshes.SIDES, axis=0).reshape(-1, 2, 3)
         self.wanted = self._wanted
 
     @property

@@ -27,8 +27,8 @@ class RobotNodes:
         self._particles = Cloud(scene, "/world/particles", 0.06, precision="float32")
         self._path = Line(scene, "/world/path", colours.PATH, 0.05)
         self._odometry = Line(scene, "/world/odometry", colours.ODOMETRY, 0.03)
-        self._dead_reckoning: list[tuple[float, float]] = []
-        self._start: Pose2 | None = None
+        self._dead_reckoning: list[tuple[int, float, float]] = []
+        self._start = Pose2()
 
     def show(self, frame: Frame, path: Float, view: View) -> None:
         """Show a new pose.
@@ -46,7 +46,7 @@ class RobotNodes:
             np.column_stack([particles[:, :2], np.full(len(particles), 0.05)]), colours.PARTICLES
         )
         self._path.show(path)
-        self._follow_odometry(frame, len(path))
+        self._follow_odometry(frame)
         self.repaint(view)
 
     def repaint(self, view: View) -> None:
@@ -54,16 +54,16 @@ class RobotNodes:
         self._particles.visible = view.layers["particles"]
         self._path.visible = view.layers["path"]
         self._odometry.visible = view.layers["odometry"]
+        if self._odometry.visible:
+            self._odometry.show(np.array(self._dead_reckoning)[:, 1:])
 
-    def _follow_odometry(self, frame: Frame, poses: int) -> None:
-        if poses <= len(self._dead_reckoning):  # played back: the path is as long as it was then
-            del self._dead_reckoning[max(poses - 1, 0) :]
-        if not self._dead_reckoning:
+    def _follow_odometry(self, frame: Frame) -> None:
+        while self._dead_reckoning and self._dead_reckoning[-1][0] >= frame.index:  # played back
+            self._dead_reckoning.pop()
+        if not self._dead_reckoning:  # both paths begin together, and the eye sees what drifts from there
             self._start = frame.estimate.T_map_base @ frame.T_odom_base.inverse()
-        if self._start is not None:
-            at = self._start @ frame.T_odom_base
-            self._dead_reckoning.append((at.x, at.y))
-        self._odometry.show(np.array(self._dead_reckoning))
+        at = self._start @ frame.T_odom_base
+        self._dead_reckoning.append((frame.index, at.x, at.y))
 
 
 def _add_body(scene: viser.SceneApi) -> None:

@@ -30,9 +30,9 @@ class ScanNodes:
 
     def __init__(self, scene: viser.SceneApi, robot: str) -> None:
         self._sensor = scene.add_frame(f"{robot}/scan", show_axes=False)
-        self._raw = Cloud(scene, f"{robot}/scan/raw", 0.03)
-        self._filtered = Cloud(scene, f"{robot}/scan/filtered", 0.04)
-        self._clusters = Cloud(scene, f"{robot}/scan/clusters", 0.06)
+        self._raw = Cloud(scene, f"{robot}/scan/raw", 0.02)
+        self._filtered = Cloud(scene, f"{robot}/scan/filtered", 0.03)
+        self._clusters = Cloud(scene, f"{robot}/scan/clusters", 0.045)
         self._fits = Batch(scene, f"{robot}/scan/fits", meshes.cylinder(), opacity=0.4, side="double")
         self._labels = Labels(scene, "/world/labels")
         self._companions = Companions()

@@ -114,7 +114,7 @@ class Scene:
     def _build(self) -> None:
         self._server = start_server(self.secret)
         gui = self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 158, 115))
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 105, 78))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
         tabs = gui.add_tab_group()
@@ -136,8 +136,10 @@ class Scene:
             infinite_grid=True,
             cell_size=1.0,
             section_size=10.0,
-            cell_color=(44, 47, 51),
-            section_color=(84, 89, 96),
+            cell_color=(40, 42, 45),  # between the two themes, for both
+            cell_thickness=0.5,
+            section_color=(60, 63, 67),
+            section_thickness=1.0,
             fade_distance=60.0,
             shadow_opacity=0.0,
         )

@@ -11,6 +11,7 @@ from mcap.writer import CompressionType, Writer
 from pipeline.files import write_beside
 from pipeline.geometry import Pose3
 from pipeline.recording import messages
+from pipeline.recording.quality_of_service import BAG_METADATA, offered_qos_profiles
 from pipeline.recording.truth_json import MEDIA_TYPE, NAME, truth_json
 from pipeline.records import Odometry, Record, Scan, Sensor, Truth
 
@@ -22,6 +23,7 @@ TOPICS = {
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
 }
+_LATCHED = "/tf_static"
 
 
 def write_recording(
@@ -69,9 +71,12 @@ class _Run:
         self._writer.start(profile="ros2", library="stemmap")
         # At the front, so that a file that is cut short still has it.
         self._writer.add_attachment(0, 0, NAME, MEDIA_TYPE, truth)
+        self._writer.add_metadata(*BAG_METADATA)
         schemas = {name: self._register(name) for name in dict.fromkeys(TOPICS.values())}
         self._channels = {
-            topic: self._writer.register_channel(topic, "cdr", schemas[name])
+            topic: self._writer.register_channel(
+                topic, "cdr", schemas[name], {"offered_qos_profiles": offered_qos_profiles(topic == _LATCHED)}
+            )
             for topic, name in TOPICS.items()
         }
         self._sequence = dict.fromkeys(TOPICS, 0)
@@ -81,7 +86,7 @@ class _Run:
         stamp = record.stamp_ns
         if self._T_base_lidar is not None:
             mounting = messages.transform(stamp, messages.BASE, messages.LIDAR, self._T_base_lidar)
-            self._write("/tf_static", stamp, mounting)
+            self._write(_LATCHED, stamp, mounting)
             self._T_base_lidar = None
         if isinstance(record, Scan):
             self._write("/velodyne_points", stamp, messages.point_cloud(record))

@@ -41,7 +41,9 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
     for k in range(clusters):
-        stride = 1 + (bounds[k + 1] - bounds[k]) // MOST_POINTS
+        # Odd, because points come ring after ring: an even stride would always skip the same rings.
+        stride = 1 + (bounds[k + 1] - bounds[k] - 1) // MOST_POINTS
+        stride += 1 - stride % 2
         members = points[bounds[k] : bounds[k + 1] : stride]
         _start_from_width(members, azimuth_step, stems[k])
         if members.shape[0] >= 5:

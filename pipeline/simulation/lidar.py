@@ -14,7 +14,8 @@ from functools import lru_cache
 import numpy as np
 
 from pipeline.records import Float, Int32, Scan, Sensor
-from pipeline.simulation.cast import first_returns, measure, pack_returns, ray_directions
+from pipeline.simulation.cast import first_returns, ray_directions
+from pipeline.simulation.receiver import measure, pack_returns
 from pipeline.simulation.solids import Solids
 from pipeline.simulation.terrain import Terrain
 

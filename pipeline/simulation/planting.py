@@ -9,8 +9,8 @@ from pipeline.errors import SourceError
 from pipeline.records import Float
 from pipeline.simulation.drive import Course
 
-_BATCH = 256
-_BATCHES = 40
+# Places are drawn few at a time while there is room, and many when the plot grows full.
+_BATCHES = (8, 16, 32, 64, 128, *[256] * 36)
 
 
 class Plot:
@@ -32,7 +32,7 @@ class Plot:
         """Distance of places (N, 2) from the nearest surface of what stands there [m]."""
         if self._taken.shape[0] == 0:
             return np.full(places.shape[0], np.inf)
-        away = np.linalg.norm(places[:, None, :] - self._taken[None, :, :2], axis=2)
+        away = np.hypot(places[:, :1] - self._taken[:, 0], places[:, 1:] - self._taken[:, 1])
         free: Float = (away - self._taken[:, 2]).min(axis=1)
         return free
 
@@ -55,8 +55,8 @@ class Plot:
         Raises:
             SourceError: The plot is full.
         """
-        for _ in range(_BATCHES):
-            places = self.centre + self.half_side * rng.uniform(-1.0, 1.0, (_BATCH, 2))
+        for count in _BATCHES:
+            places = self.centre + self.half_side * rng.uniform(-1.0, 1.0, (count, 2))
             off = self.from_course(places) - radius
             good = (off >= near) & (off <= far)
             good[good] = self.from_things(places[good]) - radius >= gap
@@ -64,7 +64,12 @@ class Plot:
                 x, y = (float(value) for value in places[int(np.argmax(good))])
                 self.take(x, y, radius)
                 return x, y
-        raise SourceError(
+        raise self.full(what)
+
+    @staticmethod
+    def full(what: str) -> SourceError:
+        """The error that says that nothing more fits."""
+        return SourceError(
             f"no place is left for another {what} in the simulated stand",
             remedy="Ask for fewer trees with trees=N",
         )

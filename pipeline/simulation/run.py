@@ -128,7 +128,7 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
         motion=motion,
         odometry=odometry,
         inertial=inertial_readings(motion, _stream(_INERTIAL, request)),
-        scans=int(request.duration_s * 1_000_000_000) // lidar.period_ns,
+        scans=round(request.duration_s * 1e9) // lidar.period_ns,
     )
 
 

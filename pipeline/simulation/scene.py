@@ -180,3 +180,4 @@ class _Work:
                 number = len(self.kinds) - 1
                 self.persons.append(Person(number, start, end, 0.0, float(speed), float(phase)))
                 return
+        raise self.plot.full("person who walks")

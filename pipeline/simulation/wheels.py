@@ -37,7 +37,7 @@ class WheelQuality:
 QUALITIES = {
     "good": WheelQuality(0.003, 0.01, 0.002, 2e-4, 0.005, 0.002),
     "normal": WheelQuality(0.01, 0.04, 0.006, 6e-4, 0.01, 0.004),
-    "poor": WheelQuality(0.03, 0.10, 0.006, 2.4e-3, 0.03, 0.006),
+    "poor": WheelQuality(0.03, 0.10, 0.006, 2.8e-3, 0.03, 0.006),
 }
 
 

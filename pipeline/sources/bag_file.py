@@ -14,13 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import SourceError
-from pipeline.sources.chunks import BrokenChunkError, Chunk, in_order, tail_ns
+from pipeline.sources.chunks import BrokenChunkError, Chunk, LastChunk, in_order, tail_ns
 from pipeline.sources.container import Channel, Message, count_loss, damaged, ros2_type_name
-from pipeline.sources.unpack import BLOCK_LIMIT, UnpackError, unpack
+from pipeline.sources.unpack import UnpackError
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_ENTRY, CONNECTION = 2, 3, 4, 5, 6, 7
 HEADER_LIMIT = 1 << 20
+#: A file with more damaged records is something else, and would take long to walk over.
+STRANGE_LIMIT = 1000
 LENGTH = struct.Struct("<I")
 Header = dict[bytes, bytes]
 
@@ -40,6 +42,7 @@ class BagFile:
         self.damage: dict[str, int] = {}
         self._connections: dict[int, tuple[str, str, str]] = {}
         self._chunks: list[Chunk] = []
+        self._last = LastChunk()
         try:
             self._walk()
             self._learn_connections()
@@ -81,14 +84,17 @@ class BagFile:
     # --- the walk over the records ---------------------------------------------------------------
 
     def _read(self, offset: int, size: int) -> bytes:
-        self._file.seek(offset)
-        return self._file.read(size)
+        try:
+            self._file.seek(offset)
+            return self._file.read(size)
+        except OSError as error:
+            raise damaged(f"cannot read on: {error.strerror}", self._path) from error
 
     def _walk(self) -> None:
         end = self._file.seek(0, 2)
         if self._read(0, len(MAGIC)) != MAGIC:
             raise damaged("not a ROS 1 bag of version 2.0", self._path)
-        at = len(MAGIC)
+        at, strange = len(MAGIC), 0
         while at + 8 <= end:
             (header_size,) = LENGTH.unpack(self._read(at, 4))
             body = at + 4 + header_size + 4
@@ -96,12 +102,13 @@ class BagFile:
                 break
             record = self._read(at + 4, header_size + 4)
             (length,) = LENGTH.unpack_from(record, header_size)
-            if body + length > end:
+            if body + length > end or strange > STRANGE_LIMIT:
                 break
             try:
                 self._take(_fields(record[:header_size]), body, length)
             except (struct.error, ValueError, KeyError):
                 count_loss(self.damage, "damaged records of the recording")
+                strange += 1
             at = body + length
         if at < end:
             count_loss(self.damage, "bytes at the end of a recording that was cut", end - at)
@@ -145,9 +152,7 @@ class BagFile:
 
     def _records(self, chunk: Chunk) -> Iterator[tuple[Header, bytes]]:
         """The records inside of a chunk as (header, content)."""
-        if chunk.length > BLOCK_LIMIT:
-            raise BrokenChunkError
-        raw = unpack(self._read(chunk.offset, chunk.length), chunk.compression, chunk.size)
+        raw = self._last.unpacked(chunk, self._read)
         at = 0
         while at < len(raw):
             try:
@@ -157,7 +162,7 @@ class BagFile:
                 header = _fields(raw[at + 4 : body - 4])
             except (struct.error, ValueError) as error:
                 raise BrokenChunkError from error
-            if body + length > len(raw):
+            if body + length > len(raw) or not header:
                 raise BrokenChunkError
             yield header, raw[body : body + length]
             at = body + length

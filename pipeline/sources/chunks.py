@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import heapq
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 
 from pipeline.sources.container import Message, count_loss
-from pipeline.sources.unpack import BLOCK_LIMIT, UnpackError
+from pipeline.sources.unpack import BLOCK_LIMIT, UnpackError, unpack
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,33 @@ class Chunk:
     size: int
     crc: int
     counts: dict[int, int] | None
+
+
+class LastChunk:
+    """Keeps the chunk that was unpacked last: opening a recording looks at its first one several times."""
+
+    def __init__(self) -> None:
+        self._offset = -1
+        self._raw = b""
+
+    def unpacked(self, chunk: Chunk, read: Callable[[int, int], bytes]) -> bytes:
+        """The unpacked bytes of a chunk.
+
+        Args:
+            chunk: To be unpacked.
+            read: Gives (offset, length) of the file.
+
+        Raises:
+            UnpackError, BrokenChunkError: It is damaged.
+        """
+        if chunk.offset != self._offset:
+            if chunk.length > BLOCK_LIMIT:
+                raise BrokenChunkError
+            raw = unpack(read(chunk.offset, chunk.length), chunk.compression, chunk.size)
+            if chunk.crc and zlib.crc32(raw) != chunk.crc:
+                raise BrokenChunkError
+            self._offset, self._raw = chunk.offset, raw
+        return self._raw
 
 
 class BrokenChunkError(Exception):

@@ -31,7 +31,9 @@ def clean_scan(
     """
     with np.errstate(invalid="ignore", over="ignore"):
         xyz = np.ascontiguousarray(points, dtype=np.float32)
-        reach = np.abs(xyz).max(axis=1) if len(xyz) else np.zeros(0, np.float32)
+        # Column by column: reducing rows of three is ten times slower.
+        x, y, z = np.abs(xyz.T)
+        reach = np.maximum(np.maximum(x, y), z)
         keep = (reach > NEAR_LIMIT) & (reach < RANGE_LIMIT)
     refused = int(len(keep) - np.count_nonzero(keep))
     if refused:

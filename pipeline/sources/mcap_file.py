@@ -13,9 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import SourceError
-from pipeline.sources.chunks import BrokenChunkError, Chunk, in_order, tail_ns
+from pipeline.sources.chunks import BrokenChunkError, Chunk, LastChunk, in_order, tail_ns
 from pipeline.sources.container import Channel, Message, count_loss, damaged, ros2_type_name
-from pipeline.sources.unpack import BLOCK_LIMIT, UnpackError, unpack
+from pipeline.sources.unpack import UnpackError
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT = 0x03, 0x04, 0x05, 0x06, 0x07, 0x09
@@ -24,6 +24,8 @@ RECORD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 CHUNK_HEAD = struct.Struct("<QQQI")
 LOOSE_RUN = 4 << 20
+#: A file with more records of no known kind is something else, and would take long to walk over.
+STRANGE_LIMIT = 1000
 DEFINITION_LIMIT = 1 << 20
 
 
@@ -44,6 +46,7 @@ class McapFile:
         self._channels: dict[int, tuple[int, str, str]] = {}
         self._chunks: list[Chunk] = []
         self._attachments: list[tuple[int, int]] = []
+        self._last = LastChunk()
         try:
             self._walk()
             self._learn_channels()
@@ -110,8 +113,11 @@ class McapFile:
     # --- the walk over the records ---------------------------------------------------------------
 
     def _read(self, offset: int, size: int) -> bytes:
-        self._file.seek(offset)
-        return self._file.read(size)
+        try:
+            self._file.seek(offset)
+            return self._file.read(size)
+        except OSError as error:
+            raise damaged(f"cannot read on: {error.strerror}", self._path) from error
 
     def _walk(self) -> None:
         end = self._file.seek(0, 2)
@@ -120,10 +126,11 @@ class McapFile:
         at = 8
         loose: list[int] = []
         whole = False
+        strange = 0
         while at + RECORD.size <= end:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
             body, after = at + RECORD.size, at + RECORD.size + length
-            if after > end or opcode == 0:
+            if after > end or opcode == 0 or strange > STRANGE_LIMIT:
                 break
             if loose and (opcode != MESSAGE or at - loose[0] > LOOSE_RUN):
                 self._close_run(loose.pop(), at)
@@ -134,14 +141,15 @@ class McapFile:
                 if opcode == FOOTER:
                     break
             else:
-                self._take(opcode, body, length)
+                strange += not self._take(opcode, body, length)
             at = after
         if loose:
             self._close_run(loose.pop(), at)
         if not whole:
             count_loss(self.damage, "bytes at the end of a recording that was cut", max(end - at, 1))
 
-    def _take(self, opcode: int, body: int, length: int) -> None:
+    def _take(self, opcode: int, body: int, length: int) -> bool:
+        """Keep what a record says; False when it is damaged or of no known kind."""
         try:
             if opcode in (SCHEMA, CHANNEL):
                 self._define(opcode, self._read(body, min(length, DEFINITION_LIMIT)))
@@ -153,6 +161,8 @@ class McapFile:
                 self._attachments.append((body, length))
         except (struct.error, ValueError):
             count_loss(self.damage, "damaged records of the recording")
+            return False
+        return 0 < opcode <= DATA_END
 
     def _define(self, opcode: int, record: bytes) -> None:
         (number,) = struct.unpack_from("<H", record)
@@ -195,18 +205,14 @@ class McapFile:
 
     def _records(self, chunk: Chunk) -> Iterator[tuple[int, memoryview]]:
         """The records inside of a chunk as (opcode, content)."""
-        if chunk.length > BLOCK_LIMIT:
-            raise BrokenChunkError
-        raw = unpack(self._read(chunk.offset, chunk.length), chunk.compression, chunk.size)
-        if chunk.crc and zlib.crc32(raw) != chunk.crc:
-            raise BrokenChunkError
+        raw = self._last.unpacked(chunk, self._read)
         view, at = memoryview(raw), 0
         while at < len(raw):
             if at + RECORD.size > len(raw):
                 raise BrokenChunkError
             opcode, length = RECORD.unpack_from(raw, at)
             at += RECORD.size
-            if at + length > len(raw):
+            if at + length > len(raw) or opcode == 0:
                 raise BrokenChunkError
             yield opcode, view[at : at + length]
             at += length

@@ -83,7 +83,8 @@ class Mounting:
             decoded = cast(Transforms, self._decoder.decode(self._channels[message.channel], payload))
         except Exception:  # whatever the generated decoders of rosbags raise
             return []
-        return [link for link in map(_link, decoded.transforms) if link is not None]
+        with np.errstate(all="ignore"):
+            return [link for link in map(_link, decoded.transforms) if link is not None]
 
 
 def _link(stamped: TransformStamped) -> Link | None:

@@ -98,8 +98,11 @@ class PcapSource:
         """The packets of one sweep, read at once."""
         offsets = self._packets.offset[rows.start : rows.stop]
         start = int(offsets[0])
-        self._file.seek(start)
-        block = self._file.read(int(offsets[-1]) + PACKET_BYTES - start)
+        try:
+            self._file.seek(start)
+            block = self._file.read(int(offsets[-1]) + PACKET_BYTES - start)
+        except OSError as error:
+            raise SourceError(f"cannot read on: {error.strerror}", where=str(self._path)) from error
         return [block[at : at + PACKET_BYTES] for at in (offsets - start).tolist()]
 
     def _one_sensor(self, packets: Packets, uri: str) -> Packets:

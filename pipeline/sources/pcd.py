@@ -34,7 +34,8 @@ def load_pcd(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
     """
     columns = read_pcd(path, losses)
     kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
-    points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)
     ring, time = first_of(columns, RING), first_of(columns, TIME)
     return clean_scan(
         stamp_ns,

@@ -123,7 +123,8 @@ def _checked(entries: dict[str, list[str]], length: int) -> PcdHeader:
     if header.data not in ("ascii", "binary", "binary_compressed"):
         raise ScanFileError(f"its data is of the unknown kind {header.data[:20]!r}")
     for axis in "xyz":
-        if axis not in names or not types[names.index(axis)].startswith("<f"):
+        place = names.index(axis) if axis in names else -1
+        if place < 0 or not types[place].startswith("<f") or counts[place] != 1:
             raise ScanFileError(f"it has no field {axis} of floating numbers")
     return header
 

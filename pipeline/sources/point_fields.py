@@ -40,7 +40,11 @@ def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64]
         ns = time.astype(np.int64)
         ns = ns - stamp_ns if abs(int(ns[0])) > 10**15 else ns
     else:
-        seconds = np.nan_to_num(time.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+        with np.errstate(invalid="ignore"):
+            seconds = time.astype(np.float64)
+        finite = np.isfinite(seconds)
+        if not finite.all():
+            seconds[~finite] = 0.0
         unit = _unit(float(np.abs(seconds).max()))
         since = stamp_ns if unit is not None else 0
         # Subtract the whole second first: a double cannot hold nanoseconds since 1970.

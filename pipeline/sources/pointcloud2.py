@@ -10,6 +10,7 @@ from pipeline.sources.cleaning import POINT_LIMIT, clean_scan
 from pipeline.sources.point_fields import REFLECTANCE, RING, TIME, first_of, is_ring, point_offsets
 from pipeline.sources.ros_messages import PointCloud2
 
+STEP_LIMIT = 64 << 10
 #: NumPy's code by the number of a PointField's datatype.
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
@@ -45,8 +46,8 @@ def _table(cloud: PointCloud2) -> NDArray[np.void]:
     width, height = int(cloud.width), int(cloud.height)
     step, row_step, length = int(cloud.point_step), int(cloud.row_step), len(cloud.data)
     count = width * height
-    if count > POINT_LIMIT:
-        raise LayoutError(f"the header claims {count} points")
+    if count > POINT_LIMIT or step > STEP_LIMIT:
+        raise LayoutError(f"the header claims {count} points of {step} bytes")
     dtype = _dtype(cloud, step)
     row = row_step if height > 1 else width * step
     if row < width * step:

@@ -158,7 +158,8 @@ class RosSource:
         reason = "the topic has no messages that can be read"
         for arrival in islice(self._scan_arrivals(None), _TRIES):
             try:
-                found = self._records.scan(arrival.content, arrival.stamp_ns, {})
+                with np.errstate(all="ignore"):
+                    found = self._records.scan(arrival.content, arrival.stamp_ns, {})
             except Exception as error:  # as in RecordDecoder.record
                 reason = f"the first scans cannot be read: {str(error)[:200] or type(error).__name__}"
                 continue
@@ -202,7 +203,7 @@ class RosSource:
         self._records.base = base = self._mounting.base_frame(self._said_base())
         has_odometry = self._topics.odometry is not None or bool(self._moving)
         linked = options.T_base_lidar or self._mounting.tree.find(base, frame)
-        warnings = [f"the definition of {topic} in the file is not used: it is damaged" for topic in refused]
+        warnings = [f"the file's definition of {topic} is not used: it is not sound" for topic in refused]
         if linked is None and has_odometry and base != frame:
             warnings.append(
                 f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "

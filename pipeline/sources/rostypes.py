@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from functools import cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
@@ -35,6 +36,8 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,127}")
 _TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,127}(/[A-Za-z][A-Za-z0-9_]{0,127}){1,3}")
 _DEFINITION_LIMIT = 64 << 10
 _ARRAY_LIMIT = 1 << 20
+#: As rosbags describes a type: its constants, and its fields with their kinds.
+Fields = tuple[list[Any], list[tuple[str, Any]]]
 
 
 class MessageDecoder:
@@ -79,16 +82,15 @@ class MessageDecoder:
                 standard.fielddefs.get(name, ([], None))[1] == fields for name, (_, fields) in found.items()
             ):
                 return
-            _check(found, channel.msgtype)
             store = get_typestore(Stores.EMPTY)
-            # Constants are not needed, and their text need not be trusted.
-            store.register({name: ([], fields) for name, (_, fields) in found.items()})
+            store.register(_closed(found, channel.msgtype, standard))
         except Exception:
             self.refused.append(channel.topic)
             return
         self._stores[channel.msgtype] = store
 
 
+@cache
 def standard_types(encoding: str) -> Typestore:
     """The definitions that come with ROS ("cdr": ROS 2, "ros1"), with those of Velodyne and tf."""
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_JAZZY)
@@ -99,7 +101,7 @@ def standard_types(encoding: str) -> Typestore:
     return store
 
 
-def _parse(channel: Channel) -> dict[str, Any]:
+def _parse(channel: Channel) -> dict[str, Fields]:
     if len(channel.definition) > _DEFINITION_LIMIT:
         raise ValueError("the definition is too long")
     if channel.definition_format == "ros2idl":
@@ -107,20 +109,44 @@ def _parse(channel: Channel) -> dict[str, Any]:
     return dict(get_types_from_msg(channel.definition, channel.msgtype))
 
 
-def _check(found: dict[str, Any], root: str) -> None:
-    """Refuse definitions that could take memory or time without end.
+def _closed(found: dict[str, Fields], root: str, standard: Typestore) -> dict[str, Fields]:
+    """The type and all that it is made of; what the file leaves out is taken from the standard.
 
     Raises:
-        ValueError: A name is no identifier, an array is too long, a type has no fields, or the
-            type is not defined.
+        ValueError: A type is not defined, or could take memory or time without end.
     """
-    if root not in found:
-        raise ValueError("the definition is of another type")
-    for name, (_, fields) in found.items():
-        if not _TYPE.fullmatch(name) or not fields:
-            raise ValueError(f"bad type {name!r}")
-        for field_name, (kind, detail) in fields:
-            if not _NAME.fullmatch(field_name):
-                raise ValueError(f"bad field {field_name!r}")
-            if kind == Nodetype.ARRAY and not 0 < detail[1] <= _ARRAY_LIMIT:
-                raise ValueError(f"bad length of {field_name}")
+    closed: dict[str, Fields] = {}
+    open_names = [root]
+    while open_names:
+        name = open_names.pop()
+        if name in closed:
+            continue
+        fields = found[name][1] if name in found else standard.fielddefs.get(name, ([], []))[1]
+        _check(name, fields)
+        # Constants are not needed, and their text need not be trusted.
+        closed[name] = ([], fields)
+        open_names += [part for _, kind in fields for part in _parts(kind)]
+    return closed
+
+
+def _parts(kind: tuple[Any, Any]) -> list[str]:
+    """The names of types in the description of a field."""
+    nodetype, detail = kind
+    if nodetype == Nodetype.NAME:
+        return [str(detail)]
+    return _parts(detail[0]) if nodetype in (Nodetype.ARRAY, Nodetype.SEQUENCE) else []
+
+
+def _check(name: str, fields: list[tuple[str, Any]]) -> None:
+    """Refuse what is no plain type.
+
+    Raises:
+        ValueError: The type has no fields, a name is no identifier, or an array is too long.
+    """
+    if not _TYPE.fullmatch(name) or not fields:
+        raise ValueError(f"bad type {name!r}")
+    for field_name, (kind, detail) in fields:
+        if not _NAME.fullmatch(field_name):
+            raise ValueError(f"bad field {field_name!r}")
+        if kind == Nodetype.ARRAY and not 0 < detail[1] <= _ARRAY_LIMIT:
+            raise ValueError(f"bad length of {field_name}")

@@ -68,6 +68,7 @@ class ScanFolder:
     def __init__(self, uri: str, path: Path, form: ScanFormat, options: SourceOptions) -> None:
         self._form = form
         self._warnings: list[str] = []
+        self._texts: list[Path] = []
         self._losses: dict[str, int] = {}
         self._files = _scan_files(path, form.suffix)
         if not self._files:
@@ -91,7 +92,7 @@ class ScanFolder:
             scans=len(self._files),
             start_ns=int(self._stamp[0]),
             end_ns=int(self._stamp[-1]),
-            digest=digest_of(self._files),
+            digest=digest_of([*self._files, *self._texts]),
             warnings=tuple(self._warnings),
         )
 
@@ -155,6 +156,7 @@ class ScanFolder:
                     continue
                 rows = self._rows(name, len(times), numbers)
                 if rows is not None:
+                    self._texts.append(place / name)
                     return times[rows]
         return numbers * STEP_NS
 
@@ -169,6 +171,7 @@ class ScanFolder:
                 continue
             rows = self._rows("poses.txt", len(poses), numbers)
             if rows is not None:
+                self._texts.append(place / "poses.txt")
                 return [poses[row] for row in rows.tolist()]
         return None
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 from pipeline.geometry import Pose3
 from pipeline.sources.ros_messages import Quaternion, Vector
 
+#: Positions on Earth in any of its frames are smaller [m].
+FARTHEST = 1e9
+
 
 class TransformTree:
     """Fixed transforms between frames; frames are compared without a leading slash."""
@@ -47,10 +50,10 @@ def pose_of(position: Vector, orientation: Quaternion) -> Pose3:
     Raises:
         ValueError: A number is not finite or the quaternion is zero.
     """
-    return Pose3.from_quaternion(
-        [position.x, position.y, position.z],
-        [orientation.w, orientation.x, orientation.y, orientation.z],
-    )
+    place = [position.x, position.y, position.z]
+    if not all(abs(axis) < FARTHEST for axis in place):
+        raise ValueError("a position is not finite")
+    return Pose3.from_quaternion(place, [orientation.w, orientation.x, orientation.y, orientation.z])
 
 
 def is_odometry_link(parent: str, child: str) -> bool:

@@ -38,7 +38,7 @@ class _Trees(msgspec.Struct, frozen=True):
 
 class _Path(msgspec.Struct, frozen=True):
     stamp_ns: Annotated[
-        list[Annotated[int, msgspec.Meta(ge=0, lt=2**63)]], msgspec.Meta(max_length=2_000_000)
+        list[Annotated[int, msgspec.Meta(ge=0, lt=2**62)]], msgspec.Meta(max_length=2_000_000)
     ]
     x: Rows
     y: Rows

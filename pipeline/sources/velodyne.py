@@ -76,7 +76,8 @@ class PacketDecoder:
             raise PacketError(str(error)) from error
         points = np.stack([table["x"], table["y"], table["z"]], axis=1)
         late = stamps_ns[-1] - stamp_ns
-        offset = np.clip(np.nan_to_num(table["time"].astype(np.float64)) * 1e9 + late, -2e9, 2e9)
+        with np.errstate(invalid="ignore"):
+            offset = np.clip(np.nan_to_num(table["time"].astype(np.float64)) * 1e9 + late, -2e9, 2e9)
         return clean_scan(
             stamp_ns, points, reflectance=table["intensity"], ring=table["ring"], offset_ns=offset
         )

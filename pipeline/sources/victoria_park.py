@@ -167,7 +167,8 @@ def _unpack(path: Path, uri: str) -> dict[str, bytes]:
     """The text files of the zip by name in lower case; sizes are checked before unpacking."""
     wanted = {"laser.txt", "drs.txt", "gps.txt"}
     try:
-        with zipfile.ZipFile(path) as archive:
+        # A damaged zip may lead before the start of the file, which is an OSError like any other.
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
             found = {Path(entry.filename).name.lower(): entry for entry in archive.infolist()}
             if not {"laser.txt", "drs.txt"} <= found.keys():
                 raise SourceError(
@@ -185,7 +186,7 @@ def _unpack(path: Path, uri: str) -> dict[str, bytes]:
         zlib.error,
         EOFError,
         RuntimeError,
-        NotImplementedError,
+        OSError,
         ValueError,
         UnicodeDecodeError,
     ) as error:

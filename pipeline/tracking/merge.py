@@ -44,6 +44,8 @@ def _first_pair(x: Float, touched: Bool, alive: Bool, radius: float) -> tuple[in
 
 
 def _join(tracks: TrackTable, old: int, young: int) -> None:
+    if tracks.stamp_ns[old] == tracks.stamp_ns[young]:  # two halves of one trunk in one scan
+        tracks.hits[old] -= 1
     tracks.x[old], tracks.P[old] = fuse(tracks.x[old], tracks.P[old], tracks.x[young], tracks.P[young])
     tracks.stamp_ns[old] = max(tracks.stamp_ns[old], tracks.stamp_ns[young])
     tracks.first_ns[old] = min(tracks.first_ns[old], tracks.first_ns[young])

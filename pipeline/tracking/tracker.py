@@ -20,6 +20,7 @@ GATHERED_SIGMA = 0.1  # m; the middle of the returns of one side lies so far bef
 NANOSECONDS = 1e-9
 DBH_OBSERVATIONS = 3  # fewer radii are no diameter yet
 SHARED_RADIUS_SIGMA = 0.01  # m; bark and taper, which more scans of one side do not average out
+SHARED_SIGMA = 0.01  # m; likewise of the position: the views of one trunk share part of their error
 
 
 class Tracker:
@@ -116,7 +117,7 @@ class Tracker:
         return Trees(
             number=t.number.copy(),
             position=t.x[:, :2].copy(),
-            covariance=t.P[:, :2, :2].copy(),
+            covariance=t.P[:, :2, :2] + SHARED_SIGMA**2 * np.eye(2),
             velocity=t.x[:, 2:].copy(),
             dbh=np.where(enough, 2.0 * t.radius / weight, np.nan),
             dbh_sigma=np.where(enough, 2.0 * radius_sigma, np.nan),

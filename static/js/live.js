@@ -18,7 +18,7 @@ const takers = {
 function takeMap({ path, ...map }) {
   state.path.length = Math.min(state.path.length, path.start);
   state.path.push(...path.points);
-  if (!state.map || map.index === 0) state.odometry.length = 0;
+  if (path.start === 0) state.odometry.length = 0; // another run
   state.map = map;
   if (map.odom) state.odometry[map.index] = map.odom;
 }

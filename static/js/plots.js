@@ -51,7 +51,8 @@ async function matrix(kind) {
 
 function curve(kind) {
   if (history.time.length < 2) return "Nothing to draw yet. Press play.";
-  const figure = layout({ showlegend: kind === "time", legend: { orientation: "h", y: 1.18 } });
+  const figure = layout({ showlegend: kind === "time", legend: { orientation: "h", y: 1.02, yanchor: "bottom" } });
+  if (kind === "time") figure.margin.t = 74;
   figure.xaxis.title = { text: "time in the run, s" };
   Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: kind === "time" ? "ms a scan" : "effective particles" } });
   if (kind === "n_eff") return [[line(history.time, history.n_eff, "N_eff")], figure];

@@ -64,7 +64,7 @@ function follow({ status }) {
 
 function say(text) {
   const error = byId("source-error");
-  setText(error, text);
+  setText(error, text.charAt(0).toUpperCase() + text.slice(1));
   error.hidden = !text;
 }
 

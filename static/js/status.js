@@ -17,7 +17,7 @@ const FIGURES = {
   mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
+  sigma: ["pose sigma", "cm", (s) => [state.map && s.state !== "failed" ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
   f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE]],
 };
 const cells = {};
@@ -41,7 +41,7 @@ function show() {
     setText(cells[name].value, text);
     cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
   }
-  cells.f1.cell.hidden = !state.evaluation;
+  cells.f1.cell.hidden = !state.evaluation || status.state === "failed";
   setText(byId("source-name"), shortSource(status.source) || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
   document.title = `${shortSource(status.source)} · stemmap`;
@@ -66,13 +66,17 @@ function showNotice(quiet) {
   const text = !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. This is the last picture; it goes on by itself when stemmap answers again.`
     : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
-    : ["failed", "waiting"].includes(status?.state) ? status.detail : "";
+    : status?.detail ?? "";
   notice.hidden = !text;
-  notice.classList.toggle("wait", status?.state !== "failed" || !state.connected);
-  setText(notice.querySelector("span"), text || "");
-  byId("notice-open").hidden = !(state.connected && status?.state === "failed");
+  const failed = state.connected && status?.state === "failed";
+  notice.classList.toggle("failed", failed);
+  notice.classList.toggle("wait", !failed);
+  document.body.classList.toggle("failed", failed);
+  setText(notice.querySelector("span"), sentence(text));
+  byId("notice-open").hidden = !failed;
 }
 
+const sentence = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 const seconds = (since) => Math.floor((performance.now() - since) / 1000);
 
 export function startStatus() {

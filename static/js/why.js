@@ -19,7 +19,7 @@ function show() {
   const lead = clusters
     ? `Scan ${state.map.index}: ${count(clusters, "cluster")}, and what each was taken for.`
     : `Scan ${state.map.index}: no cluster. Are the box and the height band where the stems are, and is Radius eps large enough?`;
-  panel().replaceChildren(el("p", { class: "lead", "data-clusters": clusters, text: lead }), bars(verdicts), points());
+  panel().replaceChildren(el("p", { class: "lead", "data-scan": state.map.index, "data-clusters": clusters, text: lead }), bars(verdicts), points());
 }
 
 function bars(verdicts) {

@@ -272,9 +272,11 @@ class FakeScene:
         self.calls: list[tuple[str, Any]] = []
 
     def show(self, frame: Frame, path: Any, /) -> None:
+        assert path.shape[1] == 2
         self.calls.append(("show", frame.index))
 
     def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None:
+        assert isinstance(parameters, Parameters)
         self.calls.append(("parameters", preset_name))
 
     def show_truth(self, trees: TruthTrees | None, /) -> None:

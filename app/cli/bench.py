@@ -1,0 +1,68 @@
+"""`stemmap bench`: measures the pipeline beside its peer, from the source tree."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from datetime import date
+from pathlib import Path
+
+from pipeline.errors import StemmapError
+
+HELP = "measure speed and memory, and write docs/benchmarks.md (needs the source tree)"
+
+_ROOT = Path(__file__).resolve().parents[2]
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("names", metavar="NAME", nargs="*", help="benchmarks to run (default: all)")
+    parser.add_argument("--list", action="store_true", help="list the benchmarks and run none")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures as JSON too")
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, help="Markdown file (default: docs/benchmarks.md of the tree)"
+    )
+    parser.add_argument(
+        "--date",
+        metavar="YYYY-MM-DD",
+        type=_date,
+        help="date written beside the figures (default: today)",
+    )
+    parser.epilog = "Sections of the Markdown file whose benchmarks are not run stay as they are."
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the benchmarks.
+
+    Raises:
+        StemmapError: This is not the source tree, a name is unknown, or a benchmark failed.
+    """
+    _find_benchmarks(_ROOT)
+    from tests.benchmarks.runner import descriptions
+    from tests.benchmarks.runner import run as run_benchmarks
+
+    if arguments.list:
+        for name, line in descriptions().items():
+            print(f"{name:10}{line}")
+        return 0
+    out = arguments.out or _ROOT / "docs" / "benchmarks.md"
+    day = arguments.date or date.today()
+    failed = run_benchmarks(arguments.names, out=out, json_file=arguments.json, day=day)
+    return 1 if failed else 0
+
+
+def _find_benchmarks(root: Path) -> None:
+    if not (root / "tests" / "benchmarks" / "runner.py").is_file():
+        raise StemmapError(
+            "the benchmarks are not part of the installed package",
+            remedy="Run `uv run stemmap bench` in a clone of the source tree",
+        )
+    if str(root) not in sys.path:
+        sys.path.insert(0, str(root))
+
+
+def _date(text: str) -> date:
+    try:
+        return date.fromisoformat(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a date like 2026-01-31") from None

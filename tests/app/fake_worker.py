@@ -1,0 +1,38 @@
+"""The worker's process with a fake mapper: `python -m tests.app.fake_worker`.
+
+`fake:N` has N scans, `prints:N` prints while it is opened, `hangs:` never comes back.
+"""
+
+from __future__ import annotations
+
+import threading
+
+from app.session import Session
+from app.worker import run_as_worker
+from pipeline.errors import SourceError
+from pipeline.parameters import Parameters
+from pipeline.sources.base import Source
+from pipeline.steps import steps
+from tests.app.fakes import FakeMapper, FakeSource
+
+
+def open_source(uri: str, _seed: int) -> Source:
+    name, _, scans = uri.partition(":")
+    if name == "missing":
+        raise SourceError("there is no such file", where=uri)
+    if name == "hangs":
+        threading.Event().wait()
+    if name == "prints":
+        print("a library greets" * 1000, flush=True)
+    return FakeSource(int(scans), uri=uri)
+
+
+if __name__ == "__main__":
+    run_as_worker(
+        Session(
+            open_source=open_source,
+            make_mapper=lambda _source, p, seed, watch: FakeMapper(p, seed, watch),
+            make_synchroniser=lambda _odometry: steps,
+            parameters=Parameters(),
+        )
+    )

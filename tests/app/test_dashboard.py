@@ -1,0 +1,156 @@
+"""What becomes of the worker's messages: scene, browsers, parameters, score."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Any
+
+import numpy as np
+import pytest
+import pytest_asyncio
+
+from app.dashboard import Dashboard
+from app.live import Live
+from app.messages import Advance, Open, Play, SetParameters, Status
+from app.parameter_state import ParameterState
+from app.worker_messages import Report, Shown
+from pipeline.errors import ParameterError
+from pipeline.parameters import preset
+from tests.app.fakes import FakeScene, FakeWorker, frame, opened, path, truth_trees
+
+
+@pytest_asyncio.fixture
+async def dashboard() -> AsyncIterator[Dashboard]:
+    made = Dashboard(ParameterState(), Live())
+    made.worker, made.scene = FakeWorker(), FakeScene()
+    await made.start(Open("fake:"))
+    yield made
+    await made.close()
+
+
+def worker(dashboard: Dashboard) -> FakeWorker:
+    assert isinstance(dashboard.worker, FakeWorker)
+    return dashboard.worker
+
+
+def scene_calls(dashboard: Dashboard) -> list[tuple[str, Any]]:
+    assert isinstance(dashboard.scene, FakeScene)
+    return dashboard.scene.calls
+
+
+def browser_knows(dashboard: Dashboard) -> dict[str, Any]:
+    messages = [json.loads(text) for _, text in dashboard.live.messages_after(0)]
+    return {message["type"]: message for message in messages}
+
+
+async def test_an_opened_source_is_played(dashboard: Dashboard) -> None:
+    assert isinstance(worker(dashboard).commands[0], SetParameters)
+    assert worker(dashboard).commands[1] == Open("fake:")
+    await dashboard.receive(opened(truth=truth_trees()))
+    assert worker(dashboard).commands[2:] == [Play()]
+    assert ("clear", None) in scene_calls(dashboard)
+    assert ("truth", True) in scene_calls(dashboard)
+    kinds = [tree["kind"] for tree in browser_knows(dashboard)["truth"]["trees"]]
+    assert kinds == ["tree", "tree", "pole"]
+
+
+async def test_the_preset_that_suits_is_set_before_the_first_scan(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened(preset="laser2d"))
+    change, play = worker(dashboard).commands[2:]
+    assert isinstance(change, SetParameters)
+    assert change.values == preset("laser2d").model_dump()
+    assert play == Play()
+    assert browser_knows(dashboard)["parameters"]["preset"] == "laser2d"
+    assert ("parameters", "laser2d") in scene_calls(dashboard)
+
+
+async def test_what_a_person_chose_stays(dashboard: Dashboard) -> None:
+    await dashboard.change_parameters({"clustering.eps": 0.3})
+    await dashboard.receive(opened(preset="laser2d"))
+    assert browser_knows(dashboard)["parameters"]["preset"] == "forest"
+    assert dashboard.parameters.parameters.clustering.eps == 0.3
+
+
+async def test_flags_are_laid_over_the_preset_that_suits() -> None:
+    def begin(suggested: str) -> Any:
+        return suggested, preset(suggested).replace({"clustering.eps": 0.33})
+
+    state = ParameterState(begin)
+    assert state.suit("laser2d")
+    assert (state.preset, state.parameters.clustering.eps) == ("laser2d", 0.33)
+    assert state.parameters.clustering.method == "range_jump"
+    assert not state.suit("laser2d")
+
+
+async def test_flags_that_do_not_fit_another_preset_leave_what_is() -> None:
+    def begin(suggested: str) -> Any:
+        if suggested != "forest":
+            raise ParameterError("filters.x_min = 0 must be less than ...")
+        return suggested, preset(suggested)
+
+    state = ParameterState(begin)
+    assert not state.suit("paper")
+    assert state.preset == "forest"
+
+
+async def test_a_picture_goes_to_scene_and_browsers_with_its_whole_path(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened())
+    await dashboard.receive(Shown(1, 0.0, frame(0, 1), 0, path([0.0])))
+    await dashboard.receive(Shown(1, 0.1, frame(1, 2, n_trees=3), 1, path([1.0])))
+    async with asyncio.timeout(10):
+        while scene_calls(dashboard)[-1] != ("show", 1):
+            await asyncio.sleep(0)
+    shown = dashboard.live.map_after(0)
+    assert shown is not None
+    _, payload, path_xy = shown
+    np.testing.assert_array_equal(path_xy, [[0.0, 0.0], [1.0, 0.0]])
+    assert payload["verdicts"] == {"too long": 1}
+    assert len(payload["trees"]) == 2
+    json.dumps(payload, allow_nan=False)
+
+
+async def test_the_score_follows_the_map_and_goes_with_the_run(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened(truth=truth_trees()))
+    await dashboard.receive(Shown(1, 0.0, frame(0, 1, n_trees=3), 0, path([0.0])))
+    async with asyncio.timeout(20):
+        while dashboard.scores.latest is None:
+            await asyncio.sleep(0.01)
+    score = browser_knows(dashboard)["evaluation"]
+    assert score["TA"] == {"count": 2, "of": 2, "rate": 1.0}
+    assert score["TR"] == {"count": 1, "of": 1, "rate": 1.0}
+    assert score["f1"] == 1.0
+    assert score["dbh_rmse_cm"] == pytest.approx(1.0)
+    assert score["position_rmse_m"] == pytest.approx(((0.05**2 + 0.1**2) / 2) ** 0.5)
+    await dashboard.receive(opened())
+    assert browser_knows(dashboard)["evaluation"] == {"type": "evaluation", "value": None}
+
+
+async def test_a_restarted_worker_stands_at_the_start_and_says_so(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened())
+    worker(dashboard).restarts = 1
+    await dashboard.receive(opened())
+    assert worker(dashboard).commands[-1] == Advance(1)
+    await dashboard.receive(Report(Status("paused")))
+    assert "started again" in dashboard.status.detail
+    await dashboard.command(Play())
+    await dashboard.receive(Report(Status("paused")))
+    assert dashboard.status.detail == ""
+
+
+async def test_playing_a_dead_worker_plays_once_it_is_back(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened())
+    worker(dashboard).pid = None
+    await dashboard.command(Play())
+    worker(dashboard).restarts = 1
+    await dashboard.receive(opened())
+    assert worker(dashboard).commands[-1] == Play()
+
+
+async def test_a_selection_is_one_everywhere(dashboard: Dashboard) -> None:
+    await dashboard.select_tree(4)
+    assert scene_calls(dashboard)[-1] == ("select", 4)
+    assert browser_knows(dashboard)["selection"] == {"type": "selection", "tree": 4}
+    await dashboard.receive(opened())
+    assert browser_knows(dashboard)["selection"]["tree"] is None

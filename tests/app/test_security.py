@@ -1,0 +1,246 @@
+"""Who may talk to the server: every route and every websocket, with each way of being refused."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from collections.abc import AsyncIterator
+from contextlib import suppress
+
+import httpx
+import pytest
+import pytest_asyncio
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosedError, InvalidStatus
+
+from app.security import Guard, allowed_hosts, new_token
+from tests.app.server_for_tests import BEARER, COOKIE, HOST, PORT, TOKEN, build_app, routes, running, served
+
+ROUTES = [
+    ("GET", "/"),
+    ("GET", "/static/plotly.min.js"),
+    ("GET", "/static/index.html"),
+    ("GET", "/static/no-such-file.js"),
+    ("GET", "/viser/"),
+    ("GET", "/api/status"),
+    ("GET", "/api/parameters"),
+    ("PATCH", "/api/parameters"),
+    ("POST", "/api/parameters/preset"),
+    ("POST", "/api/parameters/reset"),
+    ("GET", "/api/parameters.toml"),
+    ("POST", "/api/command"),
+    ("POST", "/api/open"),
+    ("GET", "/api/sources"),
+    ("GET", "/api/trees"),
+    ("GET", "/api/trees.csv"),
+    ("GET", "/api/path.csv"),
+    ("GET", "/api/evaluation"),
+    ("GET", "/api/pairs"),
+    ("GET", "/no/such/route"),
+]
+MISSES = {("GET", "/static/index.html"), ("GET", "/static/no-such-file.js")}
+SOCKETS = ["/api/live", "/viser", "/viser/"]
+
+
+@pytest_asyncio.fixture
+async def client() -> AsyncIterator[httpx.AsyncClient]:
+    async with running() as (client, _):
+        yield client
+
+
+def test_every_route_is_in_the_matrix() -> None:
+    known = {(method, path) for method, path in ROUTES} | {("WS", path) for path in SOCKETS}
+    known = known | {("GET", "/static/{path:path}")}
+    assert routes() == known - {("GET", "/no/such/route"), *MISSES}
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+async def test_nobody_without_the_token(client: httpx.AsyncClient, method: str, path: str) -> None:
+    for headers in (
+        {},
+        {"Cookie": f"stemmap_{PORT}=wrong"},
+        {"Cookie": f"stemmap_{PORT + 1}={TOKEN}"},
+        {"Authorization": "Bearer wrong"},
+        {"Authorization": f"Basic {TOKEN}"},
+        {"Cookie": f"stemmap_{PORT}={TOKEN}x"},
+        {"Cookie": f"stemmap_{PORT}="},
+    ):
+        answer = await client.request(method, path, headers=headers)
+        assert answer.status_code == 401, headers
+        assert answer.json()["error"]["remedy"]
+    wrong = await client.request(method, f"{path}?token={TOKEN}x")
+    assert wrong.status_code == 401
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+@pytest.mark.parametrize("who", [COOKIE, BEARER])
+async def test_who_has_the_token_is_let_in(
+    client: httpx.AsyncClient, method: str, path: str, who: dict[str, str]
+) -> None:
+    answer = await client.request(method, path, headers=who)
+    assert answer.status_code not in (401, 403)
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", f"evil.example:{PORT}", f"127.0.0.1:{PORT + 1}", "127.0.0.1", f"[::2]:{PORT}", ""],
+)
+async def test_a_foreign_host_is_refused(
+    client: httpx.AsyncClient, method: str, path: str, host: str
+) -> None:
+    answer = await client.request(method, path, headers={**BEARER, "Host": host})
+    assert answer.status_code == 403
+
+
+@pytest.mark.parametrize(
+    "host", [f"127.0.0.1:{PORT}", f"localhost:{PORT}", f"[::1]:{PORT}", f"LocalHost:{PORT}"]
+)
+async def test_the_names_of_this_machine_are_known(client: httpx.AsyncClient, host: str) -> None:
+    assert (await client.get("/api/status", headers={**BEARER, "Host": host})).status_code == 200
+
+
+@pytest.mark.parametrize(("method", "path"), [r for r in ROUTES if r[0] != "GET"])
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "null",
+        f"http://127.0.0.1:{PORT + 1}",
+        f"http://localhost:{PORT}",
+        "http://127.0.0.1",
+    ],
+)
+async def test_a_foreign_origin_changes_nothing(
+    client: httpx.AsyncClient, method: str, path: str, origin: str
+) -> None:
+    for who in (COOKIE, BEARER):
+        answer = await client.request(method, path, headers={**who, "Origin": origin})
+        assert answer.status_code == 403
+
+
+async def test_our_own_origin_may(client: httpx.AsyncClient) -> None:
+    headers = {**COOKIE, "Origin": f"http://{HOST}"}
+    answer = await client.post("/api/command", headers=headers, json={"type": "pause"})
+    assert answer.status_code == 202
+
+
+async def test_the_link_becomes_a_cookie_and_a_clean_address(client: httpx.AsyncClient) -> None:
+    answer = await client.get(f"/?token={TOKEN}&view=top")
+    assert answer.status_code == 303
+    assert answer.headers["location"] == "/?view=top"
+    cookie = answer.headers["set-cookie"]
+    for part in (f"stemmap_{PORT}={TOKEN}", "HttpOnly", "SameSite=strict", "Path=/"):
+        assert part in cookie
+    assert answer.headers["referrer-policy"] == "no-referrer"
+    assert TOKEN not in answer.text
+    assert (await client.get("/", headers={"Cookie": cookie.split(";")[0]})).status_code == 200
+
+
+async def test_the_token_in_the_address_works_for_the_page_alone(client: httpx.AsyncClient) -> None:
+    assert (await client.get(f"/api/status?token={TOKEN}")).status_code == 401
+    assert (await client.post(f"/?token={TOKEN}")).status_code == 401
+
+
+async def test_a_person_without_a_token_reads_what_to_do(client: httpx.AsyncClient) -> None:
+    answer = await client.get("/", headers={"Accept": "text/html"})
+    assert answer.status_code == 401
+    assert "Open the link that stemmap printed" in answer.text
+
+
+async def test_our_cookie_is_found_among_others(client: httpx.AsyncClient) -> None:
+    line = f"a=b; odd name=1; stemmap_{PORT}=old; stemmap_{PORT}={TOKEN}"
+    assert (await client.get("/api/status", headers={"Cookie": line})).status_code == 200
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+async def test_every_answer_is_careful(client: httpx.AsyncClient, method: str, path: str) -> None:
+    for who in ({}, BEARER):
+        headers = (await client.request(method, path, headers=who)).headers
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["referrer-policy"] == "no-referrer"
+        policy = headers["content-security-policy"]
+        assert "frame-ancestors 'self'" in policy
+        assert "default-src" in policy
+        if path != "/viser/":
+            assert "script-src" not in policy
+            assert "unsafe-eval" not in policy
+
+
+async def test_a_large_body_is_refused_with_and_without_its_length(client: httpx.AsyncClient) -> None:
+    body = b'{"uri": "' + b"x" * 1_000_001 + b'"}'
+    headers = {**BEARER, "Content-Type": "application/json"}
+    assert (await client.post("/api/open", headers=headers, content=body)).status_code == 413
+
+    async def pieces() -> AsyncIterator[bytes]:
+        for start in range(0, len(body), 100_000):
+            yield body[start : start + 100_000]
+
+    answer = await client.post("/api/open", headers=headers, content=pieces())
+    assert answer.status_code == 413
+    assert "1000000 bytes" in answer.json()["error"]["what"]
+
+
+@pytest.mark.parametrize("path", SOCKETS)
+async def test_a_websocket_needs_the_token_and_our_page(path: str) -> None:
+    async with served() as (host, _):
+        port = host.rpartition(":")[2]
+        ours, cookie = {"Origin": f"http://{host}"}, {"Cookie": f"stemmap_{port}={TOKEN}"}
+        refusals: list[tuple[dict[str, str], int]] = [
+            ({}, 403),
+            (ours, 401),
+            (cookie, 403),
+            ({**cookie, "Origin": "http://evil.example"}, 403),
+            ({**cookie, "Origin": f"http://localhost:{port}"}, 403),
+            ({**BEARER, "Origin": "null"}, 403),
+            ({**ours, "Cookie": f"stemmap_{port}=wrong"}, 401),
+            ({"Authorization": "Bearer wrong"}, 403),
+        ]
+        for headers, status in refusals:
+            with pytest.raises(InvalidStatus) as refused:
+                await connect(f"ws://{host}{path}", additional_headers=headers, proxy=None)
+            assert refused.value.response.status_code == status, headers
+        url = f"ws://localhost.evil.example:{port}{path}"
+        with pytest.raises(InvalidStatus) as refused:
+            await connect(url, host="127.0.0.1", additional_headers=BEARER, proxy=None)
+        assert refused.value.response.status_code == 403
+
+
+async def test_a_websocket_of_our_page_is_accepted() -> None:
+    async with served() as (host, _):
+        port = host.rpartition(":")[2]
+        by_cookie = {"Cookie": f"stemmap_{port}={TOKEN}", "Origin": f"http://{host}"}
+        for headers in (BEARER, by_cookie):
+            async with connect(f"ws://{host}/api/live", additional_headers=headers, proxy=None) as live:
+                first = json.loads(await live.recv())
+                assert first["type"] in ("status", "parameters", "truth", "evaluation", "selection")
+
+
+async def test_what_the_page_does_not_say_ends_the_connection() -> None:
+    async with (
+        served() as (host, _),
+        connect(f"ws://{host}/api/live", additional_headers=BEARER, proxy=None) as live,
+    ):
+        await live.send('{"type": "select", "tree": "first"}')
+        async with asyncio.timeout(10):
+            while live.close_code is None:
+                with suppress(ConnectionClosedError):
+                    await live.recv()
+        assert live.close_code == 1003
+
+
+def test_an_open_address_is_called_by_number_or_own_name_only() -> None:
+    guard = Guard(build_app(), token=TOKEN, host="0.0.0.0", port=PORT, body_limit=10)  # noqa: S104
+    assert guard._is_own_address(f"192.168.1.4:{PORT}")
+    assert not guard._is_own_address(f"rebound.example:{PORT}")
+    assert not guard._is_own_address(f"192.168.1.4:{PORT + 1}")
+    assert f"{socket.gethostname().lower()}:{PORT}" in allowed_hosts("0.0.0.0", PORT)  # noqa: S104
+    assert "robot.local:80" in allowed_hosts("127.0.0.1", 80, ["robot.local"])
+    assert "robot.local" in allowed_hosts("127.0.0.1", 80, ["robot.local"])
+
+
+def test_tokens_are_long_and_never_the_same() -> None:
+    tokens = {new_token() for _ in range(100)}
+    assert len(tokens) == 100
+    assert min(map(len, tokens)) >= 32

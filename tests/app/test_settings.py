@@ -1,0 +1,63 @@
+"""Settings of the environment, and the words for what cannot be used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from app.settings import VARIABLES, Settings, from_environment, is_loopback
+from pipeline.errors import StemmapError
+
+
+def test_nothing_given_is_this_machine_only() -> None:
+    assert from_environment({}) == Settings()
+    assert Settings().loopback
+
+
+def test_all_that_can_be_given(tmp_path: Path) -> None:
+    given = {
+        "STEMMAP_HOST": "localhost",
+        "STEMMAP_PORT": "9000",
+        "STEMMAP_TOKEN": "0123456789abcdef",
+        "STEMMAP_HOSTS": "Robot.local, tunnel ,",
+        "STEMMAP_RECORDINGS": str(tmp_path),
+    }
+    assert set(given) == set(VARIABLES)
+    assert from_environment(given) == Settings(
+        "localhost", 9000, "0123456789abcdef", ("robot.local", "tunnel"), tmp_path
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("STEMMAP_HOST", "0.0.0.0"),  # noqa: S104
+        ("STEMMAP_HOST", "example.org"),
+        ("STEMMAP_PORT", "80000"),
+        ("STEMMAP_PORT", "-1"),
+        ("STEMMAP_PORT", "http"),
+        ("STEMMAP_TOKEN", "short"),
+        ("STEMMAP_TOKEN", "with a\nline break in it"),
+        ("STEMMAP_TOKEN", "öööööööööööööööööö"),
+        ("STEMMAP_RECORDINGS", "/no/such/folder"),
+    ],
+)
+def test_what_cannot_be_used_names_the_variable(name: str, value: str) -> None:
+    with pytest.raises(StemmapError, match=name):
+        from_environment({name: value})
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        ("127.0.0.1", True),
+        ("127.5.5.5", True),
+        ("::1", True),
+        ("localhost", True),
+        ("::", False),
+        ("host", False),
+    ],
+)
+def test_loopback(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback

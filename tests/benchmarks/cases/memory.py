@@ -1,0 +1,77 @@
+"""Whether memory grows over a long run by more than the path and the map."""
+
+from __future__ import annotations
+
+import gc
+from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING, Any
+
+from tests.benchmarks.machine import peak_mib, resident_mib
+from tests.benchmarks.table import Cell, Table, verdict
+
+if TYPE_CHECKING:
+    from pipeline.mapper import Mapper
+
+NAME = "memory"
+LINE = "Memory over sim:long, ten minutes of driving"
+
+EVERY = 1_000  # scans between two readings
+ALLOWED_MIB = 8.0  # what an allocator may keep; a scan leaked in a thousand would be more
+
+
+def run() -> list[Table]:
+    """Map sim:long and read the memory on the way."""
+    readings = follow("sim:long", EVERY)
+    first, last = readings[0], readings[-1]
+    growth = (last[1] - last[2]) - (first[1] - first[2])
+    rows: tuple[tuple[Cell, ...], ...] = tuple(
+        (scans, resident, known, resident - known, landmarks)
+        for scans, resident, known, landmarks in readings
+    )
+    return [
+        Table(
+            "Memory of the process while it simulates and maps sim:long, preset forest",
+            ("scans", "resident MiB", "path and map MiB", "the rest MiB", "landmarks"),
+            rows,
+            (
+                f"From scan {first[0]:,} to {last[0]:,} the rest grew by {growth:.2f} MiB, "
+                f"{growth * 1024 / max(last[0] - first[0], 1):.2f} KiB a scan; asked for: no growth "
+                f"(at most {ALLOWED_MIB:g} MiB, which allocators may keep): "
+                f"{verdict(growth <= ALLOWED_MIB)}.",
+                f"Peak of the process: {peak_mib():.0f} MiB.",
+            ),
+        )
+    ]
+
+
+def follow(uri: str, every: int) -> list[tuple[int, float, float, int]]:
+    """Map a source; scans, resident memory, memory of path and map [MiB], landmarks at each reading."""
+    from pipeline.mapper import Mapper
+    from pipeline.parameters import preset
+    from pipeline.sources import open_source
+    from pipeline.steps import steps
+
+    source = open_source(uri)
+    described = source.description
+    mapper = Mapper(preset("forest"), sensor=described.sensor, T_base_lidar=described.T_base_lidar, seed=0)
+    readings = []
+    for step in steps(source.records()):
+        frame = mapper.process(step)
+        if (step.index + 1) % every == 0:
+            gc.collect()
+            resident = resident_mib()  # read before the size of the map, which copies it
+            readings.append((step.index + 1, resident, _known_mib(mapper), len(frame.estimate.landmarks)))
+    return readings
+
+
+def _known_mib(mapper: Mapper) -> float:
+    return (array_bytes(mapper.snapshot()) + array_bytes(mapper.path)) / 2**20
+
+
+def array_bytes(record: Any) -> int:
+    """Bytes of all arrays in a record and the records in it."""
+    if hasattr(record, "nbytes"):
+        return int(record.nbytes)
+    if is_dataclass(record):
+        return sum(array_bytes(getattr(record, f.name)) for f in fields(record))
+    return 0

@@ -1,0 +1,136 @@
+"""FastSLAM at three sizes, and in plain Python at the smallest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from tests.benchmarks.table import Cell, Table, ratio
+from tests.benchmarks.timing import in_turns, middle, quantile
+
+if TYPE_CHECKING:
+    from pipeline.records import Detections, Float
+
+NAME = "slam"
+LINE = "One step of FastSLAM with ten observations, at three numbers of particles and landmarks"
+
+SIZES = ((100, 30, 300), (100, 1_000, 300), (1_000, 1_000, 60))  # particles, landmarks, steps
+PEER_STEPS = 7
+OBSERVED = 10
+SPACING = 3.0  # m between landmarks on their lattice
+SIGMA = 0.05
+STRIDE = 0.05  # m a step
+
+
+def run() -> list[Table]:
+    """Our FastSLAM at all sizes, the peer's at the smallest."""
+    rows = [row(*SIZES[0], peer_steps=PEER_STEPS), *(row(*size, peer_steps=0) for size in SIZES[1:])]
+    columns = ("particles", "landmarks", "ours ms", "p99", "plain Python ms", "ratio of medians")
+    return [
+        Table(
+            "FastSLAM, ten observations a step",
+            columns,
+            tuple(rows),
+            ("Every particle knows all landmarks; resampling is part of a step when it is needed.",),
+        )
+    ]
+
+
+def row(particles: int, landmarks: int, steps: int, peer_steps: int) -> tuple[Cell, ...]:
+    """Time steps of one size."""
+    sides: dict[str, Callable[[], object]] = {"ours": Driven(_ours(particles), landmarks)}
+    if peer_steps:
+        sides["peer"] = Driven(_peer(particles), landmarks)
+    side_by_side = in_turns(sides, peer_steps) if peer_steps else {"peer": []}
+    ours = in_turns({"ours": sides["ours"]}, steps)["ours"]
+    peer = middle(side_by_side["peer"]) if peer_steps else None
+    beside = middle(side_by_side["ours"]) if peer_steps else None
+    return (
+        particles,
+        landmarks,
+        middle(ours),
+        quantile(ours, 0.99),
+        peer,
+        ratio(peer, beside) if peer is not None and beside is not None else "",
+    )
+
+
+Feed = Callable[[int, float, "Float"], None]
+
+
+class Driven:
+    """A filter that knows a lattice of landmarks and drives on through it with every call."""
+
+    def __init__(self, feed: Feed, landmarks: int) -> None:
+        import numpy as np
+
+        columns = max(1, round(landmarks**0.5))
+        k = np.arange(landmarks)
+        self._lattice = SPACING * np.stack([k // columns, k % columns - columns // 2], axis=1).astype(float)
+        self._lattice[:, 0] -= 5.0
+        self._feed, self._x, self._index = feed, 0.0, 0
+        self._random = np.random.default_rng(0)
+        for _ in range(4):  # seen so often, all of them weigh
+            for first in range(0, landmarks, OBSERVED):
+                self._observe(self._lattice[first : first + OBSERVED], 0.0)
+
+    def __call__(self) -> None:
+        """One step on, with the ten nearest landmarks seen; back to the start after ten metres."""
+        import numpy as np
+
+        motion = STRIDE if (self._index // 200) % 2 == 0 else -STRIDE
+        self._x += motion
+        distance = np.hypot(self._lattice[:, 0] - self._x, self._lattice[:, 1])
+        self._observe(self._lattice[np.argsort(distance)[:OBSERVED]], motion)
+
+    def _observe(self, landmarks: Float, motion: float) -> None:
+        import numpy as np
+
+        seen = landmarks - np.array([self._x, 0.0]) + self._random.normal(0.0, 0.5 * SIGMA, landmarks.shape)
+        self._feed(self._index, motion, seen)
+        self._index += 1
+
+
+def _ours(particles: int) -> Feed:
+    import numpy as np
+
+    from pipeline.geometry import Pose2
+    from pipeline.parameters import Parameters
+    from pipeline.slam import FastSlam
+    from pipeline.visibility import BINS
+
+    slam = FastSlam(Parameters().replace({"slam.particles": particles}).slam, 0)
+    nothing_missed = np.zeros(BINS)
+
+    def feed(index: int, motion: float, seen: Float) -> None:
+        slam.process(index, Pose2(motion, 0.0, 0.0), _detections(seen), nothing_missed)
+
+    return feed
+
+
+def _detections(seen: Float) -> Detections:
+    import numpy as np
+
+    from pipeline.records import Detections
+
+    unknown = np.full(len(seen), np.nan)
+    covariance = np.tile(SIGMA**2 * np.eye(2), (len(seen), 1, 1))
+    return Detections(np.arange(len(seen)), seen, covariance, unknown, unknown, np.zeros(len(seen)), unknown)
+
+
+def _peer(particles: int) -> Feed:
+    import numpy as np
+
+    from pipeline.parameters import Parameters
+    from tests.benchmarks.peer.fastslam import FastSlam
+    from tests.benchmarks.peer.stages import Detection
+
+    values: dict[str, Any] = dict(Parameters().replace({"slam.particles": particles}).flat())
+    slam = FastSlam(values, 0)
+
+    def feed(_index: int, motion: float, seen: Float) -> None:
+        slam.process((motion, 0.0, 0.0), [Detection(z, SIGMA**2 * np.eye(2), 1.0) for z in seen])
+        slam.estimate()
+        slam.resample_if_needed()
+
+    return feed

@@ -1,0 +1,107 @@
+"""Processes of benchmarks, seen from their parent: one thread each, and the source tree on the path."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import StemmapError
+from tests.benchmarks.table import Table
+
+ROOT = Path(__file__).resolve().parents[2]
+LONGEST_S = 1800.0
+_ONE_THREAD = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "LOKY_MAX_CPU_COUNT",
+)
+
+
+def environment() -> dict[str, str]:
+    """The environment of a child: every library at one thread."""
+    path = os.pathsep.join(p for p in (str(ROOT), os.environ.get("PYTHONPATH", "")) if p)
+    return {**os.environ, **dict.fromkeys(_ONE_THREAD, "1"), "PYTHONPATH": path}
+
+
+def tables_of(name: str) -> list[Table]:
+    """Run a benchmark in a process of its own.
+
+    Raises:
+        StemmapError: It failed; its own words are on stderr already.
+    """
+    words = [sys.executable, "-m", "tests.benchmarks.child", name]
+    try:
+        done = subprocess.run(
+            words, env=environment(), cwd=ROOT, stdout=subprocess.PIPE, timeout=LONGEST_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise StemmapError(f"the benchmark took longer than {LONGEST_S:g} s", where=name) from None
+    if done.returncode != 0:
+        raise StemmapError(f"the benchmark ended with code {done.returncode}", where=name)
+    return [Table.from_json(value) for value in json.loads(done.stdout)]
+
+
+class Side:
+    """One of two processes that are measured in turns: a line of JSON goes in, one comes out."""
+
+    def __init__(self, module: str, *words: str) -> None:
+        self.name = module
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, *words],
+            env=environment(),
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
+        """Send a question and wait for the answer.
+
+        Raises:
+            StemmapError: The process ended instead.
+        """
+        sending, receiving = self._process.stdin, self._process.stdout
+        if sending is None or receiving is None:
+            raise StemmapError("the process has no pipes", where=self.name)
+        with contextlib.suppress(BrokenPipeError):
+            sending.write(json.dumps(question) + "\n")
+            sending.flush()
+        line = receiving.readline()
+        if not line:
+            raise StemmapError(f"the process ended with code {self._process.wait()}", where=self.name)
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def end(self) -> None:
+        """Close its pipes, and end it if that is not enough."""
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    pipe.close()
+        try:
+            self._process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+@contextlib.contextmanager
+def sides(modules: Mapping[str, str], *words: str) -> Iterator[dict[str, Side]]:
+    """Start a process for each side and end them all, whatever happens."""
+    started: dict[str, Side] = {}
+    try:
+        for name, module in modules.items():
+            started[name] = Side(module, *words)
+        yield started
+    finally:
+        for side in started.values():
+            side.end()

@@ -1,0 +1,74 @@
+"""A real Chromium, a real server, and the dashboard open in it. Software rendering is slow: the window is
+small, the scene is drawn coarsely, and everything is waited for, up to a minute.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Playwright, sync_playwright
+
+from tests.browser.dashboard import Dashboard
+from tests.browser.serving import Server
+
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+PATIENCE_MS = 60_000
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Everything in this folder drives a browser."""
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.browser)
+
+
+@pytest.fixture(scope="session")
+def playwright() -> Iterator[Playwright]:
+    with sync_playwright() as started:
+        yield started
+
+
+@pytest.fixture(scope="session")
+def chromium(playwright: Playwright) -> Iterator[Browser]:
+    path = os.environ.get("CHROMIUM", "/usr/bin/chromium")
+    if not Path(path).exists():
+        pytest.skip(f"no Chromium at {path}; install it or set CHROMIUM")
+    browser = playwright.chromium.launch(executable_path=path, headless=True, args=FLAGS)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="session")
+def server(chromium: Browser) -> Iterator[Server]:
+    running = Server()
+    yield running
+    running.stop()
+
+
+def opened(chromium: Browser, link: str, width: int = 1260, height: int = 720) -> Iterator[Dashboard]:
+    """The dashboard in a browser of its own, past the card of the first visit."""
+    context = chromium.new_context(viewport={"width": width, "height": height})
+    context.set_default_timeout(PATIENCE_MS)
+    page = context.new_page()
+    dashboard = Dashboard(page)
+    page.goto(f"{link}&fixedDpr=0.3")
+    page.get_by_role("button", name="Keep watching").click()
+    yield dashboard
+    context.close()
+
+
+@pytest.fixture(scope="module")
+def dashboard(chromium: Browser, server: Server) -> Iterator[Dashboard]:
+    yield from opened(chromium, server.link)

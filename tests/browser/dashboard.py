@@ -1,0 +1,100 @@
+"""The dashboard in the words of a person who uses it."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+from playwright.sync_api import ConsoleMessage, Frame, Locator, Page, Response
+
+# What software rendering says of itself is not an error of ours.
+HARMLESS = ("GPU stall", "GL Driver Message", "Automatic fallback to software WebGL")
+
+
+class Dashboard:
+    """A page, with what it complained about."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self.errors: list[str] = []
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.on("console", self._listen)
+        page.on("response", self._look_at)
+
+    def _listen(self, message: ConsoleMessage) -> None:
+        if message.type == "error" and not any(word in message.text for word in HARMLESS):
+            self.errors.append(message.text)
+
+    def _look_at(self, response: Response) -> None:
+        if response.status >= 400:
+            self.errors.append(f"{response.status} {response.url}")
+
+    # --- what the server holds -------------------------------------------------------------------
+
+    def ask(self, path: str) -> dict[str, Any]:
+        """The JSON of an address, asked for by the page."""
+        answer = self.page.evaluate("path => fetch(path).then(answer => answer.json())", path)
+        return cast(dict[str, Any], answer)
+
+    def until(self, function: str, argument: object = None) -> None:
+        """Wait until a function of JavaScript holds in the page; it may be async."""
+        self.page.wait_for_function(function, arg=argument, polling=200)
+
+    def until_server(self, path: str, condition: str) -> None:
+        """Wait until a condition in JavaScript holds for `it`, what an address answers."""
+        self.until(
+            f"async path => {{ const it = await (await fetch(path)).json(); return {condition}; }}", path
+        )
+
+    # --- playing ---------------------------------------------------------------------------------
+
+    def pause(self) -> None:
+        """Stand still, wherever the run is."""
+        self.until(
+            "() => ['playing', 'paused', 'finished'].includes(document.querySelector('#state').dataset.state)"
+        )
+        if self.state == "playing":
+            self.page.locator("#play").click()
+        self.until("() => ['paused', 'finished'].includes(document.querySelector('#state').dataset.state)")
+
+    @property
+    def state(self) -> str:
+        """The run's state as the page shows it."""
+        return str(self.page.locator("#state").get_attribute("data-state"))
+
+    def seek(self, fraction: float) -> None:
+        """Take the thumb of the timeline to a part of the run."""
+        line = self.page.locator("#timeline")
+        box = line.bounding_box()
+        assert box is not None
+        line.click(position={"x": 8 + fraction * (box["width"] - 16), "y": box["height"] / 2})
+
+    def tab(self, name: str) -> Locator:
+        """Open a tab and give its panel."""
+        self.page.get_by_role("tab", name=name).click()
+        return self.page.locator(f"#panel-{name.lower()}")
+
+    def clusters(self) -> int:
+        """How many clusters the standing scan has, as the tab Why says."""
+        panel = self.tab("Why")
+        index = self.ask("/api/status")["scan_index"]  # the status comes before the picture of the scan
+        return int(panel.locator(f"[data-scan='{index}']").get_attribute("data-clusters") or -1)
+
+    # --- the scene -------------------------------------------------------------------------------
+
+    @property
+    def scene(self) -> Frame:
+        """The frame with viser in it."""
+        self.page.wait_for_function(
+            "() => document.querySelector('#scene').contentWindow?.location.pathname === '/viser/'"
+        )
+        return next(frame for frame in self.page.frames if "/viser/" in frame.url)
+
+    def row(self, label: str) -> Locator:
+        """The row of a parameter in the Tune panel, by the text of its label."""
+        text = self.scene.get_by_text(label, exact=False).first
+        return text.locator("xpath=ancestor::*[contains(@class, 'mantine-Flex-root')][1]")
+
+    def node_points(self, name: str) -> int:
+        """How many points a cloud of the scene has."""
+        read = "name => (window.__viserSceneTree?.getState()[name]?.message?.props?.points?.length ?? 0)"
+        return int(self.scene.evaluate(read, name)) // 3

@@ -1,0 +1,66 @@
+"""A real server in a process of its own, as a person starts it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import threading
+from collections import deque
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+_START = "import sys; from app.cli import main; sys.exit(main())"
+
+
+class Server:
+    """`stemmap serve SOURCE --no-browser`; `link` is what it printed.
+
+    Args:
+        source: What it opens.
+        port: 0 for any free one.
+        token: Of the link; empty for a new one.
+    """
+
+    def __init__(self, source: str = "sim:stand", port: int = 0, token: str = "") -> None:
+        self._log: deque[str] = deque(maxlen=50)
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _START, "serve", source, "--no-browser", "--port", str(port)],
+            cwd=ROOT,
+            env={**os.environ, **({"STEMMAP_TOKEN": token} if token else {})},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self.link = self._read_link()
+        # A full pipe would stop the server.
+        self._reader = threading.Thread(target=self._keep_reading, daemon=True)
+        self._reader.start()
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        found = re.search(r":(\d+)/", self.link)
+        assert found is not None
+        return int(found.group(1))
+
+    def stop(self) -> None:
+        """End it as Ctrl-C does, and wait."""
+        self._process.terminate()
+        self._process.wait(timeout=30)
+        self._reader.join(timeout=10)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+    def _read_link(self) -> str:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._log.append(line)
+            if found := re.search(r"http://\S+", line):
+                return found.group(0)
+        raise AssertionError("the server gave no link:\n" + "".join(self._log))
+
+    def _keep_reading(self) -> None:
+        assert self._process.stdout is not None
+        self._log.extend(self._process.stdout)

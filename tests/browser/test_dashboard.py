@@ -1,0 +1,283 @@
+"""A person at the dashboard: what they do, what the page shows, and what the server holds."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.browser.conftest import PATIENCE_MS
+from tests.browser.dashboard import Dashboard
+
+expect.set_options(timeout=PATIENCE_MS)
+
+
+@pytest.fixture(autouse=True)
+def _calm(dashboard: Dashboard):
+    """Each test begins on a standing scan in the middle of the run, with the parameters of the preset."""
+    dashboard.pause()
+    dashboard.seek(0.3)
+    dashboard.until_server(
+        "/api/status", "it.state === 'paused' && Math.abs(it.time_s - 0.3 * it.end_s) < 1.5"
+    )
+    yield
+    for dialog in dashboard.page.locator("dialog[open]").all():
+        dialog.press("Escape")
+
+
+def test_the_page_shows_the_run_and_complains_about_nothing(dashboard: Dashboard):
+    page = dashboard.page
+    expect(page.locator("#source-name")).to_have_text("sim:stand")
+    dashboard.tab("Trees")
+    expect(page.locator("#trees tbody tr").first).to_be_visible()
+    dashboard.scene.wait_for_function(
+        """() => { let points = 0;
+        window.__viserMutable?.scene?.traverse(o => {
+          if (o.isPoints) points += o.geometry.attributes.position.count;
+        });
+        return points > 1000; }"""
+    )
+    assert dashboard.node_points("/world/robot/scan/raw") > 1000
+    assert dashboard.errors == []
+
+
+def test_the_eps_slider_changes_the_clusters_of_the_standing_scan(dashboard: Dashboard):
+    before = dashboard.clusters()
+    assert before > 3
+    box = dashboard.row("Radius eps").locator("input[type=text]")
+    box.fill("5")  # all stems in one
+    box.press("Tab")
+    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
+    dashboard.until("was => Number(document.querySelector('[data-clusters]').dataset.clusters) < was", before)
+    expect(dashboard.scene.get_by_text("● Radius eps")).to_be_visible()
+    expect(dashboard.page.locator("#preset")).to_have_text("● forest, 1 changed")
+    dashboard.scene.get_by_role("button", name="Reset clustering").click()
+    dashboard.until_server("/api/parameters", "it.changed.length === 0")
+    dashboard.until(
+        "was => Number(document.querySelector('[data-clusters]').dataset.clusters) === was", before
+    )
+    expect(box).to_have_value("0.15")
+
+
+def test_the_eps_slider_moves_by_the_keyboard(dashboard: Dashboard):
+    slider = dashboard.row("Radius eps").get_by_role("slider")
+    slider.press("ArrowRight")
+    dashboard.until_server("/api/parameters", "Math.abs(it.values['clustering.eps'] - 0.16) < 1e-9")
+    slider.press("ArrowLeft")
+    dashboard.until_server("/api/parameters", "it.changed.length === 0")
+    assert dashboard.state == "paused"  # the arrow moved the slider, and not the run
+
+
+def test_a_value_that_contradicts_another_goes_back_and_says_why(dashboard: Dashboard):
+    box = dashboard.row("Eccentricity min").locator("input[type=text]")
+    box.fill("900")
+    box.press("Tab")
+    expect(dashboard.scene.get_by_text("must be less than")).to_be_visible()
+    expect(box).to_have_value("1")
+    assert dashboard.ask("/api/parameters")["changed"] == []
+
+
+def test_play_pause_step_and_seek(dashboard: Dashboard):
+    page = dashboard.page
+    start = dashboard.ask("/api/status")["scan_index"]
+    page.get_by_role("button", name="One scan forward").click()
+    dashboard.until_server("/api/status", f"it.scan_index === {start + 1}")
+    page.get_by_role("button", name="Ten scans back").click()
+    dashboard.until_server("/api/status", f"it.scan_index === {start - 9} && it.state === 'paused'")
+    page.get_by_role("button", name="Play").click()
+    dashboard.until_server("/api/status", f"it.state === 'playing' && it.scan_index > {start}")
+    expect(page.locator("#state b")).to_have_text("Playing")
+    page.get_by_role("button", name="Pause").click()
+    dashboard.until_server("/api/status", "it.state === 'paused'")
+    trees = int(page.locator("[data-figure=trees] dd").inner_text())
+    dashboard.seek(0.05)
+    dashboard.until_server("/api/status", f"it.time_s < 0.1 * it.end_s && it.trees < {trees}")
+    dashboard.until(
+        "most => Number(document.querySelector('[data-figure=trees] dd').textContent) < most", trees
+    )
+
+
+def test_the_speed_is_the_servers(dashboard: Dashboard):
+    dashboard.page.locator("#speed").select_option("4")
+    dashboard.until_server("/api/status", "it.speed === 4")
+    dashboard.page.locator("#speed").select_option("1")
+    dashboard.until_server("/api/status", "it.speed === 1")
+
+
+def test_a_preset_is_chosen_in_the_scene(dashboard: Dashboard):
+    def choose(name: str) -> None:
+        dashboard.scene.get_by_role("combobox").first.click()
+        dashboard.scene.get_by_role("option", name=name, exact=True).click()
+        dashboard.until_server("/api/parameters", f"it.preset === '{name}'")
+        expect(dashboard.page.locator("#preset")).to_have_text(name)
+
+    choose("paper")
+    assert dashboard.ask("/api/parameters")["values"]["clustering.eps"] == 0.25
+    expect(dashboard.row("Radius eps").locator("input[type=text]")).to_have_value("0.25")
+    choose("forest")
+
+
+def test_the_table_sorts(dashboard: Dashboard):
+    dashboard.tab("Trees")
+    header = dashboard.page.locator("th[data-key=seen]")
+
+    def column() -> list[int]:
+        cells = dashboard.page.locator("#trees tbody td:last-child").all_inner_texts()
+        return [int(text) for text in cells]
+
+    header.get_by_role("button").click()
+    expect(header).to_have_attribute("aria-sort", "ascending")
+    assert column() == sorted(column())
+    header.get_by_role("button").click()
+    expect(header).to_have_attribute("aria-sort", "descending")
+    assert column() == sorted(column(), reverse=True)
+    assert len(column()) > 3
+    dashboard.page.locator("th[data-key=tree], th[data-key=number]").get_by_role("button").click()
+
+
+def test_a_tree_is_found_and_selected_everywhere(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    number = page.locator("#trees tbody tr").nth(2).get_attribute("data-tree")
+    assert number is not None
+    page.locator("body").press("/")
+    page.locator("#find").fill(number)
+    row = page.locator(f"tr[data-tree='{number}']")
+    row.click()
+    expect(row).to_have_attribute("aria-selected", "true")
+    dashboard.until(SELECTION_IS_PAINTED)
+    expect(dashboard.scene.locator("body")).to_be_visible()
+    dashboard.scene.wait_for_function(
+        "number => Object.values(window.__viserSceneTree.getState())"
+        ".some(node => node?.message?.props?.text?.startsWith(`tree ${number}, DBH`))",
+        arg=number,
+    )
+    page.locator("#find").fill("")
+    page.locator("#map").press("Escape")
+    expect(row).to_have_attribute("aria-selected", "false")
+
+
+SELECTION_IS_PAINTED = """() => {
+  const canvas = document.querySelector('#map');
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  for (let i = 0; i < data.length; i += 4) {
+    if (data[i] === 0x56 && data[i + 1] === 0xB4 && data[i + 2] === 0xE9 && data[i + 3] === 255) return true;
+  }
+  return false;
+}"""
+
+
+def test_a_tree_is_selected_in_the_map(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    page.get_by_role("button", name="Fit").click()
+    canvas = page.locator("#map")
+    box = canvas.bounding_box()
+    assert box is not None
+    places = page.evaluate(GREEN_PLACES)
+    assert places
+    canvas.click(position={"x": places[0][0], "y": places[0][1]})
+    selected = page.locator("#trees tr[aria-selected=true]")
+    expect(selected).to_have_count(1)
+    canvas.click(position={"x": 3, "y": box["height"] - 3})
+    expect(selected).to_have_count(0)
+
+
+GREEN_PLACES = """() => {
+  const canvas = document.querySelector('#map');
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  const places = [];
+  for (let i = 0; i < data.length; i += 4) {
+    const [x, y] = [(i / 4) % canvas.width, Math.floor(i / 4 / canvas.width)];
+    const green = data[i] === 0 && data[i + 1] === 0x9E && data[i + 2] === 0x73;
+    if (green && y > 40) places.push([x / devicePixelRatio, y / devicePixelRatio]);
+  }
+  return places.slice(0, 1);
+}"""
+
+
+def test_scores_come_with_their_counts(dashboard: Dashboard):
+    panel = dashboard.tab("Scores")
+    expect(panel.locator("[data-rate=TA] small")).to_contain_text(" of ")
+    score = dashboard.ask("/api/evaluation")
+    expect(panel.locator("[data-rate=TA] small")).to_have_text(
+        f"{score['TA']['count']} of {score['TA']['of']}"
+    )
+    expect(panel.locator("[data-rate=FA] small")).to_have_text(
+        f"{score['FA']['count']} of {score['FA']['of']}"
+    )
+
+
+@pytest.mark.parametrize("choice", ["distance", "error", "time", "n_eff"])
+def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
+    dashboard.tab("Plots")
+    dashboard.page.locator("#plot-choice").select_option(choice)
+    expect(dashboard.page.locator("#plot .main-svg").first).to_be_visible()
+    drawn = dashboard.page.locator("#plot .hm, #plot .scatterlayer .trace")
+    expect(drawn.first).to_be_attached()
+
+
+def test_keys_work_on_the_page_and_in_the_scene(dashboard: Dashboard):
+    page = dashboard.page
+    start = dashboard.ask("/api/status")["scan_index"]
+    page.locator("#map").press("ArrowRight")
+    dashboard.until_server("/api/status", f"it.scan_index === {start + 1}")
+    page.locator("#map").press("Shift+ArrowLeft")
+    dashboard.until_server("/api/status", f"it.scan_index === {start - 9}")
+    dashboard.scene.locator("canvas").first.press("ArrowRight")
+    dashboard.until_server("/api/status", f"it.scan_index === {start - 8}")
+    page.locator("#map").press("?")
+    expect(page.get_by_role("heading", name="Keyboard shortcuts")).to_be_visible()
+
+
+def test_following_is_switched_by_a_key_of_the_page(dashboard: Dashboard):
+    scene = dashboard.scene
+    scene.get_by_role("tab", name="Layers").click()
+    follow = scene.get_by_role("checkbox", name="Follow robot")
+    expect(follow).to_be_checked()
+    dashboard.page.locator("#map").press("f")
+    expect(follow).not_to_be_checked()
+    dashboard.page.locator("#map").press("f")
+    expect(follow).to_be_checked()
+    scene.get_by_role("tab", name="Tune").click()
+
+
+def test_a_layer_is_switched_off(dashboard: Dashboard):
+    scene = dashboard.scene
+    scene.get_by_role("tab", name="Layers").click()
+    switch = scene.get_by_role("checkbox", name="Raw scan")
+    hidden = "name => window.__viserSceneTree.getState()[name].visibility === false"
+    switch.click()
+    scene.wait_for_function(hidden, arg="/world/robot/scan/raw")
+    switch.click()
+    scene.wait_for_function(f"name => !({hidden})(name)", arg="/world/robot/scan/raw")
+    scene.get_by_role("tab", name="Tune").click()
+
+
+def test_a_run_that_is_not_there_is_told_with_what_to_do(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("#source-button").click()
+    page.locator("#source-uri").fill("/nowhere/run.mcap")
+    page.get_by_role("button", name="Open", exact=True).click()
+    expect(page.locator("#source-error")).to_contain_text("/nowhere/run.mcap")
+    dashboard.errors.clear()  # the browser logs an answer that refuses
+    page.get_by_role("button", name="sim:paper").click()
+    expect(page.locator("#source-dialog")).not_to_be_visible()
+    expect(page.locator("#source-name")).to_have_text("sim:paper")
+    page.locator("#source-button").click()
+    page.get_by_role("button", name="sim:stand").click()
+    expect(page.locator("#source-name")).to_have_text("sim:stand")
+    expect(page.locator("#source-dialog")).not_to_be_visible()
+
+
+def test_light_and_dark_are_remembered(dashboard: Dashboard):
+    page = dashboard.page
+    page.get_by_role("button", name="Light or dark").click()
+    expect(page.locator("html")).to_have_attribute("data-theme", "light")
+    assert page.evaluate("localStorage.getItem('stemmap.theme')") == "light"
+    page.get_by_role("button", name="Light or dark").click()
+    expect(page.locator("html")).to_have_attribute("data-theme", "dark")
+    dashboard.scene.wait_for_function("() => window.__viserSceneTree?.getState()['/world/robot/scan/raw']")
+
+
+def test_nothing_was_complained_about(dashboard: Dashboard):
+    assert dashboard.errors == []

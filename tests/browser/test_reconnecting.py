@@ -1,0 +1,37 @@
+"""The server goes and comes back; the page says so and goes on by itself."""
+
+from __future__ import annotations
+
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import opened
+from tests.browser.serving import Server
+
+TOKEN = "a-token-only-for-this-test"
+POINTS = """() => {
+  const raw = window.__viserSceneTree?.getState()['/world/robot/scan/raw'];
+  return raw?.message.props.points.length > 100;
+}"""
+
+
+def test_a_lost_server_is_told_and_found_again(chromium: Browser):
+    first = Server(token=TOKEN)
+    for dashboard in opened(chromium, first.link):
+        page = dashboard.page
+        dashboard.scene.wait_for_function(POINTS)
+        dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
+        first.stop()
+        expect(page.locator("#state b")).to_have_text("No connection")
+        expect(page.locator("#notice")).to_contain_text("last picture")
+        assert page.locator("#trees tbody tr").count() > 0
+        dashboard.scene.evaluate("window.wasHere = true")
+        second = Server(port=first.port, token=TOKEN)
+        try:
+            expect(page.locator("#state b")).to_have_text("Playing")
+            expect(page.locator("#notice")).not_to_be_visible()
+            dashboard.scene.wait_for_function(POINTS)
+            assert dashboard.scene.evaluate(
+                "window.wasHere"
+            )  # the frame came back without being loaded again
+        finally:
+            second.stop()

@@ -1,0 +1,45 @@
+"""The page on a desk, a tablet and a phone."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import opened
+from tests.browser.dashboard import Dashboard
+from tests.browser.serving import Server
+
+SPILLS = """() => [...document.querySelectorAll('header *, main *, footer *')].filter(node => {
+  const box = node.getBoundingClientRect();
+  if (!box.width || getComputedStyle(node).visibility === 'hidden') return false;
+  if (node.closest('.scroll, svg, .figures')) return false; // scrolls or is cut by itself
+  return box.right > innerWidth + 1 || box.left < -1;
+}).map(node => `${node.tagName}#${node.id}.${node.className}`)"""
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (1024, 768), (390, 844)])
+def test_nothing_spills_over_the_edge(chromium: Browser, server: Server, size: tuple[int, int]):
+    for dashboard in opened(chromium, server.link, *size):
+        dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
+        assert dashboard.page.evaluate(SPILLS) == []
+        assert dashboard.page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        if size[0] == 1024:
+            check_drawer(dashboard)
+        if size[0] == 390:
+            check_scene_on_demand(dashboard)
+
+
+def check_drawer(dashboard: Dashboard) -> None:
+    side = dashboard.page.locator("#side")
+    expect(side).not_to_be_visible()
+    dashboard.page.locator("#drawer-button").click()
+    expect(side).to_be_visible()
+    assert dashboard.page.evaluate(SPILLS) == []
+    dashboard.page.locator("#drawer-button").click()
+    expect(side).not_to_be_visible()
+
+
+def check_scene_on_demand(dashboard: Dashboard) -> None:
+    assert dashboard.page.locator("#scene").get_attribute("src") is None
+    dashboard.page.get_by_role("button", name="Show the 3D scene").click()
+    dashboard.scene.wait_for_function("() => window.__viserSceneTree?.getState()['/world/robot/scan/raw']")

@@ -1,0 +1,384 @@
+"""The command line: what it says, what it returns, and that it never answers with a traceback."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from app.cli import COMMANDS, main
+from pipeline.parameters import PRESETS, field_specs, from_toml, preset
+
+RUN = "sim:paper?duration=2"
+
+
+class Told:
+    """What a command said and returned."""
+
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+    def refused(self, code: int, *says: str) -> None:
+        """It ended with a code and one clear line on stderr, and wrote nothing to stdout."""
+        assert (self.code, self.out) == (code, ""), self.err
+        assert self.err.count("\n") == 1, self.err
+        assert self.err.startswith("stemmap")
+        for words in says:
+            assert words in self.err
+
+
+def stemmap(capsys: pytest.CaptureFixture[str], *words: object) -> Told:
+    """Run a command in this process."""
+    code = main([str(word) for word in words])
+    told = capsys.readouterr()
+    return Told(code, told.out, told.err)
+
+
+# --- help -----------------------------------------------------------------------------------------
+
+
+def test_help_names_every_command(capsys):
+    told = stemmap(capsys, "--help")
+    assert told.code == 0
+    assert all(f"\n    {name} " in told.out for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_has_help_that_a_person_can_follow(capsys, name):
+    told = stemmap(capsys, name, "--help")
+    assert told.code == 0
+    assert told.out.startswith(f"usage: stemmap {name}")
+    assert told.err == ""
+    assert max(map(len, told.out.splitlines())) <= 130
+
+
+def test_the_version_is_that_of_the_distribution(capsys):
+    from importlib.metadata import version
+
+    assert stemmap(capsys, "--version").out == f"stemmap {version('stemmap')}\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["map"],
+        ["map", RUN],
+        ["map", RUN, "--out"],
+        ["map", RUN, "--out", "x", "--speed", "3"],
+        ["map", RUN, "--out", "x", "--seed", "-1"],
+        ["map", RUN, "--out", "x", "--seed", "1.5"],
+        ["map", RUN, "--out", "x", "--odometry", "legs"],
+        ["params", "--format", "xml"],
+        ["evaluate"],
+        ["--nothing"],
+        ["serve", "--port", "70000"],
+        ["serve", "--port", "-1"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_words_are_wrong_usage(capsys, words):
+    stemmap(capsys, *words).refused(2, "--help")
+
+
+# --- parameters -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_as_toml_is_that_preset(capsys, name):
+    told = stemmap(capsys, "params", "--preset", name, "--format", "toml")
+    assert told.code == 0
+    assert from_toml(told.out, preset("forest"), "x") == preset(name)
+
+
+def test_a_file_of_parameters_goes_in_as_it_came_out(capsys, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text(stemmap(capsys, "params", "--set", "clustering.eps=0.31", "--format", "toml").out)
+    told = stemmap(capsys, "params", "--config", file, "--set", "slam.particles=7", "--format", "toml")
+    assert from_toml(told.out, preset("paper"), "x").changes_from(preset("forest")) == {
+        "clustering.eps": 0.31,
+        "slam.particles": 7,
+    }
+
+
+def test_the_table_names_every_parameter_with_its_value(capsys):
+    told = stemmap(capsys, "params", "--preset", "paper")
+    for spec in field_specs():
+        assert f"{spec.name} = {preset('paper').flat()[spec.name]}   [" in told.out
+        assert spec.doc in told.out
+
+
+def test_markdown_has_a_column_a_preset(capsys):
+    head = stemmap(capsys, "params", "--format", "markdown").out.splitlines()[0]
+    assert all(f"`{name}`" in head for name in PRESETS)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--set", "clustering.eps=9"], ["clustering.eps = 9", "less than or equal to 5"]),
+        (["--set", "clustering.eps=0"], ["clustering.eps = 0", "greater than or equal to 0.01"]),
+        (["--set", "clustering.eps=nan"], ["finite"]),
+        (["--set", "clustering.eps=wide"], ["'wide'", "number"]),
+        (["--set", "clustering.epz=1"], ["clustering.epz", "clustering.eps"]),
+        (["--set", "clustering.eps"], ["stage.name=value"]),
+        (["--set", "filters.x_min=5", "--set", "filters.x_max=5"], ["filters.x_min", "filters.x_max"]),
+        (["--preset", "wood"], ["wood", "forest"]),
+        (["--config", "none.toml"], ["none.toml"]),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("command", ["params", "map"])
+def test_a_parameter_that_does_not_fit_is_wrong_usage(capsys, tmp_path, monkeypatch, command, words, says):
+    monkeypatch.chdir(tmp_path)
+    first = ["map", RUN, "--out", tmp_path / "out"] if command == "map" else ["params"]
+    stemmap(capsys, *first, *words).refused(2, *says)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"[clustering]\neps = 99\n", b"\xff\xfe", b"eps = 1", b"[[["])
+def test_a_file_of_parameters_that_does_not_fit_is_named(capsys, tmp_path, content):
+    file = tmp_path / "mine.toml"
+    file.write_bytes(content)
+    told = stemmap(capsys, "params", "--config", file)
+    if content == b"":
+        assert told.code == 0
+    else:
+        told.refused(2, "mine.toml")
+
+
+# --- sources --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("sim:wood", "sim:stand"),
+        ("sim:paper?speed=3", "speed"),
+        ("sim:paper?duration=x", "duration"),
+        ("none.mcap", "no such file"),
+        ("zenoh:tcp/host:7447", "live"),
+        ("ftp://host/x", "ftp"),
+        ("x\0y", "no such file"),
+    ],
+)
+def test_a_source_that_is_none_fails_in_one_line(capsys, tmp_path, monkeypatch, source, says):
+    monkeypatch.chdir(tmp_path)
+    stemmap(capsys, "map", source, "--out", "out").refused(1, says)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a.pcap", "a.zip", "a.db3", "a.bin", "a"])
+@pytest.mark.parametrize("content", [b"", b"\0" * 5000, b"hello world\n" * 99])
+def test_a_file_that_is_no_recording_fails_in_one_line(capsys, tmp_path, name, content):
+    file = tmp_path / name
+    file.write_bytes(content)
+    stemmap(capsys, "map", file, "--out", tmp_path / "out").refused(1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_of_truth_that_is_none_fails_before_the_mapping(capsys, tmp_path):
+    file = tmp_path / "truth.csv"
+    file.write_text("x,y\n1,abc\n")
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path / "out", "--truth", file)
+    told.refused(1, "line 2", "abc", "truth.csv")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "out", "--truth", tmp_path / "no.csv").refused(
+        1, "no.csv"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_made_fails_in_one_line(capsys, tmp_path):
+    (tmp_path / "file").write_text("x")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "file").refused(1, "cannot write")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "file" / "below").refused(1, "cannot write")
+
+
+def test_a_source_without_a_file_is_not_served(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stemmap(capsys, "serve", "none.mcap").refused(1, "none.mcap")
+    stemmap(capsys, "none.mcap").refused(1, "none.mcap")
+
+
+# --- map and evaluate -----------------------------------------------------------------------------
+
+FILES = {"trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json"}
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of four seconds, mapped once."""
+    folder = tmp_path_factory.mktemp("mapped") / "run"
+    assert main(["map", "sim:paper?duration=4", "--out", str(folder)]) == 0
+    return folder
+
+
+def test_mapping_twice_gives_the_same_bytes(mapped, tmp_path, capsys):
+    told = stemmap(capsys, "map", "sim:paper?duration=4", "--out", tmp_path)
+    assert told.code == 0
+    assert {file.name for file in mapped.iterdir()} == FILES == {file.name for file in tmp_path.iterdir()}
+    for name in FILES:
+        assert (mapped / name).read_bytes() == (tmp_path / name).read_bytes(), name
+
+
+def test_another_seed_gives_other_bytes(mapped, tmp_path, capsys):
+    assert stemmap(capsys, "map", "sim:paper?duration=4", "--out", tmp_path, "--seed", "1").code == 0
+    assert (mapped / "path.csv").read_bytes() != (tmp_path / "path.csv").read_bytes()
+
+
+def test_a_mapping_says_what_came_of_it(tmp_path, capsys):
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path / "out")
+    assert told.code == 0
+    assert all(line.startswith("warning: ") for line in told.err.splitlines())
+    assert told.out.startswith(f"{RUN}: 20 scans, 1.9 s")
+    for words in ("TA ", "TR ", "FA ", "FR ", "completeness", "mean pair error", "path: RMS", "median"):
+        assert words in told.out
+
+
+def test_the_record_holds_what_is_needed_to_map_again(mapped):
+    record = json.loads((mapped / "run.json").read_text())
+    assert record["source"]["uri"] == "sim:paper?duration=4"
+    assert len(record["source"]["sha256"]) == 64
+    assert record["seed"] == 0
+    assert record["preset"] == "forest"
+    assert record["parameters"] == json.loads(json.dumps(preset("forest").model_dump()))
+    assert record["scans"] == 40
+    assert record["duration_s"] == 3.9
+    points = record["points"]
+    assert sum(points.values()) - points["without a value"] == 2 * points["returns"]
+    rows = (mapped / "detections.csv").read_text().splitlines()[1:]
+    assert sum(record["verdicts"].values()) == len(rows)
+    assert record["trees"] == len((mapped / "trees.csv").read_text().splitlines()) - 1
+    assert len((mapped / "path.csv").read_text().splitlines()) == 41
+
+
+def test_evaluating_again_says_what_the_mapping_said(mapped, capsys):
+    told = stemmap(capsys, "evaluate", mapped, "--json")
+    again, once = json.loads(told.out), json.loads((mapped / "run.json").read_text())["evaluation"]
+    assert again.keys() == once.keys()
+    for name, value in once.items():
+        if isinstance(value, dict) or value is None or isinstance(value, int):
+            assert again[name] == value, name
+        else:  # trees.csv is in millimetres and millimetres of diameter
+            assert again[name] == pytest.approx(value, abs=2e-3 if "percent" not in name else 0.1), name
+
+
+def test_evaluating_prints_the_lines_of_the_mapping(mapped, capsys):
+    told = stemmap(capsys, "evaluate", mapped)
+    assert told.code == 0
+    assert [line.split(" ")[0] for line in told.out.splitlines()] == ["TA", "TR", "completeness", "position"]
+
+
+def test_evaluating_by_a_table_and_by_other_distances(mapped, tmp_path, capsys):
+    from pipeline.simulation.scenarios import SCENARIOS
+
+    table = tmp_path / "truth.csv"
+    rows = [f"{p.x},{p.y},{p.kind}" for p in SCENARIOS["paper"].placed]
+    table.write_text("\n".join(["x_m,y_m,class", *rows]) + "\n")
+    told = json.loads(stemmap(capsys, "evaluate", mapped, "--truth", table, "--json").out)
+    own = json.loads(stemmap(capsys, "evaluate", mapped, "--json").out)
+    assert told["TA"] == own["TA"]
+    assert told["dbh_count"] == 0
+    wide = json.loads(stemmap(capsys, "evaluate", mapped, "--reach", "200", "--json").out)
+    assert wide["TA"]["of"] == 7
+    stemmap(capsys, "evaluate", mapped, "--match-distance", "99").refused(2, "evaluation.match_distance")
+
+
+def test_truth_without_a_single_tree_is_no_crash(mapped, tmp_path, capsys):
+    table = tmp_path / "truth.csv"
+    table.write_text("x_m,y_m\n")
+    assert stemmap(capsys, "evaluate", mapped, "--truth", table).code == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("run.json", None),
+        ("trees.csv", None),
+        ("run.json", ""),
+        ("run.json", "[]"),
+        ("run.json", "{}"),
+        ("run.json", '{"parameters": 3}'),
+        ("run.json", '{"parameters": {"clustering": {"eps": 99}}}'),
+        ("run.json", "[" * 100_000),
+        ("trees.csv", "a,b\n"),
+        ("trees.csv", "\xff"),
+        ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n1,2\n"),
+        ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n1,2,3,4,five\n"),
+        ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n,,,,\n"),
+    ],
+)
+def test_a_damaged_run_is_said_in_one_line(mapped, tmp_path, capsys, name, content):
+    for file in mapped.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    if content is None:
+        (tmp_path / name).unlink()
+    else:
+        (tmp_path / name).write_text(content, encoding="latin-1")
+    stemmap(capsys, "evaluate", tmp_path).refused(1, str(tmp_path))
+
+
+@pytest.mark.parametrize("part", ["source", "seed"])
+def test_a_record_without_its_source_is_said_in_one_line(mapped, tmp_path, capsys, part):
+    for file in mapped.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    record = json.loads((mapped / "run.json").read_text())
+    del record[part]
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    stemmap(capsys, "evaluate", tmp_path).refused(1, str(tmp_path))
+
+
+def test_a_folder_without_a_run_is_said(tmp_path, capsys):
+    stemmap(capsys, "evaluate", tmp_path).refused(1, "stemmap map")
+    stemmap(capsys, "evaluate", tmp_path / "none").refused(1, "none")
+
+
+def test_a_failed_mapping_leaves_the_old_files(mapped, tmp_path, capsys, monkeypatch):
+    for file in mapped.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+
+    def breaks(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pipeline.export.detection_rows", breaks)
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path)
+    told.refused(1, "No space left")
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == {
+        file.name: file.read_bytes() for file in mapped.iterdir()
+    }
+
+
+def test_losses_are_said_and_told_by_the_exit_code(tmp_path, capsys, monkeypatch):
+    from pipeline.sources.simulated import SimulatedSource
+
+    whole = SimulatedSource.records
+
+    def with_a_scan_twice(self, start_ns=None):
+        for record in whole(self, start_ns):
+            yield record
+            yield record
+
+    monkeypatch.setattr(SimulatedSource, "records", with_a_scan_twice)
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path)
+    assert told.code == 3
+    assert "left out: 20 scans" in told.err
+    assert json.loads((tmp_path / "run.json").read_text())["scans"] == 20
+
+
+def test_standing_still_is_warned_of(tmp_path, capsys):
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path, "--odometry", "static")
+    assert told.code == 0
+    assert "warning:" in told.err
+    assert "standing still" in told.err
+    assert json.loads((tmp_path / "run.json").read_text())["odometry"] == "static"
+
+
+def test_presets_and_values_are_taken(tmp_path, capsys):
+    told = stemmap(
+        capsys, "map", RUN, "--out", tmp_path, "--preset", "paper", "--set", "slam.particles=5", "--seed", "3"
+    )
+    assert told.code == 0
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert (record["preset"], record["seed"]) == ("paper", 3)
+    assert record["parameters"]["slam"]["particles"] == 5
+    assert record["parameters"]["clustering"]["eps"] == 0.25

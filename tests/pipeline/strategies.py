@@ -1,0 +1,132 @@
+"""Strategies and small builders that the tests of the stages share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from hypothesis import settings
+from hypothesis import strategies as st
+
+from pipeline.geometry import Pose2, Pose3
+from pipeline.records import Clusters, Detections, Labels, Scan, Sensor, Step, Trees, TruthTrees, Verdict
+from pipeline.visibility import BINS
+
+# Compiled kernels are slow at their first call, so no example has a deadline.
+LAW = settings(max_examples=50, deadline=None)
+FEW = settings(max_examples=20, deadline=None)
+
+SENSOR = Sensor("VLP-16", rings=16, ring_step=np.radians(2.0), azimuth_step=np.radians(0.2), range_sigma=0.02)
+NOTHING_SEEN = np.zeros(BINS)
+ALL_FREE = np.full(BINS, np.inf)
+
+angles = st.floats(-30.0, 30.0, allow_nan=False)
+metres = st.floats(-50.0, 50.0, allow_nan=False)
+seeds = st.integers(0, 2**32 - 1)
+poses2 = st.builds(Pose2, metres, metres, st.floats(-3.1, 3.1))
+poses3 = st.builds(
+    lambda x, y, z, roll, pitch, yaw: Pose3.from_euler(np.array([x, y, z]), roll, pitch, yaw),
+    metres,
+    metres,
+    metres,
+    st.floats(-3.1, 3.1),
+    st.floats(-1.5, 1.5),
+    st.floats(-3.1, 3.1),
+)
+
+
+def arc(radius, half_angle, *, distance=4.0, bearing=0.0, rows=6, n=60, height=1.0, lean=(0.0, 0.0)):
+    """Points evenly along the arc of a trunk that faces the sensor, float64, shape (rows * n, 3)."""
+    turn = np.linspace(-half_angle, half_angle, n) + np.pi + bearing
+    z = np.linspace(0.0, height, rows)
+    turn, z = (grid.ravel() for grid in np.meshgrid(turn, z))
+    x = distance * np.cos(bearing) + radius * np.cos(turn) + lean[0] * (z - z.mean())
+    y = distance * np.sin(bearing) + radius * np.sin(turn) + lean[1] * (z - z.mean())
+    return np.stack([x, y, z], axis=1)
+
+
+def one_cluster(points):
+    """Labels that put all points into one cluster."""
+    return Labels(np.zeros(len(points), np.int32), 1, np.zeros(1, np.bool_))
+
+
+def scan(stamp_ns, points=(), offset_ns=None):
+    """A scan from rows of points."""
+    rows = np.asarray(points, np.float32).reshape(-1, 3)
+    return Scan(stamp_ns, rows, offset_ns=None if offset_ns is None else np.asarray(offset_ns, np.int32))
+
+
+def step(index, points=(), pose=None, **rest: Any):
+    """A step at 10 Hz."""
+    return Step(index, scan(1 + index * 100_000_000, points), pose, **rest)
+
+
+def detections(centre, *, sigma=0.03, radius=0.15, arc=1.0):
+    """Detections at rows of x, y in the base frame."""
+    rows = np.asarray(centre, np.float64).reshape(-1, 2)
+    n = len(rows)
+    return Detections(
+        cluster=np.arange(n),
+        centre=rows,
+        covariance=np.tile(np.eye(2) * sigma**2, (n, 1, 1)),
+        radius=np.full(n, radius),
+        radius_sigma=np.full(n, 0.02),
+        arc=np.full(n, arc),
+        eccentricity=np.full(n, 5.0),
+    )
+
+
+def clusters(**columns: Any):
+    """One cluster that is a tree by every rule of the preset forest, but for the columns given."""
+    good = Clusters(
+        size=np.array([60]),
+        centroid=np.array([[4.0, 0.0, 0.5]]),
+        eigenvalues=np.array([[0.01, 0.002, 0.0]]),
+        eccentricity=np.array([5.0]),
+        centre=np.array([[4.2, 0.0]]),
+        covariance=np.eye(2)[None] * 1e-4,
+        radius=np.array([0.2]),
+        radius_sigma=np.array([0.01]),
+        radial_std=np.array([0.01]),
+        arc=np.array([2.0]),
+        extent=np.array([[0.2, 0.4, 1.0]]),
+        hidden=np.array([False]),
+        verdict=np.array([Verdict.OTHER], np.int32),
+    )
+    return replace(good, **{name: np.asarray(value) for name, value in columns.items()})
+
+
+def trees(position, *, dbh=0.3, confirmed=True):
+    """A map of trees at rows of x, y."""
+    rows = np.asarray(position, np.float64).reshape(-1, 2)
+    n = len(rows)
+    return Trees(
+        number=np.arange(1, n + 1),
+        position=rows,
+        covariance=np.tile(np.eye(2) * 1e-4, (n, 1, 1)),
+        velocity=np.zeros((n, 2)),
+        dbh=np.full(n, dbh),
+        dbh_sigma=np.full(n, 0.01),
+        eccentricity=np.full(n, 5.0),
+        observations=np.full(n, 9),
+        coverage=np.full(n, 2.0),
+        first_seen_ns=np.zeros(n, np.int64),
+        last_seen_ns=np.full(n, 10**9),
+        confirmed=np.full(n, confirmed),
+    )
+
+
+def truth_trees(position, kinds=None, *, dbh=0.3):
+    """True trees (or other things) at rows of x, y."""
+    rows = np.asarray(position, np.float64).reshape(-1, 2)
+    return TruthTrees(rows[:, 0], rows[:, 1], np.full(len(rows), dbh), tuple(kinds or ("tree",) * len(rows)))
+
+
+def simulated_cloud(duration=1, scan_index=3):
+    """Points of one scan of the paper's scenario, level sensor frame, float32, shape (N, 3)."""
+    from pipeline.sources import open_source
+
+    source = open_source(f"sim:paper?duration={duration}")
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    return scans[scan_index].points

@@ -1,0 +1,125 @@
+"""Every rejected cluster has a reason, and nothing is dropped."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.detection import detections, judge
+from pipeline.parameters import preset
+from pipeline.records import Clusters, Verdict
+from tests.pipeline.strategies import clusters
+
+FOREST = preset("forest").detection
+PAPER = preset("paper").detection
+
+REASONS: list[tuple[Verdict, dict[str, Any]]] = [
+    (Verdict.TREE, {}),
+    (Verdict.HIDDEN, {"hidden": [True]}),
+    (Verdict.TOO_THICK, {"extent": [[0.2, 1.3, 1.0]]}),
+    (Verdict.TOO_THICK, {"extent": [[1.3, 0.2, 1.0]]}),
+    (Verdict.TOO_THICK, {"radius": [0.7]}),
+    (Verdict.TOO_LOW, {"extent": [[0.2, 0.4, 0.4]]}),
+    (Verdict.TOO_LONG, {"eccentricity": [61.0]}),
+    (Verdict.TOO_LONG, {"eccentricity": [np.inf]}),
+    (Verdict.NOT_ROUND, {"radial_std": [0.07]}),
+    (Verdict.NO_ARC, {"arc": [0.5]}),
+    (Verdict.TOO_THIN, {"radius": [0.03]}),
+]
+
+
+@pytest.mark.parametrize(("verdict", "columns"), REASONS, ids=lambda v: getattr(v, "label", str(v)))
+def test_each_reason_is_reached(verdict, columns):
+    assert judge(clusters(**columns), FOREST).verdict.tolist() == [verdict]
+
+
+def test_too_round_is_reached_by_the_preset_of_the_text():
+    p = preset("paper-text").detection
+    assert judge(clusters(eccentricity=[9.9]), p).verdict.tolist() == [Verdict.TOO_ROUND]
+    assert judge(clusters(eccentricity=[10.0]), p).verdict.tolist() == [Verdict.TREE]
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("eccentricity", FOREST.e_max),
+        ("radial_std", FOREST.cylindrical_stddev_thresh),
+        ("radius", FOREST.radius_min),
+        ("radius", FOREST.radius_max),
+        ("arc", np.radians(FOREST.arc_min)),
+    ],
+)
+def test_a_figure_on_its_bound_is_still_a_tree(column, value):
+    assert judge(clusters(**{column: [value]}), FOREST).verdict.tolist() == [Verdict.TREE]
+
+
+def test_the_first_reason_in_the_order_wins():
+    worst = clusters(
+        hidden=[True], extent=[[9, 9, 0]], eccentricity=[999.0], radial_std=[9.0], arc=[0.0], radius=[9.0]
+    )
+    assert judge(worst, FOREST).verdict.tolist() == [Verdict.HIDDEN]
+    seen = clusters(extent=[[0.2, 0.4, 0]], eccentricity=[999.0], radial_std=[9.0], arc=[0.0])
+    assert judge(seen, FOREST).verdict.tolist() == [Verdict.TOO_LOW]
+
+
+def test_without_a_circle_its_figures_are_not_asked_for():
+    no_circle = clusters(radius=[np.nan], radius_sigma=[np.nan], arc=[0.0])
+    assert judge(no_circle, FOREST).verdict.tolist() == [Verdict.TREE]
+
+
+def test_the_paper_keeps_by_eccentricity_and_radial_deviation_alone():
+    thing = clusters(
+        extent=[[0.5, 2.0, 0.1]], radius=[np.nan], radius_sigma=[np.nan], arc=[0.0], eccentricity=[19.9]
+    )
+    assert judge(thing, PAPER).verdict.tolist() == [Verdict.TREE]
+    for column, value, verdict in (
+        ("eccentricity", 20.1, Verdict.TOO_LONG),
+        ("radial_std", 0.11, Verdict.NOT_ROUND),
+    ):
+        assert judge(clusters(**{column: [value]}), PAPER).verdict.tolist() == [verdict]
+
+
+def _many():
+    columns = [clusters(**columns) for _, columns in REASONS]
+    return Clusters(
+        *(np.concatenate([getattr(c, name) for c in columns]) for name in Clusters.__dataclass_fields__)
+    )
+
+
+def test_nothing_is_dropped_and_nothing_left_open():
+    many = _many()
+    judged = judge(many, FOREST)
+    assert len(judged.verdict) == len(many.size)
+    assert judged.verdict.tolist() == [verdict for verdict, _ in REASONS]
+    np.testing.assert_array_equal(judged.centre, many.centre)
+
+
+def test_detections_are_the_trees_in_the_base_frame():
+    judged = judge(_many(), FOREST)
+    found = detections(judged, np.array([0.3, -0.2, 0.8]), FOREST)
+    assert found.cluster.tolist() == [0]
+    np.testing.assert_allclose(found.centre, [[4.5, -0.2]])
+    assert found.radius.tolist() == [0.2]
+
+
+@pytest.mark.parametrize("bearing", [0.0, 1.1, -2.5])
+def test_the_error_of_the_sensor_lies_along_and_across_the_ray(bearing):
+    ray = np.array([np.cos(bearing), np.sin(bearing)])
+    across = np.array([-ray[1], ray[0]])
+    judged = judge(clusters(centre=[5.0 * ray], covariance=[np.eye(2) * 1e-4]), FOREST)
+    R = detections(judged, np.zeros(3), FOREST).covariance[0]
+    assert ray @ R @ ray == pytest.approx(1e-4 + FOREST.sigma_range**2)
+    assert across @ R @ across == pytest.approx(1e-4 + (5.0 * np.radians(FOREST.sigma_bearing)) ** 2)
+    assert ray @ R @ across == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_tree_without_a_circle_gives_no_radius():
+    judged = judge(clusters(radius=[np.nan], radius_sigma=[np.nan]), FOREST)
+    assert np.isnan(detections(judged, np.zeros(3), FOREST).radius).all()
+
+
+def test_no_clusters_give_no_detections():
+    none = Clusters(*(getattr(_many(), name)[:0] for name in Clusters.__dataclass_fields__))
+    assert len(detections(judge(none, FOREST), np.zeros(3), FOREST).cluster) == 0

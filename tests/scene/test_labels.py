@@ -1,0 +1,49 @@
+"""What is written above clusters and trees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.scene import Scene
+from app.scene.labels import MOST_LABELS, Label, Labels, cluster_labels, short
+from tests.scene.frames import make_frame
+
+PATH = np.zeros((1, 2))
+
+
+def test_labels_say_eccentricity_and_verdict(scene: Scene):
+    scene.show(make_frame(0), PATH)
+    assert "e 5.0 tree" in scene._scan.texts
+    assert "e ∞ too long" in scene._scan.texts
+
+
+@pytest.mark.parametrize(
+    ("label_by", "expected"), [("verdict", "too long"), ("DBH", "30 cm"), ("none", None)]
+)
+def test_labels_say_what_was_chosen(scene: Scene, label_by: str, expected: str | None):
+    scene.show(make_frame(0), PATH)
+    scene._choose("label_by", label_by)
+    assert scene._scan.texts == [] if expected is None else expected in scene._scan.texts
+
+
+def test_trees_come_first_when_there_are_too_many():
+    frame = make_frame(0, clusters=200)
+    labels = cluster_labels(frame, np.arange(200), "verdict")
+    assert len(labels) == MOST_LABELS
+    assert {label.text for label in labels} == {"tree"}
+
+
+async def test_a_label_that_says_the_same_costs_nothing(scene: Scene):
+    labels = Labels(scene._server.scene, "/some")
+    labels.show([Label(1, "a", (0.0, 0.0, 0.0)), Label(2, "b", (1.0, 0.0, 0.0))])
+    before = scene.messages
+    labels.show([Label(2, "b", (1.05, 0.0, 0.0)), Label(1, "a", (0.0, 0.05, 0.0))])
+    assert scene.messages == before
+    labels.show([Label(3, "c", (9.0, 0.0, 0.0))])
+    assert labels.texts == ["c"]
+
+
+@pytest.mark.parametrize(("value", "text"), [(3.2189, "3.2"), (16.457, "16"), (123.4, "100"), (np.inf, "∞")])
+def test_figures_that_tremble_are_short(value: float, text: str):
+    assert short(value) == text
