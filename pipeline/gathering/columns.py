@@ -7,13 +7,13 @@ neighbourhood again and again.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.gathering.memory import SIDE, SLICE, SLICES
-from pipeline.records import Float32, Int, Int32
+from pipeline.records import Bool, Float32, Int, Int32
 
+BUCKET = 0.9  # m; as far as a column's neighbourhood reaches
 MARGIN = 1.2  # m around a tile; a column looks so far for its neighbours
 LOW, LOW_HIGH, HIGH = 1, 7, 15  # slices: 0.2 to 1.4 m and to 3 m, where a column must show
 LEAST = 3  # of them hold returns
@@ -69,22 +69,24 @@ def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
 def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) -> Float:
     """Sum over the slices of the logarithm of the returns in the cell and its eight neighbours; 0 where
     fewer than `LEAST` slices hold any."""
-    block = np.zeros((cells, cells, high))
+    block = np.zeros((cells, cells, high - LOW), np.float32)
     for i in range(mean.shape[0]):
         a = int(np.floor((mean[i, 0] - low[0] + MARGIN) / SIDE))
         b = int(np.floor((mean[i, 1] - low[1] + MARGIN) / SIDE))
         h = int(mean[i, 2] / SLICE)
         if 0 <= a < cells and 0 <= b < cells and LOW <= h < high:
-            block[a, b, h] += returns[i]
+            block[a, b, h - LOW] += returns[i]
+    along = np.zeros_like(block)  # sums of three cells along y, then of three such along x
+    for a in range(cells):
+        for b in range(1, cells - 1):
+            for h in range(high - LOW):
+                along[a, b, h] = block[a, b - 1, h] + block[a, b, h] + block[a, b + 1, h]
     strength = np.zeros((cells, cells))
     for a in range(1, cells - 1):
         for b in range(1, cells - 1):
             total, filled = 0.0, 0
-            for h in range(LOW, high):
-                n = 0.0
-                for da in range(-1, 2):
-                    for db in range(-1, 2):
-                        n += block[a + da, b + db, h]
+            for h in range(high - LOW):
+                n = along[a - 1, b, h] + along[a, b, h] + along[a + 1, b, h]
                 if n > 0.0:
                     filled += 1
                     total += np.log(1.0 + n)
@@ -94,32 +96,86 @@ def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) 
 
 
 @compiled
-def straighten(columns: Float, mean: Float32, returns: Int32) -> None:
-    """Lay each column's axis through the middles of its slices, in four rounds."""
-    for c in range(columns.shape[0]):
-        for turn in range(4):
-            _fit_line(columns[c], mean, returns, 0.35 if turn < 2 else 0.25)
+def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
+    """The voxels bucket by bucket of `BUCKET` seen from above: order (N,) and bounds (buckets + 1,)."""
+    across = int(np.ceil((side + 2 * MARGIN) / BUCKET))
+    bucket = np.empty(mean.shape[0], np.int64)
+    bounds = np.zeros(across * across + 1, np.int64)
+    for i in range(mean.shape[0]):
+        a = min(max(int((mean[i, 0] - low[0] + MARGIN) / BUCKET), 0), across - 1)
+        b = min(max(int((mean[i, 1] - low[1] + MARGIN) / BUCKET), 0), across - 1)
+        bucket[i] = a * across + b
+        bounds[bucket[i] + 1] += 1
+    bounds = np.cumsum(bounds)
+    place, order = bounds[:-1].copy(), np.empty(mean.shape[0], np.int64)
+    for i in range(mean.shape[0]):
+        order[place[bucket[i]]] = i
+        place[bucket[i]] += 1
+    return order, bounds
 
 
 @compiled
-def _fit_line(axis: Float, mean: Float32, returns: Int32, reach: float) -> None:
+def near_rows(x: float, y: float, low: Float, bounds: Int) -> Int:
+    """Runs of rows (first, one past the last) of the buckets around a place, shape (3, 2)."""
+    across = int(np.sqrt(bounds.shape[0] - 1) + 0.5)
+    a = min(max(int((x - low[0] + MARGIN) / BUCKET), 0), across - 1)
+    b = min(max(int((y - low[1] + MARGIN) / BUCKET), 0), across - 1)
+    runs = np.zeros((3, 2), np.int64)
+    for k in range(3):
+        if 0 <= a + k - 1 < across:
+            runs[k, 0] = bounds[(a + k - 1) * across + max(b - 1, 0)]
+            runs[k, 1] = bounds[(a + k - 1) * across + min(b + 1, across - 1) + 1]
+    return runs
+
+
+@compiled
+def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Float, Float]:
+    """The columns of a tile and what stands around each.
+
+    Args:
+        mean, returns, low, side: See `find_columns`.
+
+    Returns:
+        The columns, shape (K, 5), those whose foot lies in the tile; their profiles, shape
+        (K, SLICES, PROFILE).
+    """
+    found = find_columns(mean, returns, low, side)
+    order, bounds = in_buckets(mean, low, side)
+    sorted_mean, sorted_returns = mean[order], returns[order]
+    profiles = np.zeros((found.shape[0], SLICES, PROFILE))
+    kept = 0
+    for c in range(found.shape[0]):
+        axis = found[c]
+        for turn in range(4):
+            runs = near_rows(axis[0], axis[1], low, bounds)
+            _fit_line(axis, sorted_mean, sorted_returns, runs, 0.35 if turn < 2 else 0.25)
+        if low[0] <= axis[0] < low[0] + side and low[1] <= axis[1] < low[1] + side:
+            found[kept] = axis
+            profile(axis, sorted_mean, sorted_returns, near_rows(axis[0], axis[1], low, bounds), profiles[kept])
+            kept += 1
+    return found[:kept].copy(), profiles[:kept].copy()
+
+
+@compiled
+def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: float) -> None:
     """One round; a slice weighs by how much of what is around the axis lies at it, however many returns
     it has, so that foliage does not draw the axis away. A weak prior keeps it upright."""
     w, x, y, around = np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES)
-    for i in range(mean.shape[0]):
-        h = mean[i, 2]
-        s = int(h / SLICE)
-        if s < LOW or s >= HIGH:
-            continue
-        dx = mean[i, 0] - axis[0] - axis[2] * (h - 1.3)
-        dy = mean[i, 1] - axis[1] - axis[3] * (h - 1.3)
-        r2 = dx * dx + dy * dy
-        if r2 < reach * reach:
-            w[s] += returns[i]
-            x[s] += returns[i] * mean[i, 0]
-            y[s] += returns[i] * mean[i, 1]
-        elif r2 < RING_FAR * RING_FAR:
-            around[s] += returns[i]
+    for run in range(runs.shape[0]):
+        for i in range(runs[run, 0], runs[run, 1]):
+            h = mean[i, 2]
+            s = int(h / SLICE)
+            if s < LOW or s >= HIGH:
+                continue
+            dx = mean[i, 0] - axis[0] - axis[2] * (h - 1.3)
+            dy = mean[i, 1] - axis[1] - axis[3] * (h - 1.3)
+            r2 = dx * dx + dy * dy
+            if r2 < reach * reach:
+                w[s] += returns[i]
+                x[s] += returns[i] * mean[i, 0]
+                y[s] += returns[i] * mean[i, 1]
+            elif r2 < RING_FAR * RING_FAR:
+                around[s] += returns[i]
     n, sh, shh, sx, sy, shx, shy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for s in range(SLICES):
         if w[s] > 0.0:
@@ -143,41 +199,29 @@ def _fit_line(axis: Float, mean: Float32, returns: Int32, reach: float) -> None:
 
 
 @compiled
-def profile(axis: Float, mean: Float32, returns: Int32) -> Float:
-    """What stands around an axis, slice by slice, shape (SLICES, PROFILE).
+def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) -> None:
+    """What stands around an axis, slice by slice, into `rows` of zeros, shape (SLICES, PROFILE).
 
     Columns: returns inside, returns between, returns in the ring, voxels inside, filled octants of the
     ring, middle of the inside (x, y from the axis) [m], rms distance of the inside from the axis [m],
     and the second moments xx, xy, yy of the inside about its middle [m^2].
+
+    Args:
+        axis: See `find_columns`; mean, returns: voxels, bucket by bucket; runs: see `near_rows`.
+        rows: Is filled.
     """
-    rows = np.zeros((SLICES, PROFILE))
-    octants = np.zeros((SLICES, OCTANTS))
-    for i in range(mean.shape[0]):
-        h = mean[i, 2]
-        s = int(h / SLICE)
-        if s < 0 or s >= SLICES:
-            continue
-        dx = mean[i, 0] - axis[0] - axis[2] * (h - 1.3)
-        dy = mean[i, 1] - axis[1] - axis[3] * (h - 1.3)
-        r2 = dx * dx + dy * dy
-        if r2 < INSIDE * INSIDE:
-            rows[s, 0] += returns[i]
-            rows[s, 3] += 1.0
-            rows[s, 5] += returns[i] * dx
-            rows[s, 6] += returns[i] * dy
-            rows[s, 7] += returns[i] * r2
-            rows[s, 8] += returns[i] * dx * dx
-            rows[s, 9] += returns[i] * dx * dy
-            rows[s, 10] += returns[i] * dy * dy
-        elif r2 < RING_NEAR * RING_NEAR:
-            rows[s, 1] += returns[i]
-        elif r2 < RING_FAR * RING_FAR:
-            rows[s, 2] += returns[i]
-            k = int((np.arctan2(dy, dx) + np.pi) / (2.0 * np.pi) * OCTANTS)
-            octants[s, min(k, OCTANTS - 1)] += 1.0
+    octants = np.zeros((SLICES, OCTANTS), np.bool_)
+    for run in range(runs.shape[0]):
+        for i in range(runs[run, 0], runs[run, 1]):
+            h = mean[i, 2]
+            s = int(h / SLICE)
+            if s < 0 or s >= SLICES:
+                continue
+            dx = mean[i, 0] - axis[0] - axis[2] * (h - 1.3)
+            dy = mean[i, 1] - axis[1] - axis[3] * (h - 1.3)
+            _count(dx, dy, float(returns[i]), rows[s], octants[s])
     for s in range(SLICES):
-        for k in range(OCTANTS):
-            rows[s, 4] += octants[s, k] > 0.0
+        rows[s, 4] = octants[s].sum()
         if rows[s, 0] > 0.0:
             for a in range(5, PROFILE):
                 rows[s, a] /= rows[s, 0]
@@ -185,17 +229,22 @@ def profile(axis: Float, mean: Float32, returns: Int32) -> Float:
             rows[s, 8] -= rows[s, 5] * rows[s, 5]
             rows[s, 9] -= rows[s, 5] * rows[s, 6]
             rows[s, 10] -= rows[s, 6] * rows[s, 6]
-    return rows
 
 
 @compiled
-def distinct(columns: Float) -> NDArray[np.bool_]:
-    """Which columns are no weaker copy of another within `APART`, shape (K,)."""
-    kept = np.ones(columns.shape[0], np.bool_)
-    for a in range(columns.shape[0]):
-        for b in range(columns.shape[0]):
-            dx, dy = columns[a, 0] - columns[b, 0], columns[a, 1] - columns[b, 1]
-            if a != b and dx * dx + dy * dy < APART * APART:
-                if columns[b, 4] > columns[a, 4] or (columns[b, 4] == columns[a, 4] and b < a):
-                    kept[a] = False
-    return kept
+def _count(dx: float, dy: float, n: float, row: Float, octant: Bool) -> None:
+    r2 = dx * dx + dy * dy
+    if r2 < INSIDE * INSIDE:
+        row[0] += n
+        row[3] += 1.0
+        row[5] += n * dx
+        row[6] += n * dy
+        row[7] += n * r2
+        row[8] += n * dx * dx
+        row[9] += n * dx * dy
+        row[10] += n * dy * dy
+    elif r2 < RING_NEAR * RING_NEAR:
+        row[1] += n
+    elif r2 < RING_FAR * RING_FAR:
+        row[2] += n
+        octant[(dx > 0.0) * 4 + (dy > 0.0) * 2 + (abs(dx) > abs(dy))] = True

@@ -44,16 +44,24 @@ UNSEEN = -1.0  # of a figure of a band that no return tells anything of
 
 
 @compiled
-def features(axis: Float, rows: Float, viewed: float, present: float, absent: float) -> Float:
-    """The features of a column, shape (COUNT,), in the order of NAMES.
+def features(
+    axis: Float, profiles: Float, viewed: Float, present: Float, absent: Float, figures: Float
+) -> None:
+    """The features of columns, into `figures`, shape (K, COUNT), in the order of NAMES.
 
     Args:
-        axis: shape (5,), see `find_columns`.
-        rows: Its profile, shape (SLICES, PROFILE).
-        viewed: How high above the ground any scan looked there [m].
-        present, absent: In how many scans something, or nothing, stood there in free view.
+        axis: shape (K, 5), see `find_columns`.
+        profiles: shape (K, SLICES, PROFILE).
+        viewed: How high above the ground any scan looked there, shape (K,) [m].
+        present, absent: In how many scans something, or nothing, stood there in free view, shape (K,).
+        figures: Is filled.
     """
-    out = np.empty(COUNT)
+    for c in range(axis.shape[0]):
+        _features(axis[c], profiles[c], viewed[c], present[c], absent[c], figures[c])
+
+
+@compiled
+def _features(axis: Float, rows: Float, viewed: float, present: float, absent: float, out: Float) -> None:
     for b in range(BANDS.shape[0]):
         _band(rows, BANDS[b, 0], BANDS[b, 1], out[3 * b : 3 * b + 3])
     k = 3 * BANDS.shape[0]
@@ -88,8 +96,7 @@ def features(axis: Float, rows: Float, viewed: float, present: float, absent: fl
     out[k + 14] = absent / max(present + absent, 1.0)
     out[k + 15] = np.log(1.0 + inside / some)
     _shape(rows, last, out[k + 16 : k + 19])
-    out[k + 19] = last * SLICE / out[k + 6]
-    return out
+    out[k + 19] = last * SLICE / max(out[k + 6], SLICE)
 
 
 @compiled

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.compiled import compiled
-from pipeline.gathering.columns import MARGIN, find_columns, profile, straighten
+from pipeline.gathering.columns import MARGIN, PROFILE, examine
 from pipeline.gathering.features import COUNT, features
 from pipeline.gathering.forest import CLASSES, Forest, standard_forest, vote
 from pipeline.gathering.memory import SLICE, SLICES, TILE, Memory
@@ -16,7 +16,7 @@ from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Gathering as GatheringParameters
 from pipeline.records import Bool, Columns, Float32, Int, Verdict
 
-GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
+GROWN = 1.2  # a tile is judged anew when it holds so many times the returns it held
 SAME = 0.35  # m; a column found again so near is the one of before
 FOLD = 100  # scans after which a snapshot no longer repeats them one by one
 GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
@@ -78,8 +78,7 @@ class Gathering:
         look(
             c.axis, c.viewed, c.present, c.absent, pose, clear_range, steepest, sensor_offset, terrain, p.range_max
         )  # fmt: skip
-        for k, rows in enumerate(profiles, first):
-            c.figures[k] = features(c.axis[k], rows, c.viewed[k], c.present[k], c.absent[k])
+        features(c.axis[first:], profiles, c.viewed[first:], c.present[first:], c.absent[first:], c.figures[first:])
         self._judge(first)
 
     def snapshot(self) -> GatheringState:
@@ -102,26 +101,24 @@ class Gathering:
         self.memory.add(points, scan, most)
         return self.memory.judge_anew(GROWN)
 
-    def _find_again(self, tiles: Int) -> list[Float]:
+    def _find_again(self, tiles: Int) -> Float:
         """Find the columns of tiles anew, at the end of a new table; returns their profiles."""
         old = self.columns
         kept = ~_among(old.tile, tiles)
-        axes, homes, profiles = [old.axis[kept]], [old.tile[kept]], []
+        axes, homes, profiles = [old.axis[kept]], [old.tile[kept]], [np.zeros((0, SLICES, PROFILE))]
         for tile in tiles:
             mean, returns = self.memory.around(tile, MARGIN)
-            found = find_columns(mean, returns, tile * TILE, TILE)
-            straighten(found, mean, returns)
-            found = found[_inside(found, tile)]
+            found, around = examine(mean, returns, tile * TILE, TILE)
             axes.append(found)
             homes.append(np.broadcast_to(tile, (len(found), 2)))
-            profiles += [profile(axis, mean, returns) for axis in found]
+            profiles.append(around)
         fresh = _rows(np.concatenate(axes), np.concatenate(homes))
         n = len(axes[0])
         for name in ("viewed", "present", "absent", "figures", "share", "verdict"):
             getattr(fresh, name)[:n] = getattr(old, name)[kept]
         _inherit(old.axis, old.viewed, old.present, old.absent, fresh.axis, fresh.viewed, fresh.present, fresh.absent, n)  # fmt: skip
         self.columns = fresh
-        return profiles
+        return np.concatenate(profiles)
 
     def _judge(self, first: int) -> None:
         """Give the columns from a row on their verdict; who walked away is told at any time."""
@@ -150,12 +147,6 @@ def _rows(axis: Float, tile: Int) -> Columns:
         share=np.zeros((n, len(CLASSES))),
         verdict=np.full(n, Verdict.OTHER, np.int32),
     )
-
-
-def _inside(found: Float, tile: Int) -> Bool:
-    foot = found[:, :2]
-    inside: Bool = np.all((foot >= tile * TILE) & (foot < (tile + 1) * TILE), axis=1)
-    return inside
 
 
 def _among(home: Int, tiles: Int) -> Bool:
