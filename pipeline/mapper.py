@@ -12,7 +12,7 @@ from pipeline import filters, ground
 from pipeline.acquisition import acquire
 from pipeline.clustering import cluster
 from pipeline.detection import detections, judge
-from pipeline.gathering import Gathering, GatheringState, steepest_by_direction
+from pipeline.gathering import Forest, Gathering, GatheringState, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.parameters import Parameters
 from pipeline.records import Float32, Frame, Path, PoseEstimate, Sensor, Step
@@ -52,6 +52,7 @@ class Mapper:
         T_base_lidar: Where it stands on the robot.
         seed: Of every random number.
         watch: Is entered around each stage with its name, so that the caller can measure it.
+        forest: Votes on what was gathered; None takes the one that comes with the package.
     """
 
     def __init__(
@@ -62,13 +63,14 @@ class Mapper:
         T_base_lidar: Pose3,
         seed: int,
         watch: Watch = no_watch,
+        forest: Forest | None = None,
     ) -> None:
         self._parameters = parameters
         self._sensor = sensor
         self._T_base_lidar = T_base_lidar
         self._watch = watch
         self._slam = FastSlam(parameters.slam, seed)
-        self._gathering = Gathering(parameters.gathering)
+        self._gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=forest)
         self._tracker = Tracker(parameters.tracking)
         self._odometry: Pose2 | None = None
         self._path = _PathColumns()

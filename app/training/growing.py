@@ -8,14 +8,26 @@ from typing import Any
 import numpy as np
 
 from pipeline.gathering.features import NAMES
-from pipeline.gathering.forest import CLASSES
-from pipeline.records import Float, Int
+from pipeline.gathering.forest import ALL_AROUND, CLASSES, ONE_WAY
+from pipeline.records import Float, Int, Verdict
 
-TREES = 24
-DEPTH = 9
-LEAST_LEAF = 3  # examples
-SIMULATED_WEIGHT = 0.3  # real scenes are what decides, and they are few
 DOUBTFUL = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How trees are grown for a kind of sensor: their number, depth, the least examples in a leaf, and
+    what a column of a simulated scene counts beside one of a real scene, of which there are few."""
+
+    trees: int
+    depth: int
+    least: int
+    simulated: float
+
+
+# A sensor that looks one way sees a trunk from one side and no higher than its field of view; examples
+# that were driven around teach it to expect more (docs/results.md has both figures).
+PLANS = {ALL_AROUND: Plan(20, 10, 8, 0.1), ONE_WAY: Plan(40, 9, 3, 0.0)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,46 +49,64 @@ class Examples:
     label: Int
 
 
-def grow(examples: list[Examples], seed: int = 0) -> Any:  # noqa: ANN401 - scikit-learn is untyped
+@dataclass(frozen=True, slots=True, eq=False)
+class Grown:
+    """Trees of scikit-learn, and for each the shares of the kinds in its nodes, shape (nodes, classes)."""
+
+    trees: Any
+    share: list[Float]
+
+
+def grow(examples: list[Examples], plan: Plan, seed: int = 0) -> Grown:
     """Extremely randomised trees (Geurts 2006): with so few real scenes they agree better with new ones
-    than the best tree of all."""
+    than one tree does. They are split to tell trees from all else; the leaves then say what else."""
     from sklearn.ensemble import ExtraTreesClassifier
 
-    figures = np.concatenate([e.figures for e in examples])
-    label = np.concatenate([e.label for e in examples])
-    weight = np.concatenate([np.full(len(e.label), SIMULATED_WEIGHT if e.simulated else 1.0) for e in examples])
+    used = [e for e in examples if plan.simulated > 0.0 or not e.simulated]
+    figures = np.concatenate([e.figures for e in used]).astype(np.float32)
+    label = np.concatenate([e.label for e in used])
+    weight = np.concatenate([np.full(len(e.label), plan.simulated if e.simulated else 1.0) for e in used])
     sure = label != DOUBTFUL
+    figures, label, weight = figures[sure], label[sure], weight[sure]
     trees = ExtraTreesClassifier(
-        TREES, max_depth=DEPTH, min_samples_leaf=LEAST_LEAF, max_features=0.5, random_state=seed
-    )
-    return trees.fit(np.round(figures[sure], 4), label[sure], weight[sure])
+        plan.trees, max_depth=plan.depth, min_samples_leaf=plan.least, max_features=0.5, random_state=seed
+    ).fit(figures, label == CLASSES.index(Verdict.TREE), weight)
+    return Grown(trees, [_shares(tree, figures, label, weight) for tree in trees.estimators_])
 
 
-def shares(trees: Any, figures: Float) -> Float:  # noqa: ANN401
+def _shares(tree: Any, figures: Float, label: Int, weight: Float) -> Float:  # noqa: ANN401
+    share = np.zeros((tree.tree_.node_count, len(CLASSES)))
+    np.add.at(share, (tree.apply(figures), label), weight)
+    rounded: Float = np.round(share / np.maximum(share.sum(axis=1, keepdims=True), 1e-12), 2)
+    return rounded
+
+
+def shares(grown: Grown, figures: Float) -> Float:
     """Votes in the order of CLASSES, shape (N, classes)."""
-    votes = np.zeros((len(figures), len(CLASSES)))
-    votes[:, trees.classes_] = trees.predict_proba(figures)
+    leaf = grown.trees.apply(figures.astype(np.float32))
+    votes: Float = np.mean([share[leaf[:, k]] for k, share in enumerate(grown.share)], axis=0)
     return votes
 
 
-def as_json(trees: Any, scenes: list[str]) -> dict[str, Any]:  # noqa: ANN401
+def as_json(grown: dict[str, Grown], scenes: list[str]) -> dict[str, Any]:
     """What `pipeline.gathering.forest.read_forest` reads."""
     return {
-        "about": "Votes on what a column is; made by `stemmap train`. Each figure is described in docs/results.md.",
+        "about": "Votes on what a column is, made by `stemmap train`; see docs/results.md.",
         "scenes": scenes,
         "classes": [kind.label for kind in CLASSES],
-        "trees": [_node(tree.tree_, 0, trees.classes_) for tree in trees.estimators_],
+        **{
+            kind: [_node(tree.tree_, share, 0) for tree, share in zip(g.trees.estimators_, g.share, strict=True)]
+            for kind, g in grown.items()
+        },
     }
 
 
-def _node(tree: Any, row: int, classes: Int) -> dict[str, Any]:  # noqa: ANN401
+def _node(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
     if tree.children_left[row] < 0:
-        share = np.zeros(len(CLASSES))
-        share[classes] = tree.value[row, 0] / tree.value[row, 0].sum()
-        return {"share": [round(float(v), 3) for v in share]}
-    return {
-        "figure": NAMES[tree.feature[row]],
-        "at_most": round(float(tree.threshold[row]), 4),
-        "yes": _node(tree, tree.children_left[row], classes),
-        "no": _node(tree, tree.children_right[row], classes),
-    }
+        return {"share": share[row].tolist()}
+    yes = _node(tree, share, tree.children_left[row])
+    no = _node(tree, share, tree.children_right[row])
+    if "share" in yes and yes == no:
+        return yes
+    threshold = round(float(tree.threshold[row]), 4)
+    return {"figure": NAMES[tree.feature[row]], "at_most": threshold, "yes": yes, "no": no}

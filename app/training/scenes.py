@@ -33,10 +33,10 @@ _VERDICT_OF_KIND = {
 
 def gathered(uri: str, parameters: Parameters, *, every: int, static: bool) -> Iterator[Columns]:
     """The columns of a run mapped with the poses it tells, after each of MARKS scans and at the end."""
-    gathering = Gathering(parameters.gathering, _no_forest())
     taken = 0
     with closing(open_source(uri)) as source:
         sensor, T_base_lidar = source.description.sensor, source.description.T_base_lidar
+        gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=_no_forest())
         before = b""
         for step in steps(source.records(), odometry="static" if static else "auto"):
             repeated = step.scan.points.tobytes()

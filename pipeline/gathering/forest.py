@@ -18,6 +18,7 @@ from pipeline.records import Int32, Verdict
 
 # The kinds that are told apart, in the order of the JSON's shares.
 CLASSES = (Verdict.TREE, Verdict.POLE, Verdict.PERSON, Verdict.BUSH, Verdict.WALL, Verdict.OTHER)
+ALL_AROUND, ONE_WAY = "all around", "one way"
 FILE = Path(__file__).with_name("forest.json")
 _MOST_BYTES = 4_000_000
 _MOST_NODES = 100_000
@@ -45,13 +46,14 @@ class Forest:
 
 
 @cache
-def standard_forest() -> Forest:
-    """The forest that comes with the package."""
-    return read_forest(FILE)
+def standard_forest(all_around: bool) -> Forest:
+    """The forest that comes with the package for sensors that see all around, or for those that look one
+    way: what these see of a trunk differs too much for one to serve both."""
+    return read_forest(FILE, ALL_AROUND if all_around else ONE_WAY)
 
 
-def read_forest(path: Path) -> Forest:
-    """Read a forest.
+def read_forest(path: Path, kind: str) -> Forest:
+    """Read a forest for a kind of sensor, ALL_AROUND or ONE_WAY.
 
     Raises:
         StemmapError: The file is too large, is no such JSON, or asks for figures that do not exist.
@@ -59,7 +61,7 @@ def read_forest(path: Path) -> Forest:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError("it is too large")
-        return _from_json(json.loads(path.read_text(encoding="utf-8")))
+        return _from_json(json.loads(path.read_text(encoding="utf-8")), kind)
     except OSError as error:
         raise _damaged(path, str(error.strerror)) from None
     except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
@@ -72,11 +74,11 @@ def _damaged(path: Path, why: str) -> StemmapError:
     )
 
 
-def _from_json(data: dict[str, Any]) -> Forest:
-    if data["classes"] != [kind.label for kind in CLASSES]:
+def _from_json(data: dict[str, Any], kind: str) -> Forest:
+    if data["classes"] != [verdict.label for verdict in CLASSES]:
         raise ValueError("it was trained for other classes")
     rows: list[_Row] = []
-    roots = [_lay_out(tree, rows) for tree in data["trees"]]
+    roots = [_lay_out(tree, rows) for tree in data[kind]]
     if not roots:
         raise ValueError("it has no trees")
     feature, threshold, left, right, share = zip(*rows, strict=True)

@@ -16,7 +16,7 @@ from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Gathering as GatheringParameters
 from pipeline.records import Bool, Columns, Float32, Int, Verdict
 
-GROWN = 1.2  # a tile is judged anew when it holds so many times the returns it held
+GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
 SAME = 0.35  # m; a column found again so near is the one of before
 FOLD = 100  # scans after which a snapshot no longer repeats them one by one
 GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
@@ -37,12 +37,15 @@ class Gathering:
 
     Args:
         parameters: Of this stage.
+        all_around: Whether the sensor sees all around, or one way.
         forest: Votes on the columns; None takes the one that comes with the package.
     """
 
-    def __init__(self, parameters: GatheringParameters, forest: Forest | None = None) -> None:
+    def __init__(
+        self, parameters: GatheringParameters, *, all_around: bool, forest: Forest | None = None
+    ) -> None:
         self.parameters = parameters
-        self._forest = forest
+        self._forest = forest or standard_forest(all_around)
         self.memory = Memory.empty()
         self.columns = _rows(np.zeros((0, 5)), np.zeros((0, 2), np.int64))
         self._base = self.memory.copy()
@@ -123,7 +126,7 @@ class Gathering:
     def _judge(self, first: int) -> None:
         """Give the columns from a row on their verdict; who walked away is told at any time."""
         c = self.columns
-        c.share[first:] = vote(c.figures[first:], self._forest or standard_forest())
+        c.share[first:] = vote(c.figures[first:], self._forest)
         kind = np.array(CLASSES, np.int32)
         verdict = kind[c.share.argmax(axis=1)] if len(c.share) else np.zeros(0, np.int32)
         tree = c.share[:, 0] >= self.parameters.tree_share

@@ -18,6 +18,8 @@ SLICE = 0.2  # m, its height
 SLICES = 30  # so that 6 m above the ground are remembered
 TILE_CELLS = 40  # places are judged again tile by tile, of 4 m
 TILE = TILE_CELLS * SIDE
+MOST_TILES = 6  # are judged anew at a scan,
+FIRST_SCANS = 10  # but for these, when a map may end soon
 _OFFSET = TILE_CELLS << 18  # cells; keys stay positive within 1,000 km of the origin
 _FARTHEST = np.float32((_OFFSET - 2 * TILE_CELLS) * SIDE)
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
@@ -34,7 +36,7 @@ class Memory:
         following: int32, the next voxel of the same tile, -1 for none.
         tile_key, tile_slot: As for voxels; tile_first: int32, the first voxel of each tile.
         tile_returns: int64; tile_judged: int64, the returns that it had when it was last judged.
-        used, tiles: Voxels and tiles in use.
+        used, tiles: Voxels and tiles in use; added: scans that were taken.
     """
 
     key: Int
@@ -51,6 +53,7 @@ class Memory:
     tile_judged: Int
     used: int
     tiles: int
+    added: int
 
     @classmethod
     def empty(cls, room: int = 1 << 12, tile_room: int = 1 << 8) -> Memory:
@@ -71,6 +74,7 @@ class Memory:
             tile_judged=tile_ints.copy(),
             used=0,
             tiles=0,
+            added=0,
         )
 
     def copy(self) -> Memory:
@@ -89,6 +93,7 @@ class Memory:
             most: Voxels kept, a power of two.
         """
         begin = 0
+        self.added += 1
         while True:
             begin, self.used, self.tiles = _add(points, begin, scan, *self._tables(), self.used, self.tiles)
             if begin == len(points):
@@ -97,9 +102,13 @@ class Memory:
 
     def judge_anew(self, grown: float) -> Int:
         """Tiles, shape (T, 2), that hold `grown` times what they held when they were judged last; from
-        now on they count as judged."""
+        now on they count as judged. After the first scans the `MOST_TILES` that grew most come first, so
+        that no scan takes long; the others' turn comes soon."""
         now, before = self.tile_returns[: self.tiles], self.tile_judged[: self.tiles]
         due = np.flatnonzero(now > grown * before)
+        if self.added > FIRST_SCANS and len(due) > MOST_TILES:
+            growth = now[due] / np.maximum(before[due], 1)
+            due = np.sort(due[np.argsort(-growth, kind="stable")[:MOST_TILES]])
         before[due] = now[due]
         key = self.tile_key[due]
         origin = _OFFSET // TILE_CELLS
@@ -131,7 +140,7 @@ class Memory:
         n = int(np.count_nonzero(rows))
         for name in ("key", "mean", "returns", "scans", "latest"):
             getattr(fresh, name)[:n] = getattr(self, name)[: self.used][rows]
-        fresh.used = n
+        fresh.used, fresh.added = n, self.added
         fresh.tiles = _index(n, *fresh._tables())
         _keep_judged(self.tile_key, self.tile_judged, self.tiles, fresh.tile_key, fresh.tile_slot, fresh.tile_judged)
         for f in fields(self):

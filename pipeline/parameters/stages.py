@@ -258,7 +258,7 @@ class Gathering(Stage):
         19, "Memory", "bits", 12, 24, "Room for 2 to this power voxels; when full, the oldest half is forgotten."
     )
     tree_share: float = number(
-        0.5, "Votes for a tree", "", 0.0, 1.0, 0.05, "A column is a tree from this share of the votes on."
+        0.45, "Votes for a tree", "", 0.0, 1.0, 0.05, "A column is a tree from this share of the votes on."
     )
 
 
