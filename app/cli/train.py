@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Gather examples, grow the trees, print what they are worth on scenes left out, write them."""
-    from app.training.growing import PLANS, as_json, grow
+    from app.training.growing import PLANS, as_json, can_grow, grow
     from app.training.judging import leave_one_out
     from pipeline.files import write_beside
     from pipeline.parameters import preset
@@ -49,8 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     for line in leave_one_out(examples, preset("forest").gathering.tree_share):
         print(line)
     scenes = sorted({e.scene if e.simulated else Path(e.scene).name for e in examples})
-    plans = {kind: plan for kind, plan in PLANS.items() if plan.simulated > 0.0 or not all(e.simulated for e in examples)}
-    grown = {kind: grow(examples, plan) for kind, plan in plans.items()}
+    grown = {kind: grow(examples, kind) for kind in PLANS if can_grow(examples, kind)}
     text = json.dumps(as_json(grown, scenes), separators=(",", ":"))
     with write_beside(arguments.out) as file:
         file.write_text(text.replace('{"figure"', '\n{"figure"') + "\n", encoding="utf-8")

@@ -6,12 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from app.training.growing import DOUBTFUL, PLANS, Examples, grow, shares
+from app.training.growing import DOUBTFUL, TREE, Examples, can_grow, grow, shares
 from pipeline.evaluation.matching import match
-from pipeline.gathering.forest import CLASSES
-from pipeline.records import Float, Verdict
+from pipeline.gathering.forest import ALL_AROUND, ONE_WAY
+from pipeline.records import Float
 
-TREE = CLASSES.index(Verdict.TREE)
 APART = 0.5  # m
 
 
@@ -22,15 +21,11 @@ def leave_one_out(examples: list[Examples], share: float) -> Iterator[str]:
     """
     for scene in dict.fromkeys(e.scene for e in examples if not e.simulated):
         others = [e for e in examples if e.scene != scene]
-        if not others:
-            continue
         last = [e for e in examples if e.scene == scene][-1]
-        for kind, plan in PLANS.items():
-            if plan.simulated == 0.0 and all(e.simulated for e in others):
-                continue
-            votes = shares(grow(others, plan), last.figures)[:, TREE]
-            hit, of, false = count(last, votes, share)
-            yield f"left out {scene}, sensor that looks {kind}: {hit} of {of} trees, {false} false"
+        kind = ALL_AROUND if last.all_around else ONE_WAY
+        if can_grow(others, kind):
+            hit, of, false = count(last, shares(grow(others, kind), last.figures)[:, TREE], share)
+            yield f"left out {scene}: {hit} of {of} trees, {false} false"
 
 
 def count(scene: Examples, votes: Float, share: float) -> tuple[int, int, int]:

@@ -20,14 +20,15 @@ def kept_or_made(folder: Path | None, scene: str, make: Callable[[], Iterable[Ex
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         columns = {f"{name}{k}": getattr(e, name) for k, e in enumerate(made) for name in ("axis", "figures", "label")}
-        np.savez(file, scene=scene, simulated=made[0].simulated, sets=len(made), **columns)
+        np.savez(file, scene=scene, simulated=made[0].simulated, all_around=made[0].all_around, sets=len(made), **columns)
     return made
 
 
 def _read(file: Path) -> list[Examples]:
     with np.load(file, allow_pickle=False) as kept:
         scene, simulated = str(kept["scene"]), bool(kept["simulated"])
+        around = bool(kept["all_around"])
         return [
-            Examples(scene, simulated, kept[f"axis{k}"], kept[f"figures{k}"], kept[f"label{k}"])
+            Examples(scene, simulated, around, kept[f"axis{k}"], kept[f"figures{k}"], kept[f"label{k}"])
             for k in range(int(kept["sets"]))
         ]

@@ -64,7 +64,7 @@ def simulated_examples(uri: str, parameters: Parameters, every: int) -> Iterator
     assert truth is not None  # noqa: S101 - simulated runs know all
     assert truth.trees is not None  # noqa: S101
     for columns in gathered(uri, parameters, every=every, static=False):
-        yield Examples(uri, True, columns.axis, columns.figures, label_by_truth(columns.axis, truth.trees))
+        yield Examples(uri, True, True, columns.axis, columns.figures, label_by_truth(columns.axis, truth.trees))
 
 
 def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
@@ -84,10 +84,12 @@ def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
 def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Iterator[Examples]:
     """Of a folder of scans from one place (`velodyne/*.bin`, `labels/*.label`), or one such pair of files."""
     points, label = labelled_points(folder)
+    with closing(open_source(str(folder))) as source:
+        all_around = source.description.sensor.rings > 0
     for columns in gathered(str(folder), parameters, every=1, static=True):
         near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
-        yield Examples(str(folder), False, axis, figures, _label_by_points(axis, points, label))
+        yield Examples(str(folder), False, all_around, axis, figures, _label_by_points(axis, points, label))
 
 
 def labelled_points(folder: Path) -> tuple[Float, Int]:
