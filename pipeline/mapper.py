@@ -12,7 +12,7 @@ from pipeline import filters, ground
 from pipeline.acquisition import acquire
 from pipeline.clustering import cluster
 from pipeline.detection import detections, judge
-from pipeline.gathering import Forest, Gathering, GatheringState, steepest_by_direction
+from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.parameters import Parameters
 from pipeline.records import Float32, Frame, Path, PoseEstimate, Sensor, Step
@@ -139,9 +139,8 @@ class Mapper:
         if p.gathering.method == "columns" and terrain is not None and height is not None:
             with watch("gathering"):
                 steepest = steepest_by_direction(raw, sensor_offset, self._sensor.rings > 0)
-                self._gathering.add(
-                    boxed, height, step.index, estimate.T_map_base, sensor_offset, free, steepest, terrain.height
-                )  # fmt: skip
+                view = View(estimate.T_map_base, sensor_offset, free, steepest, terrain.height)
+                self._gathering.add(boxed, height, step.index, view)
                 columns = self._gathering.columns
                 self._tracker.judge(step.scan.stamp_ns, columns)
 

@@ -30,9 +30,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--scenes", default=SCENES, help=f"simulated scenes (default: {SCENES})")
     parser.add_argument("--seeds", default=SEEDS, help=f"of the simulated scenes (default: {SEEDS})")
-    parser.add_argument("--every", type=int, default=3, help="take every so many-th simulated scan (default: 3)")
     parser.add_argument(
-        "--examples", metavar="DIR", type=Path, help="keep the examples of each scene here, and take them from here"
+        "--every", type=int, default=3, help="take every so many-th simulated scan (default: 3)"
+    )
+    parser.add_argument(
+        "--examples",
+        metavar="DIR",
+        type=Path,
+        help="keep the examples of each scene here, and take them from here",
     )
 
 
@@ -74,5 +79,7 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
             make = partial(simulated_examples, uri, forest, arguments.every)
             found += kept_or_made(arguments.examples, uri, make)
     for folder in arguments.labelled:
-        found += kept_or_made(arguments.examples, str(folder), partial(labelled_examples, folder, forest, REACH))
+        found += kept_or_made(
+            arguments.examples, str(folder), partial(labelled_examples, folder, forest, REACH)
+        )
     return found

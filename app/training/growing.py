@@ -137,7 +137,9 @@ def as_json(grown: dict[str, Grown], scenes: list[str]) -> dict[str, Any]:
         "scenes": scenes,
         "classes": [kind.label for kind in CLASSES],
         **{
-            kind: [_node(tree.tree_, share, 0) for tree, share in zip(g.trees.estimators_, g.share, strict=True)]
+            kind: [
+                _node(tree.tree_, share, 0) for tree, share in zip(g.trees.estimators_, g.share, strict=True)
+            ]
             for kind, g in grown.items()
         },
     }

@@ -19,9 +19,25 @@ def kept_or_made(folder: Path | None, scene: str, make: Callable[[], Iterable[Ex
     made = list(make())
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
-        columns = {f"{name}{k}": getattr(e, name) for k, e in enumerate(made) for name in ("axis", "figures", "label")}
-        np.savez(file, scene=scene, simulated=made[0].simulated, all_around=made[0].all_around, sets=len(made), **columns)
+        columns = {
+            f"{name}{k}": getattr(e, name)
+            for k, e in enumerate(made)
+            for name in ("axis", "figures", "label")
+        }
+        np.savez(
+            file,
+            scene=scene,
+            simulated=made[0].simulated,
+            all_around=made[0].all_around,
+            sets=len(made),
+            **columns,
+        )
     return made
+
+
+def read_examples(folder: Path) -> list[Examples]:
+    """All examples of a folder, scene after scene."""
+    return [e for file in sorted(folder.glob("*.npz")) for e in _read(file)]
 
 
 def _read(file: Path) -> list[Examples]:

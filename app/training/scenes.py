@@ -11,7 +11,7 @@ import numpy as np
 from app.training.growing import DOUBTFUL, Examples
 from pipeline import ground
 from pipeline.acquisition import acquire
-from pipeline.gathering import Gathering, steepest_by_direction
+from pipeline.gathering import Gathering, View, steepest_by_direction
 from pipeline.gathering.forest import CLASSES, Forest
 from pipeline.geometry import Pose2
 from pipeline.parameters import Parameters
@@ -21,7 +21,14 @@ from pipeline.steps import steps
 from pipeline.terrain import height_above
 from pipeline.visibility import clear_range
 
-MARKS = (1, 2, 3, 8, 40, 100)  # scans after which examples are taken too: a map is judged from its first scan on
+MARKS = (
+    1,
+    2,
+    3,
+    8,
+    40,
+    100,
+)  # scans after which examples are taken too: a map is judged from its first scan on
 SAME, DOUBT = 0.3, 0.6  # m: a column so near to a trunk is it; up to there nobody can tell
 KIND_OF_LABEL = {71: Verdict.TREE, 80: Verdict.POLE, 81: Verdict.POLE, 30: Verdict.PERSON, 70: Verdict.BUSH,
                  50: Verdict.WALL, 51: Verdict.WALL, 52: Verdict.WALL}  # fmt: skip
@@ -49,7 +56,8 @@ def gathered(uri: str, parameters: Parameters, *, every: int, static: bool) -> I
             free = clear_range(raw, ground.in_band(raw, height, parameters.ground), offset)
             steepest = steepest_by_direction(raw, offset, sensor.rings > 0)
             pose = step.T_odom_base or Pose2()
-            gathering.add(raw, height, step.index, pose, offset, free, steepest, terrain.height)
+            view = View(pose, offset, free, steepest, terrain.height)
+            gathering.add(raw, height, step.index, view)
             taken += 1
             if taken in MARKS:
                 yield gathering.columns
@@ -64,7 +72,9 @@ def simulated_examples(uri: str, parameters: Parameters, every: int) -> Iterator
     assert truth is not None  # noqa: S101 - simulated runs know all
     assert truth.trees is not None  # noqa: S101
     for columns in gathered(uri, parameters, every=every, static=False):
-        yield Examples(uri, True, True, columns.axis, columns.figures, label_by_truth(columns.axis, truth.trees))
+        yield Examples(
+            uri, True, True, columns.axis, columns.figures, label_by_truth(columns.axis, truth.trees)
+        )
 
 
 def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
@@ -98,7 +108,8 @@ def labelled_points(folder: Path) -> tuple[Float, Int]:
         scans = [(folder, folder.with_suffix(".label"))]
     else:
         scans = [
-            (scan, folder / "labels" / f"{scan.stem}.label") for scan in sorted((folder / "velodyne").glob("*.bin"))
+            (scan, folder / "labels" / f"{scan.stem}.label")
+            for scan in sorted((folder / "velodyne").glob("*.bin"))
         ]
     points = [np.fromfile(scan, "<f4").reshape(-1, 4)[:, :3].astype(np.float64) for scan, _ in scans]
     labels = [np.fromfile(label, "<u4").astype(np.int64) & 0xFFFF for _, label in scans]
@@ -153,4 +164,6 @@ def _no_forest() -> Forest:
     """One leaf that knows nothing: the trees are what is being made."""
     none = np.full(1, -1, np.int32)
     zero = np.zeros(1, np.int32)
-    return Forest(zero, none, np.zeros(1), zero.copy(), zero.copy(), np.full((1, len(CLASSES)), 1.0 / len(CLASSES)))
+    return Forest(
+        zero, none, np.zeros(1), zero.copy(), zero.copy(), np.full((1, len(CLASSES)), 1.0 / len(CLASSES))
+    )

@@ -2,6 +2,6 @@
 
 from pipeline.gathering.forest import Forest
 from pipeline.gathering.gathering import Gathering, GatheringState
-from pipeline.gathering.sight import steepest_by_direction
+from pipeline.gathering.sight import View, steepest_by_direction
 
-__all__ = ["Forest", "Gathering", "GatheringState", "steepest_by_direction"]
+__all__ = ["Forest", "Gathering", "GatheringState", "View", "steepest_by_direction"]

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiled import compiled
-from pipeline.geometry import Float
 from pipeline.gathering.memory import SIDE, SLICE, SLICES
+from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
 
 BUCKET = 0.9  # m; as far as a column's neighbourhood reaches
@@ -58,7 +58,9 @@ def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Floa
 def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
     for di in range(-reach, reach + 1):
         for dj in range(-reach, reach + 1):
-            other = strength[min(max(i + di, 0), strength.shape[0] - 1), min(max(j + dj, 0), strength.shape[1] - 1)]
+            other = strength[
+                min(max(i + di, 0), strength.shape[0] - 1), min(max(j + dj, 0), strength.shape[1] - 1)
+            ]
             later = di > 0 or (di == 0 and dj > 0)
             if other > strength[i, j] or (other == strength[i, j] and not later and (di != 0 or dj != 0)):
                 return False
@@ -151,7 +153,9 @@ def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Flo
             _fit_line(axis, sorted_mean, sorted_returns, runs, 0.35 if turn < 2 else 0.25)
         if low[0] <= axis[0] < low[0] + side and low[1] <= axis[1] < low[1] + side:
             found[kept] = axis
-            profile(axis, sorted_mean, sorted_returns, near_rows(axis[0], axis[1], low, bounds), profiles[kept])
+            profile(
+                axis, sorted_mean, sorted_returns, near_rows(axis[0], axis[1], low, bounds), profiles[kept]
+            )
             kept += 1
     return found[:kept].copy(), profiles[:kept].copy()
 

@@ -143,9 +143,9 @@ def _stem(rows: Float) -> tuple[int, int, int, int, int]:
             continue
         bottom = min(bottom, s)
         top = s
-        if rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2]):
-            if clean == 0 or s - last <= GAP + 1:
-                first = min(first, s)
-                last = s
-                clean += 1
+        at_axis = rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2])
+        if at_axis and (clean == 0 or s - last <= GAP + 1):
+            first = min(first, s)
+            last = s
+            clean += 1
     return bottom, first, last, clean, top

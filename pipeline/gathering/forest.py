@@ -61,7 +61,7 @@ def read_forest(path: Path, kind: str) -> Forest:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError("it is too large")
-        return _from_json(json.loads(path.read_text(encoding="utf-8")), kind)
+        return forest_of(json.loads(path.read_text(encoding="utf-8")), kind)
     except OSError as error:
         raise _damaged(path, str(error.strerror)) from None
     except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
@@ -74,7 +74,12 @@ def _damaged(path: Path, why: str) -> StemmapError:
     )
 
 
-def _from_json(data: dict[str, Any], kind: str) -> Forest:
+def forest_of(data: dict[str, Any], kind: str) -> Forest:
+    """The forest for a kind of sensor out of what JSON holds.
+
+    Raises:
+        ValueError, TypeError, KeyError: It holds something else.
+    """
     if data["classes"] != [verdict.label for verdict in CLASSES]:
         raise ValueError("it was trained for other classes")
     rows: list[_Row] = []

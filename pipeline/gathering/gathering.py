@@ -11,8 +11,8 @@ from pipeline.gathering.columns import MARGIN, PROFILE, examine
 from pipeline.gathering.features import COUNT, features
 from pipeline.gathering.forest import CLASSES, Forest, standard_forest, vote
 from pipeline.gathering.memory import SLICE, SLICES, TILE, Memory
-from pipeline.gathering.sight import look
-from pipeline.geometry import Float, Pose2
+from pipeline.gathering.sight import View, look
+from pipeline.geometry import Float
 from pipeline.parameters.stages import Gathering as GatheringParameters
 from pipeline.records import Bool, Columns, Float32, Int, Verdict
 
@@ -51,37 +51,24 @@ class Gathering:
         self._base = self.memory.copy()
         self._since: list[tuple[Float32, int, int]] = []
 
-    def add(
-        self,
-        points: Float32,
-        height: Float32,
-        scan: int,
-        T_map_base: Pose2,
-        sensor_offset: Float,
-        clear_range: Float,
-        steepest: Float,
-        terrain: Float,
-    ) -> None:
+    def add(self, points: Float32, height: Float32, scan: int, view: View) -> None:
         """Take one scan.
 
         Args:
             points: Level sensor frame, float32, shape (N, 3) [m]; height: above the ground, (N,) [m].
             scan: Its number.
-            T_map_base: The pose; sensor_offset: the sensor in the base frame, shape (3,) [m].
-            clear_range: How far the view was free by direction of the base frame, shape (BINS,) [m].
-            steepest: Tangent of the steepest elevation of a return by direction, shape (BINS,).
-            terrain: The ground under this scan, as `Terrain.height`.
+            view: From where, how far and how high it looked.
         """
-        p, pose = self.parameters, T_map_base.as_array()
-        here = _to_map(points, height, pose, sensor_offset, p.range_max)
+        p, pose = self.parameters, view.T_map_base.as_array()
+        here = _to_map(points, height, pose, view.sensor_offset, p.range_max)
         tiles = self._remember(here, scan, 1 << p.voxels_log2)
         profiles = self._find_again(tiles)
         c = self.columns
         first = len(c.verdict) - len(profiles)
-        look(
-            c.axis, c.viewed, c.present, c.absent, pose, clear_range, steepest, sensor_offset, terrain, p.range_max
-        )  # fmt: skip
-        features(c.axis[first:], profiles, c.viewed[first:], c.present[first:], c.absent[first:], c.figures[first:])
+        seen = (view.clear_range, view.steepest, view.sensor_offset, view.terrain)
+        look(c.axis, c.viewed, c.present, c.absent, pose, *seen, p.range_max)
+        new = (c.viewed[first:], c.present[first:], c.absent[first:], c.figures[first:])
+        features(c.axis[first:], profiles, *new)
         self._judge(first)
 
     def snapshot(self) -> GatheringState:
@@ -119,7 +106,8 @@ class Gathering:
         n = len(axes[0])
         for name in ("viewed", "present", "absent", "figures", "share", "verdict"):
             getattr(fresh, name)[:n] = getattr(old, name)[kept]
-        _inherit(old.axis, old.viewed, old.present, old.absent, fresh.axis, fresh.viewed, fresh.present, fresh.absent, n)  # fmt: skip
+        known = (old.axis, old.viewed, old.present, old.absent)
+        _inherit(*known, fresh.axis, fresh.viewed, fresh.present, fresh.absent, n)
         self.columns = fresh
         return np.concatenate(profiles)
 

@@ -79,8 +79,11 @@ class Memory:
 
     def copy(self) -> Memory:
         """An independent copy."""
-        columns = [getattr(self, f.name) for f in fields(self)]
-        return Memory(*(c.copy() if isinstance(c, np.ndarray) else c for c in columns))
+        other = Memory.empty(1, 1)
+        for f in fields(self):
+            value = getattr(self, f.name)
+            setattr(other, f.name, value.copy() if isinstance(value, np.ndarray) else value)
+        return other
 
     def add(self, points: Float32, scan: int, most: int) -> None:
         """Take the points of one scan.
@@ -117,7 +120,14 @@ class Memory:
     def around(self, tile: Int, margin: float) -> tuple[Float32, Int32]:
         """Mean (N, 3) and returns (N,) of the voxels of a tile and `margin` [m] around it."""
         rows = _rows_around(
-            tile[0], tile[1], margin, self.tile_key, self.tile_slot, self.tile_first, self.following, self.mean
+            tile[0],
+            tile[1],
+            margin,
+            self.tile_key,
+            self.tile_slot,
+            self.tile_first,
+            self.following,
+            self.mean,
         )
         return self.mean[rows], self.returns[rows]
 
@@ -142,30 +152,34 @@ class Memory:
             getattr(fresh, name)[:n] = getattr(self, name)[: self.used][rows]
         fresh.used, fresh.added = n, self.added
         fresh.tiles = _index(n, *fresh._tables())
-        _keep_judged(self.tile_key, self.tile_judged, self.tiles, fresh.tile_key, fresh.tile_slot, fresh.tile_judged)
+        _keep_judged(
+            self.tile_key, self.tile_judged, self.tiles, fresh.tile_key, fresh.tile_slot, fresh.tile_judged
+        )
         for f in fields(self):
             setattr(self, f.name, getattr(fresh, f.name))
 
 
 @compiled
-def _find(key: int, keys: Int, slot: Int32) -> int:
+def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
     """The place in the hash table of a key, or where it would go."""
     mask = slot.shape[0] - 1
     shift = np.uint64(64 - int(np.log2(slot.shape[0]) + 0.5))
     at = np.int64((np.uint64(key) * _SPREAD) >> shift)
     while slot[at] >= 0 and keys[slot[at]] != key:
         at = (at + 1) & mask
-    return at
+    return int(at)
 
 
 @compiled
-def _tile_of(key: int) -> int:
+def _tile_of(key: int | np.int64) -> int:
     ix, iy = key >> 36, (key >> 5) & ((1 << 31) - 1)
-    return ((ix // TILE_CELLS) << 31) | (iy // TILE_CELLS)
+    return int(((ix // TILE_CELLS) << 31) | (iy // TILE_CELLS))
 
 
 @compiled
-def _hang_in(row: int, key: int, following: Int32, tile_key: Int, tile_slot: Int32, tile_first: Int32, tiles: int) -> int:
+def _hang_in(
+    row: int, key: int | np.int64, following: Int32, tile_key: Int, tile_slot: Int32, tile_first: Int32, tiles: int
+) -> int:
     """Put a voxel into the chain of its tile; returns the tiles in use."""
     tile = _tile_of(key)
     at = _find(tile, tile_key, tile_slot)
@@ -291,4 +305,3 @@ def _rows_around(
                     n += 1
                 row = np.int64(following[row])
     return rows[:n].copy()
-

@@ -2,15 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.direction import direction_bin
 from pipeline.gathering.memory import SLICE, SLICES
-from pipeline.geometry import Float
+from pipeline.geometry import Float, Pose2
 from pipeline.records import Float32
 from pipeline.terrain import ground_at
 from pipeline.visibility import BEHIND, BINS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """From where a scan looked, and how far and high.
+
+    Attributes:
+        T_map_base: The pose.
+        sensor_offset: The sensor in the level base frame, shape (3,) [m].
+        clear_range: How far the view was free by direction of the base frame, shape (BINS,) [m].
+        steepest: Tangent of the steepest elevation of a return by direction, shape (BINS,).
+        terrain: The ground under this scan, as `Terrain.height`.
+    """
+
+    T_map_base: Pose2
+    sensor_offset: Float
+    clear_range: Float
+    steepest: Float
+    terrain: Float
+
 
 NEAR = 0.6  # m; what is seen so near to a column is the column
 

@@ -255,7 +255,12 @@ class Gathering(Stage):
         25.0, "Gathered within", "m", 1.0, 100.0, 1.0, "Returns farther away are not gathered."
     )
     voxels_log2: int = count(
-        19, "Memory", "bits", 12, 24, "Room for 2 to this power voxels; when full, the oldest half is forgotten."
+        19,
+        "Memory",
+        "bits",
+        12,
+        24,
+        "Room for 2 to this power voxels; when full, the oldest half is forgotten.",
     )
     tree_share: float = number(
         0.45, "Votes for a tree", "", 0.0, 1.0, 0.05, "A column is a tree from this share of the votes on."

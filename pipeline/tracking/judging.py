@@ -17,7 +17,8 @@ def tree_columns(columns: Columns) -> Int:
     """Rows of the columns that are trees; of those that are one tree the one with most votes."""
     rows = np.flatnonzero(columns.verdict == Verdict.TREE)
     rows = rows[np.argsort(-columns.share[rows, 0], kind="stable")]
-    return rows[_apart(columns.axis[rows, :2], ONE_TREE)]
+    one_each: Int = rows[_apart(columns.axis[rows, :2], ONE_TREE)]
+    return one_each
 
 
 def assign_verdicts(tracks: TrackTable, columns: Columns, trees: Int) -> Int:

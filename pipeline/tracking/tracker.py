@@ -78,7 +78,9 @@ class Tracker:
         trees = tree_columns(columns)
         place = columns.axis[trees, :2]
         fresh = assign_verdicts(self.tracks, columns, trees)
-        self._begin(stamp_ns, place[fresh], np.broadcast_to(GATHERED_SIGMA**2 * np.eye(2), (len(fresh), 2, 2)))
+        self._begin(
+            stamp_ns, place[fresh], np.broadcast_to(GATHERED_SIGMA**2 * np.eye(2), (len(fresh), 2, 2))
+        )
         t = self.tracks
         t.verdict[len(t) - len(fresh) :] = Verdict.TREE
         standing = t.verdict == Verdict.TREE
