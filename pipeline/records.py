@@ -302,18 +302,15 @@ class Trees:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Columns:
-    """The upright columns that were found in what all scans gathered; columns of length K, frame of the
-    map. This is the second level of evidence: a single scan's is in Clusters.
+    """What stands upright in what all scans gathered; columns of length K, frame of the map.
 
     Attributes:
-        tile: int64, shape (K, 2): the tile of the memory in which the foot stands.
-        axis: shape (K, 5): x, y at 1.3 m above the ground [m], shift of x and y per metre of height, and
-            how strongly the column shows.
+        tile: int64, shape (K, 2): where in the memory the foot stands.
+        axis: shape (K, 5): x, y at 1.3 m [m], shift of x and y per metre of height, strength.
         viewed: How high above the ground any scan looked there [m].
         present, absent: In how many scans something, or nothing, stood there in free view.
         figures: shape (K, figures): what it is judged by, see `pipeline.gathering.features.NAMES`.
-        share: shape (K, 6): votes for tree, pole, person, bush, wall, other; they sum to 1.
-        verdict: int32, see Verdict.
+        share: shape (K, 6): votes for tree, pole, person, bush, wall, other; verdict: int32, see Verdict.
     """
 
     tile: Int

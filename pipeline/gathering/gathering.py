@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.gathering.columns import MARGIN, PROFILE, examine
-from pipeline.gathering.features import COUNT, features
+from pipeline.gathering.features import COUNT, NAMES, features
 from pipeline.gathering.forest import CLASSES, Forest, standard_forest, vote
 from pipeline.gathering.memory import SLICE, SLICES, TILE, Memory
 from pipeline.gathering.sight import View, look
@@ -19,6 +19,11 @@ from pipeline.records import Bool, Columns, Float32, Int, Verdict
 GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
 SAME = 0.35  # m; a column found again so near is the one of before
 FOLD = 100  # scans after which a snapshot no longer repeats them one by one
+ALONE = [NAMES.index(name) for name in NAMES if name.startswith("alone")]
+THICK, WIDE = NAMES.index("thick"), NAMES.index("wide")
+VOXELS, CLEAN_SLICES = NAMES.index("voxels a slice"), NAMES.index("clean slices")
+LEAST_VOXELS = 6.0
+WALL_WIDE, WALL_THIN = 0.12, 0.4  # m, and part of the width; a wall fills the 0.6 m of the inside: 0.17 m
 GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
 
 
@@ -120,9 +125,26 @@ class Gathering:
         tree = c.share[:, 0] >= self.parameters.tree_share
         verdict[~tree & (verdict == Verdict.TREE)] = Verdict.OTHER
         verdict[tree] = Verdict.TREE
+        flat, few = _part_of_a_wall(c.figures), _too_few(c.figures)
+        verdict[flat] = Verdict.WALL
+        verdict[few] = Verdict.TOO_FEW_POINTS
         gone = (c.absent >= GONE_SCANS) & (c.absent > GONE * (c.present + c.absent))
         verdict[gone] = Verdict.MOVING
         self.columns = replace(c, verdict=verdict.astype(np.int32))
+
+
+def _part_of_a_wall(figures: Float) -> Bool:
+    """Columns that go on sideways: nowhere alone, and wide but not thick. Training has too few walls."""
+    alone = figures[:, ALONE].max(axis=1, initial=0.0)
+    thick, wide = figures[:, THICK], figures[:, WIDE]
+    flat: Bool = (alone < 0.5) & (wide > WALL_WIDE) & (thick < WALL_THIN * wide)
+    return flat
+
+
+def _too_few(figures: Float) -> Bool:
+    """Columns of so few voxels that chance can pile them up."""
+    few: Bool = figures[:, VOXELS] * figures[:, CLEAN_SLICES] < LEAST_VOXELS
+    return few
 
 
 def _rows(axis: Float, tile: Int) -> Columns:

@@ -178,7 +178,13 @@ def _tile_of(key: int | np.int64) -> int:
 
 @compiled
 def _hang_in(
-    row: int, key: int | np.int64, following: Int32, tile_key: Int, tile_slot: Int32, tile_first: Int32, tiles: int
+    row: int,
+    key: int | np.int64,
+    following: Int32,
+    tile_key: Int,
+    tile_slot: Int32,
+    tile_first: Int32,
+    tiles: int,
 ) -> int:
     """Put a voxel into the chain of its tile; returns the tiles in use."""
     tile = _tile_of(key)

@@ -45,8 +45,9 @@ def assign_verdicts(tracks: TrackTable, columns: Columns, trees: Int) -> Int:
     found = track_of >= 0
     tracks.verdict[track_of[found]] = Verdict.TREE
     # What no scan has measured stands where what was gathered stands.
-    unmeasured = found & (tracks.hits[track_of] == 0)
-    tracks.x[track_of[unmeasured], :2] = columns.axis[trees[unmeasured], :2]
+    at = np.flatnonzero(found)
+    at = at[tracks.hits[track_of[at]] == 0]
+    tracks.x[track_of[at], :2] = columns.axis[trees[at], :2]
     return np.flatnonzero(~found)
 
 

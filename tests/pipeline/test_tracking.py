@@ -239,7 +239,7 @@ def test_an_unsure_heading_makes_far_trees_unsure_across():
 
 
 def test_a_diameter_needs_three_radii_and_weighs_them():
-    t = tracker()
+    t = tracker(dbh_arc_min=0.0)
     for k in range(3):
         assert np.isnan(show(t, k, [[5.0, 0.0]], radius=np.nan).dbh).all()
     trees = t.trees()
