@@ -23,7 +23,8 @@ ALONE = [NAMES.index(name) for name in NAMES if name.startswith("alone")]
 THICK, WIDE = NAMES.index("thick"), NAMES.index("wide")
 VOXELS, CLEAN_SLICES = NAMES.index("voxels a slice"), NAMES.index("clean slices")
 LEAST_VOXELS = 6.0
-WALL_WIDE, WALL_THIN = 0.12, 0.4  # m, and part of the width; a wall fills the 0.6 m of the inside: 0.17 m
+WALL_ALONE = 0.55  # part of the returns; half of a wall's end lies at its last column
+WALL_WIDE, WALL_THIN = 0.12, 0.2  # m, and part of the width; a wall fills the 0.6 m of the inside: 0.17 m
 GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
 
 
@@ -134,10 +135,12 @@ class Gathering:
 
 
 def _part_of_a_wall(figures: Float) -> Bool:
-    """Columns that go on sideways: nowhere alone, and wide but not thick. Training has too few walls."""
-    alone = figures[:, ALONE].max(axis=1, initial=0.0)
+    """Columns that go on sideways: rarely alone, and wide but not thick. Training has too few walls."""
+    bands = figures[:, ALONE]
+    told = bands >= 0.0
+    alone = np.where(told, bands, 0.0).sum(axis=1) / np.maximum(told.sum(axis=1), 1)
     thick, wide = figures[:, THICK], figures[:, WIDE]
-    flat: Bool = (alone < 0.5) & (wide > WALL_WIDE) & (thick < WALL_THIN * wide)
+    flat: Bool = (alone < WALL_ALONE) & (wide > WALL_WIDE) & (thick < WALL_THIN * wide)
     return flat
 
 
