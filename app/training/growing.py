@@ -41,7 +41,7 @@ class Plan:
 
 
 # A sensor that looks one way sees a trunk from one side and no higher than its field of view; examples
-# that were driven around teach it to expect more (docs/results.md has the figures).
+# that were driven around teach it to expect more (docs/trunks.md has the figures).
 PLANS = {
     ALL_AROUND: Plan("best", 16, 9, 3, 0.3, same=0.3, other=0.1, simulated=0.1, upright=5.0),
     ONE_WAY: Plan("extra", 40, 9, 3, 0.5, same=1.0, other=1.0, simulated=0.0),
@@ -133,7 +133,7 @@ def shares(grown: Grown, figures: Float) -> Float:
 def as_json(grown: dict[str, Grown], scenes: list[str]) -> dict[str, Any]:
     """What `pipeline.gathering.forest.read_forest` reads."""
     return {
-        "about": "Votes on what a column is, made by `stemmap train`; see docs/results.md.",
+        "about": "Votes on what a column is, made by `stemmap train`; see docs/trunks.md.",
         "scenes": scenes,
         "classes": [kind.label for kind in CLASSES],
         **{

@@ -257,7 +257,7 @@ class Gathering(Stage):
     voxels_log2: int = count(
         19,
         "Memory",
-        "bits",
+        "",
         12,
         24,
         "Room for 2 to this power voxels; when full, the oldest half is forgotten.",

@@ -8,7 +8,14 @@ from pipeline.records import Float32
 
 
 def trunk(
-    x: float, y: float, radius: float, *, top: float = 4.0, lean: float = 0.0, points: int = 4000, seed: int = 0
+    x: float,
+    y: float,
+    radius: float,
+    *,
+    top: float = 4.0,
+    lean: float = 0.0,
+    points: int = 4000,
+    seed: int = 0,
 ) -> Float32:
     """The surface of a trunk, float32, shape (N, 3): x, y, height [m]; it leans along x."""
     rng = np.random.default_rng(seed)
@@ -23,4 +30,5 @@ def bush(x: float, y: float, radius: float, *, points: int = 6000, seed: int = 0
     rng = np.random.default_rng(seed)
     way = rng.standard_normal((points, 3))
     way *= (radius * rng.uniform(0.2, 1.0, points) / np.linalg.norm(way, axis=1))[:, None]
-    return (way + np.array([x, y, radius])).astype(np.float32)
+    rows: Float32 = (way + np.array([x, y, radius])).astype(np.float32)
+    return rows

@@ -10,13 +10,22 @@ import pytest
 from app.training.growing import DOUBTFUL, PLANS, Examples, as_json, grow, shares
 from pipeline.errors import StemmapError
 from pipeline.gathering.features import COUNT, NAMES
-from pipeline.gathering.forest import ALL_AROUND, CLASSES, FILE, ONE_WAY, forest_of, read_forest, standard_forest, vote
+from pipeline.gathering.forest import (
+    ALL_AROUND,
+    CLASSES,
+    FILE,
+    ONE_WAY,
+    forest_of,
+    read_forest,
+    standard_forest,
+    vote,
+)
 
 LEAF = {"share": [1.0, 0, 0, 0, 0, 0]}
 OTHER = {"share": [0, 0, 0, 0, 0, 1.0]}
 
 
-def written(tmp_path, **changes):
+def written(tmp_path, **changes: object):
     node = {"figure": "tilt", "at_most": 0.1, "yes": LEAF, "no": OTHER}
     data = {"classes": [kind.label for kind in CLASSES], ALL_AROUND: [node], ONE_WAY: [LEAF], **changes}
     file = tmp_path / "forest.json"
@@ -75,7 +84,9 @@ def test_what_was_grown_votes_the_same_as_json():
     figures = rng.uniform(0.0, 1.0, (300, COUNT))
     label = np.where(figures[:, 3] > 0.5, 0, 1 + (figures[:, 5] > 0.5))
     label[:20] = DOUBTFUL
-    examples = [Examples("a", False, kind == ALL_AROUND, np.zeros((300, 5)), figures, label) for kind in PLANS]
+    examples = [
+        Examples("a", False, kind == ALL_AROUND, np.zeros((300, 5)), figures, label) for kind in PLANS
+    ]
     for kind in PLANS:
         grown = grow(examples, kind)
         forest = forest_of(as_json({kind: grown}, []), kind)
@@ -89,5 +100,7 @@ def test_what_was_grown_votes_the_same_as_json():
 def test_the_same_examples_grow_the_same_trees():
     rng = np.random.default_rng(2)
     figures = rng.uniform(0.0, 1.0, (100, COUNT))
-    examples = [Examples("a", False, True, np.zeros((100, 5)), figures, (figures[:, 0] > 0.5).astype(np.int64))]
+    examples = [
+        Examples("a", False, True, np.zeros((100, 5)), figures, (figures[:, 0] > 0.5).astype(np.int64))
+    ]
     assert as_json({"k": grow(examples, ALL_AROUND)}, []) == as_json({"k": grow(examples, ALL_AROUND)}, [])

@@ -7,10 +7,10 @@ import pytest
 
 from pipeline.gathering import Gathering, View
 from pipeline.gathering.gathering import FOLD, GONE_SCANS
-from pipeline.geometry import Pose2
+from pipeline.geometry import Pose2, Pose3
 from pipeline.mapper import Mapper
 from pipeline.parameters import preset
-from pipeline.records import Columns, Scan, Sensor, Step, Verdict
+from pipeline.records import Columns, Float32, Scan, Sensor, Step, Verdict
 from pipeline.terrain import SECTORS
 from pipeline.tracking import Tracker
 from pipeline.visibility import BINS
@@ -25,7 +25,7 @@ def view(free=NOWHERE_FREE, pose=None):
     return View(pose or Pose2(), np.zeros(3), free, np.ones(BINS), np.full((SECTORS, 200), -1.0))
 
 
-def gathered(*clouds, free=NOWHERE_FREE, scans=1):
+def gathered(*clouds: Float32, free=NOWHERE_FREE, scans=1):
     gathering = Gathering(FOREST.gathering, all_around=True)
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3), np.float32)
     for k in range(scans):
@@ -63,7 +63,9 @@ def test_who_walked_on_is_moving():
 
 def test_how_high_a_scan_looked_is_told_from_the_ground():
     columns = gathered(trunk(3.0, 0.0, 0.15)).columns
-    assert columns.viewed[at(columns, 3.0, 0.0)] == pytest.approx(4.0, abs=0.05)  # 3 m out at 45 degrees, plus 1 m
+    assert columns.viewed[at(columns, 3.0, 0.0)] == pytest.approx(
+        4.0, abs=0.05
+    )  # 3 m out at 45 degrees, plus 1 m
 
 
 def test_going_back_gives_the_same_again():
@@ -80,7 +82,11 @@ def test_going_back_gives_the_same_again():
         for again in range(k, k + 3):
             gathering.add(clouds[again], clouds[again][:, 2].copy(), again, view())
             for name in ("axis", "figures", "share", "verdict", "present", "absent"):
-                assert np.array_equal(getattr(gathering.columns, name), getattr(seen[again], name)), (k, again, name)
+                assert np.array_equal(getattr(gathering.columns, name), getattr(seen[again], name)), (
+                    k,
+                    again,
+                    name,
+                )
 
 
 def test_a_tree_that_no_scan_showed_begins_a_track_and_keeps_its_number():
@@ -103,8 +109,6 @@ def test_the_paper_gathers_nothing():
 
 def mapped(name, points, scans=3):
     sensor = Sensor("VLP-16", 16, float(np.radians(2.0)), 0.0035)
-    from pipeline.geometry import Pose3
-
     mapper = Mapper(preset(name), sensor=sensor, T_base_lidar=Pose3.identity(), seed=0)
     frame = None
     for k in range(scans):

@@ -312,3 +312,18 @@ def test_walking_around_a_tree_covers_it():
         trees = show(t, k, [[5.0, 0.0]], pose=pose, arc=2.0)
     assert len(trees.number) == 1
     assert trees.coverage[0] == pytest.approx(2 * np.pi)
+
+
+def test_a_diameter_needs_half_the_trunk():
+    def seen_from(bearings):
+        t = tracker()
+        trees = t.trees()
+        for k, bearing in enumerate(bearings):
+            pose = Pose2(5.0 * np.cos(bearing), 5.0 * np.sin(bearing), bearing + np.pi)
+            trees = show(t, k, [[5.0, 0.0]], pose=pose, radius=0.2, arc=np.radians(100.0))
+        return trees
+
+    assert np.isnan(seen_from([0.0, 0.1, 0.2, 0.3]).dbh).all()
+    around = seen_from([0.0, 1.0, 2.0, 3.0])
+    assert around.dbh[0] == pytest.approx(0.4)
+    assert around.coverage[0] >= np.pi
