@@ -15,6 +15,7 @@ __all__ = ["Terrain", "find_terrain", "height_above", "in_band"]
 
 NEAR = 8.0  # m; here the sensor surely sees the ground it stands on
 GHOST = 0.4  # m; ground returns of one cell lie nearer to one another than this
+WIDEST = 1.4  # a sector of the diamond against one of the circle
 TOLERANCE = 0.15  # m; grass and noise over the steepest slope
 
 
@@ -90,14 +91,14 @@ def _forget_what_overhangs(lowest: Float, slope: float) -> None:
             for k in range(bins - 2, -1, -1):
                 cone[s, k] = min(cone[s, k], cone[s, k + 1] + rise)
         for k in range(bins):
-            turn = slope * BIN * (k + 0.5) * (2.0 * np.pi / sectors)
+            turn = slope * BIN * (k + 0.5) * (WIDEST * 2.0 * np.pi / sectors)
             for s in range(2 * sectors):
                 cone[s % sectors, k] = min(cone[s % sectors, k], cone[(s - 1) % sectors, k] + turn)
             for s in range(2 * sectors, 0, -1):
                 cone[s % sectors, k] = min(cone[s % sectors, k], cone[(s + 1) % sectors, k] + turn)
     for s in range(sectors):
         for k in range(bins):
-            if lowest[s, k] > cone[s, k] + TOLERANCE:
+            if lowest[s, k] > cone[s, k] + TOLERANCE + rise:
                 lowest[s, k] = np.inf
 
 

@@ -127,15 +127,15 @@ def test_the_order_of_points_does_not_matter():
 
 
 def test_a_hedge_on_a_hill_does_not_lift_the_ground():
-    """A crown's underside 2 m up, in whole sectors, beside ground that is seen."""
-    points = _rings(20.0, 0.0)
+    """A crown's underside 4 m up hides all of the ground in some directions; beside it the ground is seen."""
+    points = _rings(10.0, np.pi)
     distance, turn = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
-    hedge = (distance > 8.0) & (np.abs(turn) < np.radians(8.0))
+    hedge = (distance > 8.0) & (distance < 16.0) & (np.abs(turn) < np.radians(5.0))
     lifted = points.copy()
-    lifted[hedge, 2] += 2.0
+    lifted[hedge, 2] += 4.0
     above = height_above(lifted, find_terrain(lifted, FOREST))
-    assert np.count_nonzero(hedge) > 30
-    assert np.median(above[hedge]) == pytest.approx(2.0, abs=0.5)
+    assert np.count_nonzero(hedge) > 15
+    assert np.mean(above[hedge] > 2.0) > 0.5
 
 
 def test_an_echo_far_below_the_ground_is_a_ghost():
