@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from pipeline.compiled import compiled
@@ -11,25 +9,14 @@ from pipeline.direction import direction_bin
 from pipeline.geometry import Float
 from pipeline.parameters.stages import Ground
 from pipeline.records import Float32
+from pipeline.terrain import BIN, SECTORS, Terrain, height_above
 
-SECTORS = 72
-BIN = 0.5  # m
+__all__ = ["Terrain", "find_terrain", "height_above", "in_band"]
+
 NEAR = 8.0  # m; here the sensor surely sees the ground it stands on
+GHOST = 0.4  # m; ground returns of one cell lie nearer to one another than this
+WIDEST = 1.4  # a sector of the diamond against one of the circle
 TOLERANCE = 0.15  # m; grass and noise over the steepest slope
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Terrain:
-    """Heights of the ground around the sensor, in the level sensor frame.
-
-    Attributes:
-        height: shape (SECTORS, bins) [m]: the ground in each polar cell.
-        seen: shape (SECTORS, bins): whether a return of the ground lay in the cell; elsewhere the
-            height goes on from the nearest cell nearer to the sensor.
-    """
-
-    height: Float
-    seen: np.ndarray[tuple[int, int], np.dtype[np.bool_]]
 
 
 def find_terrain(points: Float32, parameters: Ground) -> Terrain:
@@ -40,13 +27,9 @@ def find_terrain(points: Float32, parameters: Ground) -> Terrain:
         parameters: Of this stage.
     """
     lowest = _lowest(points, int(_reach(points) / BIN) + 1)
-    start = _start_height(lowest)
-    return Terrain(*_walk_outwards(lowest, start, float(np.tan(np.radians(parameters.slope_max)))))
-
-
-def height_above(points: Float32, terrain: Terrain) -> Float32:
-    """Height of each point above the terrain, float32, shape (N,) [m]."""
-    return _height_above(points, terrain.height)
+    slope = float(np.tan(np.radians(parameters.slope_max)))
+    _forget_what_overhangs(lowest, slope)
+    return Terrain(*_walk_outwards(lowest, _start_height(lowest), slope))
 
 
 def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
@@ -73,13 +56,50 @@ def _reach(points: Float32) -> float:
 
 @compiled
 def _lowest(points: Float32, bins: int) -> Float:
+    """The lowest return of each cell; one that lies alone far below the next is an echo's ghost."""
     lowest = np.full((SECTORS, bins), np.inf)
+    second = np.full((SECTORS, bins), np.inf)
     for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        sector = direction_bin(x, y, SECTORS)
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        s = direction_bin(x, y, SECTORS)
         k = min(int(np.sqrt(x * x + y * y) / BIN), bins - 1)
-        lowest[sector, k] = min(lowest[sector, k], points[i, 2])
+        if z < lowest[s, k]:
+            second[s, k] = lowest[s, k]
+            lowest[s, k] = z
+        elif z < second[s, k]:
+            second[s, k] = z
+    for s in range(SECTORS):
+        for k in range(bins):
+            if lowest[s, k] + GHOST < second[s, k] < np.inf:
+                lowest[s, k] = second[s, k]
     return lowest
+
+
+@compiled
+def _forget_what_overhangs(lowest: Float, slope: float) -> None:
+    """Take away cells that rise steeper than `slope` above a lower cell near by: hedges and crowns.
+
+    Two sweeps there and back carry each cell's cone of the steepest slope over the whole grid.
+    """
+    sectors, bins = lowest.shape
+    cone = lowest.copy()
+    rise = slope * BIN
+    for _ in range(2):
+        for s in range(sectors):
+            for k in range(1, bins):
+                cone[s, k] = min(cone[s, k], cone[s, k - 1] + rise)
+            for k in range(bins - 2, -1, -1):
+                cone[s, k] = min(cone[s, k], cone[s, k + 1] + rise)
+        for k in range(bins):
+            turn = slope * BIN * (k + 0.5) * (WIDEST * 2.0 * np.pi / sectors)
+            for s in range(2 * sectors):
+                cone[s % sectors, k] = min(cone[s % sectors, k], cone[(s - 1) % sectors, k] + turn)
+            for s in range(2 * sectors, 0, -1):
+                cone[s % sectors, k] = min(cone[s % sectors, k], cone[(s + 1) % sectors, k] + turn)
+    for s in range(sectors):
+        for k in range(bins):
+            if lowest[s, k] > cone[s, k] + TOLERANCE + rise:
+                lowest[s, k] = np.inf
 
 
 @compiled
@@ -103,19 +123,3 @@ def _walk_outwards(
         for j in range(last_k + 1, bins):
             height[s, j] = last
     return height, seen
-
-
-@compiled
-def _height_above(points: Float32, height: Float) -> Float32:
-    above = np.empty(points.shape[0], np.float32)
-    bins = height.shape[1]
-    for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        sector, position = direction_bin(x, y, SECTORS), np.sqrt(x * x + y * y) / BIN
-        # A cell's lowest return lies anywhere in it; interpolating between the centres of two
-        # cells keeps a slope from becoming a staircase.
-        k = min(max(int(position - 0.5), 0), bins - 1)
-        f = min(max(position - 0.5 - k, 0.0), 1.0)
-        ground = (1.0 - f) * height[sector, k] + f * height[sector, min(k + 1, bins - 1)]
-        above[i] = points[i, 2] - ground
-    return above

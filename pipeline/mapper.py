@@ -12,11 +12,13 @@ from pipeline import filters, ground
 from pipeline.acquisition import acquire
 from pipeline.clustering import cluster
 from pipeline.detection import detections, judge
+from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.parameters import Parameters
 from pipeline.records import Float32, Frame, Path, PoseEstimate, Sensor, Step
 from pipeline.shape import describe
 from pipeline.slam import FastSlam, SlamState
+from pipeline.terrain import Terrain, height_above
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
 from pipeline.visibility import clear_range
@@ -34,6 +36,7 @@ class MapperState:
     """An independent copy of all that the mapper knows between two scans."""
 
     slam: SlamState
+    gathering: GatheringState
     tracks: TrackTable
     next_number: int
     odometry: Pose2 | None
@@ -49,6 +52,7 @@ class Mapper:
         T_base_lidar: Where it stands on the robot.
         seed: Of every random number.
         watch: Is entered around each stage with its name, so that the caller can measure it.
+        forest: Votes on what was gathered; None takes the one that comes with the package.
     """
 
     def __init__(
@@ -59,12 +63,14 @@ class Mapper:
         T_base_lidar: Pose3,
         seed: int,
         watch: Watch = no_watch,
+        forest: Forest | None = None,
     ) -> None:
         self._parameters = parameters
         self._sensor = sensor
         self._T_base_lidar = T_base_lidar
         self._watch = watch
         self._slam = FastSlam(parameters.slam, seed)
+        self._gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=forest)
         self._tracker = Tracker(parameters.tracking)
         self._odometry: Pose2 | None = None
         self._path = _PathColumns()
@@ -78,6 +84,7 @@ class Mapper:
     def parameters(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self._slam.parameters = parameters.slam
+        self._gathering.parameters = parameters.gathering
         self._tracker.parameters = parameters.tracking
 
     @property
@@ -97,7 +104,9 @@ class Mapper:
             boxed = filters.pass_through(raw, p.filters)
 
         with watch("ground"):
-            band = self._above_ground(raw, boxed)
+            terrain = self._terrain(raw)
+            height = height_above(boxed, terrain) if terrain else None
+            band = boxed if height is None else ground.in_band(boxed, height, p.ground)
 
         with watch("voxel grid"):
             filtered = filters.voxel_grid(band, p.filters)
@@ -127,7 +136,17 @@ class Mapper:
                 p.slam.view_range,
             )
             self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
-            trees = self._tracker.trees()
+
+        columns = None
+        if p.gathering.method == "columns" and terrain is not None and height is not None:
+            with watch("gathering"):
+                steepest = steepest_by_direction(raw, sensor_offset, self._sensor.rings > 0)
+                view = View(estimate.T_map_base, sensor_offset, free, steepest, terrain.height)
+                self._gathering.add(boxed, height, step.index, view)
+                columns = self._gathering.columns
+                self._tracker.judge(step.scan.stamp_ns, columns)
+
+        trees = self._tracker.trees()
 
         self._path.append(step.scan.stamp_ns, estimate)
         return Frame(
@@ -153,13 +172,13 @@ class Mapper:
                 "noise": int(np.count_nonzero(labels.label < 0)),
             },
             warnings=step.warnings,
+            columns=columns,
         )
 
-    def _above_ground(self, raw: Float32, boxed: Float32) -> Float32:
+    def _terrain(self, raw: Float32) -> Terrain | None:
         if self._parameters.ground.method == "none":
-            return boxed
-        terrain = ground.find_terrain(raw, self._parameters.ground)
-        return ground.in_band(boxed, ground.height_above(boxed, terrain), self._parameters.ground)
+            return None
+        return ground.find_terrain(raw, self._parameters.ground)
 
     def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
         """The odometry's step since the last scan that had one, and its pose; without any the robot
@@ -174,6 +193,7 @@ class Mapper:
         """All state, copied; parameters are not part of it."""
         return MapperState(
             self._slam.state.copy(),
+            self._gathering.snapshot(),
             self._tracker.tracks.copy(),
             self._tracker.next_number,
             self._odometry,
@@ -183,6 +203,7 @@ class Mapper:
     def restore(self, state: MapperState) -> None:
         """Go back to a snapshot of this mapper's own past; the state itself is left untouched."""
         self._slam.state = state.slam.copy()
+        self._gathering.restore(state.gathering)
         self._tracker.tracks = state.tracks.copy()
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry

@@ -300,6 +300,29 @@ class Trees:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """What stands upright in what all scans gathered; columns of length K, frame of the map.
+
+    Attributes:
+        tile: int64, shape (K, 2): where in the memory the foot stands.
+        axis: shape (K, 5): x, y at 1.3 m [m], shift of x and y per metre of height, strength.
+        viewed: How high above the ground any scan looked there [m].
+        present, absent: In how many scans something, or nothing, stood there in free view.
+        figures: shape (K, figures): what it is judged by, see `pipeline.gathering.features.NAMES`.
+        share: shape (K, 6): votes for tree, pole, person, bush, wall, other; verdict: int32, see Verdict.
+    """
+
+    tile: Int
+    axis: Float
+    viewed: Float
+    present: Float
+    absent: Float
+    figures: Float
+    share: Float
+    verdict: Int32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
     """What SLAM believes after a scan.
 
@@ -357,6 +380,7 @@ class Frame:
         trees: The map.
         counts: How many points each stage let pass and how many it refused, by name.
         warnings: For people.
+        columns: What was gathered over the scans, None where nothing is.
     """
 
     index: int
@@ -372,3 +396,4 @@ class Frame:
     trees: Trees
     counts: Mapping[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    columns: Columns | None = None

@@ -24,6 +24,7 @@ FOUNDATION = (
     "direction",
     "association",
     "visibility",
+    "terrain",
 )
 # One stage each: they never know one another.
 STAGES = (
@@ -33,6 +34,7 @@ STAGES = (
     "clustering",
     "shape",
     "detection",
+    "gathering",
     "slam",
     "tracking",
     "evaluation",

@@ -42,6 +42,8 @@ _PAPER: dict[str, object] = {
     "slam.merge_gate": 0.0,
     "detection.sigma_range": 0.1,
     "detection.sigma_bearing": 1.0,
+    "gathering.method": "none",
+    "tracking.dbh_arc_min": 0.0,
     "tracking.velocity_sigma": 0.1,
     "tracking.acceleration_sigma": 0.001,
     "tracking.proximity_radius": 1.0,
@@ -74,6 +76,8 @@ _LASER2D: dict[str, object] = {
     "slam.miss_weight": 1.0,
     "tracking.hits_to_confirm": 5,
     "slam.update_distance": 0.5,
+    "gathering.method": "none",
+    "tracking.dbh_arc_min": 0.0,
     "tracking.distance_max": 3.0,
     "tracking.proximity_radius": 1.5,
 }

@@ -275,6 +275,30 @@ class Slam(Stage):
     )
 
 
+class Gathering(Stage):
+    """Gathering: what all scans together say of each place; the verdict on a tree is taken there."""
+
+    method: Literal["none", "columns"] = choice(
+        "columns",
+        "Verdict on a tree",
+        "By the columns that the scans gathered over height, or none: by the number of hits alone.",
+    )
+    range_max: float = number(
+        25.0, "Gathered within", "m", 1.0, 100.0, 1.0, "Returns farther away are not gathered."
+    )
+    voxels_log2: int = count(
+        19,
+        "Memory",
+        "",
+        12,
+        24,
+        "Room for 2 to this power voxels; when full, the oldest half is forgotten.",
+    )
+    tree_share: float = number(
+        0.45, "Votes for a tree", "", 0.0, 1.0, 0.05, "A column is a tree from this share of the votes on."
+    )
+
+
 class Tracking(Stage):
     """Tracking: a Kalman filter per tree (Eq. 10) and merging."""
 
@@ -307,6 +331,9 @@ class Tracking(Stage):
     )
     misses_per_hit: int = count(
         1, "Misses per hit", "", 1, 100, "So many misses in free view undo one hit; without hits a tree goes."
+    )
+    dbh_arc_min: float = number(
+        180.0, "Arc for a DBH", "deg", 0.0, 360.0, 10.0, "A diameter is told from this much of the trunk on."
     )
 
 

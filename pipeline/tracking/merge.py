@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import Bool
+from pipeline.records import Bool, Verdict
 from pipeline.tracking.table import TrackTable
 
 
@@ -51,6 +51,8 @@ def _join(tracks: TrackTable, old: int, young: int) -> None:
     tracks.first_ns[old] = min(tracks.first_ns[old], tracks.first_ns[young])
     tracks.score[old] = max(tracks.score[old], tracks.score[young])
     tracks.sides[old] |= tracks.sides[young]
+    if tracks.verdict[old] != Verdict.TREE:
+        tracks.verdict[old] = tracks.verdict[young]
     for column in (
         tracks.hits,
         tracks.eccentricity,

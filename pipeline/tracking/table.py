@@ -26,6 +26,7 @@ class TrackTable:
         radius: Sum of radii over their variances [1/m]; radius_weight: sum of 1/variance [1/m^2];
             radii: number of them.
         sides: int64: bit k is set when the sector k around the trunk was seen.
+        verdict: int64: what was gathered says of it, see Verdict; -1 for nothing.
     """
 
     number: Int
@@ -41,6 +42,7 @@ class TrackTable:
     radius_weight: Float
     radii: Int
     sides: Int
+    verdict: Int
 
     @classmethod
     def empty(cls, rows: int = 0) -> TrackTable:
@@ -60,6 +62,7 @@ class TrackTable:
             radius_weight=floats.copy(),
             radii=ints.copy(),
             sides=ints.copy(),
+            verdict=np.full(rows, -1, np.int64),
         )
 
     def __len__(self) -> int:

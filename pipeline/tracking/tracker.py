@@ -7,14 +7,17 @@ import numpy as np
 from pipeline.association import associate
 from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Tracking
-from pipeline.records import Bool, Detections, Int, Trees
+from pipeline.records import Bool, Columns, Detections, Int, Trees, Verdict
 from pipeline.tracking.anchor import anchor
+from pipeline.tracking.judging import assign_verdicts, tree_columns
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.merge import merge_near
 from pipeline.tracking.table import SECTORS, TrackTable, seen_sides
 from pipeline.visibility import in_free_view
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
+SCORE_STANDING = 5.0  # at least, of a tree that what was gathered stands for
+GATHERED_SIGMA = 0.1  # m; the middle of the returns of one side lies so far before the axis
 NANOSECONDS = 1e-9
 DBH_OBSERVATIONS = 3  # fewer radii are no diameter yet
 SHARED_RADIUS_SIGMA = 0.01  # m; bark and taper, which more scans of one side do not average out
@@ -89,6 +92,20 @@ class Tracker:
         self.tracks = merge_near(self.tracks, np.ones(len(self.tracks), np.bool_), p.proximity_radius)
         self.tracks = self.tracks.take(self.tracks.score > 0.0)
 
+    def judge(self, stamp_ns: int, columns: Columns) -> None:
+        """Take the verdicts of what was gathered: a track is confirmed by them alone, and a tree that no
+        single scan showed begins its track here."""
+        trees = tree_columns(columns)
+        place = columns.axis[trees, :2]
+        fresh = assign_verdicts(self.tracks, columns, trees)
+        self._begin(
+            stamp_ns, place[fresh], np.broadcast_to(GATHERED_SIGMA**2 * np.eye(2), (len(fresh), 2, 2))
+        )
+        t = self.tracks
+        t.verdict[len(t) - len(fresh) :] = Verdict.TREE
+        standing = t.verdict == Verdict.TREE
+        t.score[standing] = np.maximum(t.score[standing], SCORE_STANDING)
+
     def _update(self, rows: Int, stamp_ns: int, z: Float, R: Float) -> None:
         p, t = self.parameters, self.tracks
         dt = (stamp_ns - t.stamp_ns[rows]).astype(np.float64) * NANOSECONDS
@@ -114,7 +131,9 @@ class Tracker:
     def trees(self) -> Trees:
         """The map as it stands (Table 2)."""
         t = self.tracks
-        enough = t.radii >= DBH_OBSERVATIONS
+        coverage = np.bitwise_count(t.sides) * (2.0 * np.pi / SECTORS)
+        carried = coverage >= np.radians(self.parameters.dbh_arc_min) - 1e-9
+        enough = (t.radii >= DBH_OBSERVATIONS) & carried
         weight = np.where(enough, t.radius_weight, 1.0)
         radius_sigma = np.sqrt(1.0 / weight + SHARED_RADIUS_SIGMA**2)
         return Trees(
@@ -128,10 +147,12 @@ class Tracker:
                 t.eccentricities > 0, t.eccentricity / np.maximum(t.eccentricities, 1), np.nan
             ),
             observations=t.hits.copy(),
-            coverage=np.bitwise_count(t.sides) * (2.0 * np.pi / SECTORS),
+            coverage=coverage,
             first_seen_ns=t.first_ns.copy(),
             last_seen_ns=t.stamp_ns.copy(),
-            confirmed=t.hits >= self.parameters.hits_to_confirm,
+            confirmed=np.where(
+                t.verdict >= 0, t.verdict == Verdict.TREE, t.hits >= self.parameters.hits_to_confirm
+            ),
         )
 
 

@@ -124,3 +124,24 @@ def test_the_order_of_points_does_not_matter():
     other = find_terrain(points[rows], FOREST)
     np.testing.assert_array_equal(one.height, other.height)
     np.testing.assert_array_equal(one.seen, other.seen)
+
+
+def test_a_hedge_on_a_hill_does_not_lift_the_ground():
+    """A crown's underside 4 m up hides all of the ground in some directions; beside it the ground is seen."""
+    points = _rings(10.0, np.pi)
+    distance, turn = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
+    hedge = (distance > 8.0) & (distance < 16.0) & (np.abs(turn) < np.radians(5.0))
+    lifted = points.copy()
+    lifted[hedge, 2] += 4.0
+    above = height_above(lifted, find_terrain(lifted, FOREST))
+    assert np.count_nonzero(hedge) > 15
+    assert np.mean(above[hedge] > 2.0) > 0.5
+
+
+def test_an_echo_far_below_the_ground_is_a_ghost():
+    points = _rings(0.0, 0.0)
+    near = np.flatnonzero((np.hypot(points[:, 0], points[:, 1]) > 4.0) & (points[:, 1] > 0.0))
+    ghosts = points[near[::400]] - np.array([0.0, 0.0, 1.5], np.float32)
+    with_ghosts = np.concatenate([points, ghosts])
+    above = height_above(points, find_terrain(with_ghosts, FOREST))
+    assert np.abs(above[np.hypot(points[:, 0], points[:, 1]) < 10.0]).max() < 0.3

@@ -239,7 +239,7 @@ def test_an_unsure_heading_makes_far_trees_unsure_across():
 
 
 def test_a_diameter_needs_three_radii_and_weighs_them():
-    t = tracker()
+    t = tracker(dbh_arc_min=0.0)
     for k in range(3):
         assert np.isnan(show(t, k, [[5.0, 0.0]], radius=np.nan).dbh).all()
     trees = t.trees()
@@ -312,3 +312,18 @@ def test_walking_around_a_tree_covers_it():
         trees = show(t, k, [[5.0, 0.0]], pose=pose, arc=2.0)
     assert len(trees.number) == 1
     assert trees.coverage[0] == pytest.approx(2 * np.pi)
+
+
+def test_a_diameter_needs_half_the_trunk():
+    def seen_from(bearings):
+        t = tracker()
+        trees = t.trees()
+        for k, bearing in enumerate(bearings):
+            pose = Pose2(5.0 * np.cos(bearing), 5.0 * np.sin(bearing), bearing + np.pi)
+            trees = show(t, k, [[5.0, 0.0]], pose=pose, radius=0.2, arc=np.radians(100.0))
+        return trees
+
+    assert np.isnan(seen_from([0.0, 0.1, 0.2, 0.3]).dbh).all()
+    around = seen_from([0.0, 1.0, 2.0, 3.0])
+    assert around.dbh[0] == pytest.approx(0.4)
+    assert around.coverage[0] >= np.pi

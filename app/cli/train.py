@@ -1,0 +1,85 @@
+"""`stemmap train`: the decision trees behind the verdicts, made anew."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipeline.errors import StemmapError
+
+if TYPE_CHECKING:
+    from app.training.growing import Examples
+
+HELP = "make the decision trees anew that say what is a tree"
+SCENES = "stand,slope,dense"
+SEEDS = "11,12,13,14"
+REACH = 25.0  # m, of labelled scans
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument(
+        "labelled",
+        metavar="FOLDER",
+        type=Path,
+        nargs="*",
+        help="scans of one place (velodyne/*.bin, labels/*.label), or one .bin with its .label beside it",
+    )
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--scenes", default=SCENES, help=f"simulated scenes (default: {SCENES})")
+    parser.add_argument("--seeds", default=SEEDS, help=f"of the simulated scenes (default: {SEEDS})")
+    parser.add_argument(
+        "--every", type=int, default=3, help="take every so many-th simulated scan (default: 3)"
+    )
+    parser.add_argument(
+        "--examples",
+        metavar="DIR",
+        type=Path,
+        help="keep the examples of each scene here, and take them from here",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Gather examples, grow the trees, print what they are worth on scenes left out, write them."""
+    from app.training.growing import PLANS, as_json, can_grow, grow
+    from app.training.judging import leave_one_out
+    from pipeline.files import write_beside
+    from pipeline.parameters import preset
+
+    examples = _examples(arguments)
+    if not examples:
+        raise StemmapError("there is nothing to learn from", remedy="Name scenes, or folders with labels")
+    for line in leave_one_out(examples, preset("forest").gathering.tree_share):
+        print(line)
+    scenes = sorted({e.scene if e.simulated else Path(e.scene).name for e in examples})
+    grown = {kind: grow(examples, kind) for kind in PLANS if can_grow(examples, kind)}
+    text = json.dumps(as_json(grown, scenes), separators=(",", ":"))
+    with write_beside(arguments.out) as file:
+        file.write_text(text.replace('{"figure"', '\n{"figure"') + "\n", encoding="utf-8")
+    print(f"{len(examples)} sets of examples, written to {arguments.out}")
+    return 0
+
+
+def _examples(arguments: argparse.Namespace) -> list[Examples]:
+    from functools import partial
+
+    from app.training.keeping import kept_or_made
+    from app.training.scenes import labelled_examples, simulated_examples
+    from pipeline.parameters import preset
+
+    forest = preset("forest")
+    names = [name for name in arguments.scenes.split(",") if name]
+    sigma = ("0.02", "0.03", "0.01")
+    found: list[Examples] = []
+    for name in names:
+        for n, seed in enumerate(arguments.seeds.split(",")):
+            uri = f"sim:{name}?seed={seed}&odometry=exact&sigma={sigma[n % 3]}"
+            make = partial(simulated_examples, uri, forest, arguments.every)
+            found += kept_or_made(arguments.examples, uri, make)
+    for folder in arguments.labelled:
+        found += kept_or_made(
+            arguments.examples, str(folder), partial(labelled_examples, folder, forest, REACH)
+        )
+    return found

@@ -1,0 +1,156 @@
+"""Growing: decision trees from examples, as JSON, and what they are worth on scenes they never saw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.gathering.features import NAMES
+from pipeline.gathering.forest import ALL_AROUND, CLASSES, ONE_WAY
+from pipeline.records import Float, Int, Verdict
+
+DOUBTFUL = -1
+TREE = CLASSES.index(Verdict.TREE)
+UPRIGHT = (CLASSES.index(Verdict.POLE), CLASSES.index(Verdict.PERSON))
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How trees are grown for a kind of sensor.
+
+    Attributes:
+        method: "extra" cuts at random places, "best" at the best one of a random choice of figures.
+        trees, depth, least: Their number, their depth, and the least examples in a leaf.
+        figures: Part of the figures that is tried at each cut.
+        same, other, simulated: What an example counts from a real scene of this kind of sensor, of the
+            other kind, and from a simulated scene.
+        upright: How many times more poles and persons count: they are few and hard to tell.
+    """
+
+    method: str
+    trees: int
+    depth: int
+    least: int
+    figures: float
+    same: float
+    other: float
+    simulated: float
+    upright: float = 1.0
+
+
+# A sensor that looks one way sees a trunk from one side and no higher than its field of view; examples
+# that were driven around teach it to expect more (docs/trunks.md has the figures).
+PLANS = {
+    ALL_AROUND: Plan("best", 16, 9, 3, 0.3, same=0.3, other=0.1, simulated=0.1, upright=5.0),
+    ONE_WAY: Plan("extra", 40, 9, 3, 0.5, same=1.0, other=1.0, simulated=0.0),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Examples:
+    """Columns of one scene with what they really are.
+
+    Attributes:
+        scene: Its name; a scene is either trained on or judged, never both.
+        simulated: Whether it is no real one; all_around: whether its sensor sees all around.
+        axis: shape (N, 5), see `find_columns`.
+        figures: shape (N, figures).
+        label: int64, place in CLASSES, DOUBTFUL where nobody can tell.
+    """
+
+    scene: str
+    simulated: bool
+    all_around: bool
+    axis: Float
+    figures: Float
+    label: Int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grown:
+    """Trees of scikit-learn, and for each the shares of the kinds in its nodes, shape (nodes, classes)."""
+
+    trees: Any
+    share: list[Float]
+
+
+def grow(examples: list[Examples], kind: str, seed: int = 0) -> Grown:
+    """Many small trees agree better with new scenes than one does (Breiman 2001, Geurts 2006). They are
+    cut to tell trees from all else; the leaves then say what else.
+
+    Args:
+        examples: Of all scenes to learn from.
+        kind: Of the sensor, a key of PLANS.
+        seed: Of the choices made at random.
+    """
+    from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
+
+    plan = PLANS[kind]
+    figures = np.concatenate([e.figures for e in examples]).astype(np.float32)
+    label = np.concatenate([e.label for e in examples])
+    weight = np.concatenate([np.full(len(e.label), _weight(e, kind, plan)) for e in examples])
+    weight[np.isin(label, UPRIGHT)] *= plan.upright
+    used = (label != DOUBTFUL) & (weight > 0.0)
+    figures, label, weight = figures[used], label[used], weight[used]
+    method = ExtraTreesClassifier if plan.method == "extra" else RandomForestClassifier
+    trees = method(
+        plan.trees,
+        max_depth=plan.depth,
+        min_samples_leaf=plan.least,
+        max_features=plan.figures,
+        random_state=seed,
+    ).fit(figures, label == TREE, weight)
+    return Grown(trees, [_shares(tree, figures, label, weight) for tree in trees.estimators_])
+
+
+def can_grow(examples: list[Examples], kind: str) -> bool:
+    """Whether any of the scenes counts for this kind of sensor."""
+    return any(_weight(e, kind, PLANS[kind]) > 0.0 for e in examples)
+
+
+def _weight(examples: Examples, kind: str, plan: Plan) -> float:
+    if examples.simulated:
+        return plan.simulated
+    return plan.same if examples.all_around == (kind == ALL_AROUND) else plan.other
+
+
+def _shares(tree: Any, figures: Float, label: Int, weight: Float) -> Float:  # noqa: ANN401
+    share = np.zeros((tree.tree_.node_count, len(CLASSES)))
+    np.add.at(share, (tree.apply(figures), label), weight)
+    rounded: Float = np.round(share / np.maximum(share.sum(axis=1, keepdims=True), 1e-12), 2)
+    return rounded
+
+
+def shares(grown: Grown, figures: Float) -> Float:
+    """Votes in the order of CLASSES, shape (N, classes)."""
+    leaf = grown.trees.apply(figures.astype(np.float32))
+    votes: Float = np.mean([share[leaf[:, k]] for k, share in enumerate(grown.share)], axis=0)
+    return votes
+
+
+def as_json(grown: dict[str, Grown], scenes: list[str]) -> dict[str, Any]:
+    """What `pipeline.gathering.forest.read_forest` reads."""
+    return {
+        "about": "Votes on what a column is, made by `stemmap train`; see docs/trunks.md.",
+        "scenes": scenes,
+        "classes": [kind.label for kind in CLASSES],
+        **{
+            kind: [
+                _node(tree.tree_, share, 0) for tree, share in zip(g.trees.estimators_, g.share, strict=True)
+            ]
+            for kind, g in grown.items()
+        },
+    }
+
+
+def _node(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
+    if tree.children_left[row] < 0:
+        return {"share": share[row].tolist()}
+    yes = _node(tree, share, tree.children_left[row])
+    no = _node(tree, share, tree.children_right[row])
+    if "share" in yes and yes == no:
+        return yes
+    threshold = round(float(tree.threshold[row]), 4)
+    return {"figure": NAMES[tree.feature[row]], "at_most": threshold, "yes": yes, "no": no}

@@ -1,0 +1,50 @@
+"""Keeping: examples on disk, because simulating many scenes takes minutes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+
+from app.training.growing import Examples
+
+
+def kept_or_made(folder: Path | None, scene: str, make: Callable[[], Iterable[Examples]]) -> list[Examples]:
+    """The examples of a scene from the folder, or made now and put there (None: kept nowhere)."""
+    file = None if folder is None else folder / f"{hashlib.sha256(scene.encode()).hexdigest()[:16]}.npz"
+    if file is not None and file.is_file():
+        return _read(file)
+    made = list(make())
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        columns = {
+            f"{name}{k}": getattr(e, name)
+            for k, e in enumerate(made)
+            for name in ("axis", "figures", "label")
+        }
+        np.savez(
+            file,
+            scene=scene,
+            simulated=made[0].simulated,
+            all_around=made[0].all_around,
+            sets=len(made),
+            **columns,
+        )
+    return made
+
+
+def read_examples(folder: Path) -> list[Examples]:
+    """All examples of a folder, scene after scene."""
+    return [e for file in sorted(folder.glob("*.npz")) for e in _read(file)]
+
+
+def _read(file: Path) -> list[Examples]:
+    with np.load(file, allow_pickle=False) as kept:
+        scene, simulated = str(kept["scene"]), bool(kept["simulated"])
+        around = bool(kept["all_around"])
+        return [
+            Examples(scene, simulated, around, kept[f"axis{k}"], kept[f"figures{k}"], kept[f"label{k}"])
+            for k in range(int(kept["sets"]))
+        ]

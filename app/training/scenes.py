@@ -1,0 +1,169 @@
+"""Scenes to learn from: simulated ones, whose truth is exact, and folders of scans with a label a point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from app.training.growing import DOUBTFUL, Examples
+from pipeline import ground
+from pipeline.acquisition import acquire
+from pipeline.gathering import Gathering, View, steepest_by_direction
+from pipeline.gathering.forest import CLASSES, Forest
+from pipeline.geometry import Pose2
+from pipeline.parameters import Parameters
+from pipeline.records import Columns, Float, Int, TruthTrees, Verdict
+from pipeline.sources import open_source
+from pipeline.steps import steps
+from pipeline.terrain import height_above
+from pipeline.visibility import clear_range
+
+MARKS = (
+    1,
+    2,
+    3,
+    8,
+    40,
+    100,
+)  # scans after which examples are taken too: a map is judged from its first scan on
+SAME, DOUBT = 0.3, 0.6  # m: a column so near to a trunk is it; up to there nobody can tell
+KIND_OF_LABEL = {71: Verdict.TREE, 80: Verdict.POLE, 81: Verdict.POLE, 30: Verdict.PERSON, 70: Verdict.BUSH,
+                 50: Verdict.WALL, 51: Verdict.WALL, 52: Verdict.WALL}  # fmt: skip
+REACH_OF_KIND = {"pole": 0.35, "person": 0.5, "bush": 0.9, "other": 1.3}
+_VERDICT_OF_KIND = {
+    "pole": Verdict.POLE, "person": Verdict.PERSON, "bush": Verdict.BUSH, "other": Verdict.WALL,
+}  # fmt: skip
+
+
+def gathered(uri: str, parameters: Parameters, *, every: int, static: bool) -> Iterator[Columns]:
+    """The columns of a run mapped with the poses it tells, after each of MARKS scans and at the end."""
+    taken = 0
+    with closing(open_source(uri)) as source:
+        sensor, T_base_lidar = source.description.sensor, source.description.T_base_lidar
+        gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=_no_forest())
+        before = b""
+        for step in steps(source.records(), odometry="static" if static else "auto"):
+            repeated = step.scan.points.tobytes()
+            if step.index % every or repeated == before:
+                continue
+            before = repeated
+            raw, offset = acquire(step, T_base_lidar, parameters.acquisition)
+            terrain = ground.find_terrain(raw, parameters.ground)
+            height = height_above(raw, terrain)
+            free = clear_range(raw, ground.in_band(raw, height, parameters.ground), offset)
+            steepest = steepest_by_direction(raw, offset, sensor.rings > 0)
+            pose = step.T_odom_base or Pose2()
+            view = View(pose, offset, free, steepest, terrain.height)
+            gathering.add(raw, height, step.index, view)
+            taken += 1
+            if taken in MARKS:
+                yield gathering.columns
+    if taken not in MARKS:
+        yield gathering.columns
+
+
+def simulated_examples(uri: str, parameters: Parameters, every: int) -> Iterator[Examples]:
+    """Of a simulated run."""
+    with closing(open_source(uri)) as source:
+        truth = source.truth()
+    assert truth is not None  # noqa: S101 - simulated runs know all
+    assert truth.trees is not None  # noqa: S101
+    for columns in gathered(uri, parameters, every=every, static=False):
+        yield Examples(
+            uri, True, True, columns.axis, columns.figures, label_by_truth(columns.axis, truth.trees)
+        )
+
+
+def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
+    """What stands at each column, as places in CLASSES."""
+    label = np.full(len(axis), CLASSES.index(Verdict.OTHER), np.int64)
+    place = np.stack([truth.x, truth.y], axis=1)
+    kind = np.array(truth.kind)
+    for name, reach in REACH_OF_KIND.items():
+        near = _distance(axis, place[kind == name]) < reach
+        label[near] = CLASSES.index(_VERDICT_OF_KIND[name])
+    to_tree = _distance(axis, place[kind == "tree"])
+    label[(to_tree >= SAME) & (to_tree < DOUBT)] = DOUBTFUL
+    label[to_tree < SAME] = CLASSES.index(Verdict.TREE)
+    return label
+
+
+def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Iterator[Examples]:
+    """Of a folder of scans from one place (`velodyne/*.bin`, `labels/*.label`), or one such pair of files."""
+    points, label = labelled_points(folder)
+    with closing(open_source(str(folder))) as source:
+        all_around = source.description.sensor.rings > 0
+    for columns in gathered(str(folder), parameters, every=1, static=True):
+        near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
+        axis, figures = columns.axis[near], columns.figures[near]
+        yield Examples(str(folder), False, all_around, axis, figures, _label_by_points(axis, points, label))
+
+
+def labelled_points(folder: Path) -> tuple[Float, Int]:
+    """All points (N, 3) [m] of a place and their classes; returns at the origin are left out."""
+    if folder.is_file():
+        scans = [(folder, folder.with_suffix(".label"))]
+    else:
+        scans = [
+            (scan, folder / "labels" / f"{scan.stem}.label")
+            for scan in sorted((folder / "velodyne").glob("*.bin"))
+        ]
+    points = [np.fromfile(scan, "<f4").reshape(-1, 4)[:, :3].astype(np.float64) for scan, _ in scans]
+    labels = [np.fromfile(label, "<u4").astype(np.int64) & 0xFFFF for _, label in scans]
+    cloud, kinds = np.concatenate(points), np.concatenate(labels)
+    there = np.abs(cloud).max(axis=1) > 0.0
+    return cloud[there], kinds[there]
+
+
+def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
+    """Middles (N, 2) [m] of the labelled trunks: points of class 71, linked at 0.3 m."""
+    from sklearn.cluster import DBSCAN
+
+    cloud = points[label == 71]
+    if len(cloud) == 0:
+        return np.zeros((0, 2))
+    group = DBSCAN(eps=0.3, min_samples=1).fit(cloud).labels_
+    size = np.bincount(group)
+    middle = np.stack([np.bincount(group, cloud[:, a]) / size for a in range(2)], axis=1)
+    return np.asarray(middle[(size >= least) & (np.hypot(middle[:, 0], middle[:, 1]) <= reach)])
+
+
+def _label_by_points(axis: Float, points: Float, label: Int) -> Int:
+    from scipy.spatial import cKDTree
+
+    kind = np.full(len(axis), CLASSES.index(Verdict.OTHER), np.int64)
+    tree = cKDTree(points[:, :2])
+    for k, rows in enumerate(tree.query_ball_point(axis[:, :2], 0.35)):
+        names, counts = np.unique(label[rows], return_counts=True)
+        order = [int(names[i]) for i in np.argsort(-counts, kind="stable") if names[i] in KIND_OF_LABEL]
+        order = [name for name in order if name != 71]
+        if order:
+            kind[k] = CLASSES.index(KIND_OF_LABEL[order[0]])
+    to_tree = _distance(axis, trunks(points, label, 30, np.inf))
+    to_any = _distance(axis, trunks(points, label, 1, np.inf))
+    kind[(to_tree >= SAME) & (to_any < 0.5)] = DOUBTFUL
+    kind[(to_tree >= SAME) & (to_tree < DOUBT)] = DOUBTFUL
+    kind[to_tree < SAME] = CLASSES.index(Verdict.TREE)
+    return kind
+
+
+def _distance(axis: Float, place: Float) -> Float:
+    """Of each column from the nearest place [m]."""
+    if len(place) == 0:
+        return np.full(len(axis), np.inf)
+    from scipy.spatial import cKDTree
+
+    distance: Float = cKDTree(place).query(axis[:, :2])[0]
+    return distance
+
+
+def _no_forest() -> Forest:
+    """One leaf that knows nothing: the trees are what is being made."""
+    none = np.full(1, -1, np.int32)
+    zero = np.zeros(1, np.int32)
+    return Forest(
+        zero, none, np.zeros(1), zero.copy(), zero.copy(), np.full((1, len(CLASSES)), 1.0 / len(CLASSES))
+    )

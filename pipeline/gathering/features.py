@@ -1,0 +1,151 @@
+"""Features: the figures of a column by which it is judged, none of them in the sensor's own units."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.gathering.memory import SLICE, SLICES
+from pipeline.geometry import Float
+
+# Bands of height above the ground, as slices: first, one past the last.
+BANDS = np.array([[1, 4], [4, 7], [7, 11], [11, 16], [16, 30]])
+CLEAN = 0.5  # of the returns around a clean slice lie at the axis
+GAP = 2  # slices that a stem may be hidden over
+
+_BAND_WORDS = ("0.2-0.8", "0.8-1.4", "1.4-2.2", "2.2-3.2", "3.2-6")
+NAMES = tuple(
+    [f"{figure} {band} m" for band in _BAND_WORDS for figure in ("filled", "alone", "ring open")]
+    + [
+        "lowest return",
+        "clean from",
+        "clean to",
+        "clean slices",
+        "highest return",
+        "headroom",
+        "looked at up to",
+        "tilt",
+        "wobble",
+        "spread",
+        "voxels a slice",
+        "returns a voxel",
+        "returns around",
+        "crown",
+        "gone",
+        "returns a slice",
+        "thick",
+        "wide",
+        "uneven",
+        "part of the view filled",
+    ]
+)
+COUNT = len(NAMES)
+UNSEEN = -1.0  # of a figure of a band that no return tells anything of
+
+
+@compiled
+def features(
+    axis: Float, profiles: Float, viewed: Float, present: Float, absent: Float, figures: Float
+) -> None:
+    """The features of columns, into `figures`, shape (K, COUNT), in the order of NAMES.
+
+    Args:
+        axis: shape (K, 5), see `find_columns`.
+        profiles: shape (K, SLICES, PROFILE).
+        viewed: How high above the ground any scan looked there, shape (K,) [m].
+        present, absent: In how many scans something, or nothing, stood there in free view, shape (K,).
+        figures: Is filled.
+    """
+    for c in range(axis.shape[0]):
+        _features(axis[c], profiles[c], viewed[c], present[c], absent[c], figures[c])
+
+
+@compiled
+def _features(axis: Float, rows: Float, viewed: float, present: float, absent: float, out: Float) -> None:
+    for b in range(BANDS.shape[0]):
+        _band(rows, BANDS[b, 0], BANDS[b, 1], out[3 * b : 3 * b + 3])
+    k = 3 * BANDS.shape[0]
+    bottom, first, last, clean, top = _stem(rows)
+    out[k] = bottom * SLICE
+    out[k + 1] = first * SLICE
+    out[k + 2] = last * SLICE
+    out[k + 3] = clean
+    out[k + 4] = top * SLICE
+    out[k + 5] = max(viewed, top * SLICE) - top * SLICE
+    out[k + 6] = max(viewed, top * SLICE)
+    out[k + 7] = np.hypot(axis[2], axis[3])
+    inside, cells, filled, wobble, spread, ring = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for s in range(1, min(last + 1, SLICES)):
+        if rows[s, 0] > 0.0:
+            filled += 1.0
+            inside += rows[s, 0]
+            cells += rows[s, 3]
+            wobble += rows[s, 5] ** 2 + rows[s, 6] ** 2
+            spread += rows[s, 7]
+            ring += rows[s, 1] + rows[s, 2]
+    some = max(filled, 1.0)
+    out[k + 8] = np.sqrt(wobble / some)
+    out[k + 9] = spread / some
+    out[k + 10] = cells / some
+    out[k + 11] = np.log(1.0 + inside / max(cells, 1.0))
+    out[k + 12] = ring / max(inside + ring, 1.0)
+    above = 0.0
+    for s in range(last + 1, SLICES):
+        above += rows[s, 0] + rows[s, 1] + rows[s, 2]
+    out[k + 13] = above / max(above + inside, 1.0)
+    out[k + 14] = absent / max(present + absent, 1.0)
+    out[k + 15] = np.log(1.0 + inside / some)
+    _shape(rows, last, out[k + 16 : k + 19])
+    out[k + 19] = last * SLICE / max(out[k + 6], SLICE)
+
+
+@compiled
+def _shape(rows: Float, last: int, out: Float) -> None:
+    """Of the slices up to `last`: standard deviation of the inside across its long side and along it,
+    averaged [m], and how unevenly wide the slices are."""
+    xx, xy, yy, n, total, squares = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for s in range(1, min(last + 1, SLICES)):
+        if rows[s, 3] >= 2.0:
+            n += 1.0
+            xx += rows[s, 8]
+            xy += rows[s, 9]
+            yy += rows[s, 10]
+            wide = np.sqrt(max(rows[s, 8] + rows[s, 10], 0.0))
+            total += wide
+            squares += wide * wide
+    some = max(n, 1.0)
+    middle, half = 0.5 * (xx + yy) / some, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy) / some
+    out[0] = np.sqrt(max(middle - half, 0.0)) if n > 0.0 else UNSEEN
+    out[1] = np.sqrt(max(middle + half, 0.0)) if n > 0.0 else UNSEEN
+    out[2] = np.sqrt(max(squares / some - (total / some) ** 2, 0.0)) / max(total / some, 0.01)
+
+
+@compiled
+def _band(rows: Float, first: int, end: int, out: Float) -> None:
+    """Filled part of the slices, part of the returns that lies at the axis, open part of the ring."""
+    inside, around, filled, octants = 0.0, 0.0, 0.0, 0.0
+    for s in range(first, end):
+        inside += rows[s, 0]
+        around += rows[s, 1] + rows[s, 2]
+        filled += rows[s, 0] > 0.0
+        octants += rows[s, 4]
+    out[0] = filled / (end - first)
+    out[1] = inside / (inside + around) if inside > 0.0 else UNSEEN
+    out[2] = 1.0 - octants / (8.0 * (end - first))
+
+
+@compiled
+def _stem(rows: Float) -> tuple[int, int, int, int, int]:
+    """Slices: lowest with a return, first and last clean one of the run, their number, highest return."""
+    bottom, first, last, clean, top = SLICES, SLICES, 0, 0, 0
+    for s in range(1, SLICES):
+        if rows[s, 0] <= 0.0:
+            continue
+        bottom = min(bottom, s)
+        top = s
+        at_axis = rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2])
+        if at_axis and (clean == 0 or s - last <= GAP + 1):
+            first = min(first, s)
+            last = s
+            clean += 1
+    return bottom, first, last, clean, top

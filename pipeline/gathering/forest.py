@@ -1,0 +1,136 @@
+"""A few small decision trees as columns, read from JSON and walked in compiled code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.errors import StemmapError
+from pipeline.gathering.features import NAMES
+from pipeline.geometry import Float
+from pipeline.records import Int32, Verdict
+
+# The kinds that are told apart, in the order of the JSON's shares.
+CLASSES = (Verdict.TREE, Verdict.POLE, Verdict.PERSON, Verdict.BUSH, Verdict.WALL, Verdict.OTHER)
+ALL_AROUND, ONE_WAY = "all around", "one way"
+FILE = Path(__file__).with_name("forest.json")
+_MOST_BYTES = 4_000_000
+_MOST_NODES = 100_000
+
+_Row = tuple[int, float, int, int, list[float]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forest:
+    """Nodes of all trees as columns of length N.
+
+    Attributes:
+        root: int32, shape (T,): the first node of each tree.
+        feature: int32: which figure is asked for, -1 at a leaf.
+        threshold: At most this goes to `left`, more to `right` (int32, nodes).
+        share: shape (N, classes): at a leaf the shares of the kinds among what it was trained on.
+    """
+
+    root: Int32
+    feature: Int32
+    threshold: Float
+    left: Int32
+    right: Int32
+    share: Float
+
+
+@cache
+def standard_forest(all_around: bool) -> Forest:
+    """The forest that comes with the package for sensors that see all around, or for those that look one
+    way: what these see of a trunk differs too much for one to serve both."""
+    return read_forest(FILE, ALL_AROUND if all_around else ONE_WAY)
+
+
+def read_forest(path: Path, kind: str) -> Forest:
+    """Read a forest for a kind of sensor, ALL_AROUND or ONE_WAY.
+
+    Raises:
+        StemmapError: The file is too large, is no such JSON, or asks for figures that do not exist.
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ValueError("it is too large")
+        return forest_of(json.loads(path.read_text(encoding="utf-8")), kind)
+    except OSError as error:
+        raise _damaged(path, str(error.strerror)) from None
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
+        raise _damaged(path, str(error)) from None
+
+
+def _damaged(path: Path, why: str) -> StemmapError:
+    return StemmapError(
+        f"the decision trees cannot be read: {why}", where=str(path), remedy="`stemmap train` makes them anew"
+    )
+
+
+def forest_of(data: dict[str, Any], kind: str) -> Forest:
+    """The forest for a kind of sensor out of what JSON holds.
+
+    Raises:
+        ValueError, TypeError, KeyError: It holds something else.
+    """
+    if data["classes"] != [verdict.label for verdict in CLASSES]:
+        raise ValueError("it was trained for other classes")
+    rows: list[_Row] = []
+    roots = [_lay_out(tree, rows) for tree in data[kind]]
+    if not roots:
+        raise ValueError("it has no trees")
+    feature, threshold, left, right, share = zip(*rows, strict=True)
+    return Forest(
+        np.array(roots, np.int32),
+        np.array(feature, np.int32),
+        np.array(threshold, np.float64),
+        np.array(left, np.int32),
+        np.array(right, np.int32),
+        np.array(share, np.float64),
+    )
+
+
+def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
+    """Append a node and what hangs below it; returns its row."""
+    row, nothing = len(rows), [0.0] * len(CLASSES)
+    if row >= _MOST_NODES:
+        raise ValueError("it has too many nodes")
+    if "share" in node:
+        share = [float(v) for v in node["share"]]
+        if len(share) != len(CLASSES) or not all(0.0 <= v <= 1.0 for v in share):
+            raise ValueError("the shares of a leaf do not fit the classes")
+        rows.append((-1, 0.0, row, row, share))
+        return row
+    feature, threshold = NAMES.index(node["figure"]), float(node["at_most"])
+    rows.append((feature, threshold, row, row, nothing))
+    left, right = _lay_out(node["yes"], rows), _lay_out(node["no"], rows)
+    rows[row] = (feature, threshold, left, right, nothing)
+    return row
+
+
+def vote(figures: Float, forest: Forest) -> Float:
+    """Shares of the kinds in the order of CLASSES, mean over the trees, shape (K, figures) -> (K, 6)."""
+    f = forest
+    return _vote(figures, f.root, f.feature, f.threshold, f.left, f.right, f.share)
+
+
+@compiled
+def _vote(
+    figures: Float, root: Int32, feature: Int32, threshold: Float, left: Int32, right: Int32, share: Float
+) -> Float:
+    votes = np.zeros((figures.shape[0], share.shape[1]))
+    for k in range(figures.shape[0]):
+        for t in range(root.shape[0]):
+            node = root[t]
+            while feature[node] >= 0:
+                node = left[node] if figures[k, feature[node]] <= threshold[node] else right[node]
+            for c in range(share.shape[1]):
+                votes[k, c] += share[node, c] / root.shape[0]
+    return votes

@@ -1,0 +1,313 @@
+"""The memory: what was seen at each place of the map over the scans, in voxels, bounded.
+
+A voxel holds how many returns fell into it and their mean position; many scans of one trunk then take
+no more memory than its surface does, and their mean is sharper than any one return.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.records import Float32, Int, Int32
+
+SIDE = 0.1  # m, of a voxel seen from above
+SLICE = 0.2  # m, its height
+SLICES = 30  # so that 6 m above the ground are remembered
+TILE_CELLS = 40  # places are judged again tile by tile, of 4 m
+TILE = TILE_CELLS * SIDE
+MOST_TILES = 6  # are judged anew at a scan,
+FIRST_SCANS = 10  # but for these, when a map may end soon
+_OFFSET = TILE_CELLS << 18  # cells; keys stay positive within 1,000 km of the origin
+_FARTHEST = np.float32((_OFFSET - 2 * TILE_CELLS) * SIDE)
+_SPREAD = np.uint64(0x9E3779B97F4A7C15)
+
+
+@dataclass(slots=True, eq=False)
+class Memory:
+    """Voxels as columns, of which the first `used` rows count, and likewise tiles.
+
+    Attributes:
+        key: int64, the cell; slot: int32, hash table of rows, -1 where free.
+        mean: float32, shape (rows, 3): x, y in the frame of the map, height above the ground [m].
+        returns, scans: int32, how many fell into it, and in how many scans; latest: the last of these.
+        following: int32, the next voxel of the same tile, -1 for none.
+        tile_key, tile_slot: As for voxels; tile_first: int32, the first voxel of each tile.
+        tile_returns: int64; tile_judged: int64, the returns that it had when it was last judged.
+        used, tiles: Voxels and tiles in use; added: scans that were taken.
+    """
+
+    key: Int
+    slot: Int32
+    mean: Float32
+    returns: Int32
+    scans: Int32
+    latest: Int32
+    following: Int32
+    tile_key: Int
+    tile_slot: Int32
+    tile_first: Int32
+    tile_returns: Int
+    tile_judged: Int
+    used: int
+    tiles: int
+    added: int
+
+    @classmethod
+    def empty(cls, room: int = 1 << 12, tile_room: int = 1 << 8) -> Memory:
+        """Nothing is known; `room` and `tile_room` are powers of two."""
+        ints, tile_ints = np.zeros(room, np.int32), np.zeros(tile_room, np.int64)
+        return cls(
+            key=np.zeros(room, np.int64),
+            slot=np.full(2 * room, -1, np.int32),
+            mean=np.zeros((room, 3), np.float32),
+            returns=ints.copy(),
+            scans=ints.copy(),
+            latest=ints.copy(),
+            following=ints.copy(),
+            tile_key=tile_ints.copy(),
+            tile_slot=np.full(2 * tile_room, -1, np.int32),
+            tile_first=np.zeros(tile_room, np.int32),
+            tile_returns=tile_ints.copy(),
+            tile_judged=tile_ints.copy(),
+            used=0,
+            tiles=0,
+            added=0,
+        )
+
+    def copy(self) -> Memory:
+        """An independent copy."""
+        other = Memory.empty(1, 1)
+        for f in fields(self):
+            value = getattr(self, f.name)
+            setattr(other, f.name, value.copy() if isinstance(value, np.ndarray) else value)
+        return other
+
+    def add(self, points: Float32, scan: int, most: int) -> None:
+        """Take the points of one scan.
+
+        When more than `most` voxels are known, the half that was seen longest ago is forgotten.
+
+        Args:
+            points: float32, shape (N, 3): x, y in the frame of the map, height above the ground [m].
+            scan: Its number.
+            most: Voxels kept, a power of two.
+        """
+        begin = 0
+        self.added += 1
+        while True:
+            begin, self.used, self.tiles = _add(points, begin, scan, *self._tables(), self.used, self.tiles)
+            if begin == len(points):
+                return
+            self._make_room(most)
+
+    def judge_anew(self, grown: float) -> Int:
+        """Tiles, shape (T, 2), that hold `grown` times what they held when they were judged last; from
+        now on they count as judged. After the first scans the `MOST_TILES` that grew most come first, so
+        that no scan takes long; the others' turn comes soon."""
+        now, before = self.tile_returns[: self.tiles], self.tile_judged[: self.tiles]
+        due = np.flatnonzero(now > grown * before)
+        if self.added > FIRST_SCANS and len(due) > MOST_TILES:
+            growth = now[due] / np.maximum(before[due], 1)
+            due = np.sort(due[np.argsort(-growth, kind="stable")[:MOST_TILES]])
+        before[due] = now[due]
+        key = self.tile_key[due]
+        origin = _OFFSET // TILE_CELLS
+        return np.stack([(key >> 31) - origin, (key & ((1 << 31) - 1)) - origin], axis=1)
+
+    def around(self, tile: Int, margin: float) -> tuple[Float32, Int32]:
+        """Mean (N, 3) and returns (N,) of the voxels of a tile and `margin` [m] around it."""
+        rows = _rows_around(
+            tile[0],
+            tile[1],
+            margin,
+            self.tile_key,
+            self.tile_slot,
+            self.tile_first,
+            self.following,
+            self.mean,
+        )
+        return self.mean[rows], self.returns[rows]
+
+    def _tables(self) -> tuple[Int, Int32, Float32, Int32, Int32, Int32, Int32, Int, Int32, Int32, Int]:
+        return (
+            self.key, self.slot, self.mean, self.returns, self.scans, self.latest, self.following,
+            self.tile_key, self.tile_slot, self.tile_first, self.tile_returns,
+        )  # fmt: skip
+
+    def _make_room(self, most: int) -> None:
+        rows = np.ones(self.used, np.bool_)
+        room, tile_room = len(self.key), len(self.tile_key)
+        if self.tiles == tile_room:
+            tile_room *= 2
+        elif 2 * room <= most:
+            room *= 2
+        else:
+            rows[np.argsort(self.latest[: self.used], kind="stable")[: self.used // 2]] = False
+        fresh = Memory.empty(room, tile_room)
+        n = int(np.count_nonzero(rows))
+        for name in ("key", "mean", "returns", "scans", "latest"):
+            getattr(fresh, name)[:n] = getattr(self, name)[: self.used][rows]
+        fresh.used, fresh.added = n, self.added
+        fresh.tiles = _index(n, *fresh._tables())
+        _keep_judged(
+            self.tile_key, self.tile_judged, self.tiles, fresh.tile_key, fresh.tile_slot, fresh.tile_judged
+        )
+        for f in fields(self):
+            setattr(self, f.name, getattr(fresh, f.name))
+
+
+@compiled
+def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
+    """The place in the hash table of a key, or where it would go."""
+    mask = slot.shape[0] - 1
+    shift = np.uint64(64 - int(np.log2(slot.shape[0]) + 0.5))
+    at = np.int64((np.uint64(key) * _SPREAD) >> shift)
+    while slot[at] >= 0 and keys[slot[at]] != key:
+        at = (at + 1) & mask
+    return int(at)
+
+
+@compiled
+def _tile_of(key: int | np.int64) -> int:
+    ix, iy = key >> 36, (key >> 5) & ((1 << 31) - 1)
+    return int(((ix // TILE_CELLS) << 31) | (iy // TILE_CELLS))
+
+
+@compiled
+def _hang_in(
+    row: int,
+    key: int | np.int64,
+    following: Int32,
+    tile_key: Int,
+    tile_slot: Int32,
+    tile_first: Int32,
+    tiles: int,
+) -> int:
+    """Put a voxel into the chain of its tile; returns the tiles in use."""
+    tile = _tile_of(key)
+    at = _find(tile, tile_key, tile_slot)
+    if tile_slot[at] < 0:
+        tile_slot[at] = tiles
+        tile_key[tiles] = tile
+        tile_first[tiles] = -1
+        tiles += 1
+    following[row] = tile_first[tile_slot[at]]
+    tile_first[tile_slot[at]] = row
+    return tiles
+
+
+@compiled
+def _index(
+    used: int,
+    keys: Int,
+    slot: Int32,
+    mean: Float32,  # noqa: ARG001 - the tables come as one
+    returns: Int32,
+    scans: Int32,  # noqa: ARG001
+    latest: Int32,  # noqa: ARG001
+    following: Int32,
+    tile_key: Int,
+    tile_slot: Int32,
+    tile_first: Int32,
+    tile_returns: Int,
+) -> int:
+    """Fill the hash tables and chains of rows that are there already; returns the number of tiles."""
+    tiles = 0
+    for row in range(used):
+        slot[_find(keys[row], keys, slot)] = row
+        tiles = _hang_in(row, keys[row], following, tile_key, tile_slot, tile_first, tiles)
+        tile_returns[tile_slot[_find(_tile_of(keys[row]), tile_key, tile_slot)]] += returns[row]
+    return tiles
+
+
+@compiled
+def _keep_judged(old_key: Int, old_judged: Int, tiles: int, key: Int, slot: Int32, judged: Int) -> None:
+    for t in range(tiles):
+        at = _find(old_key[t], key, slot)
+        if slot[at] >= 0:
+            judged[slot[at]] = old_judged[t]
+
+
+@compiled
+def _add(
+    points: Float32,
+    begin: int,
+    scan: int,
+    keys: Int,
+    slot: Int32,
+    mean: Float32,
+    returns: Int32,
+    scans: Int32,
+    latest: Int32,
+    following: Int32,
+    tile_key: Int,
+    tile_slot: Int32,
+    tile_first: Int32,
+    tile_returns: Int,
+    used: int,
+    tiles: int,
+) -> tuple[int, int, int]:
+    """Returns the first point that found no room (their number when all did), voxels and tiles in use."""
+    for i in range(begin, points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        h = np.int64(np.floor(points[i, 2] / SLICE))
+        # Written so that a coordinate that is not a number fails it.
+        if not (0 <= h < SLICES and abs(x) < _FARTHEST and abs(y) < _FARTHEST):
+            continue
+        ix, iy = np.int64(np.floor(x / SIDE)) + _OFFSET, np.int64(np.floor(y / SIDE)) + _OFFSET
+        key = (ix << 36) | (iy << 5) | h
+        at = _find(key, keys, slot)
+        row = slot[at]
+        if row < 0:
+            if used == keys.shape[0] or tiles == tile_key.shape[0]:
+                return i, used, tiles
+            row = used
+            used += 1
+            slot[at] = row
+            keys[row], latest[row] = key, -1
+            tiles = _hang_in(row, key, following, tile_key, tile_slot, tile_first, tiles)
+        returns[row] += 1
+        for a in range(3):
+            mean[row, a] += (points[i, a] - mean[row, a]) / np.float32(returns[row])
+        if latest[row] != scan:
+            latest[row] = scan
+            scans[row] += 1
+        tile_returns[tile_slot[_find(_tile_of(key), tile_key, tile_slot)]] += 1
+    return points.shape[0], used, tiles
+
+
+@compiled
+def _rows_around(
+    tx: int,
+    ty: int,
+    margin: float,
+    tile_key: Int,
+    tile_slot: Int32,
+    tile_first: Int32,
+    following: Int32,
+    mean: Float32,
+) -> Int:
+    low_x, low_y = tx * TILE - margin, ty * TILE - margin
+    high_x, high_y = (tx + 1) * TILE + margin, (ty + 1) * TILE + margin
+    reach = int(np.ceil(margin / TILE))
+    rows = np.empty(1024, np.int64)
+    n = 0
+    origin = _OFFSET // TILE_CELLS
+    for dx in range(-reach, reach + 1):
+        for dy in range(-reach, reach + 1):
+            key = ((tx + dx + origin) << 31) | (ty + dy + origin)
+            at = _find(key, tile_key, tile_slot)
+            if tile_slot[at] < 0:
+                continue
+            row = np.int64(tile_first[tile_slot[at]])
+            while row >= 0:
+                if low_x <= mean[row, 0] < high_x and low_y <= mean[row, 1] < high_y:
+                    if n == rows.shape[0]:
+                        rows = np.append(rows, np.empty(n, np.int64))
+                    rows[n] = row
+                    n += 1
+                row = np.int64(following[row])
+    return rows[:n].copy()

@@ -1,0 +1,71 @@
+"""Columns: a trunk's axis is found where it stands, and what is flat has none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.gathering.columns import OCTANTS, PROFILE, examine
+from pipeline.gathering.features import COUNT, NAMES, features
+from pipeline.gathering.memory import SLICES, TILE, Memory
+from tests.gathering.clouds import bush, trunk
+
+LOW = np.zeros(2)
+
+
+def examined(points):
+    memory = Memory.empty()
+    memory.add(points, 0, 1 << 18)
+    mean, returns = memory.around(np.array([0, 0]), 1.2)
+    return examine(mean, returns, LOW, TILE)
+
+
+def figures_of(axis, profiles):
+    out = np.empty((len(axis), COUNT))
+    seen = np.full(len(axis), 5.0)
+    features(axis, profiles, seen, np.ones(len(axis)), np.zeros(len(axis)), out)
+    return out
+
+
+@pytest.mark.parametrize("radius", [0.06, 0.12, 0.2])
+@pytest.mark.parametrize("lean", [0.0, 0.08])
+def test_a_trunk_is_found_with_its_axis_and_lean(radius, lean):
+    axis, profiles = examined(trunk(2.03, 1.52, radius, lean=lean))
+    assert len(axis) >= 1
+    nearest = np.hypot(*(axis[:, :2] - [2.03, 1.52]).T).argmin()
+    assert axis[nearest, :2] == pytest.approx([2.03, 1.52], abs=0.03)
+    assert axis[nearest, 2:4] == pytest.approx([lean, 0.0], abs=0.02)
+    figures = dict(zip(NAMES, figures_of(axis, profiles)[nearest], strict=True))
+    assert figures["alone 0.8-1.4 m"] == 1.0
+    assert figures["ring open 0.8-1.4 m"] == 1.0
+    assert figures["filled 0.8-1.4 m"] == 1.0
+    assert figures["tilt"] == pytest.approx(lean, abs=0.02)
+    assert figures["highest return"] == pytest.approx(3.8)
+    assert figures["headroom"] == pytest.approx(1.2)
+
+
+def test_the_profile_counts_every_return_once():
+    points = trunk(2.0, 2.0, 0.1)
+    axis, profiles = examined(points)
+    assert profiles.shape == (len(axis), SLICES, PROFILE)
+    best = np.hypot(*(axis[:, :2] - 2.0).T).argmin()
+    assert profiles[best, :, :3].sum() == len(points)
+    assert (profiles[:, :, 4] <= OCTANTS).all()
+
+
+def test_leaves_fill_the_ring_of_a_bush():
+    axis, profiles = examined(bush(2.0, 2.0, 0.8))
+    alone = figures_of(axis, profiles)[:, NAMES.index("alone 0.2-0.8 m")]
+    assert alone.max() < 0.5
+
+
+def test_nothing_and_what_is_low_have_no_column():
+    assert len(examined(np.zeros((0, 3), np.float32))[0]) == 0
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(0, 4, (5000, 2)), rng.uniform(0, 0.3, 5000)]).astype(np.float32)
+    assert len(examined(ground)[0]) == 0
+    assert len(examined(np.repeat(np.array([[1.0, 1.0, 1.0]], np.float32), 10, axis=0))[0]) == 0
+
+
+def test_the_margin_belongs_to_the_neighbours():
+    assert len(examined(trunk(-0.5, 2.0, 0.1))[0]) == 0
