@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from app.live import Live
 from app.live_payload import map_payload, truth_payload
-from app.messages import Advance, Open, Play, SetParameters, Status
+from app.messages import Open, Play, SetParameters, Status
 from app.parameter_state import ParameterState
 from app.scores import Scores
 from app.throttle import Throttle
 from app.worker_mailbox import joined
-from app.worker_messages import FromWorker, Opened, Report, Shown, ToWorker
+from app.worker_messages import Begin, FromWorker, Opened, Report, Shown, ToWorker
 from pipeline.parameters import Parameters
 from pipeline.parameters.model import Value
 from pipeline.records import Frame, Path, TruthTrees
@@ -77,6 +77,7 @@ class Dashboard:
         self.path_xy = np.zeros((0, 2))
         self.truth: TruthTrees | None = None
         self.selected: int | None = None
+        self._run: int | None = None
         self._notice = ""
         self._restarts = 0
         self._go = False
@@ -89,12 +90,7 @@ class Dashboard:
 
     async def start(self, source: Open) -> None:
         """Start the worker with a source; it plays as soon as it is open."""
-        self.live.tell("status", self.status)
-        self.live.tell("parameters", self.parameters.as_plain())
-        self.live.tell("truth", None)
-        self.live.tell("evaluation", None)
-        self.live.tell("selection", {"tree": None})
-        self.scene.show_parameters(self.parameters.parameters, self.parameters.preset)
+        self._show_parameters()
         await self.worker.start()
         await self._send_parameters()
         await self.open(source)
@@ -118,6 +114,8 @@ class Dashboard:
     async def open(self, source: Open) -> None:
         """Leave the run and open another source."""
         self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
+        self._run = None
+        await self._forget(None)
         await self.command(source)
 
     async def change_parameters(self, changes: dict[str, Value]) -> None:
@@ -154,10 +152,13 @@ class Dashboard:
         self.live.tell("selection", {"tree": number})
 
     async def _tell_parameters(self) -> None:
-        self.live.tell("parameters", self.parameters.as_plain())
-        self.scene.show_parameters(self.parameters.parameters, self.parameters.preset)
+        self._show_parameters()
         await self._send_parameters()
         self._score()
+
+    def _show_parameters(self) -> None:
+        self.live.tell("parameters", self.parameters.as_plain())
+        self.scene.show_parameters(self.parameters.parameters, self.parameters.preset)
 
     async def _send_parameters(self) -> None:
         state = self.parameters
@@ -177,26 +178,35 @@ class Dashboard:
 
     async def _begin(self, opened: Opened) -> None:
         """A source is open and waits: parameters that suit it first, then it plays."""
+        self._run = opened.run
+        await self._forget(opened.truth)
+        if self.parameters.suit(opened.preset):
+            self._show_parameters()
+        restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
+        play = self._go or not restarted
+        if not play:
+            self._notice = "The mapping process ended and was started again. Press play to begin anew"
+        self._go = False
+        state = self.parameters
+        # Always with the parameters: those sent for a run that was left since did not reach the worker.
+        await self.worker.send(Begin(opened.run, state.parameters.model_dump(), state.revision, play))
+
+    async def _forget(self, truth: TruthTrees | None) -> None:
+        """Show an empty map, with the truth of the run that comes."""
         self.shown = self.path = None
-        self.truth = opened.truth
+        self.path_xy = np.zeros((0, 2))
+        self.truth = truth
         self.live.forget_map()
         self.scores.forget()
         self._show_scene.cancel()
         self.scene.clear()
-        self.scene.show_truth(opened.truth)
-        self.live.tell("truth", truth_payload(opened.truth))
+        self.scene.show_truth(truth)
+        self.live.tell("truth", truth_payload(truth))
         await self.select_tree(None)
-        if self.parameters.suit(opened.preset):
-            await self._tell_parameters()
-        restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
-        if restarted and not self._go:
-            self._notice = "The mapping process ended and was started again. Press play to begin anew"
-            await self.worker.send(Advance(1))  # a first picture instead of an empty page
-        else:
-            await self.worker.send(Play())
-        self._go = False
 
     def _show(self, shown: Shown) -> None:
+        if shown.run != self._run:  # of a run that was left
+            return
         self.path = joined(self.path, shown.path_start, shown.path)
         self.shown = shown
         self.path_xy = np.column_stack([self.path.x, self.path.y])

@@ -20,6 +20,7 @@ _encode = msgspec.json.encode
 
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 MAP_PAUSE_S = 0.09
+_EMPTY_MAP: dict[str, Any] = {"type": "map", "index": -1, "trees": []}
 
 
 class Live:
@@ -53,8 +54,9 @@ class Live:
         self._wake()
 
     def forget_map(self) -> None:
-        """There is no map any more: another run begins."""
-        self._map = None
+        """There is no map any more: another run begins. Browsers are told an empty one."""
+        if self._map is not None:
+            self.show(_EMPTY_MAP, np.zeros((0, 2)))
 
     @contextmanager
     def listener(self) -> Iterator[Listener]:

@@ -37,6 +37,7 @@ class Scores:
         self._tell = tell
         self._asked: tuple[Trees, TruthTrees, Evaluation, Float] | None = None
         self._task: asyncio.Task[None] | None = None
+        self._runs = 0
 
     def ask(self, trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> None:
         """Have the map scored soon, against the truth near the path (N, 2)."""
@@ -47,6 +48,7 @@ class Scores:
     def forget(self) -> None:
         """There is no map any more."""
         self._asked = self.latest = None
+        self._runs += 1
         self._tell(None)
 
     def close(self) -> None:
@@ -57,13 +59,15 @@ class Scores:
     async def _work(self) -> None:
         while self._asked is not None:
             asked, self._asked = self._asked, None
+            run = self._runs
             try:
                 score = await asyncio.to_thread(score_payload, *asked)
             except Exception:  # a score that fails must not end those that follow
                 _log.exception("the map could not be scored")
             else:
-                self.latest = score
-                self._tell(score)
+                if run == self._runs:  # else the map has gone meanwhile
+                    self.latest = score
+                    self._tell(score)
             await asyncio.sleep(_PAUSE_S)
 
 

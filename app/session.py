@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Literal
 
 from app.cursor import Synchroniser
-from app.messages import State, Status
+from app.messages import LONGEST_S, State, Status
 from app.run import MakeMapper, Run
 from app.session_status import describe
 from app.stopwatch import Stopwatch
@@ -23,8 +23,6 @@ MakeSynchroniser = Callable[[str], Synchroniser]
 Pace = Literal["idle", "replay", "hurry"]
 
 _NS = 1_000_000_000
-# Beyond any run, and well inside of an int64 of nanoseconds.
-_LONGEST_S = 1e9
 _MOST_WARNINGS = 20
 
 
@@ -137,15 +135,24 @@ class Session:
             return self._arrive(run)
         return frame
 
-    def play(self) -> None:
-        """Go on; from the start when the run is at its end or has failed."""
+    def play(self) -> Opened | None:
+        """Go on; from the start when the run is at its end. A run that has failed is opened again.
+
+        Returns:
+            What was opened again, if so.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        opened = None
         if self._run is None or self._state == "failed":
             if self._asked is None:
-                return
-            self.open(*self._asked)
+                return None
+            opened = self.open(*self._asked)
         elif self._state == "finished":
             self._seek_index(0)
         self._state, self._detail = "playing", ""
+        return opened
 
     def pause(self) -> None:
         """Stand still; on the way to a sought scan, once it is reached."""
@@ -166,7 +173,7 @@ class Session:
             return
         if self._state != "playing":
             self._settle()
-        seconds = min(max(time_s, 0.0), _LONGEST_S)
+        seconds = min(max(time_s, 0.0), LONGEST_S)
         stamp_ns = self._run.start_ns + round(seconds * _NS)
         index = self._run.index_at(stamp_ns)
         if index is not None:

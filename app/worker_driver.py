@@ -14,10 +14,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
+import msgspec
+
 from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
 from app.pacer import Pacer
 from app.session import Session
-from app.worker_messages import FromWorker, Report, Shown, ToWorker
+from app.worker_messages import Begin, FromWorker, Opened, Report, Shown, ToWorker
 from pipeline.errors import StemmapError
 from pipeline.parameters.model import validated
 from pipeline.records import Frame
@@ -55,6 +57,7 @@ class Driver:
         self._taken: deque[ToWorker | None] = deque()
         self._pacer = Pacer()
         self._run = 0
+        self._held = False
         self._prepared = False
         self._reported: tuple[Status, float] | None = None
         self._glimpse_at = 0.0
@@ -126,10 +129,12 @@ class Driver:
         session = self._session
         match command:
             case Play():
-                session.play()
+                self._play()
             case Pause():
+                self._held = True
                 session.pause()
             case Advance(scans=scans):
+                self._held = True
                 session.advance(scans)
             case Seek(time_s=time_s):
                 session.seek(time_s)
@@ -139,14 +144,36 @@ class Driver:
                 self._show(session.set_parameters(validated(values), revision))
             case Open():
                 self._open(command)
+            case Begin():
+                self._begin(command)
 
     def _open(self, command: Open) -> None:
         self._run += 1
         opening = f"Opening {command.uri}"
         self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
-        opened = self._session.open(command.uri, command.odometry, command.seed)
-        self._prepared = False
-        self._put(opened)
+        self._tell_opened(self._session.open(command.uri, command.odometry, command.seed))
+
+    def _play(self) -> None:
+        self._held = False
+        opened_again = self._session.play()
+        if opened_again is not None:
+            self._run += 1
+            self._tell_opened(opened_again)
+
+    def _tell_opened(self, opened: Opened) -> None:
+        self._prepared = self._held = False
+        self._put(msgspec.structs.replace(opened, run=self._run))
+
+    def _begin(self, command: Begin) -> None:
+        if command.run != self._run:  # another was opened since
+            return
+        self._show(self._session.set_parameters(validated(command.values), command.revision))
+        if self._held:  # a person, or a failure, was faster than this answer
+            return
+        if command.play:
+            self._session.play()
+        else:
+            self._session.advance(1)
 
     def _prepare(self) -> None:
         """Before the first scan, and not when opening: only now are the parameters those of the run."""
@@ -179,12 +206,16 @@ class Driver:
         try:
             return work()
         except StemmapError as error:
-            self._session.fail(str(error))
+            self._fail(str(error))
         except Exception as error:
             traceback.print_exc(file=sys.stderr)
-            self._session.fail(
+            self._fail(
                 f"The run stopped: {type(error).__name__}: {error}. This is a fault in stemmap; "
                 "the terminal shows where. Play starts the run again"
             )
         self._report()
         return None
+
+    def _fail(self, detail: str) -> None:
+        self._held = True
+        self._session.fail(detail)

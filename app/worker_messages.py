@@ -1,6 +1,9 @@
-"""What the worker tells the web process, beside `Status`. Plain data: it travels as msgpack."""
+"""What the worker and the web process say beside `Status` and the commands of people. Plain data: it
+travels as msgpack."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import msgspec
 
@@ -9,9 +12,10 @@ from pipeline.records import Frame, Path, TruthTrees
 
 
 class Opened(msgspec.Struct, frozen=True, tag="opened"):
-    """A source was opened and waits for its first command.
+    """A source was opened and waits for `Begin`.
 
     Attributes:
+        run: Counts the sources opened by this worker.
         uri: As the user wrote it.
         kind: The format in words.
         preset: The preset that suits this kind of source.
@@ -26,6 +30,7 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
     scans: int | None
     end_s: float | None
     truth: TruthTrees | None
+    run: int = 0
 
 
 class Shown(msgspec.Struct, frozen=True, tag="shown"):
@@ -53,5 +58,21 @@ class Report(msgspec.Struct, frozen=True, tag="report"):
     status: Status
 
 
+class Begin(msgspec.Struct, frozen=True, tag="begin"):
+    """The answer to `Opened`: begin with these parameters. Meant for one run: if another was opened since,
+    it is left aside.
+
+    Attributes:
+        run: Of the `Opened` that is answered.
+        values, revision: As in `SetParameters`.
+        play: Play, unless a person has said otherwise since the opening; else show the first scan.
+    """
+
+    run: int
+    values: dict[str, Any]
+    revision: int
+    play: bool
+
+
 FromWorker = Opened | Shown | Report
-ToWorker = Command
+ToWorker = Command | Begin

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
 from typing import Any
@@ -161,10 +162,9 @@ class RunFiles:
     def __init__(self, folder: FilePath) -> None:
         self._folder = folder
         self._made_folder = not folder.exists()
-        self._staging = folder / ".unfinished"
-        self._staging.mkdir(parents=True, exist_ok=True)
-        for left_by_a_killed_run in self._staging.iterdir():
-            left_by_a_killed_run.unlink()
+        folder.mkdir(parents=True, exist_ok=True)
+        # A folder of its own, so that two runs into one place do not mix their halves.
+        self._staging = FilePath(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
         self._detections = (self._staging / "detections.csv").open("w", encoding="utf-8", newline="")
         self._detections.write(csv_text(DETECTION_COLUMNS, []))
 
@@ -184,7 +184,7 @@ class RunFiles:
         }
         for name, text in texts.items():
             (self._staging / name).write_text(text, encoding="utf-8", newline="")
-        for name in ("detections.csv", *texts):
+        for name in ("detections.csv", *texts):  # run.json last: where it stands, the others do too
             (self._staging / name).replace(self._folder / name)
         self._staging.rmdir()
 

@@ -10,6 +10,7 @@ from pipeline.errors import ParameterError
 
 if TYPE_CHECKING:
     from pipeline.parameters import Parameters
+    from pipeline.sources import SourceOptions
 
 SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of .bin or .pcd scans, "
@@ -42,7 +43,58 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         "--odometry",
         choices=("auto", "wheels", "static"),
         default="auto",
-        help="auto: what the source has; static: the robot stands still",
+        help="auto: what the source has; wheels: it must have some; static: the robot stands still",
+    )
+
+
+def add_source_flags(parser: argparse.ArgumentParser) -> None:
+    """--topic and --mount."""
+    parser.add_argument(
+        "--topic",
+        metavar="ROLE=NAME",
+        dest="topics",
+        type=_topic,
+        action="append",
+        default=[],
+        help="topic of a recording for scan, odometry or imu, where the fullest one is not meant",
+    )
+    parser.add_argument(
+        "--mount",
+        metavar="X,Y,Z,ROLL,PITCH,YAW",
+        type=_mount,
+        help="where the LiDAR stands on the robot, in metres and degrees (default: what the source says)",
+    )
+
+
+def _topic(text: str) -> tuple[str, str]:
+    role, equals, name = text.partition("=")
+    if not (equals and name and role in ("scan", "odometry", "imu")):
+        raise argparse.ArgumentTypeError(f"{text!r} is not scan=NAME, odometry=NAME or imu=NAME")
+    return role, name
+
+
+def _mount(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 6 or not all(abs(number) <= 360.0 for number in numbers):
+        raise argparse.ArgumentTypeError(f"{text!r} is not six numbers x,y,z,roll,pitch,yaw")
+    return numbers
+
+
+def source_options(arguments: argparse.Namespace) -> SourceOptions:
+    """What the flags say about the source."""
+    from math import radians
+
+    from pipeline.geometry import Pose3
+    from pipeline.sources import SourceOptions
+
+    mount = arguments.mount
+    return SourceOptions(
+        topics=dict(arguments.topics),
+        T_base_lidar=None if mount is None else Pose3.from_euler(mount[:3], *map(radians, mount[3:])),
+        seed=arguments.seed,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from app.finished import read_run
-    from app.offline import evaluation_lines
+    from app.offline import evaluation_lines, far_truth
     from pipeline.evaluation import evaluate
     from pipeline.parameters import assign
 
@@ -56,6 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
     truth = _truth(arguments, finished)
     path = np.stack([finished.path.x, finished.path.y], axis=1)
     evaluation = evaluate(finished.trees, truth, parameters.evaluation, path)
+    if evaluation.TA.of + evaluation.TR.of == 0:
+        print(f"warning: {far_truth(evaluation.reach)}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(asdict(evaluation), indent=1))
     else:

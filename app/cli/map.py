@@ -7,7 +7,15 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
-from app.cli.choices import SOURCE_HELP, add_parameter_flags, add_run_flags, chosen_parameters, source
+from app.cli.choices import (
+    SOURCE_HELP,
+    add_parameter_flags,
+    add_run_flags,
+    add_source_flags,
+    chosen_parameters,
+    source,
+    source_options,
+)
 from pipeline.errors import StemmapError
 
 HELP = "map a run without a browser and write its files"
@@ -19,6 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the files")
     add_parameter_flags(parser)
     add_run_flags(parser)
+    add_source_flags(parser)
     parser.add_argument(
         "--truth", metavar="FILE", type=Path, help="ground truth trees (CSV), to be judged by"
     )
@@ -33,15 +42,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Map the run."""
+    chosen_parameters(arguments, "forest")  # a mistyped flag is said before anything heavy is loaded
+
     from app.offline import OfflineRun, map_run
-    from pipeline.sources import SourceOptions, open_source
+    from pipeline.sources import open_source
     from pipeline.truth_table import read_truth_trees
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
-    with closing(open_source(arguments.source, SourceOptions(seed=arguments.seed))) as source:
-        preset_name, parameters = chosen_parameters(arguments, source.description.preset)
+    with closing(open_source(arguments.source, source_options(arguments))) as opened:
+        preset_name, parameters = chosen_parameters(arguments, opened.description.preset)
         plan = OfflineRun(
-            source=source,
+            source=opened,
             preset=preset_name,
             parameters=parameters,
             seed=arguments.seed,
@@ -49,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
             truth_trees=truth_trees,
         )
         try:
-            outcome = map_run(plan, arguments.out, progress=_Bar(source.description.scans))
+            outcome = map_run(plan, arguments.out, progress=_Bar(opened.description.scans))
         except OSError as error:
             raise StemmapError(
                 f"cannot write: {error.strerror}", where=str(error.filename or arguments.out)

@@ -167,7 +167,9 @@ class RosSource:
                 return found
             reason = "the first scans have no points"
         raise SourceError(
-            reason, where=f"{self._uri}, topic {self._topics.scan.name}", remedy="Choose another scan topic."
+            reason,
+            where=f"{self._uri}, topic {self._topics.scan.name}",
+            remedy="Name another with --topic scan=NAME.",
         )
 
     def _scan_arrivals(self, log_start: int | None) -> Iterator[Stamped[Message]]:

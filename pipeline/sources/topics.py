@@ -94,7 +94,7 @@ def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Top
         there = any(topic.name == name for topic in topics)
         reason = f"the topic {name} is not of the type {' or '.join(types)}" if there else f"no topic {name}"
         raise SourceError(
-            f"{reason}; {_listing(topics)}", where=where, remedy=f"Choose another {role} topic."
+            f"{reason}; {_listing(topics)}", where=where, remedy=f"Name one with --topic {role}=NAME."
         )
     filled = [topic for topic in fitting if topic.count > 0] or (fitting if name is not None else [])
     # Of equally many messages the decoded cloud is preferred to the raw packets it was made of.

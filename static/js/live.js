@@ -19,7 +19,7 @@ function takeMap({ path, ...map }) {
   state.path.length = Math.min(state.path.length, path.start);
   state.path.push(...path.points);
   if (path.start === 0) state.odometry.length = 0; // another run
-  state.map = map;
+  state.map = map.index < 0 ? null : map; // -1: another run is opened, and nothing of it is mapped yet
   if (map.odom) state.odometry[map.index] = map.odom;
 }
 

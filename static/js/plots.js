@@ -93,6 +93,7 @@ function push(list, value) {
 }
 
 function recordMap({ map }) {
+  if (!map) return clearHistory();
   if (history.time.length && map.time_s < history.time.at(-1)) clearHistory();
   push(history.time, map.time_s);
   push(history.n_eff, map.n_eff);

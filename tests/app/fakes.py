@@ -292,5 +292,7 @@ class FakeScene:
         self.calls.append(("close", None))
 
 
-def opened(uri: str = "fake:", preset: str = "forest", truth: TruthTrees | None = None) -> Opened:
-    return Opened(uri=uri, kind="fake run", preset=preset, scans=5, end_s=0.4, truth=truth)
+def opened(
+    uri: str = "fake:", preset: str = "forest", truth: TruthTrees | None = None, run: int = 1
+) -> Opened:
+    return Opened(uri=uri, kind="fake run", preset=preset, scans=5, end_s=0.4, truth=truth, run=run)

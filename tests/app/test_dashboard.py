@@ -13,9 +13,9 @@ import pytest_asyncio
 
 from app.dashboard import Dashboard
 from app.live import Live
-from app.messages import Advance, Open, Play, SetParameters, Status
+from app.messages import Open, Play, SetParameters, Status
 from app.parameter_state import ParameterState
-from app.worker_messages import Report, Shown
+from app.worker_messages import Begin, Report, Shown
 from pipeline.errors import ParameterError
 from pipeline.parameters import preset
 from tests.app.fakes import FakeScene, FakeWorker, frame, opened, path, truth_trees
@@ -35,6 +35,13 @@ def worker(dashboard: Dashboard) -> FakeWorker:
     return dashboard.worker
 
 
+def begun(dashboard: Dashboard) -> Begin:
+    """The last word to the worker."""
+    last = worker(dashboard).commands[-1]
+    assert isinstance(last, Begin)
+    return last
+
+
 def scene_calls(dashboard: Dashboard) -> list[tuple[str, Any]]:
     assert isinstance(dashboard.scene, FakeScene)
     return dashboard.scene.calls
@@ -49,7 +56,7 @@ async def test_an_opened_source_is_played(dashboard: Dashboard) -> None:
     assert isinstance(worker(dashboard).commands[0], SetParameters)
     assert worker(dashboard).commands[1] == Open("fake:")
     await dashboard.receive(opened(truth=truth_trees()))
-    assert worker(dashboard).commands[2:] == [Play()]
+    assert [begun(dashboard).run, begun(dashboard).play] == [1, True]
     assert ("clear", None) in scene_calls(dashboard)
     assert ("truth", True) in scene_calls(dashboard)
     kinds = [tree["kind"] for tree in browser_knows(dashboard)["truth"]["trees"]]
@@ -58,12 +65,37 @@ async def test_an_opened_source_is_played(dashboard: Dashboard) -> None:
 
 async def test_the_preset_that_suits_is_set_before_the_first_scan(dashboard: Dashboard) -> None:
     await dashboard.receive(opened(preset="laser2d"))
-    change, play = worker(dashboard).commands[2:]
-    assert isinstance(change, SetParameters)
-    assert change.values == preset("laser2d").model_dump()
-    assert play == Play()
+    (begin,) = worker(dashboard).commands[2:]
+    assert begin == Begin(1, preset("laser2d").model_dump(), 1, play=True)
     assert browser_knows(dashboard)["parameters"]["preset"] == "laser2d"
     assert ("parameters", "laser2d") in scene_calls(dashboard)
+
+
+async def test_each_run_is_begun_with_its_parameters_even_if_those_of_the_last_one_never_arrived(
+    dashboard: Dashboard,
+) -> None:
+    await dashboard.open(Open("other:"))
+    await dashboard.receive(opened(preset="laser2d"))
+    await dashboard.receive(opened("other:", preset="laser2d", run=2))
+    assert begun(dashboard) == Begin(2, preset("laser2d").model_dump(), 1, play=True)
+    await dashboard.receive(opened("other:", run=3))
+    assert begun(dashboard) == Begin(3, preset("forest").model_dump(), 2, play=True)
+
+
+async def test_opening_empties_the_page_at_once_and_nothing_of_the_old_run_comes_back(
+    dashboard: Dashboard,
+) -> None:
+    await dashboard.receive(opened(truth=truth_trees()))
+    await dashboard.receive(Shown(1, 0.0, frame(0, 1, n_trees=3), 0, path([0.0])))
+    await dashboard.open(Open("missing:"))
+    await dashboard.receive(Shown(1, 0.1, frame(1, 2, n_trees=3), 1, path([1.0])))
+    await dashboard.receive(Report(Status("failed", "there is no such file")))
+    shown = dashboard.live.map_after(0)
+    assert shown is not None
+    assert (shown[1]["index"], shown[1]["trees"], len(shown[2])) == (-1, [], 0)
+    assert scene_calls(dashboard)[-3][0] == "clear"
+    assert (dashboard.shown, dashboard.truth, dashboard.path) == (None, None, None)
+    assert "trees" not in browser_knows(dashboard)["truth"]
 
 
 async def test_what_a_person_chose_stays(dashboard: Dashboard) -> None:
@@ -131,7 +163,7 @@ async def test_a_restarted_worker_stands_at_the_start_and_says_so(dashboard: Das
     await dashboard.receive(opened())
     worker(dashboard).restarts = 1
     await dashboard.receive(opened())
-    assert worker(dashboard).commands[-1] == Advance(1)
+    assert not begun(dashboard).play
     await dashboard.receive(Report(Status("paused")))
     assert "started again" in dashboard.status.detail
     await dashboard.command(Play())
@@ -145,7 +177,7 @@ async def test_playing_a_dead_worker_plays_once_it_is_back(dashboard: Dashboard)
     await dashboard.command(Play())
     worker(dashboard).restarts = 1
     await dashboard.receive(opened())
-    assert worker(dashboard).commands[-1] == Play()
+    assert begun(dashboard).play
 
 
 async def test_a_selection_is_one_everywhere(dashboard: Dashboard) -> None:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import pytest
 from playwright.sync_api import expect
 
-from tests.browser.conftest import PATIENCE_MS
 from tests.browser.dashboard import Dashboard
-
-expect.set_options(timeout=PATIENCE_MS)
 
 
 @pytest.fixture(autouse=True)
