@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec import Meta
+
+# Beyond any run, and well inside of an int64 of nanoseconds.
+LONGEST_S = 1e9
+MOST_SCANS = 10**9
+FASTEST = 1000.0
 
 State = Literal["starting", "playing", "paused", "finished", "waiting", "failed"]
 
@@ -64,19 +70,19 @@ class Pause(msgspec.Struct, frozen=True, tag="pause"):
 class Advance(msgspec.Struct, frozen=True, tag="advance"):
     """Pause and go some scans forward (or back, when negative)."""
 
-    scans: int = 1
+    scans: Annotated[int, Meta(ge=-MOST_SCANS, le=MOST_SCANS)] = 1
 
 
 class Seek(msgspec.Struct, frozen=True, tag="seek"):
     """Go to a time [s since the first scan]; the map becomes what it was then."""
 
-    time_s: float
+    time_s: Annotated[float, Meta(ge=0.0, le=LONGEST_S)]
 
 
 class SetSpeed(msgspec.Struct, frozen=True, tag="set_speed"):
     """Replay faster or slower than the clock; 0 is as fast as it can."""
 
-    factor: float
+    factor: Annotated[float, Meta(ge=0.0, le=FASTEST)]
 
 
 class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Literal
 
 from app.cursor import Synchroniser
-from app.messages import State, Status
+from app.messages import LONGEST_S, State, Status
 from app.run import MakeMapper, Run
 from app.session_status import describe
 from app.stopwatch import Stopwatch
@@ -23,8 +23,6 @@ MakeSynchroniser = Callable[[str], Synchroniser]
 Pace = Literal["idle", "replay", "hurry"]
 
 _NS = 1_000_000_000
-# Beyond any run, and well inside of an int64 of nanoseconds.
-_LONGEST_S = 1e9
 _MOST_WARNINGS = 20
 
 
@@ -175,7 +173,7 @@ class Session:
             return
         if self._state != "playing":
             self._settle()
-        seconds = min(max(time_s, 0.0), _LONGEST_S)
+        seconds = min(max(time_s, 0.0), LONGEST_S)
         stamp_ns = self._run.start_ns + round(seconds * _NS)
         index = self._run.index_at(stamp_ns)
         if index is not None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from typing import BinaryIO
 
 import numpy as np
 
-from app.wire import from_worker
-from app.worker_messages import FromWorker, Opened, Shown
+from app.picture import picture_of
+from app.wire import WireError, from_worker
+from app.worker_messages import FromWorker, Opened, Report, Shown
 from pipeline.records import Path
 
 # Faster pictures nobody sees; they would only fill the pipe and the browsers' sockets.
@@ -21,7 +23,8 @@ class Mailbox:
     """Writes messages to a stream in a thread of its own, so that a slow reader never stops the map.
 
     Pictures wait in one slot: a newer one replaces it. Other messages are sent in order and none is
-    dropped. After `Opened` no picture of an older run is sent.
+    dropped. After `Opened` no picture of an older run is sent. What cannot be sent is left out, and
+    the status says so.
 
     Args:
         stream: Where the bytes go; closed by nobody here.
@@ -37,6 +40,8 @@ class Mailbox:
         self._sent_run = -1
         self._sent_path: Path | None = None
         self._sent_at = -_SHORTEST_PAUSE_S
+        self._report: Report | None = None
+        self._refused = ""
         self._thread = threading.Thread(target=self._write_all, name="mailbox", daemon=True)
         self._thread.start()
 
@@ -61,13 +66,37 @@ class Mailbox:
     def _write_all(self) -> None:
         try:
             while (message := self._next()) is not None:
-                if isinstance(message, Shown):
-                    message = self._with_new_path_only(message)
-                    self._sent_at = time.monotonic()
-                self._stream.write(self._channel.encode(message))
+                for packed in self._packed(message):
+                    self._stream.write(packed)
                 self._stream.flush()
         except (BrokenPipeError, ValueError, OSError):
             return  # the web process is gone; the reader of commands ends the worker
+
+    def _packed(self, message: FromWorker) -> list[bytes]:
+        """A message in bytes; instead of one that cannot be sent, a status that says so."""
+        try:
+            return [self._channel.encode(self._made_ready(message))]
+        except WireError as error:
+            if isinstance(message, Shown):
+                self._sent_path = None  # what was in it did not arrive
+            self._refused = f"a picture could not be shown: {error}"
+            return [] if self._report is None else [self._channel.encode(self._with_refusal(self._report))]
+
+    def _made_ready(self, message: FromWorker) -> FromWorker:
+        if isinstance(message, Shown):
+            self._sent_at = time.monotonic()
+            return self._with_new_path_only(message)
+        if isinstance(message, Opened):
+            self._refused = ""
+        elif isinstance(message, Report):
+            self._report = message
+            return self._with_refusal(message)
+        return message
+
+    def _with_refusal(self, report: Report) -> Report:
+        if not self._refused:
+            return report
+        return Report(replace(report.status, warnings=[*report.status.warnings, self._refused]))
 
     def _next(self) -> FromWorker | None:
         with self._changed:
@@ -87,7 +116,8 @@ class Mailbox:
         old, self._sent_path = self._sent_path, shown.path
         start = 0 if old is None or shown.run != self._sent_run else rows_in_common(old, shown.path)
         self._sent_run = shown.run
-        return Shown(shown.run, shown.time_s, shown.frame, start, rows_from(shown.path, start))
+        picture = picture_of(shown.frame)
+        return Shown(shown.run, shown.time_s, picture, start, rows_from(shown.path, start))
 
 
 def rows_in_common(old: Path, new: Path) -> int:

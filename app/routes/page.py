@@ -76,5 +76,8 @@ def _page_path(path: str) -> Path | None:
     if "\0" in path or any(part.startswith(".") for part in wanted.parts):
         return None
     folder = page_folder().resolve()
-    found = (folder / wanted).resolve()
-    return found if found.is_relative_to(folder) and found.is_file() else None
+    try:
+        found = (folder / wanted).resolve()
+        return found if found.is_relative_to(folder) and found.is_file() else None
+    except OSError:  # a name that no disk takes
+        return None

@@ -74,6 +74,13 @@ class Tracker:
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius)
         self.tracks = self.tracks.take(self.tracks.score > 0.0)
 
+    def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
+        """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.anchor`)."""
+        p = self.parameters
+        anchor(self.tracks, landmarks, covariance, T_map_base, reach, p.distance_max, 1.0 / p.misses_per_hit)
+        self.tracks = merge_near(self.tracks, np.ones(len(self.tracks), np.bool_), p.proximity_radius)
+        self.tracks = self.tracks.take(self.tracks.score > 0.0)
+
     def _predicted(self, stamp_ns: int) -> tuple[Float, Float]:
         """Where each tree is expected now, shape (T, 2), and its covariance xx, xy, yy, shape (T, 3)."""
         t = self.tracks
@@ -84,13 +91,6 @@ class Tracker:
         spread = P[:, :2, :2] + dt * cross + dt**2 * P[:, 2:, 2:] + noise
         expected: Float = t.x[:, :2] + dt[:, :, 0] * t.x[:, 2:]
         return expected, spread[:, [0, 0, 1], [0, 1, 1]]
-
-    def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
-        """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.anchor`)."""
-        p = self.parameters
-        anchor(self.tracks, landmarks, covariance, T_map_base, reach, p.distance_max, 1.0 / p.misses_per_hit)
-        self.tracks = merge_near(self.tracks, np.ones(len(self.tracks), np.bool_), p.proximity_radius)
-        self.tracks = self.tracks.take(self.tracks.score > 0.0)
 
     def judge(self, stamp_ns: int, columns: Columns) -> None:
         """Take the verdicts of what was gathered: a track is confirmed by them alone, and a tree that no

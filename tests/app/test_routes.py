@@ -13,6 +13,7 @@ import pytest_asyncio
 
 from app.dashboard import Dashboard
 from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
+from app.routes.run import what_may_be_opened
 from app.settings import Settings
 from app.worker_messages import Report, Shown
 from pipeline.parameters import field_specs, preset
@@ -82,7 +83,12 @@ async def test_commands_reach_the_worker(both: Running, body: dict[str, Any], co
         (b'{"type": "seek", "time_s": -1}', "time_s"),
         (b'{"type": "set_speed", "factor": -1}', "factor"),
         (b'{"type": "set_speed", "factor": 1e9}', "factor"),
+        (b'{"type": "set_speed", "factor": 1e999}', "factor"),
+        (b'{"type": "set_speed", "factor": NaN}', "does not fit"),
+        (b'{"type": "seek", "time_s": 1e10}', "time_s"),
         (b'{"type": "advance", "scans": 1.5}', "scans"),
+        (b'{"type": "advance", "scans": 100000000000000000000000}', "scans"),
+        (b'{"type": "advance", "scans": -1000000001}', "scans"),
         (b"[" * 5000, "does not fit"),
         (b"\xff\xfe", "does not fit"),
     ],
@@ -186,8 +192,9 @@ async def test_what_cannot_be_opened_is_refused(both: Running, body: dict[str, A
 
 async def test_from_the_network_only_offered_files_are_opened(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").touch()
+    (tmp_path / "link.mcap").symlink_to("/etc/passwd")
     settings = Settings(host="0.0.0.0", recordings=tmp_path)  # noqa: S104
-    async with running(settings) as (client, _):
+    async with running(settings) as (client, dashboard):
         client.headers.update(BEARER)
         for uri, status in [
             ("sim:stand", 202),
@@ -195,8 +202,35 @@ async def test_from_the_network_only_offered_files_are_opened(tmp_path: Path) ->
             ("/etc/passwd", 403),
             (str(tmp_path / ".." / "other"), 403),
             ("nul\0byte", 403),
+            (str(tmp_path / "link.mcap"), 403),
+            ("~/x", 403),
+            ("~nobody-of-this-name/x", 403),
+            (f"file://{tmp_path / 'run.mcap'}", 202),
+            ("file:///etc/passwd", 403),
+            ("file:/etc/passwd", 403),
+            (f"file://file://{tmp_path / 'run.mcap'}", 403),
+            ("http://127.0.0.1/", 403),
         ]:
-            assert (await client.post("/api/open", json={"uri": uri})).status_code == status, uri
+            answer = await client.post("/api/open", json={"uri": uri})
+            assert answer.status_code == status, uri
+            if status == 202 and not uri.startswith("sim:"):
+                assert told(dashboard)[-1] == Open(str((tmp_path / "run.mcap").resolve()))
+
+
+async def test_a_home_in_the_working_folder_is_not_the_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is looked at is what is opened: `~` is a home here as it is where files are opened."""
+    (tmp_path / "~").mkdir()
+    (tmp_path / "~" / "x").touch()
+    (tmp_path / "file:").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/elsewhere")
+    settings = Settings(host="0.0.0.0", recordings=tmp_path)  # noqa: S104
+    assert what_may_be_opened("~/x", settings) is None
+    assert what_may_be_opened("file:///etc/passwd", settings) is None
+    assert what_may_be_opened("sim:stand", settings) == "sim:stand"
+    assert what_may_be_opened("~/x", Settings()) == "~/x"
 
 
 async def test_sources_offer_scenarios_and_recordings(tmp_path: Path) -> None:
@@ -259,6 +293,8 @@ async def test_pairs_have_distances_and_errors_of_matched_trees(both: Running) -
         "/static/%00",
         "/static/",
         "/static/js",
+        f"/static/{'x' * 5000}",
+        f"/static/{'x' * 300}/{'y/' * 3000}z",
         "/viser/index.html",
         "/docs",
         "/openapi.json",

@@ -14,7 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from app.messages import Advance, Open, Play, Seek, SetParameters, SetSpeed, Status
+from app.messages import (
+    FASTEST,
+    LONGEST_S,
+    MOST_SCANS,
+    Advance,
+    Open,
+    Play,
+    Seek,
+    SetParameters,
+    SetSpeed,
+    Status,
+)
 from app.wire import LARGEST_MESSAGE, LENGTH_BYTES, WireError, from_worker, to_worker
 from app.worker_messages import Opened, Report, Shown
 from pipeline.parameters import Parameters
@@ -70,9 +81,9 @@ def test_truth_and_status_survive_the_journey(x: Any) -> None:
 @given(
     st.one_of(
         st.builds(Play),
-        st.builds(Advance, st.integers(-(2**31), 2**31)),
-        st.builds(Seek, finite),
-        st.builds(SetSpeed, finite),
+        st.builds(Advance, st.integers(-MOST_SCANS, MOST_SCANS)),
+        st.builds(Seek, st.floats(0.0, LONGEST_S)),
+        st.builds(SetSpeed, st.floats(0.0, FASTEST)),
         st.builds(Open, st.text(), st.sampled_from(["auto", "static"]), st.integers(0, 2**63 - 1)),
         st.just(SetParameters(Parameters().model_dump(), 4)),
     )

@@ -6,12 +6,14 @@ import io
 import os
 import queue
 import threading
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed
+from app.picture import MOST_POINTS, picture_of
 from app.wire import from_worker
 from app.worker_driver import Driver
 from app.worker_mailbox import Mailbox, joined, rows_in_common
@@ -227,6 +229,49 @@ def test_a_path_that_was_rewritten_is_sent_from_where_it_differs() -> None:
     tail = Path(*(getattr(new, name)[start:] for name in ("stamp_ns", "x", "y", "yaw", "sigma_xy")))
     np.testing.assert_array_equal(joined(old, start, tail).x, new.x)
     assert rows_in_common(new, path([0.0])) == 1
+
+
+def test_a_huge_scan_is_thinned_evenly_in_the_picture_and_only_there() -> None:
+    n = 3 * MOST_POINTS + 7
+    x = np.column_stack([np.arange(n), np.zeros(n), np.zeros(n)]).astype(np.float32)
+    labels = (np.arange(n) % 5).astype(np.int32)
+    whole = replace(frame(0, 0), raw=x, filtered=x, labels=labels)
+    stream = io.BytesIO()
+    mailbox = Mailbox(stream)
+    mailbox.put(Shown(1, 0.0, whole, 0, path([0.0])))
+    mailbox.close(20.0)
+    (message,) = received(stream)
+    assert isinstance(message, Shown)
+    picture = message.frame
+    assert len(picture.raw) == len(picture.filtered) == len(picture.labels) == MOST_POINTS
+    assert set(np.diff(picture.raw[:, 0])) == {3.0, 4.0}
+    np.testing.assert_array_equal(picture.filtered[:, 0].astype(np.int64) % 5, picture.labels)
+    assert picture.counts["not drawn"] == 2 * (n - MOST_POINTS)
+    assert len(whole.raw) == n
+    assert picture_of(frame(0, 0)).counts == frame(0, 0).counts
+
+
+def test_a_picture_that_cannot_be_sent_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.wire.LARGEST_MESSAGE", 100_000)
+    stream = io.BytesIO()
+    mailbox = Mailbox(stream)
+    first, second = path([0.0, 1.0]), path([0.0, 1.0, 2.0])
+    huge = replace(frame(1, 1), raw=np.zeros((50_000, 3), np.float32))
+    mailbox.put(Report(make_session(FakeSource(1)).status()))
+    mailbox.put(Shown(1, 0.0, huge, 0, first))
+    for _ in range(2000):  # until its turn has come
+        if b"could not be shown" in stream.getvalue():
+            break
+        threading.Event().wait(0.01)
+    mailbox.put(Shown(1, 0.1, frame(2, 2), 0, second))
+    mailbox.close(20.0)
+    quiet, told, shown_next = received(stream)
+    assert isinstance(quiet, Report)
+    assert quiet.status.warnings == []
+    assert isinstance(told, Report)
+    assert "larger than 100000" in told.status.warnings[-1]
+    assert isinstance(shown_next, Shown)
+    assert (shown_next.path_start, shown_next.path.x.tolist()) == (0, second.x.tolist())
 
 
 def test_a_reader_that_is_gone_does_not_stop_the_loop() -> None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pipeline.records import Detections, Float, Truth
     from tests.benchmarks.slam_runs import Seen
 
-NAME = "oxford_evo"
+NAME = "oxford"
 LINE = "Oxford Evo, 100 particles, ten seeds: error of the path, all frames and every fifth"
 SEEDS = range(1, 11)
 #: Of the made odometry: parts of the distance, degrees per root of metre, degrees per metre.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.benchmarks.table import Table
 
-NAME = "victoria_park"
+NAME = "victoria"
 LINE = "Victoria Park, 100 particles, ten seeds: path against GPS, trees, duplicates"
 SEEDS = range(1, 11)
 
