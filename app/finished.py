@@ -7,11 +7,10 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Any
 
 import numpy as np
 
-from pipeline.errors import SourceError
+from pipeline.errors import ParameterError, SourceError
 from pipeline.export import PATH_COLUMNS, TREE_COLUMNS
 from pipeline.geometry import Float
 from pipeline.parameters import Parameters
@@ -19,13 +18,17 @@ from pipeline.parameters.model import validated
 from pipeline.records import Path, Trees
 
 LARGEST_FILE = 256 << 20
+_NEVER_EMPTY = frozenset(
+    {"t_s", "x_m", "y_m", "tree", "observations", "first_seen_s", "last_seen_s", "sigma_x_m", "sigma_y_m"}
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedRun:
-    """What `stemmap map` wrote: run.json as it is, the parameters in it, path and trees."""
+    """What `stemmap map` wrote: the source's URI, the seed, the parameters, path and trees."""
 
-    record: dict[str, Any]
+    uri: str
+    seed: int
     parameters: Parameters
     path: Path
     trees: Trees
@@ -39,11 +42,13 @@ def read_run(folder: FilePath) -> FinishedRun:
     """
     try:
         record = json.loads(_text(folder / "run.json"))
-        parameters = validated(record["parameters"])
-    except (ValueError, KeyError, TypeError):
+        parameters = validated(dict(record["parameters"]))
+        uri, seed = str(record["source"]["uri"]), int(record["seed"])
+    except (ValueError, KeyError, TypeError, RecursionError, ParameterError):
         raise SourceError("run.json is damaged", where=str(folder), remedy="Map the run again") from None
     return FinishedRun(
-        record,
+        uri,
+        seed,
         parameters,
         _path(_columns(folder / "path.csv", PATH_COLUMNS)),
         _trees(_columns(folder / "trees.csv", TREE_COLUMNS)),
@@ -75,7 +80,11 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
         ).reshape(len(rows) - 1, len(names))
     except ValueError:
         raise SourceError("a row is damaged", where=str(file), remedy="Map the run again") from None
-    return dict(zip(names, table.T, strict=True))
+    columns = dict(zip(names, table.T, strict=True))
+    for name in _NEVER_EMPTY.intersection(names):
+        if not np.all(np.isfinite(columns[name])):
+            raise SourceError(f"a cell of {name} is empty", where=str(file), remedy="Map the run again")
+    return columns
 
 
 def _path(c: dict[str, Float]) -> Path:

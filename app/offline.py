@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from app.odometry import odometry_warnings
 from app.stopwatch import Stopwatch
 from app.version import version
 from pipeline.errors import SourceError
@@ -91,7 +92,7 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
         seed=plan.seed,
         watch=stopwatch,
     )
-    tally = _Tally(Counter(_odometry_warnings(plan)))
+    tally = _Tally(Counter([*odometry_warnings(description, plan.odometry), *description.warnings]))
     start_ns, frame = 0, None
     left_out = Counter[str]()
     for frame in _frames(plan, mapper, stopwatch, left_out):
@@ -105,6 +106,7 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
     evaluation = _evaluate(frame, path, truth, plan.parameters)
     error = path_error(path, truth.path) if truth.path else None
     losses = {reason: n for reason, n in (left_out + Counter(plan.source.losses)).items() if n}
+    tally.tell_of_far_truth(evaluation)
     tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     outcome = Outcome(
         summary=_summary(description.uri, frame, path, evaluation, error),
@@ -128,14 +130,6 @@ def _frames(
         yield frame
 
 
-def _odometry_warnings(plan: OfflineRun) -> list[str]:
-    if plan.odometry == "static":
-        return ["the odometry is left aside (static): the robot is mapped as standing still"]
-    if not plan.source.description.has_odometry:
-        return ["the source has no odometry: the robot is mapped as standing still"]
-    return []
-
-
 @dataclass(slots=True, eq=False)
 class _Tally:
     """What is counted over a run."""
@@ -149,11 +143,16 @@ class _Tally:
         self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
         self.warned.update(frame.warnings)
 
+    def tell_of_far_truth(self, evaluation: Evaluation | None) -> None:
+        if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
+            self.warned[far_truth(evaluation.reach)] += 1
+
     def tell_of_unconfirmed(self, frame: Frame, hits: int) -> None:
         tentative = int(np.count_nonzero(~frame.trees.confirmed))
         if tentative:
+            them = "1 tree was" if tentative == 1 else f"{tentative} trees were"
             self.warned[
-                f"{tentative} trees were seen fewer than {hits} times and are not in the map; "
+                f"{them} seen fewer than {hits} times and left out of the map; "
                 "--set tracking.hits_to_confirm=1 takes them too"
             ] += 1
 
@@ -224,6 +223,14 @@ def _summary(
             f"({error.compared} true positions, {how})"
         )
     return lines
+
+
+def far_truth(reach: float) -> str:
+    """What to say when nothing of the truth lies near the path."""
+    return (
+        f"no ground truth lies within {reach:g} m of the path: it must be in the frame of the map, "
+        "with the first pose as the origin and x along its heading"
+    )
 
 
 def evaluation_lines(e: Evaluation) -> list[str]:

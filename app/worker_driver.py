@@ -55,6 +55,7 @@ class Driver:
         self._taken: deque[ToWorker | None] = deque()
         self._pacer = Pacer()
         self._run = 0
+        self._prepared = False
         self._reported: tuple[Status, float] | None = None
         self._glimpse_at = 0.0
 
@@ -97,6 +98,9 @@ class Driver:
         return 0.0 if stamp_ns is None else self._pacer.delay(stamp_ns, self._clock())
 
     def _map(self) -> None:
+        if not self._prepared:
+            self._prepare()
+            return
         hurried = self._session.pace == "hurry"
         frame = self._session.work()
         now = self._clock()
@@ -138,16 +142,20 @@ class Driver:
 
     def _open(self, command: Open) -> None:
         self._run += 1
-        self._starting(command.uri, f"Opening {command.uri}")
+        opening = f"Opening {command.uri}"
+        self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
         opened = self._session.open(command.uri, command.odometry, command.seed)
-        self._starting(
-            command.uri, "Preparing the mapper; the first time on a machine this takes up to a minute"
-        )
-        self._session.prepare()
+        self._prepared = False
         self._put(opened)
 
-    def _starting(self, uri: str, detail: str) -> None:
-        self._put(Report(Status(state="starting", detail=detail, source=uri)))
+    def _prepare(self) -> None:
+        """Before the first scan, and not when opening: only now are the parameters those of the run."""
+        self._prepared = True
+        detail = "Preparing the mapper; the first time on a machine this takes up to a minute"
+        self._put(Report(replace(self._session.status(), state="starting", detail=detail)))
+        self._session.prepare()
+        self._pacer.release()
+        self._report()
 
     def _show(self, frame: Frame | None) -> None:
         path = self._session.path

@@ -15,7 +15,7 @@ def judge(clusters: Clusters, parameters: Detection) -> Clusters:
     """The clusters with their verdicts: the first reason that holds, in the order below, else TREE."""
     p, c = parameters, clusters
     across, up = c.extent[:, 1], c.extent[:, 2]
-    has_circle = np.isfinite(c.radius_sigma)
+    has_circle = np.isfinite(c.radius)
     reasons: list[tuple[Verdict, Bool]] = [
         (Verdict.HIDDEN, c.hidden),
         (Verdict.TOO_THICK, np.maximum(across, c.extent[:, 0]) > p.size_max),
@@ -40,7 +40,7 @@ def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) 
         cluster=rows,
         centre=clusters.centre[rows] + sensor_offset[:2],
         covariance=clusters.covariance[rows] + _sensor_covariance(clusters.centre[rows], parameters),
-        radius=np.where(np.isfinite(clusters.radius_sigma[rows]), clusters.radius[rows], np.nan),
+        radius=clusters.radius[rows],
         radius_sigma=clusters.radius_sigma[rows],
         arc=clusters.arc[rows],
         eccentricity=clusters.eccentricity[rows],

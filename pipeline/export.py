@@ -86,7 +86,7 @@ def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
     """Every cluster of a scan with its verdict, in the frame of the map, as rows of DETECTION_COLUMNS."""
     c = frame.clusters
     centre = frame.estimate.T_map_base.apply(c.centre + frame.sensor_offset[:2])
-    fitted = np.isfinite(c.radius_sigma)
+    fitted = np.isfinite(c.radius)
     return [
         [
             str(frame.index),
@@ -95,7 +95,7 @@ def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
             _number(centre[k, 1], 3),
             Verdict(int(c.verdict[k])).label,
             _number(c.eccentricity[k], 3),
-            _number(c.radius[k], 3) if fitted[k] else "",
+            _number(c.radius[k], 3),
             _number(c.radial_std[k], 4),
             _number(math.degrees(c.arc[k]), 0) if fitted[k] else "",
             str(c.size[k]),
@@ -163,6 +163,8 @@ class RunFiles:
         self._made_folder = not folder.exists()
         self._staging = folder / ".unfinished"
         self._staging.mkdir(parents=True, exist_ok=True)
+        for left_by_a_killed_run in self._staging.iterdir():
+            left_by_a_killed_run.unlink()
         self._detections = (self._staging / "detections.csv").open("w", encoding="utf-8", newline="")
         self._detections.write(csv_text(DETECTION_COLUMNS, []))
 

@@ -222,8 +222,7 @@ class Clusters:
         eccentricity: lambda1 / lambda2 >= 1 (Eq. 4); inf for points on a line.
         centre: shape (K, 2) [m], the estimate of the trunk's axis.
         covariance: shape (K, 2, 2) [m^2], of `centre`.
-        radius: [m], of the circle, fitted or told by the angular width; NaN where none was asked for.
-        radius_sigma: [m], NaN where the radius was not fitted.
+        radius, radius_sigma: [m], of the fitted circle; NaN where none was fitted.
         radial_std: [m], standard deviation of the distances to the axis (the cylinder check).
         arc: Visible part of the circle [rad].
         extent: shape (K, 3) [m], size of the bounding box along the ray, across it and up.

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from pipeline.geometry import Float, Pose2, Pose3, interpolate, wrap_angle
+from pipeline.geometry import Float, Pose2, Pose3, interpolate
 from pipeline.records import Imu, Odometry, Record, Scan, Step
 
 OdometryChoice = Literal["auto", "wheels", "static"]
 WAIT = 5  # scans that wait for the odometry that follows them before they go without
 KEEP_NS = 2_000_000_000
-JUMP_SPEED = 15.0  # m/s; no forestry robot drives this fast
+STALE_NS = 250_000_000  # a reading farther away in time than this says nothing of a scan
+JUMP_SPEED, JUMP_TURN = 15.0, 6.0  # m/s, rad/s; nothing that maps trees moves this fast
+STILL = (0.0, 0.0, 0.0)
 
 
 def steps(
@@ -49,13 +52,23 @@ def steps(
     yield from joiner.ready(end=True)
 
 
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """Odometry as it is used: in the plane, without jumps; tilt None where it knows the plane alone."""
+
+    stamp_ns: int
+    pose: Pose2
+    tilt: tuple[float, float] | None
+
+
 class _Joiner:
     def __init__(self, *, use_odometry: bool, index: int, losses: Counter[str]) -> None:
         self._losses = losses
         self._use_odometry = use_odometry
         self._index = index
         self._scans: deque[Scan] = deque()
-        self._odometry: deque[Odometry] = deque()
+        self._odometry: deque[_Reading] = deque()
+        self._T_odom_jumped = Pose2()
         self._imu: deque[Imu] = deque()
         self._last_stamp: int | None = None
         self._warnings: list[str] = []
@@ -74,8 +87,25 @@ class _Joiner:
         elif self._odometry and odometry.stamp_ns <= self._odometry[-1].stamp_ns:
             self._leave_out("odometry readings that were not later than the one before")
         elif self._use_odometry:
-            self._odometry.append(odometry)
+            self._odometry.append(self._without_jump(odometry))
             self._forget(self._odometry, odometry.stamp_ns)
+
+    def _without_jump(self, odometry: Odometry) -> _Reading:
+        """The reading's pose as if every jump so far had been no motion at all."""
+        raw = odometry.T_odom_base.planar()
+        if self._odometry:
+            last = self._odometry[-1]
+            pose = self._T_odom_jumped @ raw
+            step = last.pose.inverse() @ pose
+            span = (odometry.stamp_ns - last.stamp_ns) * 1e-9
+            distance = float(np.hypot(step.x, step.y))
+            if distance > JUMP_SPEED * max(span, 0.1) or abs(step.yaw) > JUMP_TURN * max(span, 0.1):
+                self._warn(
+                    f"the odometry jumped by {distance:.1f} m and {abs(np.degrees(step.yaw)):.0f} degrees; "
+                    "that is not taken as motion"
+                )
+                self._T_odom_jumped = last.pose @ raw.inverse()
+        return _Reading(odometry.stamp_ns, self._T_odom_jumped @ raw, _tilt(odometry.T_odom_base))
 
     def add_imu(self, imu: Imu) -> None:
         if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
@@ -85,7 +115,7 @@ class _Joiner:
         self._imu.append(imu)
         self._forget(self._imu, imu.stamp_ns)
 
-    def _forget(self, kept: deque[Odometry] | deque[Imu], now_ns: int) -> None:
+    def _forget(self, kept: deque[_Reading] | deque[Imu], now_ns: int) -> None:
         oldest = self._scans[0].stamp_ns if self._scans else now_ns
         while len(kept) > 2 and kept[1].stamp_ns < oldest - KEEP_NS:
             kept.popleft()
@@ -124,25 +154,26 @@ class _Joiner:
     ) -> tuple[Pose2 | None, tuple[float, float, float], tuple[float, float] | None]:
         """Pose, velocity in the base frame, and tilt where the odometry is of the whole pose."""
         if not self._odometry:
-            return None, (0.0, 0.0, 0.0), None
+            return None, STILL, None
         before, after = _around(self._odometry, stamp_ns)
-        a, b = before.T_odom_base.planar(), after.T_odom_base.planar()
+        if stamp_ns > after.stamp_ns + STALE_NS:
+            self._warn("there is no odometry for some scans: the robot stands still in them")
+            return after.pose, STILL, None
         span = (after.stamp_ns - before.stamp_ns) * 1e-9
-        tilt = _tilt(before.T_odom_base)
         if span <= 0.0:
-            return a, (0.0, 0.0, 0.0), tilt
-        if np.hypot(b.x - a.x, b.y - a.y) > JUMP_SPEED * max(span, 0.1):
-            self._warn(f"the odometry jumped {np.hypot(b.x - a.x, b.y - a.y):.1f} m")
-            return (b if stamp_ns >= after.stamp_ns else a), (0.0, 0.0, 0.0), tilt
+            return after.pose, STILL, after.tilt
         fraction = float(np.clip((stamp_ns - before.stamp_ns) * 1e-9 / span, 0.0, 1.0))
-        step = a.inverse() @ b
-        twist = (step.x / span, step.y / span, float(wrap_angle(step.yaw)) / span)
-        return interpolate(a, b, fraction), twist, tilt
+        step = before.pose.inverse() @ after.pose
+        twist = (step.x / span, step.y / span, step.yaw / span)
+        return interpolate(before.pose, after.pose, fraction), twist, before.tilt
 
     def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
         if not self._imu:
             return None
         nearest = min(self._imu, key=lambda imu: abs(imu.stamp_ns - stamp_ns))
+        if abs(nearest.stamp_ns - stamp_ns) > STALE_NS:
+            self._warn("there is no IMU reading for some scans: they are not levelled by it")
+            return None
         try:
             roll, pitch, _ = Pose3.from_quaternion(np.zeros(3), _quaternion(nearest)).euler()
         except ValueError:
@@ -158,11 +189,11 @@ class _Joiner:
             self._warnings.append(text)
 
 
-def _around(odometry: deque[Odometry], stamp_ns: int) -> tuple[Odometry, Odometry]:
+def _around(readings: deque[_Reading], stamp_ns: int) -> tuple[_Reading, _Reading]:
     """The readings before and after a time; the two nearest ones where it lies outside."""
-    after = next((k for k, o in enumerate(odometry) if o.stamp_ns >= stamp_ns), len(odometry) - 1)
-    after = max(after, min(1, len(odometry) - 1))
-    return odometry[max(after - 1, 0)], odometry[after]
+    after = next((k for k, r in enumerate(readings) if r.stamp_ns >= stamp_ns), len(readings) - 1)
+    after = max(after, min(1, len(readings) - 1))
+    return readings[max(after - 1, 0)], readings[after]
 
 
 def _tilt(T_odom_base: Pose3) -> tuple[float, float] | None:

@@ -42,8 +42,15 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         "--odometry",
         choices=("auto", "wheels", "static"),
         default="auto",
-        help="auto: what the source has; static: the robot stands still",
+        help="auto: what the source has; wheels: it must have some; static: the robot stands still",
     )
+
+
+def source(text: str) -> str:
+    """A source from the command line; an empty word is a slip of a script, not the current folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the source is empty")
+    return text
 
 
 def seed(text: str) -> int:

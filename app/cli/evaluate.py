@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.errors import StemmapError
 
 if TYPE_CHECKING:
+    from app.finished import FinishedRun
     from pipeline.records import TruthTrees
 
 HELP = "judge a mapped run by ground truth trees"
@@ -41,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from app.finished import read_run
-    from app.offline import evaluation_lines
+    from app.offline import evaluation_lines, far_truth
     from pipeline.evaluation import evaluate
     from pipeline.parameters import assign
 
@@ -52,9 +54,11 @@ def run(arguments: argparse.Namespace) -> int:
         if value is not None
     ]
     parameters = assign(finished.parameters, changes)
-    truth = _truth(arguments, finished.record)
+    truth = _truth(arguments, finished)
     path = np.stack([finished.path.x, finished.path.y], axis=1)
     evaluation = evaluate(finished.trees, truth, parameters.evaluation, path)
+    if evaluation.TA.of + evaluation.TR.of == 0:
+        print(f"warning: {far_truth(evaluation.reach)}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(asdict(evaluation), indent=1))
     else:
@@ -63,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _truth(arguments: argparse.Namespace, record: dict[str, Any]) -> TruthTrees:
+def _truth(arguments: argparse.Namespace, finished: FinishedRun) -> TruthTrees:
     from contextlib import closing
 
     from pipeline.sources import SourceOptions, open_source
@@ -71,8 +75,8 @@ def _truth(arguments: argparse.Namespace, record: dict[str, Any]) -> TruthTrees:
 
     if arguments.truth is not None:
         return read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit)
-    uri = str(record["source"]["uri"])
-    with closing(open_source(uri, SourceOptions(seed=int(record["seed"])))) as source:
+    uri = finished.uri
+    with closing(open_source(uri, SourceOptions(seed=finished.seed))) as source:
         truth = source.truth()
     if truth is None or truth.trees is None:
         raise StemmapError(

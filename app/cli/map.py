@@ -6,20 +6,16 @@ import argparse
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from app.cli.choices import SOURCE_HELP, add_parameter_flags, add_run_flags, chosen_parameters
+from app.cli.choices import SOURCE_HELP, add_parameter_flags, add_run_flags, chosen_parameters, source
 from pipeline.errors import StemmapError
-
-if TYPE_CHECKING:
-    from app.offline import OfflineRun
 
 HELP = "map a run without a browser and write its files"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("source", metavar="SOURCE", help=SOURCE_HELP)
+    parser.add_argument("source", metavar="SOURCE", type=source, help=SOURCE_HELP)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the files")
     add_parameter_flags(parser)
     add_run_flags(parser)
@@ -53,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
             truth_trees=truth_trees,
         )
         try:
-            outcome = map_run(plan, arguments.out, progress=_progress(plan))
+            outcome = map_run(plan, arguments.out, progress=_Bar(source.description.scans))
         except OSError as error:
             raise StemmapError(
                 f"cannot write: {error.strerror}", where=str(error.filename or arguments.out)
@@ -70,14 +66,30 @@ def run(arguments: argparse.Namespace) -> int:
     return 3 if outcome.losses else 0
 
 
-def _progress(plan: OfflineRun):  # type: ignore[no-untyped-def]  # noqa: ANN202 - tqdm is untyped
-    from tqdm import tqdm
+class _Bar:
+    """A progress bar on a terminal, nothing elsewhere. Until the first scan is done it says what a
+    first run on a machine waits for."""
 
-    return tqdm(
-        total=plan.source.description.scans,
-        unit="scan",
-        desc="mapping",
-        file=sys.stderr,
-        disable=not sys.stderr.isatty(),
-        leave=False,
-    )
+    def __init__(self, scans: int | None) -> None:
+        from tqdm import tqdm
+
+        self._bar = tqdm(
+            total=scans,
+            unit="scan",
+            desc="preparing (the first run on a machine compiles for half a minute)",
+            file=sys.stderr,
+            disable=not sys.stderr.isatty(),
+            leave=False,
+        )
+        self._begun = False
+
+    def update(self, n: int = 1, /) -> object:
+        """So many scans more."""
+        if not self._begun:
+            self._bar.set_description("mapping", refresh=False)
+            self._begun = True
+        return self._bar.update(n)
+
+    def close(self) -> None:
+        """No more will come."""
+        self._bar.close()

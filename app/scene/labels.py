@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import viser
@@ -27,43 +28,46 @@ class Labels:
 
     def __init__(self, scene: viser.SceneApi, name: str, scale: float = 0.9) -> None:
         self._scene, self._name, self._scale = scene, name, scale
-        self._nodes: list[viser.LabelHandle] = []
         self._node_of: dict[int, viser.LabelHandle] = {}
+        self._shown: dict[int, Label] = {}
+        self._free: list[viser.LabelHandle] = []
 
     def show(self, labels: Iterable[Label]) -> None:
         """Show these labels, at most `MOST_LABELS`, and hide all others."""
         wanted = {label.key: label for label in list(labels)[:MOST_LABELS]}
-        for key in self._node_of.keys() - wanted.keys():
-            self._node_of.pop(key).visible = False
-        free = [node for node in self._nodes if node not in self._node_of.values()]
+        for key in self._shown.keys() - wanted.keys():
+            node = self._node_of.pop(key)
+            node.visible = False
+            self._free.append(node)
+            del self._shown[key]
         for key, label in wanted.items():
-            node = self._node_of.get(key) or (free.pop() if free else self._another())
-            self._node_of[key] = node
-            self._place(node, label)
+            if key not in self._shown:
+                self._node_of[key] = self._free.pop() if self._free else self._another()
+            self._place(key, label)
 
     @property
     def texts(self) -> list[str]:
         """What is to be read now."""
-        return [node.text for node in self._node_of.values()]
+        return [label.text for label in self._shown.values()]
 
     def _another(self) -> viser.LabelHandle:
-        node = self._scene.add_label(
-            f"{self._name}/{len(self._nodes)}",
+        return self._scene.add_label(
+            f"{self._name}/{len(self._node_of)}",
             "",
             font_screen_scale=self._scale,
             anchor="bottom-center",
             visible=False,
         )
-        self._nodes.append(node)
-        return node
 
-    @staticmethod
-    def _place(node: viser.LabelHandle, label: Label) -> None:
-        node.text = label.text
+    def _place(self, key: int, label: Label) -> None:
+        node, before = self._node_of[key], self._shown.get(key)
         # A label that trembles by a few centimetres cannot be read, and each move is a message.
-        if not node.visible or np.linalg.norm(np.subtract(label.place, node.position)) > 0.15:
-            node.position = label.place
-        node.visible = True
+        if before is not None and math.dist(before.place, label.place) < 0.15:
+            label = replace(label, place=before.place)
+        if label == before:
+            return
+        self._shown[key] = label
+        node.text, node.position, node.visible = label.text, label.place, True
 
 
 def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Label]:

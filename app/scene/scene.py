@@ -136,9 +136,9 @@ class Scene:
             infinite_grid=True,
             cell_size=1.0,
             section_size=10.0,
-            cell_color=(40, 42, 45),  # between the two themes, for both
-            cell_thickness=0.5,
-            section_color=(60, 63, 67),
+            cell_color=(112, 116, 122),  # between the two themes, for both
+            cell_thickness=0.4,
+            section_color=(96, 101, 108),
             section_thickness=1.0,
             fade_distance=60.0,
             shadow_opacity=0.0,

@@ -35,21 +35,31 @@ def _cut(
     azimuth: Float, distance: Float, order: Int, jump: float, min_points: int, gap: float
 ) -> tuple[Int32, Bool]:
     n = azimuth.shape[0]
+    # Beam i and the one before it: are they neighbours, and do they belong together? The circle is
+    # closed, so the first beam follows the last one.
+    neighbours = np.zeros(n, np.bool_)
+    begins = np.zeros(n, np.bool_)
+    for i in range(n):
+        turn = azimuth[i] - azimuth[i - 1] + (2.0 * np.pi if i == 0 else 0.0)
+        neighbours[i] = n > 1 and turn <= gap
+        begins[i] = not (neighbours[i] and abs(distance[i] - distance[i - 1]) <= jump)
+    first = 0
+    while first < n - 1 and not begins[first]:
+        first += 1
     label = np.full(n, -1, np.int32)
     hidden = np.zeros(n, np.bool_)
     clusters = 0
-    start = 0
-    for i in range(1, n + 1):
-        if i < n and azimuth[i] - azimuth[i - 1] <= gap and abs(distance[i] - distance[i - 1]) <= jump:
+    start = first
+    for k in range(first + 1, first + n + 1):
+        if k < first + n and not begins[k % n]:
             continue
-        if i - start >= min_points:
-            for k in range(start, i):
-                label[order[k]] = clusters
-            before = start > 0 and azimuth[start] - azimuth[start - 1] <= gap
-            after = i < n and azimuth[i] - azimuth[i - 1] <= gap
-            hidden[clusters] = (before and distance[start - 1] < distance[start]) or (
-                after and distance[i] < distance[i - 1]
-            )
+        if k - start >= min_points:
+            for i in range(start, k):
+                label[order[i % n]] = clusters
+            a, b = start % n, (k - 1) % n
+            before = neighbours[a] and distance[a - 1] < distance[a]
+            after = neighbours[k % n] and distance[k % n] < distance[b]
+            hidden[clusters] = before or after
             clusters += 1
-        start = i
+        start = k
     return label, hidden[:clusters].copy()

@@ -35,8 +35,10 @@ def match(found: Float, truth: Float, distance_max: float) -> Int:
 def matched_rows(trees: Trees, truth: TruthTrees, distance_max: float) -> tuple[Int, Int]:
     """Rows of `trees` (confirmed ones) and of `truth` (of kind tree) that are the same tree."""
     confirmed = np.flatnonzero(trees.confirmed)
-    stems = np.flatnonzero(np.array([kind == "tree" for kind in truth.kind], np.bool_))
-    position = np.stack([truth.x, truth.y], axis=1)[stems]
+    is_tree = np.array([kind == "tree" for kind in truth.kind], np.bool_)
+    position = np.stack([truth.x, truth.y], axis=1)
     truth_of = match(trees.position[confirmed], position, distance_max)
+    # A pole takes its match too, as in the scores; what is left are trees that are trees.
     good = truth_of >= 0
-    return confirmed[good], stems[truth_of[good]]
+    good[good] = is_tree[truth_of[good]]
+    return confirmed[good], truth_of[good]

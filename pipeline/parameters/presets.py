@@ -35,6 +35,8 @@ _PAPER: dict[str, object] = {
     "detection.arc_min": 0.0,
     "slam.particles": 100,
     "slam.view_range": 0.0,
+    # The centroid's error is the same in each scan from one side; only a step aside brings news.
+    "slam.update_distance": 1.0,
     "detection.sigma_range": 0.1,
     "detection.sigma_bearing": 1.0,
     "gathering.method": "none",

@@ -1,8 +1,8 @@
 """A leaning cylinder through the visible arc of a trunk.
 
 The axis at height z is c + a (z - z0), with z0 the mean height; the residual of a point is its
-distance to the axis minus r. Gauss-Newton with Huber's weights on the residuals divided by the
-sensor's sigma, and weak priors on lean and radius, which keep a short arc from becoming a wall.
+distance to the axis minus r. Gauss-Newton on the residuals divided by their sigma, with robust
+weights, and weak priors on lean and radius, which keep a short arc from becoming a wall.
 """
 
 from __future__ import annotations
@@ -11,15 +11,18 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import Int
+from pipeline.records import Bool, Int
 
-HUBER = 1.5  # sigma
+HUBER, TUKEY = 1.5, 4.7  # sigma
+BARK = 0.004  # m; roughness of a trunk
+MODEL = 0.003  # m; what a round trunk and a normal error leave out
+BEAM = 0.0015  # rad; half a beam's divergence: so far beside the trunk its middle may pass
 PRIOR_RADIUS, PRIOR_RADIUS_SIGMA = 0.15, 0.15  # m; half of the stems of a stand lie within
 PRIOR_LEAN_SIGMA = 0.05  # 3 degrees
 SIGMA_MIN = 0.001  # m; no range is better than that, and weights must stay finite
 MOST_POINTS = 500  # of a cluster enter its fit; more would sharpen what bark and lean blur anyway
-ITERATIONS = 12
-CONVERGED = 1e-4  # m; a hundredth of what the noise allows
+ITERATIONS = 16
+NEARLY, CONVERGED = 5e-3, 3e-4  # m; the latter is a tenth of what the best arc allows
 COLUMNS = 9  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc
 
 
@@ -35,8 +38,8 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
 
     Returns:
         Shape (K, 9): centre x, y; its variances xx, xy, yy; radius; its sigma; standard deviation of
-        the residuals; visible arc [rad]. Below five points the radius is the one that the angular
-        width tells, its sigma NaN, and the centre lies so far behind the points.
+        the residuals; visible arc [rad]. Below five points radius and sigma are NaN, and
+        the centre lies behind the points by the radius that their angular width tells.
     """
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
@@ -48,6 +51,8 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
         _start_from_width(members, azimuth_step, stems[k])
         if members.shape[0] >= 5:
             _fit(members, range_sigma, stems[k])
+        else:
+            stems[k, 5] = np.nan
     return stems
 
 
@@ -85,11 +90,14 @@ def _fit(points: Float, range_sigma: float, stem: Float) -> None:
     n = points.shape[0]
     sigma = max(range_sigma, SIGMA_MIN)
     z0 = points[:, 2].mean()
+    rays = _rays(points, z0)
+    used = np.ones(n, np.bool_)
     p = np.array([stem[0], stem[1], 0.0, 0.0, min(max(stem[5], 0.03), 0.6)])
-    H = np.empty((5, 5))
-    for _ in range(ITERATIONS):
-        g = _normal_equations(points, z0, p, sigma, H)
-        step = np.linalg.solve(H, -g)
+    g, H, step = np.empty(5), np.empty((5, 5)), np.empty(5)
+    scale = 0.0  # Huber's weights first; they need no good start
+    for k in range(ITERATIONS):
+        _normal_equations(rays, used, p, sigma, scale, g, H)
+        _solve(H, g, step)
         # A step longer than the trunk itself would throw the circle to its other side.
         longest = max(abs(step[0]), abs(step[1]), abs(step[4]))
         limit = 0.5 * p[4] + 0.02
@@ -97,50 +105,134 @@ def _fit(points: Float, range_sigma: float, stem: Float) -> None:
             step *= limit / longest
         p += step
         p[4] = max(p[4], 0.005)
-        if longest < CONVERGED:
+        if longest < CONVERGED and scale > 0.0:
             break
-    _normal_equations(points, z0, p, sigma, H)
+        if scale == 0.0 and (longest < NEARLY or k == ITERATIONS // 2):
+            scale = _settle(rays, p, sigma, used)
+    _normal_equations(rays, used, p, sigma, scale, g, H)
     C = np.linalg.inv(H)
     squares = 0.0
     for i in range(n):
-        res = _residual(points, i, z0, p)
+        res, _, _, _ = _residual(rays, i, p, sigma)
         squares += res * res
     deviation = np.sqrt(squares / n)
     # A poor fit knows less than the sensor's sigma promises.
-    inflate = max(1.0, deviation / sigma) ** 2
+    inflate = max(1.0, scale) ** 2
     stem[0], stem[1] = p[0], p[1]
-    stem[2], stem[3], stem[4] = C[0, 0] * inflate, C[0, 1] * inflate, C[1, 1] * inflate
-    stem[5], stem[6] = p[4], np.sqrt(C[4, 4] * inflate)
+    stem[2], stem[4] = C[0, 0] * inflate + MODEL * MODEL, C[1, 1] * inflate + MODEL * MODEL
+    stem[3] = C[0, 1] * inflate
+    stem[5], stem[6] = p[4], np.sqrt(C[4, 4] * inflate + MODEL * MODEL)
     stem[7], stem[8] = deviation, _arc(points, z0, p)
 
 
 @compiled
-def _residual(points: Float, i: int, z0: float, p: Float) -> float:
-    h = points[i, 2] - z0
-    dx, dy = points[i, 0] - p[0] - p[2] * h, points[i, 1] - p[1] - p[3] * h
-    return float(np.sqrt(dx * dx + dy * dy) - p[4])
+def _solve(H: Float, g: Float, step: Float) -> None:
+    """Fill step with -H^-1 g by Cholesky, H positive definite; the library's call costs ten times more."""
+    n = g.shape[0]
+    L = np.empty((5, 5))
+    for a in range(n):
+        for b in range(a + 1):
+            total = H[a, b]
+            for k in range(b):
+                total -= L[a, k] * L[b, k]
+            L[a, b] = np.sqrt(total) if a == b else total / L[b, b]
+    for a in range(n):
+        total = -g[a]
+        for k in range(a):
+            total -= L[a, k] * step[k]
+        step[a] = total / L[a, a]
+    for a in range(n - 1, -1, -1):
+        total = step[a]
+        for k in range(a + 1, n):
+            total -= L[k, a] * step[k]
+        step[a] = total / L[a, a]
 
 
 @compiled
-def _normal_equations(points: Float, z0: float, p: Float, sigma: float, H: Float) -> Float:
-    """Fill H = J^T W J + priors and return the gradient J^T W r + priors, shape (5,)."""
-    g = np.zeros(5)
+def _rays(points: Float, z0: float) -> Float:
+    """Direction x, y, length and height of each point's ray, shape (N, 4)."""
+    rays = np.empty((points.shape[0], 4))
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        reach = max(np.sqrt(x * x + y * y), 1e-9)
+        rays[i, 0], rays[i, 1], rays[i, 2], rays[i, 3] = x / reach, y / reach, reach, points[i, 2] - z0
+    return rays
+
+
+@compiled
+def _residual(rays: Float, i: int, p: Float, sigma: float) -> tuple[float, float, float, float]:
+    """Residual of a point [m], its variance [m^2], sine of the angle phi between its ray and the normal
+    where the ray meets the circle, and how much farther than the axis it lies along the ray [m].
+
+    The residual is the error of the range times cos phi. The normal is taken where the ray meets the
+    circle and not at the point: the point's own normal turns with its error, which draws the circle
+    towards the sensor. A ray whose middle passes beside the circle still returns from it with its
+    edge; farther out it is as wrong as its distance from where it would.
+    """
+    ux, uy, reach, h = rays[i, 0], rays[i, 1], rays[i, 2], rays[i, 3]
+    cx, cy = p[0] + p[2] * h, p[1] + p[3] * h
+    behind, aside = reach - (ux * cx + uy * cy), uy * cx - ux * cy
+    sine = min(max(aside / p[4], -1.0), 1.0)
+    cosine = np.sqrt(1.0 - sine * sine)
+    beam = BEAM * reach
+    beside = abs(aside) - p[4]
+    residual = -cosine * (behind + cosine * p[4]) if beside < 0.0 else max(beside - beam, 0.0)
+    variance = (sigma * cosine) ** 2 + (beam * sine) ** 2 + BARK * BARK
+    return residual, variance, sine, behind
+
+
+@compiled
+def _settle(rays: Float, p: Float, sigma: float, used: Bool) -> float:
+    """Once the circle is nearly found: leave out what lies farther away than the axis, for no beam
+    reaches the back of a trunk; and tell how much larger than its sigma a usual residual is, from
+    their median, at least 1."""
+    size = np.empty(rays.shape[0])
+    farther = 0
+    for i in range(rays.shape[0]):
+        res, variance, _, behind = _residual(rays, i, p, sigma)
+        size[i] = abs(res) / np.sqrt(variance)
+        used[i] = behind <= HUBER * sigma
+        farther += not used[i]
+    if farther > 0.3 * rays.shape[0]:  # these are views from several places
+        used[:] = True
+    return float(max(1.0, np.median(size) / 0.6745))
+
+
+@compiled
+def _normal_equations(
+    rays: Float, used: Bool, p: Float, sigma: float, scale: float, g: Float, H: Float
+) -> None:
+    """Fill H = J^T W J + priors and the gradient g = J^T W r + priors, shapes (5, 5) and (5,).
+
+    With a scale of 0 the weights are Huber's, else Tukey's: what lies far off, as where a beam was
+    split at the trunk's edge, then has no weight at all.
+    """
+    g[:] = 0.0
     H[:] = 0.0
     J = np.empty(5)
-    for i in range(points.shape[0]):
-        h = points[i, 2] - z0
-        dx, dy = points[i, 0] - p[0] - p[2] * h, points[i, 1] - p[1] - p[3] * h
-        d = max(np.sqrt(dx * dx + dy * dy), 1e-9)
-        r = d - p[4]
-        w = 1.0 / (sigma * sigma)
-        if abs(r) > HUBER * sigma:
-            w *= HUBER * sigma / abs(r)
-        J[0], J[1] = -dx / d, -dy / d
+    for i in range(rays.shape[0]):
+        if not used[i]:
+            continue
+        r, variance, sine, _ = _residual(rays, i, p, sigma)
+        if scale == 0.0:
+            # The edges, which are sharp but may be false, count no more than the rest at first.
+            w = min(1.0, HUBER * sigma / max(abs(r), 1e-9)) / (sigma * sigma)
+        else:
+            u2 = r * r / ((TUKEY * scale) ** 2 * variance)
+            if u2 >= 1.0:
+                continue
+            w = (1.0 - u2) ** 2 / variance
+        if abs(sine) == 1.0 and r == 0.0:
+            continue  # within the beam's width of the edge: it says nothing more
+        ux, uy, h = rays[i, 0], rays[i, 1], rays[i, 3]
+        cosine = np.sqrt(1.0 - sine * sine)
+        J[0], J[1] = cosine * ux + sine * uy, cosine * uy - sine * ux  # the normal looks towards us
         J[2], J[3], J[4] = J[0] * h, J[1] * h, -1.0
         for a in range(5):
-            g[a] += w * J[a] * r
+            wJ = w * J[a]
+            g[a] += wJ * r
             for b in range(a, 5):
-                H[a, b] += w * J[a] * J[b]
+                H[a, b] += wJ * J[b]
     for a in range(5):
         for b in range(a):
             H[a, b] = H[b, a]
@@ -153,7 +245,6 @@ def _normal_equations(points: Float, z0: float, p: Float, sigma: float, H: Float
     # The centre has no prior; this only keeps a degenerate cluster solvable (sigma of 10 m).
     H[0, 0] += 0.01
     H[1, 1] += 0.01
-    return g
 
 
 @compiled

@@ -28,11 +28,13 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
     """
     chosen = options or SourceOptions()
     scheme = _SCHEME.match(uri)
-    if scheme is not None and not Path(uri).exists():
-        return _open_scheme(scheme.group(1).lower(), uri, chosen)
-    path = Path(uri).expanduser()
     try:
+        if scheme is not None and not Path(uri).exists():
+            return _open_scheme(scheme.group(1).lower(), uri, chosen)
+        path = Path(uri).expanduser()
         return _opener(path, uri)(uri, path, chosen)
+    except RuntimeError as error:  # a home folder of nobody
+        raise SourceError("there is no such user", where=uri, remedy="Look at the path.") from error
     except (OSError, MemoryError) as error:
         reason = getattr(error, "strerror", None) or "too large for the memory of this machine"
         raise SourceError(

@@ -52,11 +52,12 @@ class Tracker:
         p = self.parameters
         position = T_map_base.apply(detections.centre)
         R = _in_map(detections, T_map_base, pose_covariance)
+        expected, spread = self._predicted(stamp_ns)
         row_of, _ = associate(
             position,
             R[:, [0, 0, 1], [0, 1, 1]],
-            self.tracks.x[:, :2],
-            self.tracks.P[:, [0, 0, 1], [0, 1, 1]],
+            expected,
+            spread,
             p.gate,
             p.distance_max,
         )
@@ -85,6 +86,17 @@ class Tracker:
         t.verdict[len(t) - len(fresh) :] = Verdict.TREE
         standing = t.verdict == Verdict.TREE
         t.score[standing] = np.maximum(t.score[standing], SCORE_STANDING)
+
+    def _predicted(self, stamp_ns: int) -> tuple[Float, Float]:
+        """Where each tree is expected now, shape (T, 2), and its covariance xx, xy, yy, shape (T, 3)."""
+        t = self.tracks
+        dt = ((stamp_ns - t.stamp_ns) * NANOSECONDS)[:, None, None]
+        noise = 0.25 * dt**4 * self.parameters.acceleration_sigma**2 * np.eye(2)
+        P = t.P
+        cross = P[:, :2, 2:] + P[:, 2:, :2]
+        spread = P[:, :2, :2] + dt * cross + dt**2 * P[:, 2:, 2:] + noise
+        expected: Float = t.x[:, :2] + dt[:, :, 0] * t.x[:, 2:]
+        return expected, spread[:, [0, 0, 1], [0, 1, 1]]
 
     def _update(self, rows: Int, stamp_ns: int, z: Float, R: Float) -> None:
         p, t = self.parameters, self.tracks

@@ -45,11 +45,12 @@ function lines(score) {
 }
 
 function nothing() {
+  if (!state.map) return el("p", { class: "empty", text: "Nothing mapped yet. Press play, or open a run." });
   return el("div", { class: "empty" },
     el("p", { text: "This run brings no ground truth, so there is nothing to score the map against. The simulated runs do." }),
     el("button", { text: "Open a simulated run", onclick: openSources }));
 }
 
 export function startScores() {
-  on("evaluation tab", show);
+  on("evaluation truth tab", show);
 }

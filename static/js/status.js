@@ -7,6 +7,7 @@ import { on, state } from "./state.js";
 const WORDS = {
   starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
 };
+const NO_FIGURES = ["starting", "failed"];
 const OLD_AFTER = 3000; // [ms] without a word while a run plays
 
 // name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
@@ -17,7 +18,7 @@ const FIGURES = {
   mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  sigma: ["pose sigma", "cm", (s) => [state.map && s.state !== "failed" ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
+  sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
   f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE]],
 };
 const cells = {};
@@ -37,11 +38,11 @@ function show() {
   const status = state.status;
   if (!status) return;
   for (const [name, [, , read]] of Object.entries(FIGURES)) {
-    const [text, meaning] = read(status);
+    const [text, meaning] = NO_FIGURES.includes(status.state) ? [NONE] : read(status);
     setText(cells[name].value, text);
     cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
   }
-  cells.f1.cell.hidden = !state.evaluation || status.state === "failed";
+  cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   setText(byId("source-name"), shortSource(status.source) || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
   document.title = `${shortSource(status.source)} · stemmap`;

@@ -8,9 +8,10 @@ import { on, state } from "./state.js";
 const ICONS = { play: "M5 3l12 7-12 7z", pause: "M5 3h4v14H5zM12 3h4v14h-4z" };
 let dragging = false, wanted = null, seeking = false;
 
-export const playing = () => ["playing", "starting", "waiting"].includes(state.status?.state);
-export const togglePlay = () => send(playing() ? "pause" : "play");
-export const advance = (scans) => send("advance", { scans });
+export const playing = () => ["playing", "waiting"].includes(state.status?.state);
+const ready = () => playing() || ["paused", "finished"].includes(state.status?.state);
+export const togglePlay = () => ready() && send(playing() ? "pause" : "play");
+export const advance = (scans) => ready() && send("advance", { scans });
 
 async function send(type, fields) {
   try {
@@ -44,6 +45,7 @@ function show() {
     button.setAttribute("aria-label", name === "pause" ? "Pause" : "Play");
     button.querySelector("path").setAttribute("d", ICONS[name]);
   }
+  for (const each of document.querySelectorAll(".buttons button")) each.disabled = !ready();
   const line = byId("timeline");
   line.disabled = !(status.end_s > 0);
   if (!dragging && !seeking) {
@@ -52,7 +54,7 @@ function show() {
     setText(byId("time-now"), clock(status.time_s));
   }
   line.setAttribute("aria-valuetext", clock(Number(line.value)));
-  setText(byId("time-end"), status.end_s === null ? "open end" : clock(status.end_s));
+  setText(byId("time-end"), status.end_s === null && status.scan_index >= 0 ? "open end" : clock(status.end_s));
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(status.speed);
   showWarnings(status.warnings ?? []);

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Playwright, sync_playwright
+from playwright.sync_api import Browser, Playwright, expect, sync_playwright
 
-from tests.browser.dashboard import Dashboard
+from tests.browser.dashboard import PATIENCE_S, Dashboard
 from tests.browser.serving import Server
 
 FLAGS = [
@@ -24,14 +24,23 @@ FLAGS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 ]
-PATIENCE_MS = 60_000
+PATIENCE_MS = 1000 * PATIENCE_S
+expect.set_options(timeout=PATIENCE_MS)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Everything in this folder drives a browser."""
+    """Mark what drives a browser, and let it come last: while Playwright runs, its event loop is the running
+    one of this thread, and a test that is a coroutine could not start.
+    """
     for item in items:
-        if Path(__file__).parent in item.path.parents:
+        if drives_browser(item):
             item.add_marker(pytest.mark.browser)
+    items.sort(key=drives_browser)
+
+
+def drives_browser(item: pytest.Item) -> bool:
+    """Whether a test stands in this folder."""
+    return Path(__file__).parent in item.path.parents
 
 
 @pytest.fixture(scope="session")

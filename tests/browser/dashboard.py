@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any, cast
 
 from playwright.sync_api import ConsoleMessage, Frame, Locator, Page, Response
+
+PATIENCE_S = 60
 
 # What software rendering says of itself is not an error of ours.
 HARMLESS = ("GPU stall", "GL Driver Message", "Automatic fallback to software WebGL")
@@ -35,15 +38,28 @@ class Dashboard:
         answer = self.page.evaluate("path => fetch(path).then(answer => answer.json())", path)
         return cast(dict[str, Any], answer)
 
+    def command(self, command: dict[str, Any]) -> None:
+        """Send a command as the page does."""
+        self.page.evaluate(
+            "body => fetch('/api/command', { method: 'POST', body: JSON.stringify(body),"
+            " headers: { 'Content-Type': 'application/json' } })",
+            command,
+        )
+
     def until(self, function: str, argument: object = None) -> None:
-        """Wait until a function of JavaScript holds in the page; it may be async."""
+        """Wait until a function of JavaScript, not an async one, holds in the page."""
         self.page.wait_for_function(function, arg=argument, polling=200)
 
     def until_server(self, path: str, condition: str) -> None:
         """Wait until a condition in JavaScript holds for `it`, what an address answers."""
-        self.until(
-            f"async path => {{ const it = await (await fetch(path)).json(); return {condition}; }}", path
+        # Not by wait_for_function: it takes the promise of an answer for a yes.
+        test = (
+            f"async path => {{ const it = await (await fetch(path)).json(); return Boolean({condition}); }}"
         )
+        deadline = time.monotonic() + PATIENCE_S
+        while not self.page.evaluate(test, path):
+            assert time.monotonic() < deadline, f"{path} never fulfils {condition}: {self.ask(path)}"
+            self.page.wait_for_timeout(100)
 
     # --- playing ---------------------------------------------------------------------------------
 
@@ -76,8 +92,11 @@ class Dashboard:
     def clusters(self) -> int:
         """How many clusters the standing scan has, as the tab Why says."""
         panel = self.tab("Why")
-        index = self.ask("/api/status")["scan_index"]  # the status comes before the picture of the scan
-        return int(panel.locator(f"[data-scan='{index}']").get_attribute("data-clusters") or -1)
+        # The status comes before the picture of the scan.
+        self.until_server(
+            "/api/status", "it.scan_index === Number(document.querySelector('[data-scan]').dataset.scan)"
+        )
+        return int(panel.locator("[data-clusters]").get_attribute("data-clusters") or -1)
 
     # --- the scene -------------------------------------------------------------------------------
 

@@ -124,12 +124,37 @@ def test_odometry_out_of_order_or_without_numbers_is_left_out_and_counted():
     assert len(step.warnings) == 2
 
 
-def test_a_jump_is_said_and_no_velocity_is_made_of_it():
+def test_a_jump_is_said_and_not_taken_as_motion():
     told = list(steps([odometry(0), at(10), odometry(20, 30.0), at(30), odometry(40, 30.1)]))
     assert "30.0 m" in " ".join(told[0].warnings)
     assert told[0].twist == (0.0, 0.0, 0.0)
     assert pose_of(told[0]).x == 0.0
-    assert pose_of(told[1]).x == pytest.approx(30.05)
+    assert pose_of(told[1]).x == pytest.approx(0.05)
+
+
+def test_a_flip_of_the_heading_is_no_turn_and_motion_goes_on_along_the_old_heading():
+    flipped = [
+        Odometry(START + t * MS, Pose3.from_euler([-x, 0, 0], 0, 0, np.pi)) for t, x in ((20, 0.0), (40, 0.2))
+    ]
+    (step,) = steps([odometry(0), *flipped, at(40)])
+    assert pose_of(step).yaw == pytest.approx(0.0)
+    assert pose_of(step).x == pytest.approx(0.2)
+    assert any("180 degrees" in warning for warning in step.warnings)
+
+
+def test_odometry_that_ends_gives_no_velocity_and_is_said():
+    told = list(steps([odometry(0), odometry(100, 0.1), *(at(t) for t in range(50, 2000, 50))]))
+    assert told[0].twist[0] == pytest.approx(1.0)
+    assert told[-1].twist == (0.0, 0.0, 0.0)
+    assert pose_of(told[-1]).x == pytest.approx(0.1)
+    assert any("no odometry" in warning for warning in told[-1].warnings)
+
+
+def test_a_tilt_of_long_ago_is_not_known_and_is_said():
+    told = list(steps([imu(0, 0.1, 0.0), at(10), at(900)], odometry="static"))
+    assert told[0].tilt_known
+    assert not told[1].tilt_known
+    assert any("no IMU" in warning for warning in told[1].warnings)
 
 
 def test_the_tilt_is_that_of_the_nearest_reading():
