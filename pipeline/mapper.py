@@ -23,6 +23,8 @@ from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
 from pipeline.visibility import clear_range
 
+ALWAYS_GATHERED = 10  # first scans, so that a short recording is judged on all it has
+
 Watch = Callable[[str], AbstractContextManager[None]]
 
 
@@ -137,8 +139,8 @@ class Mapper:
             )
             self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
 
-        columns = None
-        if p.gathering.method == "columns" and terrain is not None and height is not None:
+        columns = self._gathering.columns if p.gathering.method == "columns" else None
+        if columns is not None and self._is_gathered(step.index) and terrain and height is not None:
             with watch("gathering"):
                 steepest = steepest_by_direction(raw, sensor_offset, self._sensor.rings > 0)
                 view = View(estimate.T_map_base, sensor_offset, free, steepest, terrain.height)
@@ -179,6 +181,9 @@ class Mapper:
         if self._parameters.ground.method == "none":
             return None
         return ground.find_terrain(raw, self._parameters.ground)
+
+    def _is_gathered(self, index: int) -> bool:
+        return index < ALWAYS_GATHERED or index % self._parameters.gathering.every == 0
 
     def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
         """The odometry's step since the last scan that had one, and its pose; without any the robot

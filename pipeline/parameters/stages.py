@@ -286,6 +286,14 @@ class Gathering(Stage):
     range_max: float = number(
         25.0, "Gathered within", "m", 1.0, 100.0, 1.0, "Returns farther away are not gathered."
     )
+    every: int = count(
+        4,
+        "Gather every",
+        "scans",
+        1,
+        100,
+        "Of so many scans one is gathered (the first ten all are); the scans between show the same trunks.",
+    )
     voxels_log2: int = count(
         19,
         "Memory",

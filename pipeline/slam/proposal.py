@@ -27,16 +27,26 @@ def rotated(R: Float, c: float, s: float, out: Float) -> None:
 
 
 @compiled
-def innovation(mu: Float, P: Float, z: Float, R: Float, m: Float, Sigma: Float, S: Float, y: Float) -> float:
+def innovation(
+    mu: Float,
+    P: Float,
+    c: float,
+    s: float,
+    z: Float,
+    R: Float,
+    m: Float,
+    Sigma: Float,
+    S: Float,
+    y: Float,
+) -> float:
     """y = m - (position + C(yaw) z) and S = Sigma + C R C^T + J P J^T; returns det S.
 
     Args:
-        mu, P: The pose, shape (3,), and its covariance, shape (3, 3).
+        mu, P: The pose, shape (3,), and its covariance, shape (3, 3); c, s: cosine and sine of its yaw.
         z: Detection in the base frame, shape (2,) [m]; R: shape (2, 2).
         m, Sigma: Landmark, shape (2,), and its covariance xx, xy, yy, shape (3,).
         S, y: Filled: xx, xy, yy and x, y.
     """
-    c, s = np.cos(mu[2]), np.sin(mu[2])
     ax, ay = c * z[0] - s * z[1], s * z[0] + c * z[1]
     rotated(R, c, s, S)
     # J = [I, (-ay, ax)^T]
@@ -48,9 +58,8 @@ def innovation(mu: Float, P: Float, z: Float, R: Float, m: Float, Sigma: Float, 
 
 
 @compiled
-def correct_pose(mu: Float, P: Float, z: Float, S: Float, y: Float) -> None:
+def correct_pose(mu: Float, P: Float, c: float, s: float, z: Float, S: Float, y: Float) -> None:
     """Kalman update of the pose by one landmark, in place; S and y as `innovation` gives them."""
-    c, s = np.cos(mu[2]), np.sin(mu[2])
     ax, ay = c * z[0] - s * z[1], s * z[0] + c * z[1]
     det = S[0] * S[2] - S[1] * S[1]
     PJ = np.empty((3, 2))
@@ -116,7 +125,7 @@ def recognise(
             dx, dy = mean[j, 0] - wx, mean[j, 1] - wy
             if dx * dx + dy * dy > distance_max * distance_max:
                 continue
-            det = innovation(mu, P, centre[d], R[d], mean[j], covariance[j], S, y)
+            det = innovation(mu, P, c, s, centre[d], R[d], mean[j], covariance[j], S, y)
             d2 = (S[2] * y[0] * y[0] - 2.0 * S[1] * y[0] * y[1] + S[0] * y[1] * y[1]) / det
             if d2 > gate * gate:
                 continue
@@ -135,7 +144,7 @@ def recognise(
             d, j = pair[k, 0], pair[k, 1]
             if landmark_of[d] >= 0 or taken[j] or (second[d] - best[d] < AMBIGUOUS) != doubtful:
                 continue
-            det = innovation(mu, P, centre[d], R[d], mean[j], covariance[j], S, y)
+            det = innovation(mu, P, c, s, centre[d], R[d], mean[j], covariance[j], S, y)
             d2 = (S[2] * y[0] * y[0] - 2.0 * S[1] * y[0] * y[1] + S[0] * y[1] * y[1]) / det
             if d2 > gate * gate:
                 continue
@@ -143,12 +152,13 @@ def recognise(
             taken[j] = True
             if hits[j] >= hits_to_weigh:
                 log_likelihood -= 0.5 * (d2 + np.log(det))
-                correct_pose(mu, P, centre[d], S, y)
+                correct_pose(mu, P, c, s, centre[d], S, y)
+                c, s = np.cos(mu[2]), np.sin(mu[2])
     still = np.zeros(3)
     for d in range(detections):
         if landmark_of[d] < 0 or hits[landmark_of[d]] < hits_to_weigh:
             # A new tree is as likely as one at the gate, else particles that recognise nothing win.
-            det = innovation(mu, P, centre[d], R[d], mu[:2], still, S, y)
+            det = innovation(mu, P, c, s, centre[d], R[d], mu[:2], still, S, y)
             log_likelihood -= 0.5 * (gate * gate + np.log(det))
     return log_likelihood
 

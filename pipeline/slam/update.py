@@ -153,8 +153,15 @@ def _predict(pose: Float, motion: Float, covariance: Float, mu: Float, P: Float)
     mu[0] = pose[0] + c * motion[0] - s * motion[1]
     mu[1] = pose[1] + s * motion[0] + c * motion[1]
     mu[2] = pose[2] + motion[2]
-    C = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    P[:] = C @ covariance @ C.T
+    # P = C covariance C^T with the rotation C about z; written out, for the library's product of
+    # such small matrices costs more than all else here.
+    xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+    P[0, 0] = c * c * xx - 2.0 * c * s * xy + s * s * yy
+    P[0, 1] = P[1, 0] = c * s * (xx - yy) + (c * c - s * s) * xy
+    P[1, 1] = s * s * xx + 2.0 * c * s * xy + c * c * yy
+    P[0, 2] = P[2, 0] = c * covariance[0, 2] - s * covariance[1, 2]
+    P[1, 2] = P[2, 1] = s * covariance[0, 2] + c * covariance[1, 2]
+    P[2, 2] = covariance[2, 2]
 
 
 @compiled
