@@ -120,6 +120,7 @@ class Run:
             uri = self.source.description.uri
             raise SourceError("there is no scan in it", where=uri, remedy="Choose another source")
         before = self._mapper.snapshot()
+        self._mapper.parameters = self._history.at(step.index)  # those of other methods compile other code
         self._mapper.process(step)
         self._mapper.restore(before)
         self.stopwatch.clear()

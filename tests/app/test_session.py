@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from app.session import Session
 from pipeline.errors import SourceError
 from pipeline.parameters import Parameters
-from pipeline.records import Frame
+from pipeline.records import Frame, Step
 from tests.app.fakes import PERIOD_NS, START_NS, FakeMapper, FakeSource, make_session, scan
 
 SCANS = 130  # more than two kept states
@@ -393,6 +393,21 @@ def test_preparing_leaves_no_trace() -> None:
     session.advance(3)
     settle(session)
     assert checksum(session) == played({}, 2)
+
+
+def test_preparing_maps_with_the_parameters_of_the_first_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[float] = []
+    process = FakeMapper.process
+
+    def remember(self: FakeMapper, step: Step) -> Frame:
+        used.append(self.parameters.clustering.eps)
+        return process(self, step)
+
+    monkeypatch.setattr(FakeMapper, "process", remember)
+    session = opened()
+    session.set_parameters(parameters(0.7), 1)
+    session.prepare()
+    assert used == [0.7]
 
 
 def test_a_source_without_a_scan_cannot_be_prepared() -> None:
