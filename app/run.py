@@ -129,6 +129,10 @@ class Run:
         """The scan shown at a time; None when it was not read yet."""
         return self._cursor.index_at(stamp_ns)
 
+    def stamp_ns(self, index: int) -> int:
+        """Time of a scan that was read before."""
+        return self._cursor.stamp_ns(index)
+
     @property
     def known(self) -> int:
         """How many scans were read so far."""
