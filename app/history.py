@@ -4,7 +4,11 @@ in force from which scan on."""
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from typing import Generic, TypeVar
+
+import numpy as np
 
 from pipeline.parameters import Parameters
 
@@ -12,17 +16,32 @@ S = TypeVar("S")
 
 _SPACING = 50
 _MOST_STATES = 40
+_MOST_BYTES = 256 << 20
+
+
+def nbytes(state: object) -> int:
+    """Bytes of the arrays in a state: a dataclass of arrays and of such dataclasses."""
+    if isinstance(state, np.ndarray):
+        return state.nbytes
+    if is_dataclass(state):
+        return sum(nbytes(getattr(state, field.name)) for field in fields(state))
+    return 0
 
 
 class Snapshots(Generic[S]):
     """States of the mapper by the number of scans they hold (0: before the first).
 
-    At most 40 are kept: when there are more, every second goes and the spacing doubles, so that a run
-    of any length takes the same memory.
+    At most 40 are kept, and at most 256 MB of them: when there is more, every second goes and the spacing
+    doubles, so that a run of any length takes the same memory. The first always stays.
+
+    Args:
+        start: The state before the first scan.
+        size_of: Bytes that a state takes.
     """
 
-    def __init__(self, start: S) -> None:
+    def __init__(self, start: S, size_of: Callable[[S], int] = nbytes) -> None:
         self._states: dict[int, S] = {0: start}
+        self._size_of = size_of
         self._spacing = _SPACING
 
     def offer(self, scans: int, state: S) -> None:
@@ -30,9 +49,14 @@ class Snapshots(Generic[S]):
         if scans % self._spacing or scans in self._states:
             return
         self._states[scans] = state
-        if len(self._states) > _MOST_STATES:
+        while len(self._states) > 1 and self._are_too_many():
             self._spacing *= 2
             self._states = {n: s for n, s in self._states.items() if n % self._spacing == 0}
+
+    def _are_too_many(self) -> bool:
+        if len(self._states) > _MOST_STATES:
+            return True
+        return sum(self._size_of(state) for state in self._states.values()) > _MOST_BYTES
 
     def newest(self, scans: int) -> tuple[int, S]:
         """The newest state that holds at most so many scans, with its number of scans."""

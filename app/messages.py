@@ -37,6 +37,7 @@ class Status:
         health: "good", "weak" or "lost".
         warnings: The newest last, each once.
         revision: Of the parameters in force.
+        going_to: The sought time or scan in words while it is not reached yet, else empty.
     """
 
     state: State
@@ -57,6 +58,7 @@ class Status:
     health: str = "good"
     warnings: list[str] = field(default_factory=list)
     revision: int = 0
+    going_to: str = ""
 
 
 class Play(msgspec.Struct, frozen=True, tag="play"):

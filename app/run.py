@@ -120,6 +120,7 @@ class Run:
             uri = self.source.description.uri
             raise SourceError("there is no scan in it", where=uri, remedy="Choose another source")
         before = self._mapper.snapshot()
+        self._mapper.parameters = self._history.at(step.index)  # those of other methods compile other code
         self._mapper.process(step)
         self._mapper.restore(before)
         self.stopwatch.clear()
@@ -127,6 +128,10 @@ class Run:
     def index_at(self, stamp_ns: int) -> int | None:
         """The scan shown at a time; None when it was not read yet."""
         return self._cursor.index_at(stamp_ns)
+
+    def stamp_ns(self, index: int) -> int:
+        """Time of a scan that was read before."""
+        return self._cursor.stamp_ns(index)
 
     @property
     def known(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import signal
 import socket
@@ -25,6 +26,8 @@ _PORTS_TRIED = 10
 # Less waits in the kernel for a browser behind a slow radio link; what waits is old when it arrives.
 _SEND_BUFFER = 128 * 1024
 _GRACE_S = 1
+_OF_THE_PORT = (errno.EADDRINUSE, errno.EACCES)
+_OTHER_HOST = "Give an address of this machine with --host, or leave it away"
 
 
 def serve(settings: Settings, *, source: Open, parameter_state: ParameterState, open_browser: bool) -> int:
@@ -71,16 +74,23 @@ def bind(settings: Settings) -> socket.socket:
     for port in ports:
         try:
             listening = _bound(settings.host, port)
+        except socket.gaierror as error:
+            raise StemmapError(
+                f"no address is known by this name: {error.strerror}",
+                where=settings.host,
+                remedy=_OTHER_HOST,
+            ) from None
         except OSError as error:
             reason = error
             continue
         if port != first:
             print(f"Port {first} is in use; {port} is taken instead.", flush=True)  # noqa: T201
         return listening
+    other_port = "Give another port with --port, or 0 for any free one"
     raise StemmapError(
         f"cannot listen: {(reason.strerror or str(reason)).lower()}",
         where=f"{settings.host}:{first}",
-        remedy="Give another port with --port, or 0 for any free one",
+        remedy=other_port if reason.errno in _OF_THE_PORT else _OTHER_HOST,
     )
 
 

@@ -10,10 +10,12 @@ from typing import Literal
 
 from app.cursor import Synchroniser
 from app.messages import LONGEST_S, State, Status
+from app.odometry import odometry_warnings
 from app.run import MakeMapper, Run
-from app.session_status import describe
+from app.session_status import clock, describe
 from app.stopwatch import Stopwatch
 from app.worker_messages import Opened
+from pipeline.errors import SourceError
 from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path
 from pipeline.sources.base import Source
@@ -100,11 +102,16 @@ class Session:
         self._asked = (uri, odometry, seed)
         synchronise = self._make_synchroniser(odometry)
         source = self._open_source(uri, seed)
+        try:
+            warnings = odometry_warnings(source.description, odometry)
+        except SourceError:
+            source.close()
+            raise
         stopwatch = Stopwatch()
         mapper = self._make_mapper(source, self._parameters, seed, stopwatch)
         self._run = Run(source, mapper, synchronise, self._parameters, stopwatch)
         self._state, self._detail = "paused", ""
-        self._warn(source.description.warnings)
+        self._warn((*source.description.warnings, *warnings))
         return _opened(self._run)
 
     def prepare(self) -> None:
@@ -212,6 +219,7 @@ class Session:
             time_s=self.time_s,
             warnings=tuple(self._warnings),
             revision=self._revision,
+            going_to=self._going_to(),
         )
 
     def close(self) -> None:
@@ -221,6 +229,17 @@ class Session:
     @property
     def _seeking(self) -> bool:
         return self._target_index is not None or self._target_ns is not None
+
+    def _going_to(self) -> str:
+        """The sought scan in words; empty when none is."""
+        run = self._run
+        if run is None or not self._seeking:
+            return ""
+        if self._target_ns is not None:
+            return clock((self._target_ns - run.start_ns) / _NS)
+        if self._target_index is not None and self._target_index < run.known:
+            return clock((run.stamp_ns(self._target_index) - run.start_ns) / _NS)
+        return f"scan {self._target_index}"
 
     def _settle(self) -> None:
         self._state, self._detail = "paused", ""

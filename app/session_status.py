@@ -23,6 +23,7 @@ def describe(
     time_s: float,
     warnings: tuple[str, ...],
     revision: int,
+    going_to: str,
 ) -> Status:
     """The status of a run, or of none; speed, rate and lateness are the driver's to fill in."""
     if run is None:
@@ -46,7 +47,14 @@ def describe(
         health="good" if frame is None else health(frame),
         warnings=list(warnings + losses),
         revision=revision,
+        going_to=going_to,
     )
+
+
+def clock(seconds: float) -> str:
+    """A time as the page writes it: minutes and seconds."""
+    whole = int(seconds)
+    return f"{whole // 60}:{whole % 60:02d}"
 
 
 def distance_driven(path: Path) -> float:

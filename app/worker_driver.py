@@ -61,6 +61,7 @@ class Driver:
         self._prepared = False
         self._reported: tuple[Status, float] | None = None
         self._glimpse_at = 0.0
+        self._long_way_at = 0.0
 
     def run(self) -> None:
         """Work until None comes as a command."""
@@ -121,7 +122,7 @@ class Driver:
 
     def _obey(self, command: ToWorker) -> None:
         self._pacer.release()
-        self._glimpse_at = self._clock() + _GLIMPSE_S
+        self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
         self._guarded(lambda: self._carry_out(command))
         self._report()
 
@@ -192,8 +193,11 @@ class Driver:
     def _report(self) -> None:
         now = self._clock()
         playing = self._session.pace == "replay"
+        status = self._session.status()
+        if status.going_to and now >= self._long_way_at:  # a short way would only flicker
+            status = replace(status, detail=f"Going to {status.going_to} …")
         status = replace(
-            self._session.status(),
+            status,
             speed=self._pacer.speed,
             scan_rate_hz=round(self._pacer.rate_hz, 2) if playing else 0.0,
             scans_behind=self._pacer.behind(now) if playing else 0,

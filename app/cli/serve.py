@@ -6,7 +6,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from app.cli.choices import SOURCE_HELP, add_parameter_flags, add_run_flags, chosen_parameters
+from app.cli.choices import SOURCE_HELP, add_parameter_flags, add_run_flags, chosen_parameters, source
 from app.settings import DEFAULT_PORT, VARIABLES, from_environment
 from pipeline.errors import SourceError
 
@@ -20,6 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         metavar="SOURCE",
+        type=source,
         nargs="?",
         default=_DEFAULT_SOURCE,
         help=f"{SOURCE_HELP} (default: {_DEFAULT_SOURCE})",
@@ -65,15 +66,22 @@ def run(arguments: argparse.Namespace) -> int:
     )
 
 
-def _look_for(source: str) -> None:
+def _look_for(uri: str) -> None:
     """Say at once that a file is missing; what is in it, the worker finds out."""
-    if Path(source).expanduser().exists():
+    if _exists(uri):
         return
-    scheme, colon, _ = source.partition(":")
+    scheme, colon, _ = uri.partition(":")
     if not colon or "/" in scheme or len(scheme) == 1:  # C:\run.mcap has a drive, not a scheme
         raise SourceError(
-            "there is no such file or folder", where=source, remedy="Simulated runs begin with sim:"
+            "there is no such file or folder", where=uri, remedy="Simulated runs begin with sim:"
         )
+
+
+def _exists(path: str) -> bool:
+    try:
+        return Path(path).expanduser().exists()
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: a home of nobody
+        return False
 
 
 def _port(text: str) -> int:

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from app.cli.choices import seed
+
 if TYPE_CHECKING:
     from pipeline.records import Record
     from pipeline.sources.simulated import SimulatedSource
@@ -24,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", required=True, type=_mcap, metavar="RUN.mcap", help="the file to write")
     parser.add_argument(
-        "--seed", type=int, metavar="N", help="of everything random in the run; 0 if not given"
+        "--seed", type=seed, metavar="N", help="of everything random in the run; 0 if not given"
     )
     parser.add_argument("--duration", type=float, metavar="S", help="length of the run in seconds")
     parser.add_argument("--force", action="store_true", help="overwrite files that are there already")

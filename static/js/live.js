@@ -11,7 +11,7 @@ const takers = {
   map(message) { takeMap(message); },
   parameters(message) { state.parameters = message; },
   truth(message) { state.truth = message.trees ?? null; },
-  evaluation(message) { state.evaluation = "evaluation" in message ? message.evaluation : (message.TA ? message : null); },
+  evaluation(message) { state.evaluation = message.TA ? message : null; },
   selection(message) { state.selected = message.tree ?? null; },
 };
 

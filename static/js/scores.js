@@ -9,21 +9,21 @@ import { visible } from "./tabs.js";
 const RATES = {
   TA: "TA  trees found", FR: "FR  trees missed", TR: "TR  others left out", FA: "FA  others taken for trees",
 };
-const first = (score, ...names) => names.map((name) => score[name]).find((value) => value !== undefined) ?? null;
-const centimetres = (metres) => (metres === null ? NONE : `${figure(100 * metres)} cm`);
+const centimetres = (value) => (value === null ? NONE : `${figure(value)} cm`);
+const inCentimetres = (metres) => (metres === null ? NONE : centimetres(100 * metres));
 const percentOf = (value) => (value === null ? NONE : `${figure(value)} %`);
 
 const LINES = [
   ["completeness", (s) => percent(s.completeness)],
   ["correctness", (s) => percent(s.correctness)],
   ["F1", (s) => figure(s.f1)],
-  ["trees where nothing stands", (s) => String(first(s, "spurious") ?? NONE)],
-  ["position RMSE", (s) => centimetres(first(s, "position_rmse_m", "position_rmse"))],
-  ["position bias", (s) => centimetres(first(s, "position_bias_m", "position_bias"))],
-  ["DBH RMSE", (s) => centimetres(first(s, "dbh_rmse_m", "dbh_rmse"))],
-  ["DBH bias", (s) => centimetres(first(s, "dbh_bias_m", "dbh_bias"))],
-  ["mean error of pair distances", (s) => percentOf(first(s, "mean_pair_error_percent"))],
-  ["largest error of pair distances", (s) => percentOf(first(s, "largest_pair_error_percent"))],
+  ["trees where nothing stands", (s) => String(s.spurious)],
+  ["position RMSE", (s) => inCentimetres(s.position_rmse_m)],
+  ["position bias", (s) => inCentimetres(s.position_bias_m)],
+  ["DBH RMSE", (s) => centimetres(s.dbh_rmse_cm)],
+  ["DBH bias", (s) => centimetres(s.dbh_bias_cm)],
+  ["mean error of pair distances", (s) => percentOf(s.mean_pair_error_percent)],
+  ["largest error of pair distances", (s) => percentOf(s.largest_pair_error_percent)],
 ];
 
 function show() {

@@ -12,8 +12,8 @@ const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2));
 // key, title, tooltip, text, what it is sorted by
 const COLUMNS = [
   ["number", "tree", "Number of the tree", (t) => String(t.number), (t) => t.number],
-  ["x", "x m", "East of the start", (t) => fixed(t.x, 2), (t) => t.x],
-  ["y", "y m", "North of the start", (t) => fixed(t.y, 2), (t) => t.y],
+  ["x", "x m", "Along the first heading, from the start", (t) => fixed(t.x, 2), (t) => t.x],
+  ["y", "y m", "To the left of the first heading, from the start", (t) => fixed(t.y, 2), (t) => t.y],
   ["sigma", "± cm", "Standard deviation of the position", (t) => figure(sigma(t), 2), sigma],
   ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm ?? -1],
   ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.history import ParameterHistory, Snapshots
+from app.history import ParameterHistory, Snapshots, nbytes
 from pipeline.parameters import Parameters
 
 SETS = [Parameters().replace({"clustering.eps": eps}) for eps in (0.1, 0.2, 0.3)]
@@ -20,6 +20,35 @@ def test_states_stay_few_and_evenly_spread_however_long_the_run() -> None:
     gaps = {b - a for a, b in zip(sorted(held), sorted(held)[1:], strict=False)}
     assert len(gaps) == 1
     assert gaps.pop() <= 20_000 / 15
+
+
+def test_large_states_are_fewer_and_the_first_stays() -> None:
+    megabyte = 1 << 20
+    kept: Snapshots[int] = Snapshots(0, lambda scans: scans * megabyte // 50)  # grows: 1 MB every 50 scans
+    for scans in range(10_001):
+        kept.offer(scans, scans)
+        held = {kept.newest(n)[0] for n in range(0, scans + 1, 50)}
+        assert sum(n // 50 for n in held) <= 256
+        assert 0 in held
+    assert len(held) > 1
+
+
+def test_a_state_beyond_all_bounds_is_not_kept_and_harms_nothing() -> None:
+    kept: Snapshots[int] = Snapshots(0, lambda scans: scans << 40)
+    for scans in range(2001):
+        kept.offer(scans, scans)
+    assert kept.newest(2000) == (0, 0)
+
+
+def test_the_bytes_of_the_mappers_state_are_those_of_its_arrays() -> None:
+    from pipeline.geometry import Pose3
+    from pipeline.mapper import Mapper
+    from pipeline.records import Sensor
+
+    state = Mapper(Parameters(), sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0).snapshot()
+    slam = state.slam
+    least = slam.pose.nbytes + slam.mean.nbytes + slam.covariance.nbytes
+    assert least < nbytes(state) < 2 * least
 
 
 @given(st.integers(0, 500), st.integers(0, 500))

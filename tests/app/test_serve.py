@@ -178,7 +178,11 @@ async def ended(*words: str) -> tuple[int | None, str]:
         (["serve", "--port", "x"], 2, "not a port"),
         (["serve", "--preset", "best"], 2, "no preset 'best'"),
         (["serve", "--set", "clustering.eps=99"], 2, "clustering.eps"),
-        (["serve", "--host", "203.0.113.9", "--port", "0"], 1, "cannot listen"),
+        (["serve", "--host", "203.0.113.9", "--port", "0"], 1, "an address of this machine with --host"),
+        (["serve", "--host", "no.such.host.invalid"], 1, "with --host"),
+        (["serve", "~nobody-of-this-name/x"], 1, "no such file or folder (~nobody-of-this-name/x)"),
+        (["serve", ""], 2, "the source is empty"),
+        (["simulate", "stand", "--out", "never.mcap", "--seed", "-1"], 2, "'-1' is not a whole number"),
     ],
 )
 async def test_a_wrong_start_is_one_line(words: list[str], code: int, said: str) -> None:

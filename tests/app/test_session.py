@@ -4,7 +4,7 @@ scan was mapped with, and on nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 from hypothesis import given, settings
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from app.session import Session
 from pipeline.errors import SourceError
 from pipeline.parameters import Parameters
-from pipeline.records import Frame
+from pipeline.records import Frame, Step
 from tests.app.fakes import PERIOD_NS, START_NS, FakeMapper, FakeSource, make_session, scan
 
 SCANS = 130  # more than two kept states
@@ -352,6 +352,35 @@ def test_a_seek_after_a_fault_starts_from_a_sound_state() -> None:
     assert checksum(session) == played({}, 10)
 
 
+def test_the_status_says_where_a_seek_goes_until_it_is_there() -> None:
+    session = opened()
+    session.seek(6.55)
+    assert session.status().going_to == "0:06"
+    session.work()
+    assert (session.status().state, session.status().going_to) == ("paused", "0:06")
+    settle(session)
+    assert session.status().going_to == ""
+    session.advance(-55)
+    assert session.status().going_to == "0:01"
+    session.advance(100)
+    assert session.status().going_to == "scan 110"
+    settle(session)
+    assert session.status().going_to == ""
+
+
+def test_what_the_odometry_means_is_a_warning_or_a_failure() -> None:
+    source = FakeSource(5)
+    session = make_session(source)
+    session.open("fake:", "static", 0)
+    assert ["static" in warning for warning in session.status().warnings] == [True]
+    source.description = replace(source.description, has_odometry=False)
+    session.open("fake:", "auto", 0)
+    assert ["no odometry" in warning for warning in session.status().warnings] == [True]
+    with pytest.raises(SourceError, match="no odometry"):
+        session.open("fake:", "wheels", 0)
+    assert source.closed
+
+
 def test_opening_another_source_closes_the_first() -> None:
     source = FakeSource(5)
     session = make_session(source)
@@ -393,6 +422,21 @@ def test_preparing_leaves_no_trace() -> None:
     session.advance(3)
     settle(session)
     assert checksum(session) == played({}, 2)
+
+
+def test_preparing_maps_with_the_parameters_of_the_first_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[float] = []
+    process = FakeMapper.process
+
+    def remember(self: FakeMapper, step: Step) -> Frame:
+        used.append(self.parameters.clustering.eps)
+        return process(self, step)
+
+    monkeypatch.setattr(FakeMapper, "process", remember)
+    session = opened()
+    session.set_parameters(parameters(0.7), 1)
+    session.prepare()
+    assert used == [0.7]
 
 
 def test_a_source_without_a_scan_cannot_be_prepared() -> None:

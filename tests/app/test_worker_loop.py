@@ -112,6 +112,15 @@ def test_a_sought_scan_is_shown() -> None:
     assert last_status(said).state == "paused"
 
 
+def test_on_a_long_way_the_status_says_where_it_goes() -> None:
+    said = driven(FakeSource(900), Open("fake:"), Seek(85.0))
+    on_the_way = [m.status for m in said if isinstance(m, Report) and m.status.detail.startswith("Going")]
+    assert {status.detail for status in on_the_way} == {"Going to 1:25 …"}
+    assert (last_status(said).detail, last_status(said).going_to) == ("", "")
+    said = driven(FakeSource(90), Open("fake:"), Advance(3))
+    assert not [m for m in said if isinstance(m, Report) and m.status.detail.startswith("Going")]
+
+
 def test_a_change_shows_the_standing_scan_again() -> None:
     other = Parameters().replace({"clustering.eps": 0.9})
     said = driven(FakeSource(9), Open("fake:"), Advance(2), SetParameters(other.model_dump(), 8))

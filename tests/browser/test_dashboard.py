@@ -203,6 +203,29 @@ def test_scores_come_with_their_counts(dashboard: Dashboard):
     )
 
 
+def test_scores_are_shown_in_centimetres(dashboard: Dashboard):
+    panel = dashboard.tab("Scores")
+    expect(panel.locator("dl.list")).to_be_visible()
+    score = dashboard.ask("/api/evaluation")
+    for title, centimetres in {
+        "DBH RMSE": score["dbh_rmse_cm"],
+        "DBH bias": score["dbh_bias_cm"],
+        "position RMSE": 100 * score["position_rmse_m"],
+        "position bias": 100 * score["position_bias_m"],
+    }.items():
+        text = panel.locator("dt", has_text=title).locator("+ dd").inner_text()
+        figure, unit = text.split()
+        assert unit == "cm"
+        assert float(figure) == pytest.approx(centimetres, rel=0.01), title
+
+
+def test_the_columns_say_which_way_the_axes_point(dashboard: Dashboard):
+    dashboard.tab("Trees")
+    for key, words in {"x": "Along the first heading", "y": "left of the first heading"}.items():
+        button = dashboard.page.locator(f"#trees th[data-key={key}] button")
+        assert words in (button.get_attribute("title") or "")
+
+
 @pytest.mark.parametrize("choice", ["distance", "error", "time", "n_eff"])
 def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
     dashboard.tab("Plots")
