@@ -1,8 +1,9 @@
 """Who may talk to the server: the holder of the token, by a name that we know, from our own page.
 
-The link that is printed at the start carries the token once; the answer puts it in a cookie that
-scripts cannot read and other sites do not send. Host is checked against names rebound to this machine,
-Origin against pages of other servers (another port is another origin, but not another site).
+The link that is printed at the start carries the token once; the answer sets a cookie that scripts
+cannot read, that other sites do not send with what they ask for, and that ends with the browser. Host
+is checked against names rebound to this machine, Origin against pages of other servers (another port
+is another origin, but not another site).
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ from pipeline.errors import StemmapError
 _SAFE_METHODS = frozenset({"GET", "HEAD"})
 _LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 _ANY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - compared with, not bound to
-_COOKIE_AGE_S = 30 * 24 * 3600
 
 _LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
 <style>body{font:1.1rem/1.6 system-ui,sans-serif;max-width:36rem;margin:15vh auto;padding:0 1.5rem}</style>
@@ -38,6 +38,13 @@ It changes at every start.</p></html>"""
 def new_token() -> str:
     """A token that nobody guesses."""
     return secrets.token_urlsafe(24)
+
+
+def session_value(token: str, port: int) -> str:
+    """What the cookie holds: of its own, so that whoever reads it (browsers send it to every port of this
+    machine) has not got the token. It is the same after a restart with the same token, so that an open
+    page finds its server again."""
+    return hmac.new(token.encode(), f"stemmap cookie {port}".encode(), "sha256").hexdigest()
 
 
 def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozenset[str]:
@@ -71,6 +78,7 @@ class Guard:
     ) -> None:
         self._app = app
         self._token = token
+        self._session = session_value(token, port)
         self._port = port
         self._hosts = allowed_hosts(host, port, further_hosts)
         self._any_address = host in _ANY_ADDRESS
@@ -122,9 +130,8 @@ class Guard:
         reply = RedirectResponse("/" + (f"?{urlencode(query)}" if query else ""), 303)
         reply.headers["Cache-Control"] = "no-store"
         reply.headers["Referrer-Policy"] = "no-referrer"
-        reply.set_cookie(
-            self.cookie, self._token, max_age=_COOKIE_AGE_S, path="/", httponly=True, samesite="strict"
-        )
+        # Not "strict": after a link in another page or in a file it would not be sent.
+        reply.set_cookie(self.cookie, self._session, path="/", httponly=True, samesite="lax")
         return reply
 
     def _knows_host(self, headers: Headers) -> bool:
@@ -153,7 +160,7 @@ class Guard:
     def _has_cookie(self, headers: Headers) -> bool:
         # Several cookies of one name can be sent; one of another path must not hide ours.
         return any(
-            self._is_token(value)
+            _same(value, self._session)
             for line in headers.getlist("cookie")
             for part in line.split(";")
             if (value := _cookie_value(part, self.cookie)) is not None
@@ -164,7 +171,11 @@ class Guard:
         return scheme.lower() == "bearer" and self._is_token(given.strip())
 
     def _is_token(self, given: str) -> bool:
-        return hmac.compare_digest(given.encode("utf-8", "replace"), self._token.encode())
+        return _same(given, self._token)
+
+
+def _same(given: str, secret: str) -> bool:
+    return hmac.compare_digest(given.encode("utf-8", "replace"), secret.encode())
 
 
 def _cookie_value(part: str, name: str) -> str | None:

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 import uvicorn
 from starlette.types import ASGIApp
 
+from app.first_page import page_that_leads_to, show_in_browser
 from app.messages import Open
 from app.parameter_state import ParameterState
 from app.security import new_token
@@ -117,6 +118,7 @@ class _Server(uvicorn.Server):
         self._settings = settings
         self._link = link
         self._open_browser = open_browser
+        self._until_the_end = contextlib.ExitStack()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start, then print the link."""
@@ -129,7 +131,13 @@ class _Server(uvicorn.Server):
             )
         print(f"stemmap is ready: {self._link}", flush=True)  # noqa: T201
         if self._open_browser and _has_display():
-            threading.Thread(target=_open, args=(self._link,), daemon=True).start()
+            page = self._until_the_end.enter_context(page_that_leads_to(self._link))
+            threading.Thread(target=show_in_browser, args=(page,), daemon=True).start()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End, and leave no file behind."""
+        self._until_the_end.close()
+        await super().shutdown(sockets)
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -140,13 +148,6 @@ class _Server(uvicorn.Server):
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def _open(link: str) -> None:
-    import webbrowser
-
-    with contextlib.suppress(webbrowser.Error):
-        webbrowser.open(link)
 
 
 def _has_display() -> bool:

@@ -14,6 +14,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from app.dashboard import Dashboard
 from app.messages import Open
 from app.parameter_state import ParameterState
+from app.security import session_value
 from app.server import ROUTERS, build
 from app.serving import bind, uvicorn_config
 from app.settings import Settings
@@ -23,7 +24,7 @@ PORT = 8765
 HOST = f"127.0.0.1:{PORT}"
 TOKEN = "a-token-for-the-tests-only"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
-COOKIE = {"Cookie": f"stemmap_{PORT}={TOKEN}"}
+COOKIE = {"Cookie": f"stemmap_{PORT}={session_value(TOKEN, PORT)}"}
 
 
 def build_app(

@@ -14,7 +14,7 @@ import pytest_asyncio
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 
-from app.security import Guard, allowed_hosts, new_token
+from app.security import Guard, allowed_hosts, new_token, session_value
 from tests.app.server_for_tests import BEARER, COOKIE, HOST, PORT, TOKEN, build_app, routes, running, served
 
 ROUTES = [
@@ -40,6 +40,7 @@ ROUTES = [
     ("GET", "/no/such/route"),
 ]
 MISSES = {("GET", "/static/index.html"), ("GET", "/static/no-such-file.js")}
+SESSION = session_value(TOKEN, PORT)
 SOCKETS = ["/api/live", "/viser", "/viser/"]
 
 
@@ -60,10 +61,13 @@ async def test_nobody_without_the_token(client: httpx.AsyncClient, method: str, 
     for headers in (
         {},
         {"Cookie": f"stemmap_{PORT}=wrong"},
-        {"Cookie": f"stemmap_{PORT + 1}={TOKEN}"},
+        {"Cookie": f"stemmap_{PORT}={TOKEN}"},
+        {"Cookie": f"stemmap_{PORT + 1}={SESSION}"},
+        {"Cookie": f"stemmap_{PORT}={session_value(TOKEN, PORT + 1)}"},
+        {"Authorization": f"Bearer {SESSION}"},
         {"Authorization": "Bearer wrong"},
         {"Authorization": f"Basic {TOKEN}"},
-        {"Cookie": f"stemmap_{PORT}={TOKEN}x"},
+        {"Cookie": f"stemmap_{PORT}={SESSION}x"},
         {"Cookie": f"stemmap_{PORT}="},
     ):
         answer = await client.request(method, path, headers=headers)
@@ -131,8 +135,10 @@ async def test_the_link_becomes_a_cookie_and_a_clean_address(client: httpx.Async
     assert answer.status_code == 303
     assert answer.headers["location"] == "/?view=top"
     cookie = answer.headers["set-cookie"]
-    for part in (f"stemmap_{PORT}={TOKEN}", "HttpOnly", "SameSite=strict", "Path=/"):
+    for part in (f"stemmap_{PORT}={SESSION}", "HttpOnly", "SameSite=lax", "Path=/"):
         assert part in cookie
+    for part in ("Max-Age", "expires", TOKEN):  # it ends with the browser, and does not give the token away
+        assert part not in cookie
     assert answer.headers["referrer-policy"] == "no-referrer"
     assert TOKEN not in answer.text
     assert (await client.get("/", headers={"Cookie": cookie.split(";")[0]})).status_code == 200
@@ -150,7 +156,7 @@ async def test_a_person_without_a_token_reads_what_to_do(client: httpx.AsyncClie
 
 
 async def test_our_cookie_is_found_among_others(client: httpx.AsyncClient) -> None:
-    line = f"a=b; odd name=1; stemmap_{PORT}=old; stemmap_{PORT}={TOKEN}"
+    line = f"a=b; odd name=1; stemmap_{PORT}=old; stemmap_{PORT}={SESSION}"
     assert (await client.get("/api/status", headers={"Cookie": line})).status_code == 200
 
 
@@ -186,7 +192,8 @@ async def test_a_large_body_is_refused_with_and_without_its_length(client: httpx
 async def test_a_websocket_needs_the_token_and_our_page(path: str) -> None:
     async with served() as (host, _):
         port = host.rpartition(":")[2]
-        ours, cookie = {"Origin": f"http://{host}"}, {"Cookie": f"stemmap_{port}={TOKEN}"}
+        ours = {"Origin": f"http://{host}"}
+        cookie = {"Cookie": f"stemmap_{port}={session_value(TOKEN, int(port))}"}
         refusals: list[tuple[dict[str, str], int]] = [
             ({}, 403),
             (ours, 401),
@@ -210,7 +217,10 @@ async def test_a_websocket_needs_the_token_and_our_page(path: str) -> None:
 async def test_a_websocket_of_our_page_is_accepted() -> None:
     async with served() as (host, _):
         port = host.rpartition(":")[2]
-        by_cookie = {"Cookie": f"stemmap_{port}={TOKEN}", "Origin": f"http://{host}"}
+        by_cookie = {
+            "Cookie": f"stemmap_{port}={session_value(TOKEN, int(port))}",
+            "Origin": f"http://{host}",
+        }
         for headers in (BEARER, by_cookie):
             async with connect(f"ws://{host}/api/live", additional_headers=headers, proxy=None) as live:
                 first = json.loads(await live.recv())

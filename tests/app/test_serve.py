@@ -202,6 +202,43 @@ async def test_a_port_in_use_is_one_line() -> None:
     assert len(errors.strip().splitlines()) == 1
 
 
+async def test_the_browser_is_started_without_the_token_and_no_file_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A browser of our own writes down what it was called with, and what it read there."""
+    seen = tmp_path / "seen"
+    browser = tmp_path / "browser"
+    browser.write_text(
+        "#!/bin/sh\n"
+        f'file="${{1#file://}}"\necho "$1" > {seen}.new\nstat -c %a "$file" >> {seen}.new\n'
+        f'cat "$file" >> {seen}.new\nmv {seen}.new {seen}\n'
+    )
+    browser.chmod(0o755)
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setenv("BROWSER", str(browser))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    process = await start("serve", "--port", "0", "sim:stand?duration=20")
+    try:
+        assert process.stdout is not None
+        async with asyncio.timeout(60):
+            found = LINK.match((await process.stdout.readline()).decode())
+            while not seen.exists():
+                await asyncio.sleep(0.05)
+        assert found
+        address, rights, page = seen.read_text().split("\n", 2)
+        assert found[3] not in address
+        assert rights == "600"
+        assert f"url={found[1]}?token={found[3]}" in page
+        process.send_signal(signal.SIGTERM)
+        async with asyncio.timeout(20):
+            await process.wait()
+        assert list(tmp_path.glob("stemmap-*")) == []
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.communicate()
+
+
 def test_without_a_port_the_next_free_one_is_taken(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
