@@ -77,6 +77,7 @@ class Dashboard:
         self.path_xy = np.zeros((0, 2))
         self.truth: TruthTrees | None = None
         self.selected: int | None = None
+        self.scene_viewers = 0
         self._run: int | None = None
         self._notice = ""
         self._restarts = 0

@@ -68,4 +68,11 @@ async def _receive(browser: WebSocket, dashboard: Dashboard) -> None:
 @router.websocket("/viser/")
 async def viser(browser: WebSocket, dashboard: Dash) -> None:
     """The 3D scene."""
-    await bridge(browser, dashboard.scene)
+    if dashboard.scene_viewers >= _MOST_BROWSERS:
+        await browser.close(_TRY_AGAIN_LATER)
+        return
+    dashboard.scene_viewers += 1
+    try:
+        await bridge(browser, dashboard.scene)
+    finally:
+        dashboard.scene_viewers -= 1

@@ -93,7 +93,9 @@ class Scene:
     def select(self, number: int | None) -> None:
         """Mark a tree by its number; None marks none."""
         self._selected = number
-        self._repaint()
+        if self._frame is not None:  # the scan is large and does not change by this
+            with self._server.atomic():
+                self._map.repaint(self._frame, number, self._view)
 
     def clear(self) -> None:
         """Forget the run: an empty scene, the panel as it is."""

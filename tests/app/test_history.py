@@ -25,6 +25,7 @@ def test_states_stay_few_and_evenly_spread_however_long_the_run() -> None:
 def test_large_states_are_fewer_and_the_first_stays() -> None:
     megabyte = 1 << 20
     kept: Snapshots[int] = Snapshots(0, lambda scans: scans * megabyte // 50)  # grows: 1 MB every 50 scans
+    held: set[int] = set()
     for scans in range(10_001):
         kept.offer(scans, scans)
         held = {kept.newest(n)[0] for n in range(0, scans + 1, 50)}

@@ -198,6 +198,25 @@ async def test_a_slow_browser_holds_viser_back() -> None:
         page.transport.abort()
 
 
+async def test_more_browsers_than_the_machine_can_bear_are_sent_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.routes.sockets._MOST_BROWSERS", 2)
+
+    async def handler(connection: ServerConnection) -> None:
+        await connection.send(b"hello")
+        await closed(connection)
+
+    async with fake_viser(handler) as scene, served(scene) as (host, dashboard):
+        async with browser(host) as first, browser(host) as second:
+            assert (await first.recv(), await second.recv()) == (b"hello", b"hello")
+            with pytest.raises(InvalidStatus):
+                await browser(host)
+        async with asyncio.timeout(10):
+            while dashboard.scene_viewers:
+                await asyncio.sleep(0.01)
+        async with browser(host) as again:
+            assert await again.recv() == b"hello"
+
+
 async def test_a_wrong_secret_or_no_viser_is_a_refusal() -> None:
     async def handler(connection: ServerConnection) -> None:
         await connection.send(b"hello")

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 
 from app.scene import Scene
 from app.scene import scene as scene_module
+from app.scene.cloud import Cloud
 from pipeline.geometry import Pose2
 from pipeline.records import TruthTrees
 from tests.scene.frames import make_frame, make_trees
@@ -148,6 +150,28 @@ def test_selection_is_marked_and_named(scene: Scene):
     scene.select(None)
     assert not node(scene, "/world/selection").visible
     assert not any(text.startswith("tree") for text in scene._map.texts)
+
+
+def test_a_click_or_a_look_around_sends_no_points(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    scene.show(make_frame(0), PATH[:1])
+    touched: list[str] = []
+    monkeypatch.setattr(Cloud, "show", lambda self, *_: touched.append(self.node.name))
+    scene.select(7)
+    assert touched == []
+    monkeypatch.undo()
+    handle = type(node(scene, "/world/robot/scan/raw"))
+    queue = handle._queue_update
+
+    def remember(self: Any, name: str, value: Any) -> None:
+        touched.append(name)
+        queue(self, name, value)
+
+    monkeypatch.setattr(handle, "_queue_update", remember)
+    scene._choose("follow", False)
+    assert touched == []
+    scene._choose("colour_by", "height")
+    assert "points" not in touched
+    assert "colors" in touched
 
 
 def test_truth_comes_and_goes(scene: Scene):
