@@ -20,9 +20,11 @@ _MOST_BYTES = 256 << 20
 
 
 def nbytes(state: object) -> int:
-    """Bytes of the arrays in a state: a dataclass of arrays and of such dataclasses."""
+    """Bytes of the arrays in a state: of dataclasses, lists and tuples, however deep."""
     if isinstance(state, np.ndarray):
         return state.nbytes
+    if isinstance(state, list | tuple):
+        return sum(map(nbytes, state))
     if is_dataclass(state):
         return sum(nbytes(getattr(state, field.name)) for field in fields(state))
     return 0
