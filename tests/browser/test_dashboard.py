@@ -274,10 +274,14 @@ def test_a_layer_is_switched_off(dashboard: Dashboard):
 
 def test_a_run_that_is_not_there_is_told_with_what_to_do(dashboard: Dashboard):
     page = dashboard.page
+    dashboard.tab("Trees")
+    expect(page.locator("#trees tbody tr").first).to_be_visible()
     page.locator("#source-button").click()
     page.locator("#source-uri").fill("/nowhere/run.mcap")
     page.get_by_role("button", name="Open", exact=True).click()
     expect(page.locator("#source-error")).to_contain_text("/nowhere/run.mcap")
+    expect(page.locator("#trees tbody tr")).to_have_count(0)  # of the run that was left nothing stays
+    expect(page.locator("#trees-empty")).to_contain_text("Nothing mapped yet")
     dashboard.errors.clear()  # the browser logs an answer that refuses
     page.get_by_role("button", name="sim:paper").click()
     expect(page.locator("#source-dialog")).not_to_be_visible()
