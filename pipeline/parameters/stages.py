@@ -288,8 +288,8 @@ class Gathering(Stage):
     )
     every: int = count(
         4,
-        "Gather every",
-        "scans",
+        "Gather every so many scans",
+        "",
         1,
         100,
         "Of so many scans one is gathered (the first ten all are); the scans between show the same trunks.",

@@ -77,8 +77,8 @@ def _centroids_as_stems(members: Float, bounds: Int, centroid: Float, range_sigm
     stem = np.full((len(centroid), COLUMNS), np.nan)
     stem[:, 0:2] = centroid[:, :2]
     x, y = centroid[:, 0], centroid[:, 1]
-    reach = np.maximum(np.hypot(x, y), 1e-9)
-    ux, uy = x / reach, y / reach
+    bearing = np.arctan2(y, x)
+    ux, uy = np.cos(bearing), np.sin(bearing)
     # It lies before the centre by more than half of a radius that nobody knows: along the ray this is
     # an error of that size, the same in each scan from one side, and not a noise that averages out.
     along = CENTROID_BIAS**2
