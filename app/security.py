@@ -9,6 +9,7 @@ is another origin, but not another site).
 from __future__ import annotations
 
 import hmac
+import html
 import ipaddress
 import secrets
 import socket
@@ -33,6 +34,10 @@ _LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>ste
 <p>This dashboard belongs to whoever started it. In the terminal where <code>stemmap</code> runs stands a
 link that ends in <code>?token=</code> and some letters: open that one.
 It changes at every start.</p></html>"""
+
+
+_LEAD_ON = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
+<meta http-equiv="refresh" content="0;url={target}"><p><a href="{target}">Open the dashboard</a></p></html>"""
 
 
 def new_token() -> str:
@@ -119,19 +124,27 @@ class Guard:
             query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
             given = [value for name, value in query if name == "token"]
             if given and self._is_token(given[-1]):
-                return self._welcome([(name, value) for name, value in query if name != "token"])
+                rest = [(name, value) for name, value in query if name != "token"]
+                return self._welcome(rest, from_elsewhere=headers.get("sec-fetch-site") == "cross-site")
         if self._has_cookie(headers) or self._has_bearer(headers):
             return None
         if scope["type"] == "http" and "text/html" in headers.get("accept", ""):
             return HTMLResponse(_LOGIN_PAGE, 401, {"Cache-Control": "no-store"})
         return error_reply(401, "the token is missing or wrong", remedy="Open the link that stemmap printed")
 
-    def _welcome(self, query: list[tuple[str, str]]) -> Response:
-        reply = RedirectResponse("/" + (f"?{urlencode(query)}" if query else ""), 303)
+    def _welcome(self, query: list[tuple[str, str]], *, from_elsewhere: bool) -> Response:
+        """Give the cookie and lead on to the page without the token.
+
+        A strict cookie is not sent along a redirect that began in a file or on another site; from a
+        page of our own it is, so whoever comes from there is led on by such a page.
+        """
+        target = "/" + (f"?{urlencode(query)}" if query else "")
+        reply: Response = RedirectResponse(target, 303)
+        if from_elsewhere:
+            reply = HTMLResponse(_LEAD_ON.format(target=html.escape(target)))
         reply.headers["Cache-Control"] = "no-store"
         reply.headers["Referrer-Policy"] = "no-referrer"
-        # Not "strict": after a link in another page or in a file it would not be sent.
-        reply.set_cookie(self.cookie, self._session, path="/", httponly=True, samesite="lax")
+        reply.set_cookie(self.cookie, self._session, path="/", httponly=True, samesite="strict")
         return reply
 
     def _knows_host(self, headers: Headers) -> bool:

@@ -135,7 +135,7 @@ async def test_the_link_becomes_a_cookie_and_a_clean_address(client: httpx.Async
     assert answer.status_code == 303
     assert answer.headers["location"] == "/?view=top"
     cookie = answer.headers["set-cookie"]
-    for part in (f"stemmap_{PORT}={SESSION}", "HttpOnly", "SameSite=lax", "Path=/"):
+    for part in (f"stemmap_{PORT}={SESSION}", "HttpOnly", "SameSite=strict", "Path=/"):
         assert part in cookie
     for part in ("Max-Age", "expires", TOKEN):  # it ends with the browser, and does not give the token away
         assert part not in cookie
@@ -254,3 +254,13 @@ def test_tokens_are_long_and_never_the_same() -> None:
     tokens = {new_token() for _ in range(100)}
     assert len(tokens) == 100
     assert min(map(len, tokens)) >= 32
+
+
+async def test_who_comes_from_elsewhere_is_led_on_by_a_page_of_our_own(client: httpx.AsyncClient) -> None:
+    """A strict cookie would not go along with a redirect that another site began."""
+    query = {"token": TOKEN, "run": '"><b>'}
+    answer = await client.get("/", params=query, headers={"Sec-Fetch-Site": "cross-site"})
+    assert answer.status_code == 200
+    assert "SameSite=strict" in answer.headers["set-cookie"]
+    assert "url=/?run=%22%3E%3Cb%3E" in answer.text
+    assert TOKEN not in answer.text
