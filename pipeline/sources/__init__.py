@@ -48,7 +48,7 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
 
         return open_simulated(uri, options)
     if scheme == "file":
-        return open_source(uri.removeprefix("file://"), options)
+        return open_source(uri[len("file:") :].removeprefix("//"), options)
     if scheme in _LIVE:
         raise SourceError(
             "this version does not read live input", where=uri, remedy="Record it first and open the file."

@@ -65,7 +65,9 @@ def follow(uri: str, every: int) -> list[tuple[int, float, float, int]]:
 
 
 def _known_mib(mapper: Mapper) -> float:
-    return (array_bytes(mapper.snapshot()) + array_bytes(mapper.path)) / 2**20
+    # The gathered voxels are there twice: as they are, and as they were at the last fold.
+    voxels = array_bytes(mapper._gathering.memory)
+    return (array_bytes(mapper.snapshot()) + array_bytes(mapper.path) + voxels) / 2**20
 
 
 def array_bytes(record: Any) -> int:
@@ -74,4 +76,6 @@ def array_bytes(record: Any) -> int:
         return int(record.nbytes)
     if is_dataclass(record):
         return sum(array_bytes(getattr(record, f.name)) for f in fields(record))
+    if isinstance(record, tuple | list):
+        return sum(array_bytes(part) for part in record)
     return 0
