@@ -107,7 +107,8 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
     error = path_error(path, truth.path) if truth.path else None
     losses = {reason: n for reason, n in (left_out + Counter(plan.source.losses)).items() if n}
     tally.tell_of_far_truth(evaluation)
-    tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
+    if plan.parameters.gathering.method == "none":  # else a track is judged by more than its hits
+        tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     outcome = Outcome(
         summary=_summary(description.uri, frame, path, evaluation, error),
         warnings=tally.warnings(),

@@ -84,18 +84,19 @@ def _forget_what_overhangs(lowest: Float, slope: float) -> None:
     sectors, bins = lowest.shape
     cone = lowest.copy()
     rise = slope * BIN
+    across = rise * (np.arange(bins) + 0.5) * (WIDEST * 2.0 * np.pi / sectors)
     for _ in range(2):
         for s in range(sectors):
             for k in range(1, bins):
                 cone[s, k] = min(cone[s, k], cone[s, k - 1] + rise)
             for k in range(bins - 2, -1, -1):
                 cone[s, k] = min(cone[s, k], cone[s, k + 1] + rise)
-        for k in range(bins):
-            turn = slope * BIN * (k + 0.5) * (WIDEST * 2.0 * np.pi / sectors)
-            for s in range(2 * sectors):
-                cone[s % sectors, k] = min(cone[s % sectors, k], cone[(s - 1) % sectors, k] + turn)
-            for s in range(2 * sectors, 0, -1):
-                cone[s % sectors, k] = min(cone[s % sectors, k], cone[(s + 1) % sectors, k] + turn)
+        for there in (1, -1):  # around the circle, twice, so that the seam is none
+            for turn in range(2 * sectors):
+                s = (there * turn) % sectors
+                before = (s - there) % sectors
+                for k in range(bins):
+                    cone[s, k] = min(cone[s, k], cone[before, k] + across[k])
     for s in range(sectors):
         for k in range(bins):
             if lowest[s, k] > cone[s, k] + TOLERANCE + rise:
