@@ -21,6 +21,7 @@ PRIOR_RADIUS, PRIOR_RADIUS_SIGMA = 0.15, 0.15  # m; half of the stems of a stand
 PRIOR_LEAN_SIGMA = 0.05  # 3 degrees
 SIGMA_MIN = 0.001  # m; no range is better than that, and weights must stay finite
 MOST_POINTS = 500  # of a cluster enter its fit; more would sharpen what bark and lean blur anyway
+ENOUGH = 60  # points, of which a third still is an arc
 ITERATIONS = 16
 NEARLY, CONVERGED = 5e-3, 3e-4  # m; the latter is a tenth of what the best arc allows
 COLUMNS = 9  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc
@@ -92,11 +93,17 @@ def _fit(points: Float, range_sigma: float, stem: Float) -> None:
     z0 = points[:, 2].mean()
     rays = _rays(points, z0)
     used = np.ones(n, np.bool_)
+    # A third of the points leads near the circle; all of them then make it sharp.
+    some = rays[::3].copy() if n > ENOUGH else rays
+    every = np.ones(some.shape[0], np.bool_)
     p = np.array([stem[0], stem[1], 0.0, 0.0, min(max(stem[5], 0.03), 0.6)])
     g, H, step = np.empty(5), np.empty((5, 5)), np.empty(5)
     scale = 0.0  # Huber's weights first; they need no good start
     for k in range(ITERATIONS):
-        _normal_equations(rays, used, p, sigma, scale, g, H)
+        if scale == 0.0:
+            _normal_equations(some, every, p, sigma, scale, g, H)
+        else:
+            _normal_equations(rays, used, p, sigma, scale, g, H)
         _solve(H, g, step)
         # A step longer than the trunk itself would throw the circle to its other side.
         longest = max(abs(step[0]), abs(step[1]), abs(step[4]))
