@@ -40,11 +40,6 @@ class Cursor:
         self._steps = self._read(None)
 
     @property
-    def next_index(self) -> int:
-        """The index of the step that `take` gives next."""
-        return self._next
-
-    @property
     def known(self) -> int:
         """How many steps from the start were read so far."""
         return len(self._stamps)
