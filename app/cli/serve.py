@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _look_for(uri: str) -> None:
-    """Say at once that a file is missing; what is in it, the worker finds out."""
+    """Say at once that a file or a scenario is missing; what is in a file, the worker finds out."""
     if _exists(uri):
         return
     scheme, colon, _ = uri.partition(":")
@@ -75,6 +75,10 @@ def _look_for(uri: str) -> None:
         raise SourceError(
             "there is no such file or folder", where=uri, remedy="Simulated runs begin with sim:"
         )
+    if scheme == "sim":
+        from pipeline.simulation.uri import parse_uri
+
+        parse_uri(uri)  # an unknown scenario is said here; the scene itself is built in the worker
 
 
 def _exists(path: str) -> bool:

@@ -17,7 +17,8 @@ from pipeline.simulation.motion import Motion, lay_on_terrain
 from pipeline.simulation.scene import Scene, build_scene
 from pipeline.simulation.solids import Solids
 from pipeline.simulation.uri import EXACT, RunRequest
-from pipeline.simulation.wheels import ODOMETRY_HZ, QUALITIES, wheel_odometry
+from pipeline.simulation.wheel_qualities import QUALITIES
+from pipeline.simulation.wheels import ODOMETRY_HZ, wheel_odometry
 
 # Raise it with every change that changes a run's bytes.
 VERSION = 1

@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 
 from pipeline.errors import SourceError
 from pipeline.simulation.scenarios import SCENARIOS, Scenario
-from pipeline.simulation.wheels import QUALITIES
+from pipeline.simulation.wheel_qualities import QUALITIES
 
 SCHEME = "sim:"
 EXACT = "exact"

@@ -12,7 +12,8 @@ from pipeline.simulation.inertial import GRAVITY, inertial_readings
 from pipeline.simulation.motion import lay_on_terrain, rotations
 from pipeline.simulation.scenarios import SCENARIOS, Scenario
 from pipeline.simulation.terrain import Terrain
-from pipeline.simulation.wheels import QUALITIES, wheel_odometry
+from pipeline.simulation.wheel_qualities import QUALITIES
+from pipeline.simulation.wheels import wheel_odometry
 from pipeline.sources.simulated import open_simulated
 
 FLAT = Terrain(np.zeros((1, 4)))
