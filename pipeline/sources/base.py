@@ -10,6 +10,24 @@ from pipeline.geometry import Pose3
 from pipeline.records import Record, Sensor, Truth
 
 
+@dataclass(frozen=True, slots=True)
+class RecordedTopic:
+    """A topic that a recording holds, whether it is read or not.
+
+    Attributes:
+        name, type: e.g. "/velodyne_points" and "sensor_msgs/msg/PointCloud2".
+        messages: How many.
+        read_as: What it is read as ("scan", "odometry", "imu", "transforms"), "" when it is not read.
+        fits: The role that it could be given with `--topic`, "" when none.
+    """
+
+    name: str
+    type: str
+    messages: int
+    read_as: str
+    fits: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceDescription:
     """What is known of a source before its first scan is read.
@@ -24,6 +42,7 @@ class SourceDescription:
         start_ns, end_ns: Time of the first and last scan, None when not known.
         digest: SHA-256 (hex) of what is read: file contents, or the scenario's definition.
         preset: The preset that suits this kind of source.
+        topics: What a recording of messages holds; () where there are no topics.
         warnings: What a person should know, e.g. that there is no odometry.
     """
 
@@ -38,6 +57,7 @@ class SourceDescription:
     end_ns: int | None
     digest: str
     preset: str = "forest"
+    topics: tuple[RecordedTopic, ...] = ()
     warnings: tuple[str, ...] = ()
 
 

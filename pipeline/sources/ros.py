@@ -226,6 +226,7 @@ class RosSource:
             start_ns=first.stamp_ns,
             end_ns=self._last_stamp(),
             digest="",
+            topics=self._topics.recorded(),
             warnings=tuple(warnings),
         )
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from pipeline.errors import SourceError
+from pipeline.sources.base import RecordedTopic
 from pipeline.sources.container import Channel
 from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, ROS1_TRANSFORMS, TRANSFORMS, VELODYNE_SCAN
 
@@ -31,13 +32,24 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """The topics that are read; `fixed` and `moving` carry transforms."""
+    """The topics that are read; `fixed` and `moving` carry transforms, `every` is all there is."""
 
     scan: Topic
     odometry: Topic | None
     imu: Topic | None
     fixed: tuple[Topic, ...]
     moving: tuple[Topic, ...]
+    every: tuple[Topic, ...]
+
+    def recorded(self) -> tuple[RecordedTopic, ...]:
+        """All topics for people, each with what it is read as."""
+        reading: dict[Topic, str] = dict.fromkeys((*self.fixed, *self.moving), "transforms")
+        chosen = {"scan": self.scan, "odometry": self.odometry, "imu": self.imu}
+        reading.update({topic: role for role, topic in chosen.items() if topic is not None})
+        return tuple(
+            RecordedTopic(topic.name, topic.msgtype, topic.count, reading.get(topic, ""), _role_of(topic))
+            for topic in self.every
+        )
 
 
 def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where: str) -> Topics:
@@ -70,7 +82,11 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
     transforms = [topic for topic in topics if topic.msgtype in (TRANSFORMS, ROS1_TRANSFORMS)]
     fixed = tuple(topic for topic in transforms if topic.name.endswith("tf_static"))
     moving = tuple(topic for topic in transforms if not topic.name.endswith("tf_static"))
-    return Topics(scan, chosen["odometry"], chosen["imu"], fixed, moving)
+    return Topics(scan, chosen["odometry"], chosen["imu"], fixed, moving, tuple(topics))
+
+
+def _role_of(topic: Topic) -> str:
+    return next((role for role, types in TYPES_BY_ROLE.items() if topic.msgtype in types), "")
 
 
 def _group(channels: Iterable[Channel]) -> list[Topic]:

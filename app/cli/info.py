@@ -1,0 +1,125 @@
+"""`stemmap info`: what is in a source, and what can be done with it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from contextlib import closing
+from typing import TYPE_CHECKING, Any
+
+from app.cli.choices import SOURCE_HELP, add_source_flags, seed, source, source_options
+
+if TYPE_CHECKING:
+    from pipeline.records import Sensor, Truth
+    from pipeline.sources import Source, SourceDescription
+
+HELP = "say what is in a recording and what can be done with it"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("source", metavar="SOURCE", type=source, help=SOURCE_HELP)
+    add_source_flags(parser)
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of a simulated run (default: 0)")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Open it, look, print."""
+    from pipeline.sources import open_source
+
+    with closing(open_source(arguments.source, source_options(arguments))) as opened:
+        if arguments.json:
+            print(json.dumps(_record(opened), indent=1, allow_nan=False))
+        else:
+            print("\n".join(_lines(opened)))
+    return 0
+
+
+def _record(opened: Source) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    d, truth = opened.description, opened.truth()
+    trees, others = _truth_counts(truth)
+    return {
+        "uri": d.uri,
+        "kind": d.kind,
+        "digest": d.digest,
+        "scans": d.scans,
+        "start_ns": d.start_ns,
+        "end_ns": d.end_ns,
+        "sensor": asdict(d.sensor),
+        "T_base_lidar": {"R": d.T_base_lidar.R.tolist(), "t": d.T_base_lidar.t.tolist()},
+        "odometry": d.has_odometry,
+        "imu": d.has_imu,
+        "preset": d.preset,
+        "topics": [asdict(topic) for topic in d.topics],
+        "truth": {"trees": trees, "others": others, "path": truth is not None and truth.path is not None},
+        "losses": opened.losses,
+        "warnings": list(d.warnings),
+    }
+
+
+def _lines(opened: Source) -> list[str]:
+    d, truth = opened.description, opened.truth()
+    x, y, z = d.T_base_lidar.t
+    trees, others = _truth_counts(truth)
+    known = [f"{trees} trees, {others} that are none"] if trees + others else []
+    known += ["the path"] if truth is not None and truth.path is not None else []
+    rows = [
+        ("kind", d.kind),
+        ("scans", _scans(d)),
+        ("LiDAR", _sensor(d.sensor)),
+        ("mounted", f"x {x:.2f} m, y {y:.2f} m, z {z:.2f} m on the robot"),
+        ("odometry", "yes" if d.has_odometry else "no: it is mapped as if the robot stood still"),
+        ("IMU", "yes" if d.has_imu else "no"),
+        ("truth", ", ".join(known) or "none; give trees with --truth trees.csv"),
+        ("preset", f"{d.preset} suits it"),
+        ("SHA-256", d.digest),
+    ]
+    lines = [f"{name:10}{text}" for name, text in rows]
+    lines += [f"warning: {text}" for text in d.warnings]
+    lines += [f"left out: {count} {reason}" for reason, count in opened.losses.items()]
+    return lines + _topic_lines(d) + _commands(d)
+
+
+def _topic_lines(d: SourceDescription) -> list[str]:
+    if not d.topics:
+        return []
+    lines = ["", "topics (* is read; --topic ROLE=NAME chooses another)"]
+    width = max(len(topic.name) for topic in d.topics)
+    for topic in d.topics:
+        mark, use = ("*", topic.read_as) if topic.read_as else (" ", topic.fits and f"could be {topic.fits}")
+        lines.append(f" {mark} {topic.name:{width}}  {topic.messages:>8,}  {topic.type}  {use}".rstrip())
+    return lines
+
+
+def _commands(d: SourceDescription) -> list[str]:
+    import shlex
+
+    uri = shlex.quote(d.uri)
+    return ["", f"watch it:  stemmap {uri}", f"map it:    stemmap map {uri} --out out"]
+
+
+def _scans(d: SourceDescription) -> str:
+    if d.scans is None:
+        return "not counted"
+    if d.start_ns is None or d.end_ns is None or d.end_ns <= d.start_ns:
+        return f"{d.scans:,}"
+    seconds = (d.end_ns - d.start_ns) * 1e-9
+    return f"{d.scans:,} in {seconds:.1f} s, {(d.scans - 1) / seconds:.1f} Hz"
+
+
+def _sensor(sensor: Sensor) -> str:
+    from math import degrees
+
+    rings = f", {sensor.rings} ring{'s' * (sensor.rings != 1)}" if sensor.rings else ""
+    step = f" {degrees(sensor.ring_step):.2f} degrees apart" if sensor.ring_step else ""
+    return f"{sensor.name}{rings}{step}, range error {100.0 * sensor.range_sigma:.1f} cm"
+
+
+def _truth_counts(truth: Truth | None) -> tuple[int, int]:
+    """True trees, and what else is known to stand there."""
+    kinds = () if truth is None or truth.trees is None else truth.trees.kind
+    trees = sum(kind == "tree" for kind in kinds)
+    return trees, len(kinds) - trees
