@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.worker_messages import Shown
+from pipeline.health import Health
 from pipeline.records import Frame, TruthTrees, Verdict
 
 Float = NDArray[np.float64]
@@ -31,9 +32,28 @@ def map_payload(shown: Shown) -> dict[str, Any]:
         "odom": _rounded(frame.T_odom_base.as_array()),
         "sigma_xy": round(float(np.sqrt(np.mean(np.diagonal(estimate.covariance)[:2]))), _DIGITS),
         "n_eff": round(estimate.n_eff, 1),
+        "health": health_payload(frame.health),
         "trees": trees_payload(frame, start_ns=frame.stamp_ns - round(shown.time_s * _NS)),
         "verdicts": verdict_counts(frame.clusters.verdict),
         "counts": dict(frame.counts),
+    }
+
+
+def health_payload(health: Health) -> dict[str, Any]:
+    """How far the pose can be trusted: one word, why, and the figures behind it; what is not known is
+    None."""
+    return {
+        "state": health.state,
+        "reason": health.reason,
+        "n_eff": _known(health.n_eff),
+        "ancestors": health.ancestors,
+        "detections": health.detections,
+        "recognised": _known(health.recognised),
+        "ambiguous": _known(health.ambiguous),
+        "innovation": _known(health.innovation),
+        "sigma_xy_m": _known(health.sigma_xy),
+        "sigma_yaw_deg": _known(math.degrees(health.sigma_yaw)),
+        "odometry_sigmas": _known(health.odometry),
     }
 
 
@@ -98,6 +118,10 @@ def first_difference(old: Float | None, new: Float) -> int:
 def _rounded(values: Float) -> list[float]:
     rounded: list[float] = np.round(values, _DIGITS).tolist()
     return rounded
+
+
+def _known(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None
 
 
 def _finite(values: Float) -> list[float | None]:

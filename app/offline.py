@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from app.odometry import odometry_warnings
+from app.run_health import RunHealth
 from app.stopwatch import Stopwatch
 from app.version import version
 from pipeline.errors import SourceError
@@ -110,7 +111,7 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
     if plan.parameters.gathering.method == "none":  # else a track is judged by more than its hits
         tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     outcome = Outcome(
-        summary=_summary(description.uri, frame, path, evaluation, error),
+        summary=_summary(description.uri, frame, path, evaluation, error) + tally.health.summary(),
         warnings=tally.warnings(),
         losses=losses,
         scan_ms=stopwatch.scan_ms,
@@ -138,8 +139,10 @@ class _Tally:
     warned: Counter[str]
     points: Counter[str] = field(default_factory=Counter)
     verdicts: Counter[str] = field(default_factory=Counter)
+    health: RunHealth = field(default_factory=RunHealth)
 
     def add(self, frame: Frame) -> None:
+        self.health.add(frame)
         self.points.update(frame.counts)
         self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
         self.warned.update(frame.warnings)
@@ -201,6 +204,7 @@ def _run_record(
         "distance_m": round(_length(path), 3),
         "trees": int(np.count_nonzero(frame.trees.confirmed)),
         "points": dict(tally.points),
+        "health": tally.health.record(int(path.stamp_ns[0])),
         "verdicts": dict(sorted(tally.verdicts.items())),
         "evaluation": None if evaluation is None else asdict(evaluation),
         "path_error": None if error is None else asdict(error),

@@ -6,12 +6,9 @@ import numpy as np
 
 from app.messages import State, Status
 from app.run import Run
-from pipeline.records import Frame, Path
+from pipeline.records import Path
 
 _NS = 1_000_000_000
-# Position sigmas [m] up to which a tree map stays usable, and beyond which trees get mixed up: a third
-# of the usual distance between neighbouring trunks, and the whole of it.
-_GOOD_SIGMA, _WEAK_SIGMA = 0.5, 1.5
 
 
 def describe(
@@ -44,7 +41,7 @@ def describe(
         stage_ms={stage: round(ms, 3) for stage, ms in run.stopwatch.stage_ms.items()},
         trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
         distance_m=round(distance_driven(run.path), 3),
-        health="good" if frame is None else health(frame),
+        health="good" if frame is None else frame.health.state,
         warnings=list(warnings + losses),
         revision=revision,
         going_to=going_to,
@@ -60,11 +57,3 @@ def clock(seconds: float) -> str:
 def distance_driven(path: Path) -> float:
     """Length of a path [m]."""
     return float(np.hypot(np.diff(path.x), np.diff(path.y)).sum())
-
-
-def health(frame: Frame) -> str:
-    """ "good", "weak" or "lost", by how well the position is known."""
-    sigma = float(np.sqrt(np.mean(np.diagonal(frame.estimate.covariance)[:2])))
-    if not np.isfinite(sigma) or sigma > _WEAK_SIGMA:
-        return "lost"
-    return "good" if sigma <= _GOOD_SIGMA else "weak"

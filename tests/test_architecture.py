@@ -19,6 +19,8 @@ FOUNDATION = (
     "geometry",
     "compiled",
     "files",
+    "health",
+    "readings",
     "records",
     "parameters",
     "direction",

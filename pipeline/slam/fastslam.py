@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.geometry import Float, Pose2, mean_angle, wrap_angle
 from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, Int, PoseEstimate
+from pipeline.slam.health import TOLD, ScanTold, judged, remembered, scan_told
 from pipeline.slam.motion import compound, moved_poses, step_covariance
 from pipeline.slam.resampling import low_variance_ancestors, normalised, take_ancestors
 from pipeline.slam.state import SlamState
@@ -47,10 +48,15 @@ class FastSlam:
         offset = float(rng.random())
         state = self._moved(self.state.with_particles(p.particles), motion)
         used = index == 0 or state.since_update >= p.update_distance
+        told, driven, spread = np.zeros((p.particles, TOLD)), state.since_update, state.motion_covariance
         if used:
-            state = self._observed(state, detections, clear_range, noise)
+            state = self._observed(state, detections, clear_range, noise, told)
         weights = normalised(state.log_weight)
-        state = replace(state, best=int(np.argmax(weights))) if used else state
+        scan = ScanTold()
+        if used:
+            scan = scan_told(told, weights, len(detections.cluster), spread)
+            recent = remembered(state.recent, scan, driven)
+            state = replace(state, best=int(np.argmax(weights)), recent=recent)
         estimate = _estimate(state, weights, p.hits_to_weigh)
         ancestors = None
         if used and estimate.n_eff < p.resample_below * p.particles:
@@ -59,7 +65,12 @@ class FastSlam:
             estimate = replace(estimate, resampled=True)
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
         self.state = replace(state, genealogy=genealogy)
-        return estimate
+        return replace(
+            estimate,
+            health=judged(
+                state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.covariance
+            ),
+        )
 
     def path(self) -> Float:
         """x, y [m], yaw [rad] at every scan as the best particle has it behind it, shape (N, 3)."""
@@ -82,7 +93,7 @@ class FastSlam:
         )
 
     def _observed(
-        self, state: SlamState, detections: Detections, clear_range: Float, noise: Float
+        self, state: SlamState, detections: Detections, clear_range: Float, noise: Float, told: Float
     ) -> SlamState:
         p = self.parameters
         state = state.with_room(len(detections.cluster))
@@ -111,6 +122,7 @@ class FastSlam:
             p.looks,
             p.merge_gate,
             p.miss_weight,
+            told,
         )
         state.log_weight[:] -= state.log_weight.max()
         return replace(

@@ -17,6 +17,7 @@ from pipeline.records import Float32, Int
 
 RECENT_POSES = 300_000  # of all particles that are kept: the time in which a loop can still choose
 BLOCK = 512  # scans that are settled at once
+FOUNDED = 50  # scans; a filter whose particles all come from one so early has no other past to choose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,10 +36,13 @@ class Genealogy:
     Attributes:
         settled: Blocks of float64, shape (BLOCK, 3): x, y [m], yaw [rad], the far past.
         recent: The generations since then, oldest first.
+        founders: Which particle each one comes from, shape (P,), since the last time that the number of
+            scans was a multiple of FOUNDED, and since the time before it; None before the first scan.
     """
 
     settled: tuple[Float, ...] = ()
     recent: tuple[Generation, ...] = ()
+    founders: tuple[Int, Int] | None = None
 
     def __len__(self) -> int:
         return BLOCK * len(self.settled) + len(self.recent)
@@ -51,11 +55,25 @@ class Genealogy:
             ancestors: Who comes from whom after it, shape (Q,).
             leaf: The best particle after it; its path is taken where the past has to be settled.
         """
+        founders = self._founders_after(len(pose), ancestors)
         recent = (*self.recent, Generation(pose.astype(np.float32), ancestors))
         if len(recent) < BLOCK + max(BLOCK, RECENT_POSES // len(pose)):
-            return Genealogy(self.settled, recent)
+            return Genealogy(self.settled, recent, founders)
         rows = _walk(recent, leaf)[:BLOCK]
-        return Genealogy((*self.settled, rows), recent[BLOCK:])
+        return Genealogy((*self.settled, rows), recent[BLOCK:], founders)
+
+    def _founders_after(self, particles: int, ancestors: Int | None) -> tuple[Int, Int]:
+        everyone = np.arange(particles)
+        newer, older = self.founders or (everyone, everyone)
+        if len(self) % FOUNDED == 0:
+            newer, older = everyone, newer
+        return (newer, older) if ancestors is None else (newer[ancestors], older[ancestors])
+
+    @property
+    def distinct_ancestors(self) -> int:
+        """How many particles of FOUNDED to 2 FOUNDED scans ago the particles of today come from; of the
+        first scan, while there were fewer."""
+        return 0 if self.founders is None else int(np.count_nonzero(np.bincount(self.founders[1])))
 
     def redrawn(self, rows: Int) -> Genealogy:
         """The same past of particles drawn anew: each one comes from the particle in its row."""
@@ -63,7 +81,8 @@ class Genealogy:
             return self
         last = self.recent[-1]
         ancestors = rows if last.ancestors is None else last.ancestors[rows]
-        return Genealogy(self.settled, (*self.recent[:-1], Generation(last.pose, ancestors)))
+        founders = self.founders and (self.founders[0][rows], self.founders[1][rows])
+        return Genealogy(self.settled, (*self.recent[:-1], Generation(last.pose, ancestors)), founders)
 
     def path(self, leaf: int) -> Float:
         """x, y [m], yaw [rad] of every scan as the particle `leaf` of the last one has it behind it,

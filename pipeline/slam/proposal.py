@@ -13,6 +13,8 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int, Int32
+from pipeline.slam.health import AMBIGUOUS as DOUBTFUL
+from pipeline.slam.health import FOUND, INNOVATION, MOST_HITS, RECOGNISED
 
 AMBIGUOUS = 6.0  # of -2 log likelihood: the second choice is a twentieth as likely
 
@@ -90,6 +92,7 @@ def recognise(
     distance_max: float,
     hits_to_weigh: int,
     landmark_of: Int,
+    told: Float,
 ) -> float:
     """Find the landmark of each detection, one to one, correct the pose, and weigh.
 
@@ -104,6 +107,7 @@ def recognise(
         gate: Largest Mahalanobis distance [sigma]; distance_max: largest distance [m].
         hits_to_weigh: Landmarks seen fewer times neither correct nor weigh.
         landmark_of: shape (D,), filled with rows, -1 for none.
+        told: shape (TOLD,), filled as far as the detections say (see health).
 
     Returns:
         Log likelihood of the detections.
@@ -152,15 +156,32 @@ def recognise(
             taken[j] = True
             if hits[j] >= hits_to_weigh:
                 log_likelihood -= 0.5 * (d2 + np.log(det))
+                told[INNOVATION] += d2
+                told[RECOGNISED] += 1.0
+                told[FOUND] += min(float(hits[j]), MOST_HITS)
                 correct_pose(mu, P, c, s, centre[d], S, y)
                 c, s = np.cos(mu[2]), np.sin(mu[2])
-    still = np.zeros(3)
     for d in range(detections):
+        if second[d] - best[d] < AMBIGUOUS:
+            told[DOUBTFUL] += 1.0
+    return log_likelihood - _price_of_new(mu, P, centre, R, hits, landmark_of, hits_to_weigh, gate)
+
+
+@compiled
+def _price_of_new(
+    mu: Float, P: Float, centre: Float, R: Float, hits: Int32, landmark_of: Int, hits_to_weigh: int,
+    gate: float,
+) -> float:  # fmt: skip
+    """What detections of no well known landmark take from the log likelihood: a new tree is as likely as
+    one at the gate, else particles that recognise nothing win."""
+    S, y, still = np.empty(3), np.empty(2), np.zeros(3)
+    c, s = np.cos(mu[2]), np.sin(mu[2])
+    price = 0.0
+    for d in range(centre.shape[0]):
         if landmark_of[d] < 0 or hits[landmark_of[d]] < hits_to_weigh:
-            # A new tree is as likely as one at the gate, else particles that recognise nothing win.
             det = innovation(mu, P, c, s, centre[d], R[d], mu[:2], still, S, y)
-            log_likelihood -= 0.5 * (gate * gate + np.log(det))
-    return log_likelihood
+            price += 0.5 * (gate * gate + np.log(det))
+    return price
 
 
 @compiled

@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.geometry import Float
 from pipeline.records import Float32, Int, Int32
 from pipeline.slam.genealogy import Genealogy
+from pipeline.slam.health import Recent
 from pipeline.slam.resampling import normalised
 
 FIRST_CAPACITY = 32
@@ -32,6 +33,7 @@ class SlamState:
         detections: How many detections were seen so far.
         best: The particle that explained the last scans best; its map and past are shown.
         genealogy: Where the particles came from.
+        recent: What the health is judged by.
     """
 
     pose: Float
@@ -48,6 +50,7 @@ class SlamState:
     detections: int
     best: int = 0
     genealogy: Genealogy = field(default_factory=Genealogy)
+    recent: Recent = field(default_factory=Recent)
 
     @classmethod
     def at_origin(cls, particles: int) -> SlamState:

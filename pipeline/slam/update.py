@@ -7,6 +7,7 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
+from pipeline.slam.health import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.landmarks import kalman_update, merge_duplicates, remove_gone
 from pipeline.slam.proposal import draw, recognise, rotated
 from pipeline.visibility import is_in_free_view
@@ -40,6 +41,7 @@ def observe(
     looks: float,
     merge_gate: float,
     miss_weight: float,
+    told: Float,
 ) -> None:
     """Update every particle in place; shapes as in SlamState.
 
@@ -58,6 +60,7 @@ def observe(
         looks: A landmark is never known better than by so many independent looks.
         merge_gate: Two landmarks nearer than this are one [sigma].
         miss_weight: What one miss takes from the log weight.
+        told: shape (P, TOLD), filled: what each particle tells of the scan (see health).
     """
     detections = centre.shape[0]
     reach = view_range
@@ -67,8 +70,11 @@ def observe(
     near_room = np.empty(mean.shape[1], np.int64)
     mu = np.empty(3)
     P = np.empty((3, 3))
+    before = np.empty(3)
+    told[:] = 0.0
     for p in range(pose.shape[0]):
         _predict(pose[p], motion, motion_covariance, mu, P)
+        before[:] = mu
         if not use_proposal:
             draw(mu, P, noise[p], pose[p])
             mu[:] = pose[p]
@@ -77,32 +83,20 @@ def observe(
         near = _in_reach(mean[p, :known], mu, reach, near_room)
         log_weight[p] += recognise(
             mu, P, centre, R, near, mean[p, :known], covariance[p, :known], hits[p, :known],
-            gate, distance_max, hits_to_weigh, landmark_of,
+            gate, distance_max, hits_to_weigh, landmark_of, told[p],
         )  # fmt: skip
+        _shift(before, mu, motion[2], told[p])
         if use_proposal:
             draw(mu, P, noise[p], pose[p])
         seen = np.zeros(known, np.bool_)
         count[p] = _learn(
-            pose[p],
-            mean[p],
-            covariance[p],
-            hits[p],
-            score[p],
-            birth[p],
-            known,
-            landmark_of,
-            centre,
-            R,
-            first_birth,
-            looks,
-            seen,
-        )
-        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
-        for j in near:
-            if not seen[j] and is_in_free_view(mean[p, j], pose[p], c, s, clear_range, view_range):
-                score[p, j] -= miss
-                if hits[p, j] >= hits_to_weigh:
-                    log_weight[p] -= miss_weight
+            pose[p], mean[p], covariance[p], hits[p], score[p], birth[p], known, landmark_of,
+            centre, R, first_birth, looks, seen,
+        )  # fmt: skip
+        log_weight[p] -= miss_weight * _miss(
+            pose[p], mean[p], hits[p], score[p], near, seen, clear_range, view_range, miss, hits_to_weigh,
+            told[p],
+        )  # fmt: skip
         merge_duplicates(mean[p], covariance[p], hits[p], score[p], birth[p], near, seen, merge_gate)
         remove_gone(mean[p], covariance[p], hits[p], score[p], birth[p], count, p, near)
 
@@ -162,6 +156,44 @@ def _predict(pose: Float, motion: Float, covariance: Float, mu: Float, P: Float)
     P[0, 2] = P[2, 0] = c * covariance[0, 2] - s * covariance[1, 2]
     P[1, 2] = P[2, 1] = s * covariance[0, 2] + c * covariance[1, 2]
     P[2, 2] = covariance[2, 2]
+
+
+@compiled
+def _miss(
+    pose: Float,
+    mean: Float,
+    hits: Int32,
+    score: Float32,
+    near: Int,
+    seen: Bool,
+    clear_range: Float,
+    view_range: float,
+    miss: float,
+    hits_to_weigh: int,
+    told: Float,
+) -> float:
+    """Take from the score of landmarks in free view that were not seen; returns how many well known ones
+    there are."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    missed = 0.0
+    for j in near:
+        if not seen[j] and is_in_free_view(mean[j], pose, c, s, clear_range, view_range):
+            score[j] -= miss
+            if hits[j] >= hits_to_weigh:
+                told[MISSED] += min(float(hits[j]), MOST_HITS)
+                missed += 1.0
+    return missed
+
+
+@compiled
+def _shift(before: Float, after: Float, turn: float, told: Float) -> None:
+    """How far the scan moved a pose, in the frame of the odometry's covariance."""
+    c, s = np.cos(before[2] - turn), np.sin(before[2] - turn)
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    shift = told[SHIFT]
+    shift[0] = c * dx + s * dy
+    shift[1] = c * dy - s * dx
+    shift[2] = (after[2] - before[2] + np.pi) % (2.0 * np.pi) - np.pi
 
 
 @compiled

@@ -1,0 +1,136 @@
+"""What sources give: scans, motion, and what is known for certain. Times are integer nanoseconds, lengths
+metres, angles radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry import Pose3
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Int = NDArray[np.int64]
+Int32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One sweep of the LiDAR (Eq. 1), in the sensor's own frame (`lidar`).
+
+    Attributes:
+        stamp_ns: Time of the sweep.
+        points: float32, shape (N, 3) [m], all finite, no returns at the origin.
+        reflectance: float32, shape (N,), in the sensor's own scale, or None.
+        ring: int32, shape (N,), the laser that saw the point (0 = lowest), or None.
+        offset_ns: int32, shape (N,), time of each point relative to `stamp_ns`, or None.
+        dropped: How many returns the reader left out because they were not finite or empty.
+    """
+
+    stamp_ns: int
+    points: Float32
+    reflectance: Float32 | None = None
+    ring: Int32 | None = None
+    offset_ns: Int32 | None = None
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Where the wheels (or another source) say the base is.
+
+    Attributes:
+        stamp_ns: Time of the pose.
+        T_odom_base: The pose of the base in the odometry's own frame.
+    """
+
+    stamp_ns: int
+    T_odom_base: Pose3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imu:
+    """One reading of the inertial unit, turned into the base frame.
+
+    Attributes:
+        stamp_ns: Time of the reading.
+        angular_velocity: shape (3,) [rad/s].
+        linear_acceleration: shape (3,) [m/s^2], +9.81 along z when it stands still and level.
+        orientation: Quaternion w, x, y, z of the base in a level frame, shape (4,), or None.
+    """
+
+    stamp_ns: int
+    angular_velocity: Float
+    linear_acceleration: Float
+    orientation: Float | None = None
+
+
+Record = Scan | Odometry | Imu
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What is known of the LiDAR. It decides how far apart neighbouring returns lie.
+
+    Attributes:
+        name: For people, e.g. "VLP-16".
+        rings: Number of lasers; 1 for a planar laser; 0 when unknown or not a spinning sensor.
+        ring_step: Angle between neighbouring lasers [rad]; 0 when unknown.
+        azimuth_step: Angle between neighbouring shots [rad].
+        range_sigma: Standard deviation of a range [m].
+        range_max: Longest range that it reports [m].
+    """
+
+    name: str = "LiDAR"
+    rings: int = 0
+    ring_step: float = 0.0
+    azimuth_step: float = 0.0035
+    range_sigma: float = 0.02
+    range_max: float = 100.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthTrees:
+    """What really stands in the plot (trees and others), in the frame of the map.
+
+    Attributes:
+        x, y: shape (N,) [m].
+        dbh: Diameter at breast height [m], NaN where it is not known, shape (N,).
+        kind: One of "tree", "pole", "person", "bush", "other" each.
+    """
+
+    x: Float
+    y: Float
+    dbh: Float
+    kind: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthPath:
+    """Where the robot really was.
+
+    Attributes:
+        stamp_ns: int64, shape (N,), ascending.
+        x, y: shape (N,) [m].
+        yaw: shape (N,) [rad], NaN where only the position is known (GNSS).
+        same_frame: Whether x and y are in the frame of the map; if not, it is aligned before it is
+            compared.
+    """
+
+    stamp_ns: Int
+    x: Float
+    y: Float
+    yaw: Float
+    same_frame: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What is known for certain about a run; either part may be missing."""
+
+    trees: TruthTrees | None = None
+    path: TruthPath | None = None
