@@ -38,6 +38,7 @@ STAGES = (
     "detection",
     "gathering",
     "slam",
+    "relocalisation",
     "tracking",
     "evaluation",
     "export",

@@ -26,6 +26,7 @@ class Parameters(BaseModel):
     shape: stages.Shape = Field(default_factory=stages.Shape)
     detection: stages.Detection = Field(default_factory=stages.Detection)
     slam: stages.Slam = Field(default_factory=stages.Slam)
+    relocalisation: stages.Relocalisation = Field(default_factory=stages.Relocalisation)
     gathering: stages.Gathering = Field(default_factory=stages.Gathering)
     tracking: stages.Tracking = Field(default_factory=stages.Tracking)
     evaluation: stages.Evaluation = Field(default_factory=stages.Evaluation)

@@ -275,6 +275,17 @@ class Slam(Stage):
     )
 
 
+class Relocalisation(Stage):
+    """Relocalisation: where a constellation of stems stands in a map that is known."""
+
+    stems_min: int = count(
+        6, "Stems in agreement", "", 4, 100, "No pose is taken that fewer stems agree with."
+    )
+    slack: float = number(
+        0.1, "Slack", "m", 0.0, 1.0, 0.01, "How far a map may be bent over a constellation (one sigma)."
+    )
+
+
 class Gathering(Stage):
     """Gathering: what all scans together say of each place; the verdict on a tree is taken there."""
 
