@@ -15,9 +15,21 @@ from pipeline.detection import detections, judge
 from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.parameters import Parameters
-from pipeline.records import Float32, Frame, Path, PoseEstimate, Sensor, Step
+from pipeline.records import (
+    Clusters,
+    Detections,
+    Float32,
+    Frame,
+    Int32,
+    Path,
+    PoseEstimate,
+    Sensor,
+    Stems,
+    Step,
+)
 from pipeline.shape import describe
 from pipeline.slam import FastSlam, SlamState
+from pipeline.stems import take_stems
 from pipeline.terrain import Terrain, height_above
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
@@ -99,6 +111,63 @@ class Mapper:
         """Map one scan."""
         p, watch = self._parameters, self._watch
 
+        seen = self._perceive(step) if step.scan.stems is None else self._take_stems(step, step.scan.stems)
+        found, free = seen.detections, seen.free
+
+        with watch("slam"):
+            motion, odometry = self._motion(step)
+            estimate = self._slam.process(step.index, motion, found, free)
+
+        with watch("tracking"):
+            self._tracker.process(
+                step.scan.stamp_ns,
+                estimate.T_map_base,
+                estimate.covariance,
+                found,
+                free,
+                p.slam.view_range,
+            )
+            self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
+
+        columns = self._gathering.columns if p.gathering.method == "columns" else None
+        if columns is not None and self._is_gathered(step.index) and seen.above is not None:
+            boxed, height, terrain = seen.above
+            with watch("gathering"):
+                steepest = steepest_by_direction(seen.raw, seen.sensor_offset, self._sensor.rings > 0)
+                view = View(estimate.T_map_base, seen.sensor_offset, free, steepest, terrain.height)
+                self._gathering.add(boxed, height, step.index, view)
+                columns = self._gathering.columns
+                self._tracker.judge(step.scan.stamp_ns, columns)
+
+        trees = self._tracker.trees()
+
+        self._path.append(step.scan.stamp_ns, estimate)
+        return Frame(
+            index=step.index,
+            stamp_ns=step.scan.stamp_ns,
+            raw=seen.raw,
+            filtered=seen.filtered,
+            labels=seen.labels,
+            clusters=seen.clusters,
+            detections=found,
+            estimate=estimate,
+            T_odom_base=odometry,
+            sensor_offset=seen.sensor_offset,
+            trees=trees,
+            counts={
+                "returns": len(step.scan.points),
+                "without a value": step.scan.dropped,
+                "out of range": len(step.scan.points) - len(seen.raw),
+                **seen.counts,
+            },
+            warnings=step.warnings,
+            columns=columns,
+        )
+
+    def _perceive(self, step: Step) -> _Seen:
+        """From the scan to detections: sections 3.1 to 3.3."""
+        p, watch = self._parameters, self._watch
+
         with watch("acquisition"):
             raw, sensor_offset = acquire(step, self._T_base_lidar, p.acquisition)
 
@@ -124,57 +193,46 @@ class Mapper:
             found = detections(judged, sensor_offset, p.detection)
             free = clear_range(raw, filtered, sensor_offset)
 
-        with watch("slam"):
-            motion, odometry = self._motion(step)
-            estimate = self._slam.process(step.index, motion, found, free)
-
-        with watch("tracking"):
-            self._tracker.process(
-                step.scan.stamp_ns,
-                estimate.T_map_base,
-                estimate.covariance,
-                found,
-                free,
-                p.slam.view_range,
-            )
-            self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
-
-        columns = self._gathering.columns if p.gathering.method == "columns" else None
-        if columns is not None and self._is_gathered(step.index) and terrain and height is not None:
-            with watch("gathering"):
-                steepest = steepest_by_direction(raw, sensor_offset, self._sensor.rings > 0)
-                view = View(estimate.T_map_base, sensor_offset, free, steepest, terrain.height)
-                self._gathering.add(boxed, height, step.index, view)
-                columns = self._gathering.columns
-                self._tracker.judge(step.scan.stamp_ns, columns)
-
-        trees = self._tracker.trees()
-
-        self._path.append(step.scan.stamp_ns, estimate)
-        return Frame(
-            index=step.index,
-            stamp_ns=step.scan.stamp_ns,
+        return _Seen(
             raw=raw,
             filtered=filtered,
             labels=labels.label,
             clusters=judged,
             detections=found,
-            estimate=estimate,
-            T_odom_base=odometry,
+            free=free,
             sensor_offset=sensor_offset,
-            trees=trees,
+            above=(boxed, height, terrain) if terrain and height is not None else None,
             counts={
-                "returns": len(step.scan.points),
-                "without a value": step.scan.dropped,
-                "out of range": len(step.scan.points) - len(raw),
                 "out of the box": len(raw) - len(boxed),
                 "ground or too high": len(boxed) - len(band),
                 "averaged in voxels": len(band) - len(filtered),
                 "clustered": int(np.count_nonzero(labels.label >= 0)),
                 "noise": int(np.count_nonzero(labels.label < 0)),
             },
-            warnings=step.warnings,
-            columns=columns,
+        )
+
+    def _take_stems(self, step: Step, stems: Stems) -> _Seen:
+        """From stems that another program found to detections."""
+        p, watch = self._parameters, self._watch
+
+        with watch("acquisition"):
+            places, sensor_offset, clusters = take_stems(step, stems, self._T_base_lidar, p.acquisition)
+
+        with watch("detection"):
+            judged = judge(clusters, p.detection)
+            found = detections(judged, sensor_offset, p.detection)
+            free = clear_range(places, places, sensor_offset)
+
+        return _Seen(
+            raw=places,
+            filtered=places,
+            labels=np.arange(len(places), dtype=np.int32),
+            clusters=judged,
+            detections=found,
+            free=free,
+            sensor_offset=sensor_offset,
+            above=None,
+            counts={"clustered": len(places)},
         )
 
     def _terrain(self, raw: Float32) -> Terrain | None:
@@ -213,6 +271,26 @@ class Mapper:
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
         self._path.cut(state.path_length)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """What one scan shows, before it is known where it was taken; see Frame.
+
+    Attributes:
+        free: How far the view is free by direction (see visibility).
+        above: Points of the box, their heights above the ground, and the ground; None without a ground.
+    """
+
+    raw: Float32
+    filtered: Float32
+    labels: Int32
+    clusters: Clusters
+    detections: Detections
+    free: Float
+    sensor_offset: Float
+    above: tuple[Float32, Float32, Terrain] | None
+    counts: dict[str, int]
 
 
 class _PathColumns:

@@ -19,6 +19,19 @@ Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Stems:
+    """Stems that another program found in a sweep, one row a point of its scan.
+
+    Attributes:
+        axis: Unit vectors along the stems, upwards, sensor frame, shape (N, 3); NaN where not known.
+        dbh: Diameter at breast height [m], NaN where none was fitted, shape (N,).
+    """
+
+    axis: Float
+    dbh: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Scan:
     """One sweep of the LiDAR (Eq. 1), in the sensor's own frame (`lidar`).
 
@@ -29,6 +42,7 @@ class Scan:
         ring: int32, shape (N,), the laser that saw the point (0 = lowest), or None.
         offset_ns: int32, shape (N,), time of each point relative to `stamp_ns`, or None.
         dropped: How many returns the reader left out because they were not finite or empty.
+        stems: Where the source gives stems instead of returns; then `points` are their places.
     """
 
     stamp_ns: int
@@ -37,6 +51,7 @@ class Scan:
     ring: Int32 | None = None
     offset_ns: Int32 | None = None
     dropped: int = 0
+    stems: Stems | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,6 +20,7 @@ from pipeline.readings import Odometry as Odometry
 from pipeline.readings import Record as Record
 from pipeline.readings import Scan as Scan
 from pipeline.readings import Sensor as Sensor
+from pipeline.readings import Stems as Stems
 from pipeline.readings import Truth as Truth
 from pipeline.readings import TruthPath as TruthPath
 from pipeline.readings import TruthTrees as TruthTrees

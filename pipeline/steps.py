@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.geometry import Float, Pose2, Pose3, interpolate
+from pipeline.geometry import Float, Pose2, Pose3, interpolate, wrap_angle
 from pipeline.records import Imu, Odometry, Record, Scan, Step
 
 OdometryChoice = Literal["auto", "wheels", "static"]
@@ -165,7 +165,8 @@ class _Joiner:
         fraction = float(np.clip((stamp_ns - before.stamp_ns) * 1e-9 / span, 0.0, 1.0))
         step = before.pose.inverse() @ after.pose
         twist = (step.x / span, step.y / span, step.yaw / span)
-        return interpolate(before.pose, after.pose, fraction), twist, before.tilt
+        tilt = _tilt_between(before, after, fraction)
+        return interpolate(before.pose, after.pose, fraction), twist, tilt
 
     def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
         if not self._imu:
@@ -194,6 +195,15 @@ def _around(readings: deque[_Reading], stamp_ns: int) -> tuple[_Reading, _Readin
     after = next((k for k, r in enumerate(readings) if r.stamp_ns >= stamp_ns), len(readings) - 1)
     after = max(after, min(1, len(readings) - 1))
     return readings[max(after - 1, 0)], readings[after]
+
+
+def _tilt_between(before: _Reading, after: _Reading, fraction: float) -> tuple[float, float] | None:
+    """Roll and pitch between two readings; a reading in the plane beside one in space is level by chance."""
+    if before.tilt is None and after.tilt is None:
+        return None
+    (roll, pitch), (roll_after, pitch_after) = before.tilt or (0.0, 0.0), after.tilt or (0.0, 0.0)
+    turn = float(wrap_angle(roll_after - roll))
+    return roll + fraction * turn, pitch + fraction * (pitch_after - pitch)
 
 
 def _tilt(T_odom_base: Pose3) -> tuple[float, float] | None:

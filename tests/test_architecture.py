@@ -36,19 +36,21 @@ STAGES = (
     "clustering",
     "shape",
     "detection",
+    "stems",
     "gathering",
     "slam",
     "relocalisation",
     "tracking",
     "evaluation",
     "export",
+    "exchange",
     "truth_table",
     "steps",
 )
 # What stands around the stages and what each may know beside the foundation.
 AROUND = {
     "simulation": set(),
-    "sources": {"simulation", "truth_table"},
+    "sources": {"simulation", "truth_table", "exchange"},
     "recording": {"sources", "simulation"},
     "mapper": set(STAGES),
 }

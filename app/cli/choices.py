@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from pipeline.sources import SourceOptions
 
 SOURCE_HELP = (
-    "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of .bin or .pcd scans, "
-    "or a simulated run such as sim:stand"
+    "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of .bin or .pcd scans "
+    "or of TreeManagerState_<i>.csv stems, or a simulated run such as sim:stand"
 )
 
 

@@ -83,6 +83,21 @@ _LASER2D: dict[str, object] = {
     "tracking.proximity_radius": 1.5,
 }
 
+# Stems that another program found, about a scan every half metre: their places err by a decimetre whatever
+# their distance, the views of one stem share most of it, and what stands in a frame was checked before.
+_STEMS: dict[str, object] = {
+    "acquisition.range_min": 0.0,
+    "acquisition.range_max": 20.0,
+    "detection.radius_min": 0.0,
+    "detection.arc_min": 0.0,
+    "detection.sigma_range": 0.1,
+    "slam.noise_distance": 0.05,
+    "slam.noise_turn_distance": 0.6,
+    "slam.distance_max": 2.0,
+    "gathering.method": "none",
+    "tracking.dbh_arc_min": 0.0,
+}
+
 PRESETS: dict[str, tuple[str, dict[str, object]]] = {
     "forest": ("The best that we know for trunks seen by a 3D LiDAR; the default", {}),
     "paper": ("Table 1 of the paper: eccentricity below 20", _PAPER),
@@ -90,6 +105,7 @@ PRESETS: dict[str, tuple[str, dict[str, object]]] = {
         "The paper's text: eccentricity between 10 and 20",
         {**_PAPER, "detection.e_min": 10.0},
     ),
+    "stems": ("Ready stems of another program, as in a folder of TreeManagerState files", _STEMS),
     "laser2d": ("A planar laser, as on the car of Victoria Park", _LASER2D),
 }
 

@@ -58,6 +58,12 @@ def _kitti(uri: str, path: Path, options: SourceOptions) -> Source:
     return open_kitti(uri, path, options)
 
 
+def _tree_manager(uri: str, folder: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.tree_manager import TreeManagerSource
+
+    return TreeManagerSource(uri, folder, options)
+
+
 def _pcd(uri: str, path: Path, options: SourceOptions) -> Source:
     from pipeline.sources.pcd import open_pcd
 
@@ -104,7 +110,12 @@ FILES = (
 
 READABLE = ", ".join(
     [kind.words for kind in FILES]
-    + ["a folder of .bin or .pcd scans", "a rosbag2 folder", "sim:stand and the other sim: scenarios"]
+    + [
+        "a folder of .bin or .pcd scans",
+        "a rosbag2 folder",
+        "a folder of TreeManagerState_<i>.csv with trajectory.txt",
+        "sim:stand and the other sim: scenarios",
+    ]
 )
 
 
@@ -124,7 +135,10 @@ def expected_format(path: Path) -> Format | None:
 
 def folder_opener(folder: Path) -> Opener | None:
     """How to open a folder, None when nothing in it can be read."""
-    suffixes = {path.suffix.lower() for path in folder.iterdir() if path.is_file()}
+    names = {path.name for path in folder.iterdir() if path.is_file()}
+    if any(name.startswith("TreeManagerState_") for name in names):
+        return _tree_manager
+    suffixes = {Path(name).suffix.lower() for name in names}
     if suffixes & {".mcap", ".db3", ".zstd"}:
         return _bag_folder
     inside = folder / "velodyne"

@@ -33,7 +33,7 @@ def read_poses(path: Path) -> list[Pose3]:
         TextError: It has another form.
         OSError: It cannot be read.
     """
-    rows = _numbers(path, 12).reshape(-1, 3, 4)
+    rows = read_table(path, 12).reshape(-1, 3, 4)
     R, t = rows[:, :, :3], rows[:, :, 3]
     if not np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-2):
         raise TextError("its matrices are no rotations")
@@ -55,7 +55,7 @@ def read_times(path: Path) -> Int:
         OSError: It cannot be read.
     """
     try:
-        times = np.rint(_numbers(path, 1) * 1e9).astype(np.int64).ravel()
+        times = np.rint(read_table(path, 1) * 1e9).astype(np.int64).ravel()
     except TextError:
         times = np.array([_date(line) for line in _text(path).split("\n") if line.strip()], dtype=np.int64)
     if not len(times) or np.any(np.diff(times) < 0):
@@ -72,9 +72,14 @@ def _text(path: Path) -> str:
         raise TextError("it is no text") from error
 
 
-def _numbers(path: Path, columns: int) -> Float:
-    """Rows of finite numbers below 10^10, shape (rows * columns,)."""
-    lines = [line.split() for line in _text(path).split("\n") if line.strip()]
+def read_table(path: Path, columns: int) -> Float:
+    """Rows of finite numbers below 10^10, shape (rows, columns); lines that begin with # are left aside.
+
+    Raises:
+        TextError: It has another form.
+        OSError: It cannot be read.
+    """
+    lines = [line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
     if not lines or any(len(line) != columns for line in lines):
         raise TextError(f"its rows do not have {columns} numbers")
     try:
@@ -83,7 +88,7 @@ def _numbers(path: Path, columns: int) -> Float:
         raise TextError("it has words where numbers should be") from error
     if not np.all(np.abs(numbers) < 1e10):
         raise TextError("it has numbers that are not finite or too large")
-    return numbers
+    return numbers.reshape(-1, columns)
 
 
 def _date(line: str) -> int:
