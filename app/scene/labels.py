@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from pipeline.records import Frame, Verdict
 
 MOST_LABELS = 60  # more than 200 halve the frame rate of a browser, and nobody reads 60
+STEM_HEIGHT = 2.0  # m; drawn where no height was measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +85,7 @@ def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Lab
     clusters, pose = frame.clusters, frame.estimate.T_map_base
     base = clusters.centroid + frame.sensor_offset
     places = pose.apply(base[:, :2])
-    tops = base[:, 2] + 0.5 * clusters.extent[:, 2] + 0.1
+    tops = base[:, 2] + 0.5 * shown_height(clusters.extent[:, 2]) + 0.1
     order = np.lexsort((np.linalg.norm(base[:, :2], axis=1), clusters.verdict != Verdict.TREE))
     return [
         Label(int(numbers[k]), text, (float(places[k, 0]), float(places[k, 1]), float(tops[k])))
@@ -99,7 +101,13 @@ def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
     if label_by == "DBH":
         radius = float(frame.clusters.radius[k])
         return f"{200 * radius:.0f} cm" if np.isfinite(radius) else ""
-    return f"e {short(float(frame.clusters.eccentricity[k]))} {verdict}"
+    eccentricity = float(frame.clusters.eccentricity[k])
+    return verdict if np.isnan(eccentricity) else f"e {short(eccentricity)} {verdict}"
+
+
+def shown_height(height: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How tall a cluster is drawn [m]; a stem that another program found has no height."""
+    return np.where(np.isnan(height), STEM_HEIGHT, np.maximum(height, 0.2))
 
 
 def short(value: float) -> str:

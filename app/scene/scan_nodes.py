@@ -11,7 +11,7 @@ from app.scene.batch import Batch
 from app.scene.cloud import Cloud
 from app.scene.colours import Colours
 from app.scene.companions import Companions
-from app.scene.labels import Labels, cluster_labels
+from app.scene.labels import Labels, cluster_labels, shown_height
 from app.scene.view import View
 from pipeline.records import Frame
 
@@ -76,7 +76,7 @@ class ScanNodes:
         rows = frame.detections.cluster
         rows = rows[np.isfinite(frame.clusters.radius[rows])]
         clusters = frame.clusters
-        height = np.maximum(clusters.extent[rows, 2], 0.2)
+        height = shown_height(clusters.extent[rows, 2])
         foot = clusters.centroid[rows, 2] - 0.5 * height
         radius = clusters.radius[rows]
         self._fits.show(
@@ -100,7 +100,7 @@ def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) ->
     if colour_by == "cluster":
         table = colours.by_category(numbers)
     elif colour_by == "eccentricity":  # 1 is round, 100 a line
-        table = colours.ramp(np.log10(np.maximum(clusters.eccentricity, 1.0)), 0.0, 2.0)
+        table = colours.ramp(np.log10(np.fmax(clusters.eccentricity, 1.0)), 0.0, 2.0)
     elif colour_by == "stage":
         table = np.tile(np.array([colours.CLUSTERED], dtype=np.uint8), (len(clusters.size), 1))
         table[frame.detections.cluster] = colours.TREE

@@ -55,6 +55,16 @@ def test_the_pose_is_interpolated_to_the_time_of_the_scan(ms, speed, turn):
     assert step.warnings == ()
 
 
+@LAW
+@given(st.floats(0.0, 40.0), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+def test_the_tilt_of_the_pose_is_that_of_the_time_of_the_scan(ms, roll, pitch):
+    records = [odometry(0, roll=0.1), at(ms), odometry(40, 0.02, roll=roll, pitch=pitch)]
+    (step,) = steps(records)
+    assert step.tilt_known
+    assert step.roll == pytest.approx(0.1 + (roll - 0.1) * ms / 40, abs=1e-6)
+    assert step.pitch == pytest.approx(pitch * ms / 40, abs=1e-6)
+
+
 def test_the_twist_is_in_the_frame_of_the_robot():
     (step,) = steps([odometry(0, 0, 0, np.pi / 2), at(50), odometry(100, 0.0, 0.2, np.pi / 2)])
     np.testing.assert_allclose(step.twist, [2.0, 0.0, 0.0], atol=1e-9)

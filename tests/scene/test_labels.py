@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,3 +49,16 @@ async def test_a_label_that_says_the_same_costs_nothing(scene: Scene):
 @pytest.mark.parametrize(("value", "text"), [(3.2189, "3.2"), (16.457, "16"), (123.4, "100"), (np.inf, "∞")])
 def test_figures_that_tremble_are_short(value: float, text: str):
     assert short(value) == text
+
+
+def test_a_stem_of_another_program_is_labelled_and_drawn_without_eccentricity_and_height(scene: Scene):
+    frame = make_frame(0)
+    unknown = np.full(len(frame.clusters.size), np.nan)
+    extent = np.column_stack([frame.clusters.extent[:, :2], unknown])
+    ready = replace(frame.clusters, eccentricity=unknown, extent=extent)
+    scene.show(replace(frame, clusters=ready), PATH)
+    assert set(scene._scan.texts) == {"tree", "too long"}
+    scene._choose("colour_by", "eccentricity")
+    fits = scene._server.scene.get_handle_by_name("/world/robot/scan/fits")
+    assert fits is not None
+    assert np.isfinite(fits.batched_scales).all()  # type: ignore[attr-defined]
