@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import StemmapError
 from pipeline.geometry import Float, Pose2, Pose3
-from pipeline.records import Path, Trees
+from pipeline.records import Int, Path, Trees
 
 TRAJECTORY = "trajectory.txt"
 AXIS = tuple(f"axis_{row}{column}" for row in range(3) for column in range(3))
@@ -41,12 +41,12 @@ def state_text(rows: Iterable[Sequence[float | bool]]) -> str:
     return "\n".join([",".join(COLUMNS), *lines]) + "\n"
 
 
-def trajectory_text(seconds: Float, poses: Iterable[Pose3]) -> str:
-    """The file of poses; times in seconds, shape (N,)."""
+def trajectory_text(stamp_ns: Int, poses: Iterable[Pose3]) -> str:
+    """The file of poses; times in nanoseconds, shape (N,)."""
     lines = []
-    for time, pose in zip(seconds.tolist(), poses, strict=True):
+    for stamp, pose in zip(stamp_ns.tolist(), poses, strict=True):
         w, x, y, z = pose.quaternion().tolist()
-        lines.append(" ".join([f"{time:.9f}", *(f"{v:.9f}" for v in (*pose.t.tolist(), x, y, z, w))]))
+        lines.append(" ".join([f"{stamp * 1e-9:.9f}", *(f"{v:.9f}" for v in (*pose.t.tolist(), x, y, z, w))]))
     return "\n".join(lines) + "\n"
 
 
@@ -99,7 +99,7 @@ def _write(folder: FilePath, path: Path, trees: Trees, reach: float) -> int:
         rows = [_row(trees, known[k], place[k]) for k in np.flatnonzero(here)]
         (folder / state_name(frame)).write_text(state_text(rows), encoding="utf-8", newline="")
     full = [Pose3.from_euler(np.array([p.x, p.y, 0.0]), 0.0, 0.0, p.yaw) for p in poses]
-    text = trajectory_text(path.stamp_ns * 1e-9, full)
+    text = trajectory_text(path.stamp_ns, full)
     (folder / TRAJECTORY).write_text(text, encoding="utf-8", newline="")
     return int(np.count_nonzero(~written))
 

@@ -38,7 +38,9 @@ def write(folder: Path, frames: int = 4, *, first: int = 0, rows: int | None = N
             state_text([stem(3.0 + k, 1.0, dbh=0.25), stem(-2.0, 4.0)])
         )
     count = frames if rows is None else rows
-    (folder / "trajectory.txt").write_text(trajectory_text(100.0 + 0.5 * np.arange(count), poses(count)))
+    (folder / "trajectory.txt").write_text(
+        trajectory_text(100_000_000_000 + 500_000_000 * np.arange(count), poses(count))
+    )
     return folder
 
 
@@ -80,7 +82,9 @@ def test_the_published_frames_are_those_of_the_whole_run(shared_data: Path, tmp_
         (tmp_path / state_name(k)).write_bytes((shared_data / "oxford_evo" / state_name(k)).read_bytes())
     table = evo["trajectory"][:2]
     told = [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in table]
-    (tmp_path / "trajectory.txt").write_text(trajectory_text(table[:, 0], told))
+    (tmp_path / "trajectory.txt").write_text(
+        trajectory_text(np.rint(table[:, 0] * 1e9).astype(np.int64), told)
+    )
     source = opened(tmp_path)
     for k, scan in enumerate(scans(source)):
         rows = evo["frame"] == k
