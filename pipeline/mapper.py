@@ -15,6 +15,7 @@ from pipeline.detection import detections, judge
 from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.parameters import Parameters
+<<<<<<< HEAD
 from pipeline.records import (
     Clusters,
     Detections,
@@ -27,6 +28,9 @@ from pipeline.records import (
     Stems,
     Step,
 )
+=======
+from pipeline.records import Float32, Frame, Int, Path, PoseEstimate, Sensor, Step
+>>>>>>> e776ffc (Save a map so that another mapper goes on from it to the same bytes)
 from pipeline.shape import describe
 from pipeline.slam import FastSlam, SlamState
 from pipeline.stems import take_stems
@@ -263,6 +267,20 @@ class Mapper:
             len(self._path),
         )
 
+    def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float) -> None:
+        """Go on from a state of another mapper; `stamp_ns` and `sigma_xy` are its path's, one a scan."""
+        self._path = _PathColumns(stamp_ns, sigma_xy)
+        self.restore(state)
+
+    def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
+        """Say where the base stands before scan `index`; its odometry begins anew there.
+
+        Args:
+            covariance: Of x, y [m], yaw [rad], shape (3, 3).
+        """
+        self._slam.place(index, T_map_base, covariance)
+        self._odometry = None
+
     def restore(self, state: MapperState) -> None:
         """Go back to a snapshot of this mapper's own past; the state itself is left untouched."""
         self._slam.state = state.slam.copy()
@@ -296,10 +314,10 @@ class _Seen:
 class _PathColumns:
     """Stamps and sigmas of a path that grows by doubling."""
 
-    def __init__(self) -> None:
-        self._stamp = np.zeros(64, np.int64)
-        self._sigma: Float = np.zeros(64)
-        self._length = 0
+    def __init__(self, stamp_ns: Int | None = None, sigma: Float | None = None) -> None:
+        self._stamp = np.zeros(64, np.int64) if stamp_ns is None else stamp_ns.copy()
+        self._sigma: Float = np.zeros(64) if sigma is None else sigma.copy()
+        self._length = 0 if stamp_ns is None else len(stamp_ns)
 
     def __len__(self) -> int:
         return self._length

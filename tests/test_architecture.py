@@ -19,6 +19,7 @@ FOUNDATION = (
     "geometry",
     "compiled",
     "files",
+    "saving",
     "health",
     "readings",
     "records",
@@ -53,6 +54,7 @@ AROUND = {
     "sources": {"simulation", "truth_table", "exchange"},
     "recording": {"sources", "simulation"},
     "mapper": set(STAGES),
+    "saved_map": {*STAGES, "mapper"},
 }
 FORBIDDEN_IN_PIPELINE = {
     "app",

@@ -37,6 +37,14 @@ class GatheringState:
     since: tuple[tuple[Float32, int, int], ...]
     columns: Columns
 
+    def folded(self) -> Memory:
+        """The memory with the scans since, of its own."""
+        memory = self.base.copy()
+        for points, scan, most in self.since:
+            memory.add(points, scan, most)
+            memory.judge_anew(GROWN)
+        return memory
+
 
 class Gathering:
     """All that is remembered of places, and the columns in it.
@@ -53,7 +61,7 @@ class Gathering:
         self.parameters = parameters
         self._forest = forest or standard_forest(all_around)
         self.memory = Memory.empty()
-        self.columns = _rows(np.zeros((0, 5)), np.zeros((0, 2), np.int64))
+        self.columns = no_columns()
         self._base = self.memory.copy()
         self._since: list[tuple[Float32, int, int]] = []
 
@@ -84,10 +92,7 @@ class Gathering:
     def restore(self, state: GatheringState) -> None:
         """Go back to a snapshot; the state itself is left untouched."""
         self._base, self._since = state.base, list(state.since)
-        self.memory = state.base.copy()
-        for points, scan, most in state.since:
-            self.memory.add(points, scan, most)
-            self.memory.judge_anew(GROWN)
+        self.memory = state.folded()
         self.columns = state.columns
 
     def _remember(self, points: Float32, scan: int, most: int) -> Int:
@@ -132,6 +137,11 @@ class Gathering:
         gone = (c.absent >= GONE_SCANS) & (c.absent > GONE * (c.present + c.absent))
         verdict[gone] = Verdict.MOVING
         self.columns = replace(c, verdict=verdict.astype(np.int32))
+
+
+def no_columns() -> Columns:
+    """A table of columns without rows."""
+    return _rows(np.zeros((0, 5)), np.zeros((0, 2), np.int64))
 
 
 def _part_of_a_wall(figures: Float) -> Bool:

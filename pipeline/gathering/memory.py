@@ -170,6 +170,12 @@ def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
     return int(at)
 
 
+def index(memory: Memory, rows: int) -> None:
+    """Fill the tables of a memory of which the first rows of columns were set."""
+    memory.used = rows
+    memory.tiles = _index(rows, *memory._tables())
+
+
 @compiled
 def _tile_of(key: int | np.int64) -> int:
     ix, iy = key >> 36, (key >> 5) & ((1 << 31) - 1)

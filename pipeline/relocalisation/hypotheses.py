@@ -42,7 +42,8 @@ def pairs_within(position: Float, shortest: float, longest: float, most: int) ->
 
 @compiled
 def _walk_pairs(
-    position: Float, order: Int, shortest: float, longest: float, bins: Int, taken: int, row: Int32, length: Float
+    position: Float, order: Int, shortest: float, longest: float,
+    bins: Int, taken: int, row: Int32, length: Float,
 ) -> None:  # fmt: skip
     """Count the pairs by their length in bins, and write those of the first `taken` bins where there is
     room for them."""

@@ -21,6 +21,7 @@ from pipeline.slam.resampling import low_variance_ancestors, normalised, take_an
 from pipeline.slam.state import SlamState
 from pipeline.slam.update import observe
 
+PLACED = 1  # tells the draws of a placing from those of a scan
 TURN_AS_DISTANCE = 1.0  # m/rad; a robot that turns on the spot sees the trees anew as well
 
 
@@ -71,6 +72,21 @@ class FastSlam:
                 state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.covariance
             ),
         )
+
+    def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
+        """Put all particles where another source says the base is now, with the map of the best one.
+
+        Args:
+            index: Number of the scan, for the draws.
+            T_map_base: The pose; covariance: of x, y [m], yaw [rad], shape (3, 3).
+        """
+        noise = np.random.default_rng([self._seed, index, PLACED]).standard_normal(
+            (self.parameters.particles, 3)
+        )
+        values, axes = np.linalg.eigh(covariance)
+        pose = T_map_base.as_array() + noise @ (axes * np.sqrt(np.maximum(values, 0.0))).T
+        pose[:, 2] = wrap_angle(pose[:, 2])
+        self.state = self.state.placed(pose)
 
     def path(self) -> Float:
         """x, y [m], yaw [rad] at every scan as the best particle has it behind it, shape (N, 3)."""

@@ -103,6 +103,26 @@ class SlamState:
             birth=np.pad(self.birth, ((0, 0), (0, extra))),
         )
 
+    def placed(self, pose: Float) -> SlamState:
+        """All particles with the map and the past of the best one, at new poses, shape (P, 3)."""
+        rows = np.full(len(pose), self.best)
+        return replace(
+            self,
+            pose=pose,
+            log_weight=np.zeros(len(pose)),
+            mean=self.mean[rows],
+            covariance=self.covariance[rows],
+            hits=self.hits[rows],
+            score=self.score[rows],
+            birth=self.birth[rows],
+            count=self.count[rows],
+            motion=np.zeros(3),
+            motion_covariance=np.zeros((3, 3)),
+            best=0,
+            genealogy=self.genealogy.redrawn(rows),
+            recent=Recent(mapped=self.recent.mapped),
+        )
+
     def with_particles(self, particles: int) -> SlamState:
         """The same belief with another number of particles, drawn as low-variance resampling does."""
         if particles == len(self.pose):

@@ -1,0 +1,116 @@
+"""A map as it is saved: all that the mapper knows, so that it goes on from there to the same bytes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pipeline.gathering import GatheringState, PackedMemory, no_columns
+from pipeline.geometry import Float, Pose2
+from pipeline.mapper import Mapper, MapperState
+from pipeline.records import Columns, Int, Trees
+from pipeline.slam import SlamState
+from pipeline.slam.genealogy import BLOCK
+from pipeline.slam.state import FIRST_CAPACITY
+from pipeline.tracking import Tracker
+from pipeline.tracking.table import TrackTable
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedMap:
+    """See MapperState; `stamp_ns` and `sigma_xy` are those of the path, one a scan."""
+
+    slam: SlamState
+    memory: PackedMemory
+    columns: Columns
+    tracks: TrackTable
+    next_number: int
+    odometry: Pose2 | None
+    stamp_ns: Int
+    sigma_xy: Float
+
+    @classmethod
+    def of(cls, mapper: Mapper) -> SavedMap:
+        """What a mapper knows now."""
+        state, path = mapper.snapshot(), mapper.path
+        return cls(
+            state.slam,
+            PackedMemory.of(state.gathering.folded()),
+            state.gathering.columns,
+            state.tracks,
+            state.next_number,
+            state.odometry,
+            path.stamp_ns,
+            path.sigma_xy,
+        )
+
+    def state(self) -> MapperState:
+        """As the mapper takes it.
+
+        Raises:
+            ValueError: Its parts do not fit one another; they come from a file.
+        """
+        _check_slam(self.slam)
+        n = len(self.slam.genealogy)
+        if not len(self.stamp_ns) == len(self.sigma_xy) == n or np.any(np.diff(self.stamp_ns) <= 0):
+            raise ValueError("the stamps are not those of the path")
+        _check_rows(self.tracks, TrackTable.empty())
+        _check_rows(self.columns, no_columns())
+        if (
+            len(self.tracks)
+            and not 0 < self.tracks.number.min() <= self.tracks.number.max() < self.next_number
+        ):
+            raise ValueError("the numbers of the trees are out of order")
+        gathering = GatheringState(self.memory.unpacked(), (), self.columns)
+        return MapperState(self.slam, gathering, self.tracks, self.next_number, self.odometry, n)
+
+    def trees(self, mapper: Mapper) -> Trees:
+        """The trees of the map, by the parameters of a mapper."""
+        tracker = Tracker(mapper.parameters.tracking)
+        tracker.tracks, tracker.next_number = self.tracks, self.next_number
+        return tracker.trees()
+
+
+def _check_slam(slam: SlamState) -> None:
+    P = len(slam.pose)
+    M = slam.mean.shape[1] if slam.mean.ndim == 3 else 0
+    template = SlamState.at_origin(max(P, 1))
+    for f in fields(SlamState):
+        wanted = getattr(template, f.name)
+        if isinstance(wanted, np.ndarray):
+            shape = tuple(
+                M if axis == 1 and d == FIRST_CAPACITY else d for axis, d in enumerate(wanted.shape)
+            )
+            if getattr(slam, f.name).shape != shape:
+                raise ValueError(f"{f.name} of the particles has another shape")
+    if slam.count.min() < 0 or slam.count.max() > M or not 0 <= slam.best < P:
+        raise ValueError("there are more landmarks or particles than room")
+    if not np.all(np.isfinite(slam.pose)):
+        raise ValueError("a pose is not finite")
+    past = slam.genealogy
+    after = P
+    for generation in reversed(past.recent):
+        size, ancestors = len(generation.pose), generation.ancestors
+        fits = size == after if ancestors is None else len(ancestors) == after and _within(ancestors, size)
+        if not fits or generation.pose.shape != (size, 3):
+            raise ValueError("the particles have another past")
+        after = size
+    if any(block.shape != (BLOCK, 3) for block in past.settled):
+        raise ValueError("the path has other columns")
+    if past.founders is not None and any(len(f) != P or not _within(f, 1 << 20) for f in past.founders):
+        raise ValueError("the particles have other founders")
+
+
+def _within(rows: Int, size: int) -> bool:
+    return rows.ndim == 1 and bool(np.all((rows >= 0) & (rows < size)))
+
+
+def _check_rows(table: TrackTable | Columns, empty: TrackTable | Columns) -> None:
+    """All columns as long as the first, each row shaped as in an empty table."""
+    n = None
+    for f in fields(table):
+        column, wanted = getattr(table, f.name), getattr(empty, f.name)
+        n = len(column) if n is None and column.ndim else n
+        if column.shape != (n, *wanted.shape[1:]):
+            raise ValueError(f"{f.name} has another shape")
