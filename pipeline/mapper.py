@@ -15,12 +15,12 @@ from pipeline.detection import detections, judge
 from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.parameters import Parameters
-<<<<<<< HEAD
 from pipeline.records import (
     Clusters,
     Detections,
     Float32,
     Frame,
+    Int,
     Int32,
     Path,
     PoseEstimate,
@@ -28,9 +28,6 @@ from pipeline.records import (
     Stems,
     Step,
 )
-=======
-from pipeline.records import Float32, Frame, Int, Path, PoseEstimate, Sensor, Step
->>>>>>> e776ffc (Save a map so that another mapper goes on from it to the same bytes)
 from pipeline.shape import describe
 from pipeline.slam import FastSlam, SlamState
 from pipeline.stems import take_stems
