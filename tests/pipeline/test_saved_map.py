@@ -119,7 +119,7 @@ def _with(state, **changes):
     ],
 )
 def test_parts_that_do_not_fit_are_refused(change):
-    with pytest.raises(ValueError, match="."):
+    with pytest.raises(ValueError, match=r"."):
         change(saved()[0]).state()
 
 
