@@ -98,7 +98,7 @@ def test_a_cut_file_is_refused():
             read_archive(data[:length], "a file")
 
 
-def _with(state, **changes):
+def _with(state, **changes: Any):
     return replace(state, slam=replace(state.slam, **changes))
 
 
