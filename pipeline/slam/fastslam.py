@@ -80,9 +80,8 @@ class FastSlam:
             index: Number of the scan, for the draws.
             T_map_base: The pose; covariance: of x, y [m], yaw [rad], shape (3, 3).
         """
-        noise = np.random.default_rng([self._seed, index, PLACED]).standard_normal(
-            (self.parameters.particles, 3)
-        )
+        rng = np.random.default_rng([self._seed, index, PLACED])
+        noise = rng.standard_normal((self.parameters.particles, 3))
         values, axes = np.linalg.eigh(covariance)
         pose = T_map_base.as_array() + noise @ (axes * np.sqrt(np.maximum(values, 0.0))).T
         pose[:, 2] = wrap_angle(pose[:, 2])
