@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from pathlib import Path as FilePath
 from typing import Any, Protocol
 
 import numpy as np
 
+from app.continuing import Beginning, Continued, at_origin, go_on
 from app.odometry import odometry_warnings
-from app.run_health import RunHealth
+from app.saved_run import FORMAT, SavedRun
 from app.stopwatch import Stopwatch
+from app.tally import Tally
 from app.version import version
 from pipeline.errors import SourceError
 from pipeline.evaluation import Evaluation, PathError, Rate, evaluate, path_error
 from pipeline.export import RunFiles
 from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
-from pipeline.records import Frame, Path, Truth, TruthTrees, Verdict
+from pipeline.records import Frame, Path, Truth, TruthTrees
+from pipeline.saved_map import SavedMap
 from pipeline.sources.base import Source
-from pipeline.steps import OdometryChoice, steps
+from pipeline.steps import OdometryChoice
 
 MEASURED_SCANS = 100_000  # of which times are kept for the medians
 
@@ -38,7 +41,7 @@ class Progress(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OfflineRun:
-    """What to map, and how."""
+    """What to map, and how; `stop_after` so many scans."""
 
     source: Source
     preset: str
@@ -46,6 +49,8 @@ class OfflineRun:
     seed: int
     odometry: OdometryChoice
     truth_trees: TruthTrees | None = None
+    continued: Continued | None = None
+    stop_after: int | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -66,14 +71,22 @@ class Outcome:
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
-def map_run(plan: OfflineRun, folder: FilePath, progress: Progress) -> Outcome:
+def map_run(
+    plan: OfflineRun, folder: FilePath, progress: Progress, earlier: FilePath | None = None
+) -> Outcome:
     """Map a run and write its files.
+
+    Args:
+        plan: What to map.
+        folder: For the files.
+        progress: Told of each scan.
+        earlier: Folder of the run that is continued.
 
     Raises:
         SourceError: Nothing could be read.
         OSError: The folder could not be written; nothing new stands in it then.
     """
-    files = RunFiles(folder)
+    files = RunFiles(folder, earlier)
     try:
         return _map(plan, files, progress)
     except BaseException:
@@ -93,79 +106,85 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
         seed=plan.seed,
         watch=stopwatch,
     )
-    tally = _Tally(Counter([*odometry_warnings(description, plan.odometry), *description.warnings]))
-    start_ns, frame = 0, None
+    begun = _beginning(plan, mapper)
+    tally, start_ns, frame = begun.tally, begun.start_ns, None
     left_out = Counter[str]()
-    for frame in _frames(plan, mapper, stopwatch, left_out):
-        start_ns = frame.stamp_ns if frame.index == 0 else start_ns
+    to_map = begun.steps(plan.source, plan.odometry, left_out)
+    for step in islice(to_map, plan.stop_after):
+        with stopwatch.whole_scan():
+            frame = mapper.process(step)
+        start_ns = frame.stamp_ns if start_ns is None else start_ns
         files.add(frame, start_ns)
         tally.add(frame)
         progress.update(1)
-    if frame is None:
-        raise SourceError("there is no scan in it", where=description.uri)
-    path, truth = mapper.path, _truth(plan)
+    if frame is None or start_ns is None:
+        what = (
+            "there is no scan in it" if not begun.scans else "there is no scan in it that was not mapped yet"
+        )
+        raise SourceError(what, where=description.uri)
+    path, truth = mapper.path, _truth(plan, begun)
     evaluation = _evaluate(frame, path, truth, plan.parameters)
     error = path_error(path, truth.path) if truth.path else None
-    losses = {reason: n for reason, n in (left_out + Counter(plan.source.losses)).items() if n}
+    counted = begun.losses + left_out + Counter(plan.source.losses)
+    losses = {reason: n for reason, n in counted.items() if n}
+    state = _saved(plan, begun, mapper, start_ns, losses).as_bytes()
     tally.tell_of_far_truth(evaluation)
     if plan.parameters.gathering.method == "none":  # else a track is judged by more than its hits
         tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
+    record = _run_record(plan, tally, frame, path, evaluation, error, losses)
+    if len(begun.sources) > 1:
+        first, *others = begun.sources
+        record["source"].update(uri=first.uri, sha256=first.digest)
+        record["continued"] = [asdict(other) for other in others]
     outcome = Outcome(
-        summary=_summary(description.uri, frame, path, evaluation, error) + tally.health.summary(),
+        summary=_summary(description.uri, frame, path, evaluation, error)
+        + _start_words(begun)
+        + tally.health.summary(),
         warnings=tally.warnings(),
         losses=losses,
         scan_ms=stopwatch.scan_ms,
         stage_ms=stopwatch.stage_ms,
     )
-    files.finish(
-        frame.trees, path, start_ns, _run_record(plan, tally, frame, path, evaluation, error, losses)
-    )
+    files.finish(frame.trees, path, start_ns, record, state)
     return outcome
 
 
-def _frames(
-    plan: OfflineRun, mapper: Mapper, stopwatch: Stopwatch, left_out: Counter[str]
-) -> Iterator[Frame]:
-    for step in steps(plan.source.records(), odometry=plan.odometry, losses=left_out):
-        with stopwatch.whole_scan():
-            frame = mapper.process(step)
-        yield frame
+def _beginning(plan: OfflineRun, mapper: Mapper) -> Beginning:
+    description = plan.source.description
+    warnings = [*odometry_warnings(description, plan.odometry), *description.warnings]
+    if plan.continued is None:
+        return at_origin(plan.source, warnings)
+    return go_on(plan.continued, plan.source, mapper, plan.odometry, plan.seed, warnings)
 
 
-@dataclass(slots=True, eq=False)
-class _Tally:
-    """What is counted over a run."""
-
-    warned: Counter[str]
-    points: Counter[str] = field(default_factory=Counter)
-    verdicts: Counter[str] = field(default_factory=Counter)
-    health: RunHealth = field(default_factory=RunHealth)
-
-    def add(self, frame: Frame) -> None:
-        self.health.add(frame)
-        self.points.update(frame.counts)
-        self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
-        self.warned.update(frame.warnings)
-
-    def tell_of_far_truth(self, evaluation: Evaluation | None) -> None:
-        if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
-            self.warned[far_truth(evaluation.reach)] += 1
-
-    def tell_of_unconfirmed(self, frame: Frame, hits: int) -> None:
-        tentative = int(np.count_nonzero(~frame.trees.confirmed))
-        if tentative:
-            them = "1 tree was" if tentative == 1 else f"{tentative} trees were"
-            self.warned[
-                f"{them} seen fewer than {hits} times and left out of the map; "
-                "--set tracking.hits_to_confirm=1 takes them too"
-            ] += 1
-
-    def warnings(self) -> list[str]:
-        return [text if n == 1 else f"{text} ({n} times)" for text, n in self.warned.items()]
+def _saved(
+    plan: OfflineRun, begun: Beginning, mapper: Mapper, start_ns: int, losses: dict[str, int]
+) -> SavedRun:
+    return SavedRun(
+        FORMAT,
+        begun.sources,
+        plan.preset,
+        plan.parameters.model_dump_json(),
+        plan.seed,
+        start_ns,
+        begun.tally,
+        losses,
+        SavedMap.of(mapper),
+    )
 
 
-def _truth(plan: OfflineRun) -> Truth:
-    known = plan.source.truth() or Truth()
+def _start_words(begun: Beginning) -> list[str]:
+    last = begun.sources[-1]
+    if last.start != "constellation":
+        return []
+    x, y, yaw = last.pose
+    return [
+        f"started at {x:.2f}, {y:.2f} m, {np.degrees(yaw):.1f} degrees of the map: {last.stems} stems agree"
+    ]
+
+
+def _truth(plan: OfflineRun, begun: Beginning) -> Truth:
+    known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
 
 
@@ -177,7 +196,7 @@ def _evaluate(frame: Frame, path: Path, truth: Truth, parameters: Parameters) ->
 
 def _run_record(
     plan: OfflineRun,
-    tally: _Tally,
+    tally: Tally,
     frame: Frame,
     path: Path,
     evaluation: Evaluation | None,
@@ -228,14 +247,6 @@ def _summary(
             f"({error.compared} true positions, {how})"
         )
     return lines
-
-
-def far_truth(reach: float) -> str:
-    """What to say when nothing of the truth lies near the path."""
-    return (
-        f"no ground truth lies within {reach:g} m of the path: it must be in the frame of the map, "
-        "with the first pose as the origin and x along its heading"
-    )
 
 
 def evaluation_lines(e: Evaluation) -> list[str]:

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
@@ -154,27 +155,32 @@ class RunFiles:
 
     Args:
         folder: Made when it is not there; files of an earlier run are replaced.
+        earlier: Folder of the run that this one continues; its detections come first.
 
     Raises:
         OSError: The folder cannot be made or written.
     """
 
-    def __init__(self, folder: FilePath) -> None:
+    def __init__(self, folder: FilePath, earlier: FilePath | None = None) -> None:
         self._folder = folder
         self._made_folder = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         # A folder of its own, so that two runs into one place do not mix their halves.
         self._staging = FilePath(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
-        self._detections = (self._staging / "detections.csv").open("w", encoding="utf-8", newline="")
-        self._detections.write(csv_text(DETECTION_COLUMNS, []))
+        rows = self._staging / "detections.csv"
+        if earlier is not None and (earlier / rows.name).is_file():
+            shutil.copyfile(earlier / rows.name, rows)
+        else:
+            rows.write_text(csv_text(DETECTION_COLUMNS, []), encoding="utf-8", newline="")
+        self._detections = rows.open("a", encoding="utf-8", newline="")
 
     def add(self, frame: Frame, start_ns: int) -> None:
         """Write the clusters of one scan."""
         writer = csv.writer(self._detections, lineterminator="\n")
         writer.writerows(detection_rows(frame, start_ns))
 
-    def finish(self, trees: Trees, path: Path, start_ns: int, run: dict[str, Any]) -> None:
-        """Write the other files and give all of them their names."""
+    def finish(self, trees: Trees, path: Path, start_ns: int, run: dict[str, Any], state: bytes) -> None:
+        """Write the other files and give all of them their names; `state` is what the run goes on from."""
         self._detections.close()
         texts = {
             "trees.csv": csv_text(TREE_COLUMNS, tree_rows(trees, start_ns)),
@@ -184,7 +190,12 @@ class RunFiles:
         }
         for name, text in texts.items():
             (self._staging / name).write_text(text, encoding="utf-8", newline="")
-        for name in ("detections.csv", *texts):  # run.json last: where it stands, the others do too
+        (self._staging / "state.zip").write_bytes(state)
+        for name in (
+            "detections.csv",
+            "state.zip",
+            *texts,
+        ):  # run.json last: where it stands, the others do too
             (self._staging / name).replace(self._folder / name)
         self._staging.rmdir()
 

@@ -116,12 +116,15 @@ def seed(text: str) -> int:
     return value
 
 
-def chosen_parameters(arguments: argparse.Namespace, suggested: str) -> tuple[str, Parameters]:
+def chosen_parameters(
+    arguments: argparse.Namespace, suggested: str, present: Parameters | None = None
+) -> tuple[str, Parameters]:
     """The name of the preset and the parameters that the flags ask for.
 
     Args:
         arguments: Parsed, with the flags of `add_parameter_flags`.
         suggested: The preset that suits the source, where none is named.
+        present: What stands for the suggested preset, of a map that is continued.
 
     Raises:
         ParameterError: A name, value or file does not fit.
@@ -129,7 +132,7 @@ def chosen_parameters(arguments: argparse.Namespace, suggested: str) -> tuple[st
     from pipeline.parameters import assign, from_toml, preset
 
     name = arguments.preset or suggested
-    parameters = preset(name)
+    parameters = present if present is not None and not arguments.preset else preset(name)
     if arguments.config is not None:
         try:
             text = arguments.config.read_text(encoding="utf-8")

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from app.cli.choices import (
     SOURCE_HELP,
@@ -16,7 +18,10 @@ from app.cli.choices import (
     source,
     source_options,
 )
-from pipeline.errors import StemmapError
+from pipeline.errors import ParameterError, StemmapError
+
+if TYPE_CHECKING:
+    from app.continuing import Start
 
 HELP = "map a run without a browser and write its files"
 
@@ -34,23 +39,53 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dbh-unit", choices=("m", "cm", "mm"), help="of a truth column that does not say it"
     )
+    parser.add_argument(
+        "--continue",
+        dest="continued",
+        metavar="DIR",
+        type=Path,
+        help="go on with the map that an earlier run saved there; trees keep their numbers",
+    )
+    parser.add_argument(
+        "--start",
+        metavar="WHERE",
+        type=_start,
+        help="of a continued map: auto (found by the stems around, the default); X,Y,YAW in m and degrees; "
+        "last (where the earlier run ended); resume (the same drive goes on)",
+    )
+    parser.add_argument(
+        "--stop-after", metavar="N", type=_scans, help="map so many scans; --start resume maps the rest"
+    )
+    parser.set_defaults(seed=None)
     parser.epilog = (
-        "DIR gets trees.csv, path.csv, trees.geojson, detections.csv, run.json (all the same bytes for the\n"
-        "same source, parameters and seed). Exit code 3 says that something was left out."
+        "DIR gets trees.csv, path.csv, trees.geojson, detections.csv, run.json and state.zip, from which\n"
+        "--continue goes on (all the same bytes for the same\n"
+        "source, parameters and seed). Exit code 3 says that something was left out."
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Map the run."""
+    if arguments.start is not None and arguments.continued is None:
+        raise ParameterError("--start is of a continued map", remedy="Name it with --continue DIR")
     chosen_parameters(arguments, "forest")  # a mistyped flag is said before anything heavy is loaded
 
+    from app.continuing import Continued
     from app.offline import OfflineRun, map_run
+    from app.saved_run import read_saved_run
     from pipeline.sources import open_source
     from pipeline.truth_table import read_truth_trees
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
+    saved = read_saved_run(arguments.continued) if arguments.continued else None
+    if arguments.seed is None:
+        arguments.seed = saved.seed if saved else 0
     with closing(open_source(arguments.source, source_options(arguments))) as opened:
-        preset_name, parameters = chosen_parameters(arguments, opened.description.preset)
+        preset_name, parameters = chosen_parameters(
+            arguments,
+            saved.preset if saved else opened.description.preset,
+            saved.chosen_parameters() if saved else None,
+        )
         plan = OfflineRun(
             source=opened,
             preset=preset_name,
@@ -58,9 +93,12 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             odometry=arguments.odometry,
             truth_trees=truth_trees,
+            continued=Continued(saved, _in_the_map(arguments.start)) if saved else None,
+            stop_after=arguments.stop_after,
         )
         try:
-            outcome = map_run(plan, arguments.out, progress=_Bar(opened.description.scans))
+            bar = _Bar(opened.description.scans)
+            outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
         except OSError as error:
             raise StemmapError(
                 f"cannot write: {error.strerror}", where=str(error.filename or arguments.out)
@@ -75,6 +113,32 @@ def run(arguments: argparse.Namespace) -> int:
     for reason, number in outcome.losses.items():
         print(f"left out: {number} {reason}", file=sys.stderr)
     return 3 if outcome.losses else 0
+
+
+def _in_the_map(start: str | tuple[float, float, float] | None) -> Start:
+    from pipeline.geometry import Pose2
+
+    if isinstance(start, tuple):
+        return Pose2(*start)
+    return "last" if start == "last" else "resume" if start == "resume" else "auto"
+
+
+def _start(text: str) -> str | tuple[float, float, float]:
+    if text in ("auto", "last", "resume"):
+        return text
+    try:
+        x, y, yaw = (float(part) for part in text.split(","))
+        if max(abs(x), abs(y)) <= 1e6 and abs(yaw) <= 360.0:
+            return x, y, math.radians(yaw)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"{text!r} is not auto, last, resume or three numbers x,y,yaw")
+
+
+def _scans(text: str) -> int:
+    if text.isascii() and text.isdigit() and 0 < int(text) < 1 << 31:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
 
 
 class _Bar:

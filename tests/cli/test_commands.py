@@ -202,7 +202,7 @@ def test_a_source_without_a_file_is_not_served(capsys, tmp_path, monkeypatch):
 
 # --- map and evaluate -----------------------------------------------------------------------------
 
-FILES = {"trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json"}
+FILES = {"trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json", "state.zip"}
 
 
 @pytest.fixture(scope="module")

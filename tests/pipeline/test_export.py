@@ -29,7 +29,7 @@ from pipeline.parameters import preset
 from pipeline.records import Path
 from tests.pipeline.strategies import LAW, SENSOR, arc, step, trees
 
-NAMES = {"trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json"}
+NAMES = {"trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json", "state.zip"}
 START = 1_700_000_000_000_000_000
 
 
@@ -153,7 +153,7 @@ def write(folder, t=None, run=None):
     """A whole small run."""
     files = RunFiles(folder)
     files.add(a_frame(), 0)
-    files.finish(trees([[1.0, 2.0]]) if t is None else t, a_path(), START, run or {"seed": 0})
+    files.finish(trees([[1.0, 2.0]]) if t is None else t, a_path(), START, run or {"seed": 0}, b"state")
     return {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
 
 
@@ -206,7 +206,7 @@ def test_a_run_that_cannot_be_written_down_leaves_the_old_one(tmp_path):
     before = write(tmp_path)
     files = RunFiles(tmp_path)
     with pytest.raises(ValueError, match="JSON"):
-        files.finish(trees([]), a_path(), START, {"error": float("nan")})
+        files.finish(trees([]), a_path(), START, {"error": float("nan")}, b"state")
     files.abandon()
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
