@@ -30,16 +30,16 @@ def lzf_decompress(block: bytes | memoryview, size: int) -> NDArray[np.uint8]:
 
 
 @compiled
-def _unpack(block: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> np.int64:
+def _unpack(block: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
     """Number of bytes written, -1 when the block leads out of either array."""
-    at, out = np.int64(0), np.int64(0)
+    at, out = 0, 0
     while at < len(block):
-        control = np.int64(block[at])
+        control = int(block[at])
         at += 1
         if control < 32:
             run = control + 1
             if at + run > len(block) or out + run > len(unpacked):
-                return np.int64(-1)
+                return -1
             for k in range(run):
                 unpacked[out + k] = block[at + k]
             at += run
@@ -47,16 +47,16 @@ def _unpack(block: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> np.int64:
             run = control >> 5
             if run == 7:
                 if at >= len(block):
-                    return np.int64(-1)
-                run += np.int64(block[at])
+                    return -1
+                run += int(block[at])
                 at += 1
             if at >= len(block):
-                return np.int64(-1)
-            source = out - ((control & 31) << 8) - np.int64(block[at]) - 1
+                return -1
+            source = out - ((control & 31) << 8) - int(block[at]) - 1
             at += 1
             run += 2
             if source < 0 or out + run > len(unpacked):
-                return np.int64(-1)
+                return -1
             # The source may overlap what is written: it repeats, so bytes go one by one.
             for k in range(run):
                 unpacked[out + k] = unpacked[source + k]
