@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,18 +11,49 @@ import numpy as np
 
 from pipeline.exchange import state_name, state_text
 from pipeline.geometry import Pose2, Pose3
-from pipeline.records import Float
+from pipeline.records import Int, TruthPath
+from pipeline.records import Path as DrivenPath
 
 _KEYS = ("xyz", "axis_z", "dbh", "dbh_approx", "score", "reconstructed", "n_clusters")
 
 
-def write_states(evo: dict[str, np.ndarray], folder: Path, every: int = 1) -> None:
-    """Write one TreeManagerState file a frame; frames that are not `every`-th get no file."""
-    order = np.argsort(evo["frame"], kind="stable")
-    begin = np.searchsorted(evo["frame"][order], np.arange(len(evo["trajectory"]) + 1))
-    for frame in range(0, len(evo["trajectory"]), every):
-        rows = order[begin[frame] : begin[frame + 1]]
-        (folder / state_name(frame)).write_text(state_text(_rows({k: evo[k][rows] for k in _KEYS})))
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """The run: columns of its stems by name, and where the sensor was, one pose a frame."""
+
+    stems: dict[str, np.ndarray]
+    stamp_ns: Int
+    poses: list[Pose3]
+
+    @property
+    def truth(self) -> TruthPath:
+        """The recorded path."""
+        path = self.path(self.poses)
+        return TruthPath(path.stamp_ns, path.x, path.y, path.yaw, same_frame=False)
+
+    def path(self, poses: Sequence[Pose3]) -> DrivenPath:
+        """Poses of all frames as a path."""
+        x, y, yaw = np.array([pose.planar().as_array() for pose in poses]).T
+        return DrivenPath(self.stamp_ns, x, y, yaw, np.zeros(len(poses)))
+
+
+def read_recorded(file: Path) -> Recorded:
+    """The run as it was kept; times count from its start."""
+    evo = np.load(file)
+    table = evo["trajectory"]
+    poses = [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in table]
+    stamp_ns = np.rint((table[:, 0] - table[0, 0]) * 1e9).astype(np.int64)
+    return Recorded({key: evo[key] for key in ("frame", *_KEYS)}, stamp_ns, poses)
+
+
+def write_states(recorded: Recorded, folder: Path, every: int = 1) -> None:
+    """Write one TreeManagerState file a frame; only every so many-th has stems, the others are empty."""
+    stems, frames = recorded.stems, len(recorded.poses)
+    order = np.argsort(stems["frame"], kind="stable")
+    begin = np.searchsorted(stems["frame"][order], np.arange(frames + 1))
+    for frame in range(frames):
+        rows = order[begin[frame] : begin[frame + 1] if frame % every == 0 else begin[frame]]
+        (folder / state_name(frame)).write_text(state_text(_rows({key: stems[key][rows] for key in _KEYS})))
 
 
 def _rows(stems: dict[str, np.ndarray]) -> list[list[float | bool]]:
@@ -33,11 +65,6 @@ def _rows(stems: dict[str, np.ndarray]) -> list[list[float | bool]]:
     table = np.hstack([axes.reshape(n, 9), stems["xyz"], numbers]).tolist()
     known = zip(stems["reconstructed"].tolist(), stems["n_clusters"].tolist(), strict=True)
     return [[*row, bool(r), int(c)] for row, (r, c) in zip(table, known, strict=True)]
-
-
-def trajectory_poses(table: Float) -> list[Pose3]:
-    """Poses of rows t x y z qx qy qz qw, shape (N, 8)."""
-    return [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in table]
 
 
 def perturbed(

@@ -1,95 +1,82 @@
-"""Stems found in a forest of 1.5 km (Oxford Evo) with made odometry, over ten seeds."""
+"""Stems of a forest of 1.5 km (Oxford Evo) read from their folder, with made odometry, over ten seeds."""
 
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tests.benchmarks.table import Table
 
 if TYPE_CHECKING:
-    from pipeline.records import Detections, Float, Truth
-    from tests.benchmarks.slam_runs import Seen
+    from tests.benchmarks.tree_manager_folder import Recorded
 
 NAME = "oxford"
 LINE = "Oxford Evo, 100 particles, ten seeds: error of the path, all frames and every fifth"
 SEEDS = range(1, 11)
-#: Of the made odometry: parts of the distance, degrees per root of metre, degrees per metre.
+#: Of the made odometry: part of a step's length, degrees per root of metre, degrees per metre.
 DISTANCE, TURN, BIAS = 0.02, 0.5, 0.02
-REACH = 20.0  # m; stems farther away are left out
-CHANGES: dict[str, object] = {
-    "slam.noise_distance": 0.05,
-    "slam.noise_turn_distance": 0.6,
-    "slam.distance_max": 2.0,
-    "slam.view_range": 0.0,
-}
+COLUMNS = ("seed", "odometry RMS [m]", "RMS [m]", "median [m]", "largest [m]", "trees")
 
 
 def run() -> list[Table]:
     """One table with all frames, one with every fifth; the odometry differs by seed as well."""
+    from tests.benchmarks.tree_manager_folder import read_recorded
+
+    root = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
+    recorded = read_recorded(root / "oxford_evo" / "Evo.npz")
+    return [_table(recorded, every) for every in (1, 5)]
+
+
+def _table(recorded: Recorded, every: int) -> Table:
+    import tempfile
+
+    import numpy as np
+
+    from tests.benchmarks.tree_manager_folder import write_states
+
+    with tempfile.TemporaryDirectory(prefix="stemmap-oxford-") as folder:
+        write_states(recorded, Path(folder), every)
+        rows = []
+        for seed in SEEDS:
+            rows.append(_mapped(recorded, Path(folder), seed))
+            print(f"every {every}, seed {seed}: {rows[-1][2]:.3f} m", file=sys.stderr, flush=True)
+    rms = [row[2] for row in rows]
+    said = f"RMS over {len(rows)} seeds: median {np.median(rms):.3f} m, worst {max(rms):.3f} m"
+    return Table(f"{LINE}: every {every}", COLUMNS, tuple(rows), (said,))
+
+
+def _mapped(recorded: Recorded, folder: Path, seed: int) -> tuple[int, float, float, float, float, int]:
+    """The folder with a seed's odometry through source and mapper, as `stemmap map FOLDER` does it."""
+    from contextlib import closing
+
+    import numpy as np
+
+    from pipeline.evaluation import path_error
+    from pipeline.exchange import TRAJECTORY, trajectory_text
+    from pipeline.mapper import Mapper
     from pipeline.parameters import preset
-    from tests.benchmarks.slam_runs import COLUMNS, mapped, summary
+    from pipeline.sources import open_source
+    from pipeline.steps import steps
+    from tests.benchmarks.tree_manager_folder import perturbed
 
-    parameters = preset("forest").replace(CHANGES)
-    tables = []
-    for every in (1, 5):
-        frames = (_frames(seed, every) for seed in SEEDS)
-        runs = [
-            mapped(rows, truth, parameters, seed) for seed, (rows, truth) in zip(SEEDS, frames, strict=True)
-        ]
-        title = f"{LINE}: every {every}"
-        tables.append(Table(title, COLUMNS, tuple(r.row() for r in runs), (summary(runs),)))
-    return tables
-
-
-def _frames(seed: int, every: int) -> tuple[list[Seen], Truth]:
-    """Frames levelled by the pose's roll and pitch, with perturbed increments of the trajectory."""
-    import numpy as np
-
-    from pipeline.geometry import Pose2, Pose3
-    from pipeline.records import Truth, TruthPath
-    from pipeline.visibility import BINS
-    from tests.benchmarks.slam_runs import Seen
-
-    data = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
-    evo = np.load(data / "oxford_evo" / "Evo.npz")
-    table = evo["trajectory"]
-    poses = [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in table]
-    stamp = np.rint((table[:, 0] - table[0, 0]) * 1e9).astype(np.int64)
-    rng = np.random.default_rng(seed)
-    odometry, rows = Pose2(), []
-    for k, pose in enumerate(poses):
-        if k:
-            step = poses[k - 1].planar().inverse() @ pose.planar()
-            d = float(np.hypot(step.x, step.y))
-            n = rng.standard_normal(2)
-            turn = np.radians(TURN * np.sqrt(d) * n[1] + BIAS * d)
-            grown = 1.0 + DISTANCE * n[0]
-            odometry = odometry @ Pose2(step.x * grown, step.y * grown, step.yaw + float(turn))
-        roll, pitch, _ = pose.euler()
-        level = Pose3.from_euler(np.zeros(3), roll, pitch, 0.0)
-        found = level.apply(evo["xyz"][evo["frame"] == k])[:, :2] if k % every == 0 else np.zeros((0, 2))
-        found = found[np.hypot(found[:, 0], found[:, 1]) < REACH]
-        rows.append(Seen(int(stamp[k]), odometry, _detections(found), np.zeros(BINS)))
-    path = TruthPath(
-        stamp,
-        table[:, 1],
-        table[:, 2],
-        np.array([p.planar().yaw for p in poses]),
-        same_frame=False,
+    told = perturbed(
+        recorded.poses,
+        distance=DISTANCE,
+        turn=np.radians(TURN),
+        bias=np.radians(BIAS),
+        rng=np.random.default_rng(seed),
     )
-    return rows, Truth(path=path)
-
-
-def _detections(centre: Float) -> Detections:
-    import numpy as np
-
-    from pipeline.records import Detections
-
-    n = len(centre)
-    nothing = np.full(n, np.nan)
-    R = np.zeros((n, 2, 2))
-    reach = np.hypot(centre[:, 0], centre[:, 1])
-    R[:, 0, 0] = R[:, 1, 1] = 0.1**2 + (reach * np.radians(0.4)) ** 2
-    return Detections(np.arange(n), centre, R, nothing, nothing, np.zeros(n), nothing)
+    (folder / TRAJECTORY).write_text(trajectory_text(recorded.stamp_ns, told), encoding="utf-8")
+    with closing(open_source(str(folder))) as source:
+        known = source.description
+        mapper = Mapper(preset(known.preset), sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed)
+        for step in steps(source.records()):
+            frame = mapper.process(step)
+    error = path_error(mapper.path, recorded.truth, align=True)
+    before = path_error(recorded.path(told), recorded.truth, align=True)
+    assert error is not None
+    assert before is not None
+    trees = int(np.count_nonzero(frame.trees.confirmed))
+    return seed, before.rms, error.rms, error.median, error.largest, trees
