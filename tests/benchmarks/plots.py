@@ -119,9 +119,18 @@ def draw(drawn: Drawn, file: Path) -> None:
     if drawn.truth_trees is not None:
         t = drawn.truth_trees
         is_tree = np.array([kind == "tree" for kind in t.kind])
-        ring = {"facecolors": "none", "edgecolors": INK, "linewidths": 0.6}
-        axes.scatter(t.x[is_tree], t.y[is_tree], s=26, label="true trees", **ring)
-    axes.scatter(*shown.T, s=5, color=TREE, linewidths=0, label=f"trees of the map ({len(shown)})")
+        axes.scatter(
+            t.x[is_tree],
+            t.y[is_tree],
+            s=26,
+            facecolors="none",
+            edgecolors=INK,
+            linewidths=0.6,
+            label="true trees",
+        )
+    axes.scatter(
+        shown[:, 0], shown[:, 1], s=5, color=TREE, linewidths=0, label=f"trees of the map ({len(shown)})"
+    )
     axes.plot(*odometry.T, color=ODOMETRY, lw=1.0, label="odometry alone", zorder=0)
     if truth is not None:
         axes.plot(*truth.T, color=TRUTH, lw=2.6, alpha=0.55, label=drawn.truth_name)
@@ -133,7 +142,7 @@ def draw(drawn: Drawn, file: Path) -> None:
     axes.grid(lw=0.3, alpha=0.5)
     axes.legend(fontsize=7, loc="best", framealpha=0.9)
     figure.tight_layout()
-    figure.savefig(file)
+    figure.savefig(file, bbox_inches="tight", pad_inches=0.08)
     plt.close(figure)
     _with_few_colours(file)
 

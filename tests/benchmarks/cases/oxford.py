@@ -72,10 +72,12 @@ def _mapped(recorded: Recorded, folder: Path, seed: int) -> tuple[int, float, fl
     with closing(open_source(str(folder))) as source:
         known = source.description
         mapper = Mapper(preset(known.preset), sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed)
+        frame = None
         for step in steps(source.records()):
             frame = mapper.process(step)
     error = path_error(mapper.path, recorded.truth, align=True)
     before = path_error(recorded.path(told), recorded.truth, align=True)
+    assert frame is not None
     assert error is not None
     assert before is not None
     trees = int(np.count_nonzero(frame.trees.confirmed))
