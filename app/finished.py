@@ -15,12 +15,10 @@ from pipeline.export import PATH_COLUMNS, TREE_COLUMNS
 from pipeline.geometry import Float
 from pipeline.parameters import Parameters
 from pipeline.parameters.model import validated
-from pipeline.records import Path, Trees
+from pipeline.records import Int, Path, Trees
 
 LARGEST_FILE = 256 << 20
-_NEVER_EMPTY = frozenset(
-    {"t_s", "x_m", "y_m", "tree", "observations", "first_seen_s", "last_seen_s", "sigma_x_m", "sigma_y_m"}
-)
+_NEVER_EMPTY = frozenset({"t_s", "x_m", "y_m", "tree", "observations", "sigma_x_m", "sigma_y_m"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,7 +104,15 @@ def _trees(c: dict[str, Float]) -> Trees:
         eccentricity=c["eccentricity"],
         observations=c["observations"].astype(np.int64),
         coverage=np.radians(c["coverage_deg"]),
-        first_seen_ns=np.round(c["first_seen_s"] * 1e9).astype(np.int64),
-        last_seen_ns=np.round(c["last_seen_s"] * 1e9).astype(np.int64),
+        first_seen_ns=_stamps(c["first_seen_s"]),
+        last_seen_ns=_stamps(c["last_seen_s"]),
         confirmed=np.ones(n, np.bool_),
     )
+
+
+def _stamps(seconds: Float) -> Int:
+    """Nanoseconds; -1 where no time is known, as in the map of a whole cloud."""
+    stamps: Int = np.where(np.isfinite(seconds), np.round(np.nan_to_num(seconds) * 1e9), -1.0).astype(
+        np.int64
+    )
+    return stamps

@@ -8,12 +8,13 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
+from pipeline.geometry import Float
 from pipeline.records import Frame, Path, Trees, Verdict
 
 TREE_COLUMNS = (
@@ -48,7 +49,8 @@ DETECTION_COLUMNS = (
 
 
 def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
-    """The confirmed trees as rows of TREE_COLUMNS; seconds count from `start_ns`."""
+    """The confirmed trees as rows of TREE_COLUMNS; seconds count from `start_ns`, and a stamp
+    below 0 is unknown."""
     return [
         [
             str(trees.number[k]),
@@ -108,15 +110,34 @@ def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
     ]
 
 
-def geojson(trees: Trees, start_ns: int) -> str:
-    """The confirmed trees as a FeatureCollection in the local frame of the map, in metres.
+ROBOTS_FRAME = {"type": "local", "unit": "m", "origin": "first pose of the robot, x along its heading"}
 
-    RFC 7946 wants WGS84; a run without georeference says so by its `coordinateFrame` member.
+
+def geojson(
+    trees: Trees,
+    start_ns: int,
+    *,
+    frame: Mapping[str, str] | None = None,
+    lon_lat: Float | None = None,
+) -> str:
+    """The confirmed trees as a FeatureCollection.
+
+    RFC 7946 wants WGS84; a map without georeference says so by its `coordinateFrame` member.
+
+    Args:
+        trees: The map.
+        start_ns: Seconds count from here.
+        frame: What the coordinates of `trees` are; None means ROBOTS_FRAME.
+        lon_lat: Longitude and latitude of each confirmed tree, shape (T, 2) [degrees], where they are known:
+            they become the geometry, and x and y properties.
     """
     features = []
-    for row in tree_rows(trees, start_ns):
+    for k, row in enumerate(tree_rows(trees, start_ns)):
         values = dict(zip(TREE_COLUMNS, row, strict=True))
-        x, y = float(values.pop("x_m")), float(values.pop("y_m"))
+        if lon_lat is None:
+            x, y = float(values.pop("x_m")), float(values.pop("y_m"))
+        else:
+            x, y = (round(float(v), 8) for v in lon_lat[k])
         properties: dict[str, Any] = {
             name: None if text == "" else json.loads(text) for name, text in values.items()
         }
@@ -128,15 +149,10 @@ def geojson(trees: Trees, start_ns: int) -> str:
                 "properties": properties,
             }
         )
-    collection = {
-        "type": "FeatureCollection",
-        "coordinateFrame": {
-            "type": "local",
-            "unit": "m",
-            "origin": "first pose of the robot, x along its heading",
-        },
-        "features": features,
-    }
+    collection: dict[str, Any] = {"type": "FeatureCollection"}
+    if lon_lat is None:
+        collection["coordinateFrame"] = dict(ROBOTS_FRAME if frame is None else frame)
+    collection["features"] = features
     return json.dumps(collection, indent=1) + "\n"
 
 
@@ -179,23 +195,43 @@ class RunFiles:
         writer = csv.writer(self._detections, lineterminator="\n")
         writer.writerows(detection_rows(frame, start_ns))
 
-    def finish(self, trees: Trees, path: Path, start_ns: int, run: dict[str, Any], state: bytes) -> None:
-        """Write the other files and give all of them their names; `state` is what the run goes on from."""
+    def add_rows(self, rows: Iterable[Sequence[str]]) -> None:
+        """Write rows of DETECTION_COLUMNS."""
+        csv.writer(self._detections, lineterminator="\n").writerows(rows)
+
+    def finish(
+        self,
+        trees: Trees,
+        path: Path,
+        start_ns: int,
+        run: dict[str, Any],
+        state: bytes | None,
+        further: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write the other files and give all of them their names.
+
+        Args:
+            trees, path, start_ns, run: What was found.
+            state: What the run goes on from; None where nothing goes on.
+            further: Texts of files beside the others, or in their place, by name.
+        """
         self._detections.close()
         texts = {
             "trees.csv": csv_text(TREE_COLUMNS, tree_rows(trees, start_ns)),
             "path.csv": csv_text(PATH_COLUMNS, path_rows(path, start_ns)),
             "trees.geojson": geojson(trees, start_ns),
+            **(further or {}),
             "run.json": json.dumps(run, indent=1, allow_nan=False) + "\n",
         }
         for name, text in texts.items():
             (self._staging / name).write_text(text, encoding="utf-8", newline="")
-        (self._staging / "state.zip").write_bytes(state)
-        for name in (
-            "detections.csv",
-            "state.zip",
-            *texts,
-        ):  # run.json last: where it stands, the others do too
+        states = [] if state is None else ["state.zip"]
+        if state is None:
+            (self._folder / "state.zip").unlink(missing_ok=True)  # of an earlier run
+        else:
+            (self._staging / "state.zip").write_bytes(state)
+        # run.json last: where it stands, the others do too
+        for name in ("detections.csv", *states, *texts):
             (self._staging / name).replace(self._folder / name)
         self._staging.rmdir()
 
@@ -210,7 +246,7 @@ class RunFiles:
 
 
 def _seconds(stamp_ns: int, start_ns: int) -> float:
-    return (int(stamp_ns) - start_ns) * 1e-9
+    return (int(stamp_ns) - start_ns) * 1e-9 if stamp_ns >= 0 else math.nan
 
 
 def _number(value: float, digits: int) -> str:

@@ -50,8 +50,9 @@ STAGES = (
 )
 # What stands around the stages and what each may know beside the foundation.
 AROUND = {
-    "simulation": set(),
-    "sources": {"simulation", "truth_table", "exchange"},
+    "plot": {"clustering", "gathering"},
+    "simulation": {"plot"},
+    "sources": {"simulation", "truth_table", "exchange", "plot"},
     "recording": {"sources", "simulation"},
     "mapper": set(STAGES),
     "saved_map": {*STAGES, "mapper"},

@@ -56,9 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     parameters = assign(finished.parameters, changes)
     truth = _truth(arguments, finished)
-    path = np.stack([finished.path.x, finished.path.y], axis=1)
+    # A whole cloud was mapped without a path: all of the truth is asked for.
+    path = np.stack([finished.path.x, finished.path.y], axis=1) if len(finished.path.x) else None
     evaluation = evaluate(finished.trees, truth, parameters.evaluation, path)
-    if evaluation.TA.of + evaluation.TR.of == 0:
+    if path is not None and evaluation.TA.of + evaluation.TR.of == 0:
         print(f"warning: {far_truth(evaluation.reach)}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(asdict(evaluation), indent=1))

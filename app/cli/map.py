@@ -56,6 +56,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stop-after", metavar="N", type=_scans, help="map so many scans; --start resume maps the rest"
     )
+    parser.add_argument(
+        "--as",
+        dest="kind",
+        choices=("auto", "scans", "plot"),
+        default="auto",
+        help="plot: the file is one whole cloud of a plot (auto: .las and .laz are)",
+    )
     parser.set_defaults(seed=None)
     parser.epilog = (
         "DIR gets trees.csv, path.csv, trees.geojson, detections.csv, run.json and state.zip, from which\n"
@@ -70,6 +77,33 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--start is of a continued map", remedy="Name it with --continue DIR")
     chosen_parameters(arguments, "forest")  # a mistyped flag is said before anything heavy is loaded
 
+    from pipeline.sources.clouds import is_cloud
+
+    if arguments.kind == "plot" or (arguments.kind == "auto" and is_cloud(arguments.source)):
+        return _run_plot(arguments)
+    return _run_scans(arguments)
+
+
+def _run_plot(arguments: argparse.Namespace) -> int:
+    """A whole cloud of a plot."""
+    if arguments.continued is not None or arguments.stop_after is not None:
+        raise ParameterError(
+            "a whole cloud has no scans to go on with", remedy="Leave --continue and --stop-after away"
+        )
+    from app.plot_run import map_plot_run
+    from pipeline.sources.clouds import open_cloud
+    from pipeline.truth_table import read_truth_trees
+
+    truth = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
+    name, parameters = chosen_parameters(arguments, "forest")
+    try:
+        outcome = map_plot_run(open_cloud(arguments.source), name, parameters, truth, arguments.out)
+    except OSError as error:
+        raise _cannot_write(error, arguments.out) from None
+    return _tell(outcome.summary, arguments.out, outcome.warnings, outcome.losses)
+
+
+def _run_scans(arguments: argparse.Namespace) -> int:
     from app.continuing import Continued
     from app.offline import OfflineRun, map_run
     from app.saved_run import read_saved_run
@@ -100,19 +134,26 @@ def run(arguments: argparse.Namespace) -> int:
             bar = _Bar(opened.description.scans)
             outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
         except OSError as error:
-            raise StemmapError(
-                f"cannot write: {error.strerror}", where=str(error.filename or arguments.out)
-            ) from None
-    for line in outcome.summary:
-        print(line)
+            raise _cannot_write(error, arguments.out) from None
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
-    print(f"median {outcome.scan_ms:.2f} ms a scan ({stages})")
-    print(f"files in {arguments.out}")
-    for warning in outcome.warnings:
+    times = f"median {outcome.scan_ms:.2f} ms a scan ({stages})"
+    return _tell([*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses)
+
+
+def _cannot_write(error: OSError, out: Path) -> StemmapError:
+    return StemmapError(f"cannot write: {error.strerror}", where=str(error.filename or out))
+
+
+def _tell(summary: list[str], out: Path, warnings: list[str], losses: dict[str, int]) -> int:
+    """Print what came of it; the exit code."""
+    for line in summary:
+        print(line)
+    print(f"files in {out}")
+    for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    for reason, number in outcome.losses.items():
+    for reason, number in losses.items():
         print(f"left out: {number} {reason}", file=sys.stderr)
-    return 3 if outcome.losses else 0
+    return 3 if losses else 0
 
 
 def _in_the_map(start: str | tuple[float, float, float] | None) -> Start:
