@@ -6,40 +6,93 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.parameters.stages import Detection
-from pipeline.records import Bool, Clusters, Detections, Verdict
+from pipeline.records import Bool, Clusters, Detections, Int, Int32, Verdict
 
 
 def judge(clusters: Clusters, parameters: Detection) -> Clusters:
     """The clusters with their verdicts: the first reason that holds, in the order below, else TREE."""
     p, c = parameters, clusters
-    across, up = c.extent[:, 1], c.extent[:, 2]
-    has_circle = np.isfinite(c.radius)
-    reasons: list[tuple[Verdict, Bool]] = [
-        (Verdict.HIDDEN, c.hidden),
-        (Verdict.TOO_THICK, np.maximum(across, c.extent[:, 0]) > p.size_max),
-        (Verdict.TOO_LOW, up < p.height_extent_min),
-        (Verdict.TOO_ROUND, c.eccentricity < p.e_min),
-        (Verdict.TOO_LONG, c.eccentricity > p.e_max),
-        (Verdict.NOT_ROUND, c.radial_std > p.cylindrical_stddev_thresh),
-        (Verdict.NO_ARC, has_circle & (c.arc < np.radians(p.arc_min))),
-        (Verdict.TOO_THIN, has_circle & (c.radius < p.radius_min)),
-        (Verdict.TOO_THICK, has_circle & (c.radius > p.radius_max)),
-    ]
-    verdict = np.full(len(c.size), Verdict.TREE, np.int32)
-    for reason, holds in reversed(reasons):
-        verdict[holds] = reason
+    verdict = _verdicts(
+        c.hidden,
+        c.extent,
+        c.eccentricity,
+        c.radial_std,
+        c.radius,
+        c.arc,
+        p.size_max,
+        p.height_extent_min,
+        p.e_min,
+        p.e_max,
+        p.cylindrical_stddev_thresh,
+        float(np.radians(p.arc_min)),
+        p.radius_min,
+        p.radius_max,
+    )
     return replace(clusters, verdict=verdict)
+
+
+@compiled
+def _verdicts(
+    hidden: Bool,
+    extent: Float,
+    eccentricity: Float,
+    radial_std: Float,
+    radius: Float,
+    arc: Float,
+    size_max: float,
+    height_extent_min: float,
+    e_min: float,
+    e_max: float,
+    deviation_max: float,
+    arc_min: float,
+    radius_min: float,
+    radius_max: float,
+) -> Int32:
+    verdict = np.empty(len(hidden), np.int32)
+    for k in range(len(hidden)):
+        # What is not a number fails every comparison: without a circle its figures are not asked for.
+        has_circle = np.isfinite(radius[k])
+        if hidden[k]:
+            verdict[k] = Verdict.HIDDEN
+        elif max(extent[k, 0], extent[k, 1]) > size_max:
+            verdict[k] = Verdict.TOO_THICK
+        elif extent[k, 2] < height_extent_min:
+            verdict[k] = Verdict.TOO_LOW
+        elif eccentricity[k] < e_min:
+            verdict[k] = Verdict.TOO_ROUND
+        elif eccentricity[k] > e_max:
+            verdict[k] = Verdict.TOO_LONG
+        elif radial_std[k] > deviation_max:
+            verdict[k] = Verdict.NOT_ROUND
+        elif has_circle and arc[k] < arc_min:
+            verdict[k] = Verdict.NO_ARC
+        elif has_circle and radius[k] < radius_min:
+            verdict[k] = Verdict.TOO_THIN
+        elif has_circle and radius[k] > radius_max:
+            verdict[k] = Verdict.TOO_THICK
+        else:
+            verdict[k] = Verdict.TREE
+    return verdict
 
 
 def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) -> Detections:
     """The clusters judged to be trees, in the base frame (Eq. 8: p_base = T_base_lidar p_lidar)."""
     rows = np.flatnonzero(clusters.verdict == Verdict.TREE)
+    centre, covariance = _seen_from_base(
+        rows,
+        clusters.centre,
+        clusters.covariance,
+        sensor_offset,
+        parameters.sigma_range,
+        float(np.radians(parameters.sigma_bearing)),
+    )
     return Detections(
         cluster=rows,
-        centre=clusters.centre[rows] + sensor_offset[:2],
-        covariance=clusters.covariance[rows] + _sensor_covariance(clusters.centre[rows], parameters),
+        centre=centre,
+        covariance=covariance,
         radius=clusters.radius[rows],
         radius_sigma=clusters.radius_sigma[rows],
         arc=clusters.arc[rows],
@@ -47,19 +100,28 @@ def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) 
     )
 
 
-def _sensor_covariance(centre: Float, p: Detection) -> Float:
-    """What the fit does not know of: an error along and across the ray, shape (D, 2, 2) [m^2].
-
-    Args:
-        centre: shape (D, 2) [m], seen from the sensor.
-        p: sigma_range along the ray, sigma_bearing times the distance across it.
-    """
-    reach = np.maximum(np.hypot(centre[:, 0], centre[:, 1]), 1e-6)
-    ux, uy = centre[:, 0] / reach, centre[:, 1] / reach
-    along = p.sigma_range**2
-    across = (reach * np.radians(p.sigma_bearing)) ** 2
-    R = np.empty((len(centre), 2, 2))
-    R[:, 0, 0] = along * ux * ux + across * uy * uy
-    R[:, 0, 1] = R[:, 1, 0] = (along - across) * ux * uy
-    R[:, 1, 1] = along * uy * uy + across * ux * ux
-    return R
+@compiled
+def _seen_from_base(
+    rows: Int,
+    centre: Float,
+    covariance: Float,
+    sensor_offset: Float,
+    sigma_range: float,
+    sigma_bearing: float,
+) -> tuple[Float, Float]:
+    """Centres of the clusters in these rows in the base frame, shape (D, 2) [m], and covariances, shape
+    (D, 2, 2) [m^2]: the fit's and what it does not know of, an error of `sigma_range` along the ray and
+    of `sigma_bearing` times the distance across it."""
+    place, spread = np.empty((len(rows), 2)), np.empty((len(rows), 2, 2))
+    for d in range(len(rows)):
+        x, y = centre[rows[d], 0], centre[rows[d], 1]
+        reach = max(np.sqrt(x * x + y * y), 1e-6)
+        ux, uy = x / reach, y / reach
+        along, across = sigma_range * sigma_range, (reach * sigma_bearing) ** 2
+        C, R = covariance[rows[d]], spread[d]
+        R[0, 0] = C[0, 0] + along * ux * ux + across * uy * uy
+        R[0, 1] = C[0, 1] + (along - across) * ux * uy
+        R[1, 0] = C[1, 0] + (along - across) * ux * uy
+        R[1, 1] = C[1, 1] + along * uy * uy + across * ux * ux
+        place[d, 0], place[d, 1] = x + sensor_offset[0], y + sensor_offset[1]
+    return place, spread

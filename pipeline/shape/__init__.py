@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.parameters.stages import Shape
 from pipeline.records import Clusters, Float32, Int, Labels, Sensor, Verdict
-from pipeline.shape.moments import gather, moments, spread_about
+from pipeline.shape.moments import gather, moments, planar_eigenvalues, spread_about, take_rows
 from pipeline.shape.stem import COLUMNS, fit_stems
 
 CENTROID_BIAS = 0.18  # m; measured on trunks of 8 to 35 cm radius at 2 to 10 m
@@ -24,7 +25,7 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
         parameters: Of this stage.
     """
     order, bounds = gather(labels.label, labels.clusters)
-    members = points[order].astype(np.float64)
+    members = take_rows(points, order)
     centroid, covariance, extent = moments(members, bounds)
     eigenvalues = _eigenvalues(covariance, parameters.plane)
     size = np.diff(bounds)
@@ -38,7 +39,7 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
         eigenvalues=eigenvalues,
         eccentricity=eccentricity(eigenvalues),
         centre=stem[:, 0:2],
-        covariance=np.stack([stem[:, [2, 3]], stem[:, [3, 4]]], axis=1),
+        covariance=stem[:, [2, 3, 3, 4]].reshape(-1, 2, 2),
         radius=stem[:, 5],
         radius_sigma=stem[:, 6],
         radial_std=stem[:, 7],
@@ -49,6 +50,7 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
     )
 
 
+@compiled
 def eccentricity(eigenvalues: Float) -> Float:
     """e = lambda1 / lambda2 (Eq. 4) of descending eigenvalues, shape (K, 2 or 3) [m^2].
 
@@ -56,19 +58,21 @@ def eccentricity(eigenvalues: Float) -> Float:
 
     This is the paper's word. The eccentricity of geometry, sqrt(1 - lambda2 / lambda1), is another.
     """
-    first, second = eigenvalues[:, 0], eigenvalues[:, 1]
-    line = second <= FLAT * np.maximum(first, 1.0)
-    one_place = first <= FLAT
-    ratio: Float = np.where(line, np.where(one_place, 1.0, np.inf), first / np.where(line, 1.0, second))
+    ratio = np.ones(eigenvalues.shape[0])
+    for k in range(eigenvalues.shape[0]):
+        first, second = eigenvalues[k, 0], eigenvalues[k, 1]
+        if second > FLAT * max(first, 1.0):
+            ratio[k] = first / second
+        elif first > FLAT:
+            ratio[k] = np.inf
     return ratio
 
 
 def _eigenvalues(covariance: Float, dimensions: int) -> Float:
     """Descending eigenvalues of shape (K, 3); the third is 0 when only x and y are taken."""
-    values = np.zeros((len(covariance), 3))
-    if len(covariance):
-        ascending = np.linalg.eigvalsh(covariance[:, :dimensions, :dimensions])
-        values[:, :dimensions] = np.maximum(ascending[:, ::-1], 0.0)
+    if dimensions == 2:
+        return planar_eigenvalues(covariance)
+    values: Float = np.maximum(np.linalg.eigvalsh(covariance)[:, ::-1], 0.0)
     return values
 
 

@@ -32,6 +32,16 @@ def gather(label: Int32, clusters: int) -> tuple[Int, Int]:
 
 
 @compiled
+def take_rows(points: Float32, order: Int) -> Float:
+    """The points in that order, in double precision, shape (M, 3)."""
+    taken = np.empty((order.shape[0], 3))
+    for k in range(order.shape[0]):
+        i = order[k]
+        taken[k, 0], taken[k, 1], taken[k, 2] = points[i, 0], points[i, 1], points[i, 2]
+    return taken
+
+
+@compiled
 def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
     """Centroid (K, 3) [m], covariance (K, 3, 3) [m^2] with 1/N, and extent (K, 3) [m].
 
@@ -43,26 +53,48 @@ def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
     extent = np.zeros((clusters, 3))
     for k in range(clusters):
         n = bounds[k + 1] - bounds[k]
+        mx, my, mz = 0.0, 0.0, 0.0
         for i in range(bounds[k], bounds[k + 1]):
-            for a in range(3):
-                centroid[k, a] += points[i, a] / n
-        rho = max(np.hypot(centroid[k, 0], centroid[k, 1]), 1e-9)
-        ux, uy = centroid[k, 0] / rho, centroid[k, 1] / rho
-        low = np.full(3, np.inf)
-        high = np.full(3, -np.inf)
-        d = np.empty(3)
+            mx += points[i, 0]
+            my += points[i, 1]
+            mz += points[i, 2]
+        mx, my, mz = mx / n, my / n, mz / n
+        rho = max(np.sqrt(mx * mx + my * my), 1e-9)
+        ux, uy = mx / rho, my / rho
+        near, far, right, left, low, high = np.inf, -np.inf, np.inf, -np.inf, np.inf, -np.inf
+        xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for i in range(bounds[k], bounds[k + 1]):
-            for a in range(3):
-                d[a] = points[i, a] - centroid[k, a]
-            for a in range(3):
-                for b in range(3):
-                    covariance[k, a, b] += d[a] * d[b] / n
-            along, across = ux * d[0] + uy * d[1], ux * d[1] - uy * d[0]
-            low[0], high[0] = min(low[0], along), max(high[0], along)
-            low[1], high[1] = min(low[1], across), max(high[1], across)
-            low[2], high[2] = min(low[2], d[2]), max(high[2], d[2])
-        extent[k] = high - low
+            x, y, z = points[i, 0] - mx, points[i, 1] - my, points[i, 2] - mz
+            xx += x * x
+            xy += x * y
+            xz += x * z
+            yy += y * y
+            yz += y * z
+            zz += z * z
+            along, across = ux * x + uy * y, ux * y - uy * x
+            near, far = min(near, along), max(far, along)
+            right, left = min(right, across), max(left, across)
+            low, high = min(low, z), max(high, z)
+        centroid[k, 0], centroid[k, 1], centroid[k, 2] = mx, my, mz
+        C = covariance[k]
+        C[0, 0], C[1, 1], C[2, 2] = xx / n, yy / n, zz / n
+        C[0, 1] = C[1, 0] = xy / n
+        C[0, 2] = C[2, 0] = xz / n
+        C[1, 2] = C[2, 1] = yz / n
+        extent[k, 0], extent[k, 1], extent[k, 2] = far - near, left - right, high - low
     return centroid, covariance, extent
+
+
+@compiled
+def planar_eigenvalues(covariance: Float) -> Float:
+    """Descending eigenvalues of the upper left 2 x 2 of each matrix, shape (K, 3); the third is 0."""
+    values = np.zeros((covariance.shape[0], 3))
+    for k in range(covariance.shape[0]):
+        C = covariance[k]
+        middle, half = 0.5 * (C[0, 0] + C[1, 1]), 0.5 * (C[0, 0] - C[1, 1])
+        root = np.sqrt(half * half + C[0, 1] * C[0, 1])
+        values[k, 0], values[k, 1] = max(middle + root, 0.0), max(middle - root, 0.0)
+    return values
 
 
 @compiled
