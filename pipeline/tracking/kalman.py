@@ -37,29 +37,72 @@ def process_noise(dt: float, acceleration_sigma: float) -> Float:
 
 
 @compiled
-def _update_compiled(
-    x: Float, P: Float, dt: float, acceleration_sigma: float, z: Float, R: Float
-) -> tuple[Float, Float]:
-    F = transition(dt)
-    x = F @ x
-    P = F @ P @ F.T + process_noise(dt, acceleration_sigma)
-    y = z - x[:2]
-    S = P[:2, :2] + R
-    K = np.ascontiguousarray(P[:, :2]) @ np.linalg.inv(S)
-    x = x + K @ y
-    I_KH = np.eye(4)
-    I_KH[:, :2] -= K
-    P = I_KH @ P @ I_KH.T + K @ R @ K.T  # Joseph's form stays symmetric and positive
-    return x, P
-
-
-@compiled
 def _update_rows_compiled(
     x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
 ) -> None:
+    K, M = np.empty((4, 2)), np.empty((4, 4))
     for k in range(rows.shape[0]):
         row = rows[k]
-        x[row], P[row] = _update_compiled(x[row], P[row], dt[k], acceleration_sigma, z[k], R[k])
+        _predict(x[row], P[row], dt[k], acceleration_sigma)
+        _correct(x[row], P[row], z[k], R[k], K, M)
+
+
+@compiled
+def _predict(x: Float, P: Float, dt: float, acceleration_sigma: float) -> None:
+    """x = F x, P = F P F^T + Q in place: velocities times dt come to the positions."""
+    for a in range(2):
+        x[a] += dt * x[a + 2]
+        for b in range(4):
+            P[a, b] += dt * P[a + 2, b]
+    for b in range(4):
+        for a in range(2):
+            P[b, a] += dt * P[b, a + 2]
+    q = acceleration_sigma * acceleration_sigma
+    for a in range(2):
+        P[a, a] += 0.25 * dt**4 * q
+        P[a, a + 2] += 0.5 * dt**3 * q
+        P[a + 2, a] += 0.5 * dt**3 * q
+        P[a + 2, a + 2] += dt * dt * q
+
+
+@compiled
+def _correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None:
+    """x = x + K y, P = (I - K H) P (I - K H)^T + K R K^T in place; K (4, 2) and M (4, 4) are room.
+
+    Joseph's form stays symmetric and positive.
+    """
+    y0, y1 = z[0] - x[0], z[1] - x[1]
+    S00, S01, S11 = P[0, 0] + R[0, 0], P[0, 1] + R[0, 1], P[1, 1] + R[1, 1]
+    det = S00 * S11 - S01 * S01
+    for a in range(4):
+        K[a, 0] = (P[a, 0] * S11 - P[a, 1] * S01) / det
+        K[a, 1] = (P[a, 1] * S00 - P[a, 0] * S01) / det
+        x[a] += K[a, 0] * y0 + K[a, 1] * y1
+    for a in range(4):
+        for b in range(4):
+            M[a, b] = P[a, b] - K[a, 0] * P[0, b] - K[a, 1] * P[1, b]
+    for a in range(4):
+        for b in range(a, 4):
+            KR0, KR1 = K[a, 0] * R[0, 0] + K[a, 1] * R[1, 0], K[a, 0] * R[0, 1] + K[a, 1] * R[1, 1]
+            P[a, b] = M[a, b] - M[a, 0] * K[b, 0] - M[a, 1] * K[b, 1] + KR0 * K[b, 0] + KR1 * K[b, 1]
+            P[b, a] = P[a, b]
+
+
+@compiled
+def expected_positions(
+    x: Float, P: Float, stamp_ns: Int, now_ns: int, acceleration_sigma: float
+) -> tuple[Float, Float]:
+    """Where each tree is expected now, shape (T, 2) [m], and its covariance xx, xy, yy, shape (T, 3)."""
+    place, spread = np.empty((x.shape[0], 2)), np.empty((x.shape[0], 3))
+    for t in range(x.shape[0]):
+        dt = (now_ns - stamp_ns[t]) * 1e-9
+        noise = 0.25 * dt**4 * acceleration_sigma * acceleration_sigma
+        place[t, 0], place[t, 1] = x[t, 0] + dt * x[t, 2], x[t, 1] + dt * x[t, 3]
+        C = P[t]
+        spread[t, 0] = C[0, 0] + dt * (C[0, 2] + C[2, 0]) + dt * dt * C[2, 2] + noise
+        spread[t, 1] = C[0, 1] + dt * (C[0, 3] + C[2, 1]) + dt * dt * C[2, 3]
+        spread[t, 2] = C[1, 1] + dt * (C[1, 3] + C[3, 1]) + dt * dt * C[3, 3] + noise
+    return place, spread
 
 
 def _update_rows_filterpy(

@@ -6,11 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int
-
-SECTORS = 36  # of 10 degrees around a trunk, kept as bits: which sides were seen
 
 
 @dataclass(slots=True, eq=False)
@@ -76,26 +73,13 @@ class TrackTable:
         """The rows where the mask holds."""
         return TrackTable(*(getattr(self, f.name)[rows] for f in fields(self)))
 
+    def with_score(self) -> TrackTable:
+        """The rows that have any score left; itself where all have."""
+        standing = self.score > 0.0
+        return self if standing.all() else self.take(standing)
+
     def extended(self, more: TrackTable) -> TrackTable:
         """These rows and then the others."""
         return TrackTable(
             *(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self))
         )
-
-
-@compiled
-def seen_sides(from_bearing: Float, arc: Float) -> Int:
-    """Bits of the sectors around each trunk that a view from a direction shows, int64, shape (D,).
-
-    Args:
-        from_bearing: Direction from the trunk to the sensor, frame of the map, shape (D,) [rad].
-        arc: Visible arc around that direction, shape (D,) [rad].
-    """
-    step = 2.0 * np.pi / SECTORS
-    bits = np.zeros(from_bearing.shape[0], np.int64)
-    for d in range(from_bearing.shape[0]):
-        first = int(np.ceil((from_bearing[d] - arc[d] / 2) / step - 1e-9))
-        last = int(np.floor((from_bearing[d] + arc[d] / 2) / step + 1e-9))
-        for k in range(first, min(last, first + SECTORS)):  # a sector counts when all of it was seen
-            bits[d] |= np.int64(1) << (k % SECTORS)
-    return bits

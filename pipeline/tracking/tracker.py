@@ -10,18 +10,18 @@ from pipeline.parameters.stages import Tracking
 from pipeline.records import Bool, Columns, Detections, Int, Trees, Verdict
 from pipeline.tracking.anchor import anchor
 from pipeline.tracking.judging import assign_verdicts, tree_columns
-from pipeline.tracking.kalman import ENGINES
+from pipeline.tracking.kalman import ENGINES, expected_positions
 from pipeline.tracking.merge import merge_near
-from pipeline.tracking.table import SECTORS, TrackTable, seen_sides
+from pipeline.tracking.observation import add_observations, in_map, table_figures
+from pipeline.tracking.table import TrackTable
 from pipeline.visibility import in_free_view
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
 SCORE_STANDING = 5.0  # at least, of a tree that what was gathered stands for
 GATHERED_SIGMA = 0.1  # m; the middle of the returns of one side lies so far before the axis
 NANOSECONDS = 1e-9
-DBH_OBSERVATIONS = 3  # fewer radii are no diameter yet
-SHARED_RADIUS_SIGMA = 0.01  # m; bark and taper, which more scans of one side do not average out
-SHARED_SIGMA = 0.01  # m; likewise of the position: the views of one trunk share part of their error
+SHARED_SIGMA = 0.01  # m; bark and taper: the views of one trunk share part of their error
+SHARED_COVARIANCE = SHARED_SIGMA**2 * np.eye(2)
 
 
 class Tracker:
@@ -51,17 +51,11 @@ class Tracker:
             view_range: A tree nearer than this can be missed [m].
         """
         p = self.parameters
-        position = T_map_base.apply(detections.centre)
-        R = _in_map(detections, T_map_base, pose_covariance)
-        expected, spread = self._predicted(stamp_ns)
-        row_of, _ = associate(
-            position,
-            R[:, [0, 0, 1], [0, 1, 1]],
-            expected,
-            spread,
-            p.gate,
-            p.distance_max,
-        )
+        t = self.tracks
+        pose = T_map_base.as_array()
+        position, R, R3 = in_map(detections.centre, detections.covariance, pose, pose_covariance)
+        expected, spread = expected_positions(t.x, t.P, t.stamp_ns, stamp_ns, p.acceleration_sigma)
+        row_of, _ = associate(position, R3, expected, spread, p.gate, p.distance_max)
         old, fresh = np.flatnonzero(row_of >= 0), np.flatnonzero(row_of < 0)
         touched = np.zeros(len(self.tracks), np.bool_)
         touched[row_of[old]] = True
@@ -71,26 +65,14 @@ class Tracker:
         self._begin(stamp_ns, position[fresh], R[fresh])
         _gather(self.tracks, row_of, position, T_map_base, detections)
         touched = np.concatenate([touched, np.ones(len(fresh), np.bool_)])
-        self.tracks = merge_near(self.tracks, touched, p.proximity_radius)
-        self.tracks = self.tracks.take(self.tracks.score > 0.0)
+        self.tracks = merge_near(self.tracks, touched, p.proximity_radius).with_score()
 
     def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
         """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.anchor`)."""
         p = self.parameters
         anchor(self.tracks, landmarks, covariance, T_map_base, reach, p.distance_max, 1.0 / p.misses_per_hit)
-        self.tracks = merge_near(self.tracks, np.ones(len(self.tracks), np.bool_), p.proximity_radius)
-        self.tracks = self.tracks.take(self.tracks.score > 0.0)
-
-    def _predicted(self, stamp_ns: int) -> tuple[Float, Float]:
-        """Where each tree is expected now, shape (T, 2), and its covariance xx, xy, yy, shape (T, 3)."""
-        t = self.tracks
-        dt = ((stamp_ns - t.stamp_ns) * NANOSECONDS)[:, None, None]
-        noise = 0.25 * dt**4 * self.parameters.acceleration_sigma**2 * np.eye(2)
-        P = t.P
-        cross = P[:, :2, 2:] + P[:, 2:, :2]
-        spread = P[:, :2, :2] + dt * cross + dt**2 * P[:, 2:, 2:] + noise
-        expected: Float = t.x[:, :2] + dt[:, :, 0] * t.x[:, 2:]
-        return expected, spread[:, [0, 0, 1], [0, 1, 1]]
+        touched = np.ones(len(self.tracks), np.bool_)
+        self.tracks = merge_near(self.tracks, touched, p.proximity_radius).with_score()
 
     def judge(self, stamp_ns: int, columns: Columns) -> None:
         """Take the verdicts of what was gathered: a track is confirmed by them alone, and a tree that no
@@ -114,6 +96,8 @@ class Tracker:
         t.score[rows] = np.minimum(t.score[rows] + 1.0, SCORE_MAX)
 
     def _begin(self, stamp_ns: int, z: Float, R: Float) -> None:
+        if len(z) == 0:
+            return
         new = TrackTable.empty(len(z))
         new.number[:] = self.next_number + np.arange(len(z))
         self.next_number += len(z)
@@ -130,54 +114,50 @@ class Tracker:
 
     def trees(self) -> Trees:
         """The map as it stands (Table 2)."""
-        t = self.tracks
-        coverage = np.bitwise_count(t.sides) * (2.0 * np.pi / SECTORS)
-        carried = coverage >= np.radians(self.parameters.dbh_arc_min) - 1e-9
-        enough = (t.radii >= DBH_OBSERVATIONS) & carried
-        weight = np.where(enough, t.radius_weight, 1.0)
-        radius_sigma = np.sqrt(1.0 / weight + SHARED_RADIUS_SIGMA**2)
+        p, t = self.parameters, self.tracks
+        coverage, dbh, dbh_sigma, eccentricity, confirmed = table_figures(
+            t.sides,
+            t.radii,
+            t.radius,
+            t.radius_weight,
+            t.eccentricity,
+            t.eccentricities,
+            t.verdict,
+            t.hits,
+            p.hits_to_confirm,
+            float(np.radians(p.dbh_arc_min)),
+        )
         return Trees(
             number=t.number.copy(),
             position=t.x[:, :2].copy(),
-            covariance=t.P[:, :2, :2] + SHARED_SIGMA**2 * np.eye(2),
+            covariance=t.P[:, :2, :2] + SHARED_COVARIANCE,
             velocity=t.x[:, 2:].copy(),
-            dbh=np.where(enough, 2.0 * t.radius / weight, np.nan),
-            dbh_sigma=np.where(enough, 2.0 * radius_sigma, np.nan),
-            eccentricity=np.where(
-                t.eccentricities > 0, t.eccentricity / np.maximum(t.eccentricities, 1), np.nan
-            ),
+            dbh=dbh,
+            dbh_sigma=dbh_sigma,
+            eccentricity=eccentricity,
             observations=t.hits.copy(),
             coverage=coverage,
             first_seen_ns=t.first_ns.copy(),
             last_seen_ns=t.stamp_ns.copy(),
-            confirmed=np.where(
-                t.verdict >= 0, t.verdict == Verdict.TREE, t.hits >= self.parameters.hits_to_confirm
-            ),
+            confirmed=confirmed,
         )
 
 
 def _gather(t: TrackTable, rows: Int, z: Float, T_map_base: Pose2, seen: Detections) -> None:
     """Add what one scan's detections say about their trunks; no two are of the same trunk."""
-    t.hits[rows] += 1
-    finite = np.isfinite(seen.eccentricity)
-    t.eccentricity[rows[finite]] += seen.eccentricity[finite]
-    t.eccentricities[rows[finite]] += 1
-    round_ones = np.isfinite(seen.radius)
-    weight = 1.0 / seen.radius_sigma[round_ones] ** 2
-    t.radius[rows[round_ones]] += weight * seen.radius[round_ones]
-    t.radius_weight[rows[round_ones]] += weight
-    t.radii[rows[round_ones]] += 1
-    bearing = np.arctan2(T_map_base.y - z[:, 1], T_map_base.x - z[:, 0])
-    t.sides[rows] |= seen_sides(bearing, seen.arc)
-
-
-def _in_map(detections: Detections, T_map_base: Pose2, pose_covariance: Float) -> Float:
-    """Covariance of the detections in the frame of the map, shape (D, 2, 2): their own, turned, and
-    the pose's, J Sigma J^T with J = d(position) / d(x, y, yaw)."""
-    C = T_map_base.rotation()
-    turned: Float = C @ detections.covariance @ C.T
-    arm = detections.centre @ C.T
-    J = np.zeros((len(arm), 2, 3))
-    J[:, 0, 0] = J[:, 1, 1] = 1.0
-    J[:, 0, 2], J[:, 1, 2] = -arm[:, 1], arm[:, 0]
-    return turned + J @ pose_covariance @ J.transpose(0, 2, 1)
+    add_observations(
+        rows,
+        z,
+        T_map_base.as_array(),
+        seen.eccentricity,
+        seen.radius,
+        seen.radius_sigma,
+        seen.arc,
+        t.hits,
+        t.eccentricity,
+        t.eccentricities,
+        t.radius,
+        t.radius_weight,
+        t.radii,
+        t.sides,
+    )

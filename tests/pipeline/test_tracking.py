@@ -14,7 +14,7 @@ from pipeline.parameters import preset
 from pipeline.tracking import Tracker
 from pipeline.tracking.kalman import ENGINES, process_noise, transition
 from pipeline.tracking.merge import fuse
-from pipeline.tracking.table import SECTORS, seen_sides
+from pipeline.tracking.observation import SECTORS, seen_sides
 from tests.pipeline.strategies import ALL_FREE, FEW, LAW, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").tracking
@@ -284,7 +284,7 @@ STEP = 2 * np.pi / SECTORS
 
 def sectors(bearing, arc):
     """The sectors that one view shows."""
-    bits = int(seen_sides(np.array([bearing]), np.array([arc]))[0])
+    bits = int(seen_sides(bearing, arc))
     return {k for k in range(64) if bits >> k & 1}
 
 

@@ -1,0 +1,134 @@
+"""What one observation tells of a tree, and what all of them together tell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.geometry import Float
+from pipeline.records import Bool, Int, Verdict
+
+SECTORS = 36  # of 10 degrees around a trunk, kept as bits: which sides were seen
+DBH_OBSERVATIONS = 3  # fewer radii are no diameter yet
+SHARED_RADIUS_SIGMA = 0.01  # m; bark and taper, which more scans of one side do not average out
+
+
+@compiled
+def in_map(
+    centre: Float, covariance: Float, pose: Float, pose_covariance: Float
+) -> tuple[Float, Float, Float]:
+    """Detections in the frame of the map: centres, shape (D, 2) [m], their covariances, shape (D, 2, 2),
+    and the same as xx, xy, yy, shape (D, 3).
+
+    The covariance is the detection's own, turned, and the pose's, J Sigma J^T with J = d(position) /
+    d(x, y, yaw).
+
+    Args:
+        centre: Base frame, shape (D, 2) [m]; covariance: shape (D, 2, 2).
+        pose: x, y [m], yaw [rad], shape (3,); pose_covariance: shape (3, 3).
+    """
+    D, Sigma = centre.shape[0], pose_covariance
+    place, R, packed = np.empty((D, 2)), np.empty((D, 2, 2)), np.empty((D, 3))
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    for d in range(D):
+        x, y = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
+        a, b, e = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
+        xx = c * c * a - 2.0 * c * s * b + s * s * e
+        xy = c * s * (a - e) + (c * c - s * s) * b
+        yy = s * s * a + 2.0 * c * s * b + c * c * e
+        xx += Sigma[0, 0] - 2.0 * y * Sigma[0, 2] + y * y * Sigma[2, 2]
+        xy += Sigma[0, 1] + x * Sigma[0, 2] - y * Sigma[1, 2] - x * y * Sigma[2, 2]
+        yy += Sigma[1, 1] + 2.0 * x * Sigma[1, 2] + x * x * Sigma[2, 2]
+        place[d, 0], place[d, 1] = pose[0] + x, pose[1] + y
+        packed[d, 0], packed[d, 1], packed[d, 2] = xx, xy, yy
+        R[d, 0, 0], R[d, 0, 1], R[d, 1, 0], R[d, 1, 1] = xx, xy, xy, yy
+    return place, R, packed
+
+
+@compiled
+def add_observations(
+    rows: Int,
+    place: Float,
+    pose: Float,
+    eccentricity: Float,
+    radius: Float,
+    radius_sigma: Float,
+    arc: Float,
+    hits: Int,
+    eccentricity_sum: Float,
+    eccentricities: Int,
+    radius_sum: Float,
+    radius_weight: Float,
+    radii: Int,
+    sides: Int,
+) -> None:
+    """Add one scan's detections to the columns of their trees (see `TrackTable`), in place.
+
+    Args:
+        rows: The tree of each detection, none twice, shape (D,).
+        place: Frame of the map, shape (D, 2) [m]; pose: of the robot, shape (3,).
+        eccentricity, radius, radius_sigma, arc: See `Detections`, shape (D,).
+    """
+    for d in range(rows.shape[0]):
+        t = rows[d]
+        hits[t] += 1
+        if np.isfinite(eccentricity[d]):
+            eccentricity_sum[t] += eccentricity[d]
+            eccentricities[t] += 1
+        if np.isfinite(radius[d]):
+            weight = 1.0 / (radius_sigma[d] * radius_sigma[d])
+            radius_sum[t] += weight * radius[d]
+            radius_weight[t] += weight
+            radii[t] += 1
+        bearing = np.arctan2(pose[1] - place[d, 1], pose[0] - place[d, 0])
+        sides[t] |= seen_sides(bearing, arc[d])
+
+
+@compiled
+def seen_sides(from_bearing: float, arc: float) -> np.int64:
+    """Bits of the sectors around a trunk that a view from a direction shows.
+
+    Args:
+        from_bearing: Direction from the trunk to the sensor, frame of the map [rad].
+        arc: Visible arc around that direction [rad].
+    """
+    step = 2.0 * np.pi / SECTORS
+    bits = np.int64(0)
+    first = int(np.ceil((from_bearing - arc / 2) / step - 1e-9))
+    last = int(np.floor((from_bearing + arc / 2) / step + 1e-9))
+    for k in range(first, min(last, first + SECTORS)):  # a sector counts when all of it was seen
+        bits |= np.int64(1) << np.int64(k % SECTORS)
+    return bits
+
+
+@compiled
+def table_figures(
+    sides: Int,
+    radii: Int,
+    radius: Float,
+    radius_weight: Float,
+    eccentricity: Float,
+    eccentricities: Int,
+    verdict: Int,
+    hits: Int,
+    hits_to_confirm: int,
+    dbh_arc_min: float,
+) -> tuple[Float, Float, Float, Float, Bool]:
+    """Coverage [rad], DBH and its sigma [m], mean eccentricity, and which trees are confirmed, each of
+    shape (T,), from the columns of a `TrackTable`; NaN for what was not told."""
+    T = sides.shape[0]
+    coverage, dbh, dbh_sigma, mean = np.empty(T), np.full(T, np.nan), np.full(T, np.nan), np.full(T, np.nan)
+    confirmed = np.empty(T, np.bool_)
+    for t in range(T):
+        left, seen = sides[t], 0
+        while left:
+            left &= left - 1  # takes the lowest bit away
+            seen += 1
+        coverage[t] = seen * (2.0 * np.pi / SECTORS)
+        if radii[t] >= DBH_OBSERVATIONS and coverage[t] >= dbh_arc_min - 1e-9:
+            dbh[t] = 2.0 * radius[t] / radius_weight[t]
+            dbh_sigma[t] = 2.0 * np.sqrt(1.0 / radius_weight[t] + SHARED_RADIUS_SIGMA**2)
+        if eccentricities[t] > 0:
+            mean[t] = eccentricity[t] / eccentricities[t]
+        confirmed[t] = verdict[t] == Verdict.TREE if verdict[t] >= 0 else hits[t] >= hits_to_confirm
+    return coverage, dbh, dbh_sigma, mean, confirmed
