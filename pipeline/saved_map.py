@@ -62,7 +62,7 @@ class SavedMap:
             and not 0 < self.tracks.number.min() <= self.tracks.number.max() < self.next_number
         ):
             raise ValueError("the numbers of the trees are out of order")
-        gathering = GatheringState(self.memory.unpacked(), (), self.columns)
+        gathering = GatheringState(self.memory.checked(), (), self.columns)
         return MapperState(self.slam, gathering, self.tracks, self.next_number, self.odometry, n)
 
     def trees(self, mapper: Mapper) -> Trees:

@@ -11,6 +11,7 @@ from pipeline.gathering.columns import MARGIN, PROFILE, examine
 from pipeline.gathering.features import COUNT, NAMES, features
 from pipeline.gathering.forest import CLASSES, Forest, standard_forest, vote
 from pipeline.gathering.memory import SLICE, SLICES, TILE, Memory
+from pipeline.gathering.packed import PackedMemory
 from pipeline.gathering.sight import View, look
 from pipeline.geometry import Float
 from pipeline.parameters.stages import Gathering as GatheringParameters
@@ -33,13 +34,13 @@ class GatheringState:
     """What is known between two scans: a memory that nobody changes any more, the scans since, and the
     columns. It shares all of that with the gathering, so that taking it costs nothing."""
 
-    base: Memory
+    base: PackedMemory
     since: tuple[tuple[Float32, int, int], ...]
     columns: Columns
 
     def folded(self) -> Memory:
         """The memory with the scans since, of its own."""
-        memory = self.base.copy()
+        memory = self.base.unpacked()
         for points, scan, most in self.since:
             memory.add(points, scan, most)
             memory.judge_anew(GROWN)
@@ -60,9 +61,9 @@ class Gathering:
     ) -> None:
         self.parameters = parameters
         self._forest = forest or standard_forest(all_around)
-        self.memory = Memory.empty()
+        self.memory = Memory.empty(1 << parameters.voxels_log2)
         self.columns = no_columns()
-        self._base = self.memory.copy()
+        self._base = PackedMemory.of(self.memory)
         self._since: list[tuple[Float32, int, int]] = []
 
     def add(self, points: Float32, height: Float32, scan: int, view: View) -> None:
@@ -97,7 +98,7 @@ class Gathering:
 
     def _remember(self, points: Float32, scan: int, most: int) -> Int:
         if len(self._since) >= FOLD:
-            self._base, self._since = self.memory.copy(), []
+            self._base, self._since = PackedMemory.of(self.memory), []
         self._since.append((points, scan, most))
         self.memory.add(points, scan, most)
         return self.memory.judge_anew(GROWN)

@@ -23,6 +23,9 @@ FIRST_SCANS = 10  # but for these, when a map may end soon
 _OFFSET = TILE_CELLS << 18  # cells; keys stay positive within 1,000 km of the origin
 _FARTHEST = np.float32((_OFFSET - 2 * TILE_CELLS) * SIDE)
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
+KEPT = ("key", "mean", "returns", "scans", "latest")  # of each voxel; all else follows from these
+
+_Tables = tuple[Int, Int32, Float32, Int32, Int32, Int32, Int32, Int32, Int, Int32, Int32, Int]
 
 
 @dataclass(slots=True, eq=False)
@@ -30,10 +33,10 @@ class Memory:
     """Voxels as columns, of which the first `used` rows count, and likewise tiles.
 
     Attributes:
-        key: int64, the cell; slot: int32, hash table of rows, -1 where free.
+        key: int64, the cell; slot: int32, hash table of row + 1, 0 where free.
         mean: float32, shape (rows, 3): x, y in the frame of the map, height above the ground [m].
         returns, scans: int32, how many fell into it, and in how many scans; latest: the last of these.
-        following: int32, the next voxel of the same tile, -1 for none.
+        following: int32, the next voxel of the same tile, -1 for none; home: int32, row of that tile.
         tile_key, tile_slot: As for voxels; tile_first: int32, the first voxel of each tile.
         tile_returns: int64; tile_judged: int64, the returns that it had when it was last judged.
         used, tiles: Voxels and tiles in use; added: scans that were taken.
@@ -46,6 +49,7 @@ class Memory:
     scans: Int32
     latest: Int32
     following: Int32
+    home: Int32
     tile_key: Int
     tile_slot: Int32
     tile_first: Int32
@@ -57,33 +61,33 @@ class Memory:
 
     @classmethod
     def empty(cls, room: int = 1 << 12, tile_room: int = 1 << 8) -> Memory:
-        """Nothing is known; `room` and `tile_room` are powers of two."""
-        ints, tile_ints = np.zeros(room, np.int32), np.zeros(tile_room, np.int64)
+        """Nothing is known; `room` and `tile_room` are powers of two.
+
+        All is zeros, so that the system gives pages only as rows come into use: room for a whole map
+        costs nothing before it is filled, and a map that grows need never move.
+        """
         return cls(
             key=np.zeros(room, np.int64),
-            slot=np.full(2 * room, -1, np.int32),
+            slot=np.zeros(2 * room, np.int32),
             mean=np.zeros((room, 3), np.float32),
-            returns=ints.copy(),
-            scans=ints.copy(),
-            latest=ints.copy(),
-            following=ints.copy(),
-            tile_key=tile_ints.copy(),
-            tile_slot=np.full(2 * tile_room, -1, np.int32),
+            returns=np.zeros(room, np.int32),
+            scans=np.zeros(room, np.int32),
+            latest=np.zeros(room, np.int32),
+            following=np.zeros(room, np.int32),
+            home=np.zeros(room, np.int32),
+            tile_key=np.zeros(tile_room, np.int64),
+            tile_slot=np.zeros(2 * tile_room, np.int32),
             tile_first=np.zeros(tile_room, np.int32),
-            tile_returns=tile_ints.copy(),
-            tile_judged=tile_ints.copy(),
+            tile_returns=np.zeros(tile_room, np.int64),
+            tile_judged=np.zeros(tile_room, np.int64),
             used=0,
             tiles=0,
             added=0,
         )
 
     def copy(self) -> Memory:
-        """An independent copy."""
-        other = Memory.empty(1, 1)
-        for f in fields(self):
-            value = getattr(self, f.name)
-            setattr(other, f.name, value.copy() if isinstance(value, np.ndarray) else value)
-        return other
+        """An independent copy with the same room; only what is in use takes memory."""
+        return self._with_room(np.arange(self.used), len(self.key), len(self.tile_key))
 
     def add(self, points: Float32, scan: int, most: int) -> None:
         """Take the points of one scan.
@@ -107,15 +111,8 @@ class Memory:
         """Tiles, shape (T, 2), that hold `grown` times what they held when they were judged last; from
         now on they count as judged. After the first scans the `MOST_TILES` that grew most come first, so
         that no scan takes long; the others' turn comes soon."""
-        now, before = self.tile_returns[: self.tiles], self.tile_judged[: self.tiles]
-        due = np.flatnonzero(now > grown * before)
-        if self.added > FIRST_SCANS and len(due) > MOST_TILES:
-            growth = now[due] / np.maximum(before[due], 1)
-            due = np.sort(due[np.argsort(-growth, kind="stable")[:MOST_TILES]])
-        before[due] = now[due]
-        key = self.tile_key[due]
-        origin = _OFFSET // TILE_CELLS
-        return np.stack([(key >> 31) - origin, (key & ((1 << 31) - 1)) - origin], axis=1)
+        most = MOST_TILES if self.added > FIRST_SCANS else self.tiles
+        return _due_tiles(self.tile_key, self.tile_returns, self.tile_judged, self.tiles, grown, most)
 
     def around(self, tile: Int, margin: float) -> tuple[Float32, Int32]:
         """Mean (N, 3) and returns (N,) of the voxels of a tile and `margin` [m] around it."""
@@ -131,41 +128,44 @@ class Memory:
         )
         return self.mean[rows], self.returns[rows]
 
-    def _tables(self) -> tuple[Int, Int32, Float32, Int32, Int32, Int32, Int32, Int, Int32, Int32, Int]:
+    def _tables(self) -> _Tables:
         return (
-            self.key, self.slot, self.mean, self.returns, self.scans, self.latest, self.following,
+            self.key, self.slot, self.mean, self.returns, self.scans, self.latest, self.following, self.home,
             self.tile_key, self.tile_slot, self.tile_first, self.tile_returns,
         )  # fmt: skip
 
     def _make_room(self, most: int) -> None:
-        rows = np.ones(self.used, np.bool_)
+        rows = np.arange(self.used)
         room, tile_room = len(self.key), len(self.tile_key)
         if self.tiles == tile_room:
             tile_room *= 2
-        elif 2 * room <= most:
-            room *= 2
+        elif room < most:
+            room = most
         else:
-            rows[np.argsort(self.latest[: self.used], kind="stable")[: self.used // 2]] = False
-        fresh = Memory.empty(room, tile_room)
-        n = int(np.count_nonzero(rows))
-        for name in ("key", "mean", "returns", "scans", "latest"):
-            getattr(fresh, name)[:n] = getattr(self, name)[: self.used][rows]
-        fresh.used, fresh.added = n, self.added
-        fresh.tiles = _index(n, *fresh._tables())
-        _keep_judged(
-            self.tile_key, self.tile_judged, self.tiles, fresh.tile_key, fresh.tile_slot, fresh.tile_judged
-        )
+            rows = np.sort(np.argsort(self.latest[: self.used], kind="stable")[self.used // 2 :])
+        fresh = self._with_room(rows, room, tile_room)
         for f in fields(self):
             setattr(self, f.name, getattr(fresh, f.name))
+
+    def _with_room(self, rows: Int, room: int, tile_room: int) -> Memory:
+        fresh = Memory.empty(room, tile_room)
+        for name in KEPT:
+            np.take(getattr(self, name), rows, axis=0, out=getattr(fresh, name)[: len(rows)])
+        fresh.added = self.added
+        index(fresh, len(rows))
+        _keep_judged(
+            self.tile_key[: self.tiles], self.tile_judged, fresh.tile_key, fresh.tile_slot, fresh.tile_judged
+        )
+        return fresh
 
 
 @compiled
 def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
     """The place in the hash table of a key, or where it would go."""
     mask = slot.shape[0] - 1
-    shift = np.uint64(64 - int(np.log2(slot.shape[0]) + 0.5))
-    at = np.int64((np.uint64(key) * _SPREAD) >> shift)
-    while slot[at] >= 0 and keys[slot[at]] != key:
+    # The upper bits of the product are well mixed, 26 of them enough for any table that is allowed.
+    at = np.int64((np.uint64(key) * _SPREAD) >> np.uint64(38)) & mask
+    while slot[at] > 0 and keys[slot[at] - 1] != key:
         at = (at + 1) & mask
     return int(at)
 
@@ -184,9 +184,10 @@ def _tile_of(key: int | np.int64) -> int:
 
 @compiled
 def _hang_in(
-    row: int,
+    row: int | np.int64,
     key: int | np.int64,
     following: Int32,
+    home: Int32,
     tile_key: Int,
     tile_slot: Int32,
     tile_first: Int32,
@@ -195,13 +196,14 @@ def _hang_in(
     """Put a voxel into the chain of its tile; returns the tiles in use."""
     tile = _tile_of(key)
     at = _find(tile, tile_key, tile_slot)
-    if tile_slot[at] < 0:
-        tile_slot[at] = tiles
+    if tile_slot[at] == 0:
         tile_key[tiles] = tile
         tile_first[tiles] = -1
         tiles += 1
-    following[row] = tile_first[tile_slot[at]]
-    tile_first[tile_slot[at]] = row
+        tile_slot[at] = tiles
+    home[row] = tile_slot[at] - 1
+    following[row] = tile_first[home[row]]
+    tile_first[home[row]] = row
     return tiles
 
 
@@ -215,6 +217,7 @@ def _index(
     scans: Int32,  # noqa: ARG001
     latest: Int32,  # noqa: ARG001
     following: Int32,
+    home: Int32,
     tile_key: Int,
     tile_slot: Int32,
     tile_first: Int32,
@@ -223,18 +226,42 @@ def _index(
     """Fill the hash tables and chains of rows that are there already; returns the number of tiles."""
     tiles = 0
     for row in range(used):
-        slot[_find(keys[row], keys, slot)] = row
-        tiles = _hang_in(row, keys[row], following, tile_key, tile_slot, tile_first, tiles)
-        tile_returns[tile_slot[_find(_tile_of(keys[row]), tile_key, tile_slot)]] += returns[row]
+        slot[_find(keys[row], keys, slot)] = row + 1
+        tiles = _hang_in(row, keys[row], following, home, tile_key, tile_slot, tile_first, tiles)
+        tile_returns[home[row]] += returns[row]
     return tiles
 
 
 @compiled
-def _keep_judged(old_key: Int, old_judged: Int, tiles: int, key: Int, slot: Int32, judged: Int) -> None:
-    for t in range(tiles):
+def _keep_judged(old_key: Int, old_judged: Int, key: Int, slot: Int32, judged: Int) -> None:
+    for t in range(old_key.shape[0]):
         at = _find(old_key[t], key, slot)
-        if slot[at] >= 0:
-            judged[slot[at]] = old_judged[t]
+        if slot[at] > 0:
+            judged[slot[at] - 1] = old_judged[t]
+
+
+@compiled
+def _due_tiles(key: Int, returns: Int, judged: Int, tiles: int, grown: float, most: int) -> Int:
+    """Tiles, shape (T, 2), at most so many, that are due, in the order of the table; marks them judged."""
+    growth = np.zeros(tiles)
+    due = 0
+    for t in range(tiles):
+        if returns[t] > grown * judged[t]:
+            growth[t] = returns[t] / max(judged[t], 1)
+            due += 1
+    for _ in range(due - most):  # rarely more than a few stay behind, and rarely many are due
+        least = -1
+        for t in range(tiles):
+            if growth[t] > 0.0 and (least < 0 or growth[t] <= growth[least]):
+                least = t
+        growth[least] = 0.0
+    found, n, origin = np.empty((min(due, most), 2), np.int64), 0, _OFFSET // TILE_CELLS
+    for t in range(tiles):
+        if growth[t] > 0.0:
+            judged[t] = returns[t]
+            found[n, 0], found[n, 1] = (key[t] >> 31) - origin, (key[t] & ((1 << 31) - 1)) - origin
+            n += 1
+    return found
 
 
 @compiled
@@ -249,6 +276,7 @@ def _add(
     scans: Int32,
     latest: Int32,
     following: Int32,
+    home: Int32,
     tile_key: Int,
     tile_slot: Int32,
     tile_first: Int32,
@@ -257,6 +285,7 @@ def _add(
     tiles: int,
 ) -> tuple[int, int, int]:
     """Returns the first point that found no room (their number when all did), voxels and tiles in use."""
+    row, last = np.int64(-1), np.int64(-1)
     for i in range(begin, points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         h = np.int64(np.floor(points[i, 2] / SLICE))
@@ -265,23 +294,25 @@ def _add(
             continue
         ix, iy = np.int64(np.floor(x / SIDE)) + _OFFSET, np.int64(np.floor(y / SIDE)) + _OFFSET
         key = (ix << 36) | (iy << 5) | h
-        at = _find(key, keys, slot)
-        row = slot[at]
-        if row < 0:
-            if used == keys.shape[0] or tiles == tile_key.shape[0]:
-                return i, used, tiles
-            row = used
-            used += 1
-            slot[at] = row
-            keys[row], latest[row] = key, -1
-            tiles = _hang_in(row, key, following, tile_key, tile_slot, tile_first, tiles)
+        if key != last:
+            at = _find(key, keys, slot)
+            row = np.int64(slot[at]) - 1
+            if row < 0:
+                if used == keys.shape[0] or tiles == tile_key.shape[0]:
+                    return i, used, tiles
+                row = np.int64(used)
+                used += 1
+                slot[at] = used
+                keys[row], latest[row] = key, -1
+                tiles = _hang_in(row, key, following, home, tile_key, tile_slot, tile_first, tiles)
+            last = key
         returns[row] += 1
         for a in range(3):
             mean[row, a] += (points[i, a] - mean[row, a]) / np.float32(returns[row])
         if latest[row] != scan:
             latest[row] = scan
             scans[row] += 1
-        tile_returns[tile_slot[_find(_tile_of(key), tile_key, tile_slot)]] += 1
+        tile_returns[home[row]] += 1
     return points.shape[0], used, tiles
 
 
@@ -306,9 +337,9 @@ def _rows_around(
         for dy in range(-reach, reach + 1):
             key = ((tx + dx + origin) << 31) | (ty + dy + origin)
             at = _find(key, tile_key, tile_slot)
-            if tile_slot[at] < 0:
+            if tile_slot[at] == 0:
                 continue
-            row = np.int64(tile_first[tile_slot[at]])
+            row = np.int64(tile_first[tile_slot[at] - 1])
             while row >= 0:
                 if low_x <= mean[row, 0] < high_x and low_y <= mean[row, 1] < high_y:
                     if n == rows.shape[0]:

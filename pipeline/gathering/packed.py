@@ -1,4 +1,4 @@
-"""The memory as it is saved: without the tables by which its voxels are found."""
+"""The memory as it is kept and saved: without the tables by which its voxels are found."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.gathering.memory import TILE_CELLS, Memory, index
+from pipeline.gathering.memory import KEPT, TILE_CELLS, Memory, index
 from pipeline.records import Float32, Int, Int32
 
 LARGEST_ROOM = 1 << 25  # more than the parameters allow
@@ -15,8 +15,9 @@ MASK = (1 << 31) - 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedMemory:
-    """A memory as it is saved: columns of the voxels and tiles in use, in their order, without the tables
-    that find them; `room` and `tile_room` are what was there for both. See Memory."""
+    """A memory as it was, which nobody changes any more: columns of the voxels and tiles in use, in their
+    order, without the tables that find them; `room` and `tile_room` are what was there for both. See
+    Memory."""
 
     key: Int
     mean: Float32
@@ -30,15 +31,30 @@ class PackedMemory:
 
     @classmethod
     def of(cls, memory: Memory) -> PackedMemory:
-        """What cannot be found again from the rest."""
-        n = memory.used
+        """What cannot be found again from the rest, copied."""
+        columns = {name: getattr(memory, name)[: memory.used].copy() for name in KEPT}
+        judged = memory.tile_judged[: memory.tiles].copy()
         return cls(
-            memory.key[:n], memory.mean[:n], memory.returns[:n], memory.scans[:n], memory.latest[:n],
-            memory.tile_judged[: memory.tiles], len(memory.key), len(memory.tile_key), memory.added,
-        )  # fmt: skip
+            **columns,
+            tile_judged=judged,
+            room=len(memory.key),
+            tile_room=len(memory.tile_key),
+            added=memory.added,
+        )
 
     def unpacked(self) -> Memory:
-        """The same memory, to the bit.
+        """The same memory, to the bit."""
+        n = len(self.key)
+        memory = Memory.empty(self.room, self.tile_room)
+        for name in KEPT:
+            getattr(memory, name)[:n] = getattr(self, name)
+        memory.added = self.added
+        index(memory, n)
+        memory.tile_judged[: memory.tiles] = self.tile_judged
+        return memory
+
+    def checked(self) -> PackedMemory:
+        """Itself, if it can be unpacked; what comes from a file need not.
 
         Raises:
             ValueError: The columns do not fit one another or a key stands for no place.
@@ -60,10 +76,4 @@ class PackedMemory:
         tile = ((self.key >> 36) // TILE_CELLS << 31) | ((self.key >> 5) & MASK) // TILE_CELLS
         if len(np.unique(tile)) != tiles:
             raise ValueError("the tiles are not those of the voxels")
-        memory = Memory.empty(self.room, self.tile_room)
-        for name in ("key", "mean", "returns", "scans", "latest"):
-            getattr(memory, name)[:n] = getattr(self, name)
-        memory.added = self.added
-        index(memory, n)
-        memory.tile_judged[:tiles] = self.tile_judged
-        return memory
+        return self

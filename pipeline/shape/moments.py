@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import Int, Int32
+from pipeline.records import Float32, Int, Int32
 
 
 @compiled
