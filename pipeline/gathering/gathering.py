@@ -19,7 +19,7 @@ from pipeline.records import Bool, Columns, Float32, Int, Verdict
 
 GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
 SAME = 0.35  # m; a column found again so near is the one of before
-FOLD = 100  # scans after which a snapshot no longer repeats them one by one
+FOLD = 25  # scans after which a snapshot no longer repeats them one by one; as many are kept
 ALONE = [NAMES.index(name) for name in NAMES if name.startswith("alone")]
 THICK, WIDE = NAMES.index("thick"), NAMES.index("wide")
 VOXELS, CLEAN_SLICES = NAMES.index("voxels a slice"), NAMES.index("clean slices")

@@ -1,0 +1,110 @@
+"""What it costs to find the trunks in one scan, from the ground to the verdict."""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tests.benchmarks.table import Cell, Table, verdict
+from tests.benchmarks.timing import middle, quantile
+
+if TYPE_CHECKING:
+    from pipeline.records import Sensor, Step
+
+NAME = "detection"
+LINE = "From the ground to the verdict, one scan of a VLP-16 and of 64 rings"
+
+DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
+STAGES = ("ground", "voxel grid", "clustering", "shape", "detection")
+VLP16_MS, RINGS_64_MS = 2.0, 15.0  # asked for
+VLP16_SCANS, EVERY = 500, 5
+WARM, ROUNDS = 1, 20  # times that the scans are gone through
+
+
+class StageClock:
+    """The mapper's `Watch`: CPU milliseconds of each stage, one entry a scan."""
+
+    def __init__(self) -> None:
+        self.ms: dict[str, list[float]] = {stage: [] for stage in STAGES}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Measure one stage; others than those of detection are let pass."""
+        start = time.thread_time()
+        yield
+        if stage in self.ms:
+            self.ms[stage].append(1e3 * (time.thread_time() - start))
+
+    def scans(self) -> list[float]:
+        """Milliseconds of each scan, all stages together."""
+        return [sum(stages) for stages in zip(*self.ms.values(), strict=True)]
+
+
+def run() -> list[Table]:
+    """Scans of the simulated stand and, where the recordings are, of a street with 64 rings."""
+    cases = [("sim:stand, VLP-16", VLP16_MS, _steps("sim:stand", VLP16_SCANS, EVERY))]
+    for folder in ("kitti", "semantickitti"):
+        if (DATA / folder).is_dir():
+            cases.append((f"{folder}, 64 rings", RINGS_64_MS, _steps(str(DATA / folder), 10, 1)))
+    clocks = [(name, asked, len(found[1]), *_measured(*found)) for name, asked, found in cases]
+    reached = "; ".join(
+        f"{name}: at most {asked:g} ms {verdict(middle(clock.scans()) <= asked)}"
+        for name, asked, _, clock, _ in clocks
+    )
+    rows: tuple[tuple[Cell, ...], ...] = tuple(
+        (name, scans, returns, clusters, middle(clock.scans()), quantile(clock.scans(), 0.99))
+        for name, _, scans, clock, (returns, clusters) in clocks
+    )
+    stages: tuple[tuple[Cell, ...], ...] = tuple(
+        (stage, *(middle(clock.ms[stage]) for *_, clock, _ in clocks)) for stage in STAGES
+    )
+    return [
+        Table(
+            "Ground, voxel grid, clustering, shape and verdict by CPU time, preset forest",
+            ("run", "scans", "returns", "clusters", "median ms", "p99 ms"),
+            rows,
+            (f"Asked for, as medians on one core: {reached}.",),
+        ),
+        Table("Median of each stage", ("stage", *(f"{name} ms" for name, *_ in clocks)), stages),
+    ]
+
+
+def _steps(uri: str, until: int, every: int) -> tuple[Sensor, list[Step]]:
+    """The sensor, and every so many-th step of a run up to a scan."""
+    from contextlib import closing
+
+    from pipeline.sources import open_source
+    from pipeline.steps import steps
+
+    with closing(open_source(uri)) as source:
+        about = source.description
+        taken = []
+        for step in steps(source.records(), odometry="auto" if about.has_odometry else "static"):
+            if step.index >= until:
+                break
+            if step.index % every == 0:
+                taken.append(step)
+        return about.sensor, taken
+
+
+def _measured(sensor: Sensor, run: Sequence[Step]) -> tuple[StageClock, tuple[int, int]]:
+    """Times of the scans, gone through again and again, and their median returns and clusters."""
+    from pipeline.geometry import Pose3
+    from pipeline.mapper import Mapper
+    from pipeline.parameters import preset
+
+    clock, returns, clusters = StageClock(), [], []
+    for turn in range(WARM + ROUNDS):
+        clock = StageClock() if turn == WARM else clock
+        mapper = Mapper(preset("forest"), sensor=sensor, T_base_lidar=Pose3.identity(), seed=0, watch=clock)
+        gc.collect()
+        for step in run:
+            seen = mapper._perceive(step)
+            returns.append(len(step.scan.points))
+            clusters.append(len(seen.clusters.size))
+    return clock, (round(middle(returns)), round(middle(clusters)))
