@@ -103,7 +103,9 @@ def go_on(
     pose = start if isinstance(start, Pose2) else None
     covariance = np.diag(np.square(GIVEN_SIGMA))
     if start == "auto":
-        found = localise(source, mapper.parameters, Stems.of_trees(saved.map.trees(mapper)), odometry, seed)
+        found = localise(
+            source, mapper.parameters, Stems.of_trees(saved.map.trees(mapper.parameters)), odometry, seed
+        )
         pose, covariance = found.pose, found.covariance
     mapper.load(replace(saved.map.state(), odometry=None), path, saved.map.sigma_xy)
     if pose is None:

@@ -7,6 +7,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,21 @@ def read_run(folder: FilePath) -> FinishedRun:
         _path(_columns(folder / "path.csv", PATH_COLUMNS)),
         _trees(_columns(folder / "trees.csv", TREE_COLUMNS)),
     )
+
+
+def read_run_record(folder: FilePath) -> dict[str, Any]:
+    """run.json of a run's folder.
+
+    Raises:
+        SourceError: It is missing or is not what `stemmap map` writes.
+    """
+    try:
+        record = json.loads(_text(folder / "run.json"))
+        if isinstance(record["source"], dict) and isinstance(record["parameters"], dict):
+            return dict(record)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        pass
+    raise SourceError("run.json is damaged", where=str(folder), remedy="Map the run again")
 
 
 def _text(file: FilePath) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pipeline.health import Health, HealthState
@@ -34,6 +34,29 @@ class RunHealth:
     _spans_left_out: int = 0
     _was: HealthState = "good"
     _worst: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of_both(cls, first: RunHealth, second: RunHealth, scans: int, shift_ns: int) -> RunHealth:
+        """Of two runs after one another: the second comes after so many scans, later by `shift_ns`."""
+        moved = [
+            replace(
+                span,
+                first=span.first + scans,
+                last=span.last + scans,
+                start_ns=span.start_ns + shift_ns,
+                end_ns=span.end_ns + shift_ns,
+            )
+            for span in second._spans
+        ]
+        spans = first._spans + moved
+        left_out = first._spans_left_out + second._spans_left_out + max(len(spans) - MOST_SPANS, 0)
+        worst = {
+            name: (min if name in ("n_eff", "ancestors") else max)(
+                run._worst[name] for run in (first, second) if name in run._worst
+            )
+            for name in {**first._worst, **second._worst}
+        }
+        return cls(first._scans + second._scans, spans[:MOST_SPANS], left_out, second._was, worst)
 
     def add(self, frame: Frame) -> None:
         """Take the next scan."""

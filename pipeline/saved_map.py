@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.gathering import GatheringState, PackedMemory, no_columns
 from pipeline.geometry import Float, Pose2
 from pipeline.mapper import Mapper, MapperState
+from pipeline.parameters import Parameters
 from pipeline.records import Columns, Int, Trees
 from pipeline.slam import SlamState
 from pipeline.slam.genealogy import BLOCK
@@ -65,9 +66,9 @@ class SavedMap:
         gathering = GatheringState(self.memory.checked(), (), self.columns)
         return MapperState(self.slam, gathering, self.tracks, self.next_number, self.odometry, n)
 
-    def trees(self, mapper: Mapper) -> Trees:
-        """The trees of the map, by the parameters of a mapper."""
-        tracker = Tracker(mapper.parameters.tracking)
+    def trees(self, parameters: Parameters) -> Trees:
+        """The trees of the map, by these parameters."""
+        tracker = Tracker(parameters.tracking)
         tracker.tracks, tracker.next_number = self.tracks, self.next_number
         return tracker.trees()
 

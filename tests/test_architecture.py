@@ -56,6 +56,7 @@ AROUND = {
     "recording": {"sources", "simulation"},
     "mapper": set(STAGES),
     "saved_map": {*STAGES, "mapper"},
+    "merged_map": {*STAGES, "saved_map"},
 }
 FORBIDDEN_IN_PIPELINE = {
     "app",

@@ -14,7 +14,7 @@ import sys
 from app.version import version
 from pipeline.errors import ParameterError, StemmapError
 
-COMMANDS = ("serve", "map", "info", "simulate", "evaluate", "export", "params", "train", "bench")
+COMMANDS = ("serve", "map", "merge", "info", "simulate", "evaluate", "export", "params", "train", "bench")
 
 DONE, FAILED, WRONG_USAGE, DONE_WITH_LOSSES = 0, 1, 2, 3
 

@@ -25,7 +25,7 @@ def merge_near(tracks: TrackTable, touched: Bool, radius: float) -> TrackTable:
         old, young = _first_pair(tracks.x, touched, alive, radius)
         if old < 0:
             return tracks if alive.all() else tracks.take(alive)
-        _join(tracks, old, young)
+        join(tracks, old, young)
         alive[young] = False
         touched[old] = True
 
@@ -43,7 +43,8 @@ def _first_pair(x: Float, touched: Bool, alive: Bool, radius: float) -> tuple[in
     return -1, -1
 
 
-def _join(tracks: TrackTable, old: int, young: int) -> None:
+def join(tracks: TrackTable, old: int, young: int) -> None:
+    """Add to a tree, by its row, what is known of another row of the same tree, which is left as it is."""
     if tracks.stamp_ns[old] == tracks.stamp_ns[young]:  # two halves of one trunk in one scan
         tracks.hits[old] -= 1
     tracks.x[old], tracks.P[old] = fuse(tracks.x[old], tracks.P[old], tracks.x[young], tracks.P[young])

@@ -1,0 +1,190 @@
+"""Two finished runs of one stand made one: its files, and which tree is which."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections import Counter
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from app.continuing import PAUSE_NS
+from app.finished import read_run_record
+from app.run_health import RunHealth
+from app.saved_run import SavedRun, read_saved_run
+from app.tally import Tally
+from app.version import version
+from pipeline.errors import StemmapError
+from pipeline.export import DETECTION_COLUMNS, RunFiles, csv_text
+from pipeline.geometry import Pose2
+from pipeline.merged_map import MergedMap, merge_maps
+from pipeline.parameters import Parameters
+from pipeline.records import Path
+from pipeline.relocalisation import Match, Stems, find_constellation
+
+CORRESPONDENCE_COLUMNS = ("tree", "tree_a", "tree_b", "distance_m")
+HYPOTHESES = 3_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Merging:
+    """What came of it, for people: trees of a, of b, and in both; the match of the two maps."""
+
+    a: int
+    b: int
+    both: int
+    match: Match
+
+
+def merge_runs(
+    folder_a: FilePath, folder_b: FilePath, out: FilePath, parameters: Parameters | None
+) -> Merging:
+    """Merge run b into run a and write the files of a run, with correspondence.csv beside them.
+
+    Args:
+        folder_a, folder_b: Of finished runs.
+        out: For the files.
+        parameters: None takes those of run a.
+
+    Raises:
+        StemmapError: A run cannot be read, or the two maps do not fit with confidence.
+        OSError: The folder cannot be written; nothing new stands in it then.
+    """
+    a, b = read_saved_run(folder_a), read_saved_run(folder_b)
+    chosen = a.chosen_parameters() if parameters is None else parameters
+    record = read_run_record(folder_a)
+    trees_a, trees_b = a.map.trees(chosen), b.map.trees(b.chosen_parameters())
+    match = find_constellation(
+        Stems.of_trees(trees_b), Stems.of_trees(trees_a), chosen.relocalisation, hypotheses=HYPOTHESES
+    )
+    if match.pose is None:
+        raise StemmapError(
+            f"the two maps do not fit with confidence: {match.reason} "
+            f"({len(match.local)} stems agree, {match.second} in another pose)",
+            where=str(folder_b),
+            remedy="Merge runs that share more trees, or map the second one with --continue and --start",
+        )
+    shift = 0 if b.start_ns > a.map.stamp_ns[-1] else int(a.map.stamp_ns[-1]) + PAUSE_NS - b.start_ns
+    merged = merge_maps(a.map, b.map, match.pose, match.covariance, shift, chosen)
+    saved = _joined(a, b, merged, match, shift, chosen)
+    files = RunFiles(out, folder_a)
+    try:
+        files.add_rows(
+            _moved_rows(folder_b / "detections.csv", match.pose, len(a.map.stamp_ns), shift, a, b)
+        )
+        trees = merged.map.trees(chosen)
+        path = _path(merged)
+        _update(record, saved, path, int(np.count_nonzero(trees.confirmed)), match)
+        table = _correspondence(merged, set(trees.number[trees.confirmed].tolist()), a, b)
+        more = {"correspondence.csv": csv_text(CORRESPONDENCE_COLUMNS, table)}
+        files.finish(trees, path, a.start_ns, record, saved.as_bytes(), more)
+    except BaseException:
+        files.abandon()
+        raise
+    both = sum(1 for row in table if row[1] and row[2])
+    return Merging(sum(1 for row in table if row[1]), sum(1 for row in table if row[2]), both, match)
+
+
+def _joined(
+    a: SavedRun, b: SavedRun, merged: MergedMap, match: Match, shift: int, parameters: Parameters
+) -> SavedRun:
+    scans, pose = len(a.map.stamp_ns), match.pose or Pose2()
+    moved = []
+    for source in b.sources:
+        at = pose @ Pose2(*source.pose)
+        moved.append(
+            replace(
+                source,
+                from_scan=source.from_scan + scans,
+                start="merged" if source.start == "origin" else source.start,
+                pose=(at.x, at.y, at.yaw),
+                stems=source.stems or len(match.local),
+                stamp_shift_ns=source.stamp_shift_ns + shift,
+            )
+        )
+    tally = Tally(
+        a.tally.warned + b.tally.warned,
+        a.tally.points + b.tally.points,
+        a.tally.verdicts + b.tally.verdicts,
+        RunHealth.of_both(a.tally.health, b.tally.health, scans, shift),
+    )
+    return replace(
+        a,
+        sources=(*a.sources, *moved),
+        parameters=parameters.model_dump_json(),
+        tally=tally,
+        losses=dict(Counter(a.losses) + Counter(b.losses)),
+        map=merged.map,
+    )
+
+
+def _path(merged: MergedMap) -> Path:
+    m = merged.map
+    poses = m.slam.genealogy.path(m.slam.best)
+    return Path(m.stamp_ns, poses[:, 0], poses[:, 1], poses[:, 2], m.sigma_xy)
+
+
+def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, match: Match) -> None:
+    """Make the record of run a that of both."""
+    first, *others = saved.sources
+    record["source"].update(uri=first.uri, sha256=first.digest)
+    record.update(
+        stemmap=version(),
+        parameters=json.loads(saved.parameters),
+        scans=len(path.stamp_ns),
+        duration_s=round((int(path.stamp_ns[-1]) - int(path.stamp_ns[0])) * 1e-9, 6),
+        distance_m=round(float(np.hypot(np.diff(path.x), np.diff(path.y)).sum()), 3),
+        trees=trees,
+        points=dict(saved.tally.points),
+        health=saved.tally.health.record(saved.start_ns),
+        verdicts=dict(sorted(saved.tally.verdicts.items())),
+        evaluation=None,
+        path_error=None,
+        warnings=saved.tally.warnings(),
+        losses=saved.losses,
+        continued=[asdict(other) for other in others],
+        merged={
+            "stems": len(match.local),
+            "second": match.second,
+            "log10_false_alarms": round(match.false_alarms, 2),
+            "sigma_m_m_rad": [round(float(s), 5) for s in np.sqrt(np.diag(match.covariance))],
+        },
+    )
+
+
+def _correspondence(merged: MergedMap, shown: set[int], a: SavedRun, b: SavedRun) -> list[list[str]]:
+    """Rows of CORRESPONDENCE_COLUMNS of the confirmed trees of the merged map, by number."""
+    rows = {n: [str(n), str(n), "", ""] for n in a.map.tracks.number.tolist() if n in shown}
+    told = zip(b.map.tracks.number.tolist(), merged.number_of.tolist(), merged.distance.tolist(), strict=True)
+    for old, new, distance in told:
+        if new not in shown:
+            continue
+        row = rows.setdefault(new, [str(new), "", "", ""])
+        row[2] = str(old)
+        row[3] = "" if math.isnan(distance) else f"{distance:.3f}"
+    return [rows[n] for n in sorted(rows)]
+
+
+def _moved_rows(
+    file: FilePath, T: Pose2, scans: int, shift: int, a: SavedRun, b: SavedRun
+) -> list[list[str]]:
+    """The detections of run b in the frame, the numbers and the times of run a."""
+    seconds = (b.start_ns + shift - a.start_ns) * 1e-9
+    try:
+        with file.open(encoding="utf-8", newline="") as text:
+            header, *rows = csv.reader(text)
+        if tuple(header) != DETECTION_COLUMNS:
+            raise ValueError
+        at = T.apply(np.array([[float(row[2]), float(row[3])] for row in rows]).reshape(len(rows), 2))
+        return [
+            [str(int(row[0]) + scans), f"{float(row[1]) + seconds:.3f}", f"{x:.3f}", f"{y:.3f}", *row[4:]]
+            for row, (x, y) in zip(rows, at.tolist(), strict=True)
+        ]
+    except (OSError, ValueError, IndexError):
+        raise StemmapError(
+            "its detections cannot be read", where=str(file), remedy="Map the run again"
+        ) from None

@@ -1,0 +1,179 @@
+"""Two maps of one stand made one: the first keeps its frame and its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.association import associate
+from pipeline.gathering import PackedMemory
+from pipeline.gathering.memory import TILE
+from pipeline.geometry import Float, Pose2, wrap_angle
+from pipeline.parameters import Parameters
+from pipeline.records import Bool, Columns, Int, Verdict
+from pipeline.saved_map import SavedMap
+from pipeline.slam import SlamState
+from pipeline.slam.genealogy import BLOCK, Genealogy, Generation
+from pipeline.tracking.merge import join
+from pipeline.tracking.table import SECTORS, TrackTable
+
+GATE = 5.0  # sigma; beyond it two trees are two
+SAME_COLUMN = 0.35  # m
+MOST_RETURNS = 20  # of a voxel of the second map; more say nothing new
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedMap:
+    """What came of a merging.
+
+    Attributes:
+        map: The trees, landmarks and paths of both.
+        number_of: The number of each tree of the second map in the merged one, int64, shape (T,).
+        distance: How far apart the two trees stood that became one, NaN for a tree of its own, (T,) [m].
+    """
+
+    map: SavedMap
+    number_of: Int
+    distance: Float
+
+
+def merge_maps(
+    a: SavedMap, b: SavedMap, T_a_b: Pose2, covariance: Float, stamp_shift_ns: int, parameters: Parameters
+) -> MergedMap:
+    """Bring map b into map a.
+
+    Args:
+        a, b: The maps.
+        T_a_b: Where the frame of b stands in that of a; covariance: of it, shape (3, 3).
+        stamp_shift_ns: Added to the times of b, which must then come after those of a.
+        parameters: Of all stages.
+    """
+    moved = _moved_tracks(b.tracks, T_a_b, covariance, stamp_shift_ns)
+    slack = parameters.relocalisation.slack**2
+    row_of, _ = associate(
+        moved.x[:, :2], _flat(moved.P) + np.array([slack, 0.0, slack]), a.tracks.x[:, :2], _flat(a.tracks.P),
+        GATE, parameters.tracking.distance_max,
+    )  # fmt: skip
+    fresh = row_of < 0
+    number_of = np.zeros(len(moved), np.int64)
+    distance = np.full(len(moved), np.nan)
+    number_of[fresh] = a.next_number + np.arange(np.count_nonzero(fresh))
+    number_of[~fresh] = a.tracks.number[row_of[~fresh]]
+    gap = moved.x[~fresh, :2] - a.tracks.x[row_of[~fresh], :2]
+    distance[~fresh] = np.hypot(gap[:, 0], gap[:, 1])
+    both = a.tracks.extended(moved)
+    for k in np.flatnonzero(~fresh):
+        join(both, int(row_of[k]), len(a.tracks) + int(k))
+    matched = row_of[~fresh]
+    hidden = (a.tracks.verdict[matched] < 0) & (both.verdict[matched] != Verdict.TREE)
+    both.verdict[matched[hidden]] = -1  # a tree that the first run shows by its hits stays shown
+    both.number[len(a.tracks) :] = number_of
+    tracks = both.take(np.concatenate([np.ones(len(a.tracks), np.bool_), fresh]))
+    path = np.concatenate([a.slam.genealogy.path(a.slam.best), _moved_path(b, T_a_b)])
+    merged = replace(
+        a,
+        slam=_slam(a.slam, b.slam, T_a_b, covariance, path, parameters.tracking.distance_max),
+        memory=_memory(a.memory, b.memory, T_a_b, len(path), 1 << parameters.gathering.voxels_log2),
+        columns=_columns(a.columns, b.columns, T_a_b),
+        tracks=tracks,
+        next_number=a.next_number + int(np.count_nonzero(fresh)),
+        odometry=None,
+        stamp_ns=np.concatenate([a.stamp_ns, b.stamp_ns + stamp_shift_ns]),
+        sigma_xy=np.concatenate(
+            [a.sigma_xy, np.hypot(b.sigma_xy, np.sqrt(np.trace(covariance[:2, :2]) / 2))]
+        ),
+    )
+    return MergedMap(merged, number_of, distance)
+
+
+def _flat(P: Float) -> Float:
+    flat: Float = P[:, [0, 0, 1], [0, 1, 1]]
+    return flat
+
+
+def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int) -> TrackTable:
+    moved = tracks.copy()
+    C = np.kron(np.eye(2), T.rotation())
+    moved.x[:] = tracks.x @ C.T
+    moved.x[:, :2] += [T.x, T.y]
+    moved.P[:] = C @ tracks.P @ C.T
+    J = np.zeros((len(tracks), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = T.y - moved.x[:, 1], moved.x[:, 0] - T.x
+    moved.P[:, :2, :2] += J @ covariance @ J.transpose(0, 2, 1)
+    moved.stamp_ns[:] += shift_ns
+    moved.first_ns[:] += shift_ns
+    turn = round(T.yaw / (2.0 * np.pi / SECTORS)) % SECTORS
+    all_sides = (1 << SECTORS) - 1
+    moved.sides[:] = ((tracks.sides << turn) | (tracks.sides >> (SECTORS - turn))) & all_sides
+    return moved
+
+
+def _moved_path(b: SavedMap, T: Pose2) -> Float:
+    poses = b.slam.genealogy.path(b.slam.best)
+    return np.column_stack([T.apply(poses[:, :2]), wrap_angle(poses[:, 2] + T.yaw)])
+
+
+def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, reach: float) -> SlamState:
+    """The best map of each in every particle, which stand where the second run ended."""
+    P = len(a.pose)
+    known, other = a.count[a.best], b.count[b.best]
+    mean = T.apply(b.mean[b.best, :other])
+    C = T.rotation()
+    full = b.covariance[b.best, :other][:, [[0, 1], [1, 2]]]
+    R = _flat(C @ full @ C.T + covariance[:2, :2])
+    row_of, _ = associate(mean, R, a.mean[a.best, :known], a.covariance[a.best, :known], np.inf, reach)
+    new = np.flatnonzero(row_of < 0)
+    state = a.placed(np.tile(path[-1], (P, 1))).copy().with_room(len(new))
+    rows = slice(known, known + len(new))
+    state.mean[:, rows], state.covariance[:, rows] = mean[new], R[new]
+    for name in ("hits", "score", "birth"):
+        getattr(state, name)[:, rows] = getattr(b, name)[b.best, new]
+    state.birth[:, rows] += a.detections
+    state.count[:] = known + len(new)
+    return replace(state, detections=a.detections + b.detections, genealogy=_past(path, P))
+
+
+def _past(path: Float, particles: int) -> Genealogy:
+    """All particles with one path behind them."""
+    blocks = len(path) // BLOCK
+    settled = tuple(path[BLOCK * k : BLOCK * (k + 1)].copy() for k in range(blocks))
+    recent = tuple(
+        Generation(np.tile(row.astype(np.float32), (particles, 1)), None) for row in path[BLOCK * blocks :]
+    )
+    return Genealogy(settled, recent)
+
+
+def _memory(a: PackedMemory, b: PackedMemory, T: Pose2, scan: int, most: int) -> PackedMemory:
+    """The voxels of a, and the means of those of b as often as they were seen, up to a bound."""
+    memory = a.unpacked()
+    points = b.mean.copy()
+    points[:, :2] = T.apply(b.mean[:, :2].astype(np.float64))
+    memory.add(np.repeat(points, np.minimum(b.returns, MOST_RETURNS), axis=0), scan, most)
+    memory.added += b.added - 1
+    while len(memory.judge_anew(1.0)):  # the columns of both stand until more is seen
+        pass
+    return PackedMemory.of(memory)
+
+
+def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
+    """The columns of a, and those of b at places where a has none."""
+    axis = b.axis.copy()
+    axis[:, :2] = T.apply(b.axis[:, :2])
+    axis[:, 2:4] = b.axis[:, 2:4] @ T.rotation().T
+    new = _apart(axis[:, :2], a.axis[:, :2])
+    names = ("viewed", "present", "absent", "figures", "share", "verdict")
+    joined = {name: np.concatenate([getattr(a, name), getattr(b, name)[new]]) for name in names}
+    tile = np.floor(axis[new, :2] / TILE).astype(np.int64)
+    return Columns(tile=np.concatenate([a.tile, tile]), axis=np.concatenate([a.axis, axis[new]]), **joined)
+
+
+def _apart(place: Float, other: Float) -> Bool:
+    from scipy.spatial import cKDTree
+
+    if not len(place) or not len(other):
+        return np.ones(len(place), np.bool_)
+    distance, _ = cKDTree(other).query(place)
+    apart: Bool = distance > SAME_COLUMN
+    return apart
