@@ -73,9 +73,7 @@ def merge_runs(
     saved = _joined(a, b, merged, match, shift, chosen)
     files = RunFiles(out, folder_a)
     try:
-        files.add_rows(
-            _moved_rows(folder_b / "detections.csv", match.pose, len(a.map.stamp_ns), shift, a, b)
-        )
+        files.add_rows(_moved_rows(folder_b / "detections.csv", match.pose, len(a.map.stamp_ns), shift, a, b))
         trees = merged.map.trees(chosen)
         path = _path(merged)
         _update(record, saved, path, int(np.count_nonzero(trees.confirmed)), match)
