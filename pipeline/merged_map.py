@@ -15,8 +15,10 @@ from pipeline.records import Bool, Columns, Int, Verdict
 from pipeline.saved_map import SavedMap
 from pipeline.slam import SlamState
 from pipeline.slam.genealogy import BLOCK, Genealogy, Generation
+from pipeline.slam.maps import MapColumns, shared_map
 from pipeline.tracking.merge import join
-from pipeline.tracking.table import SECTORS, TrackTable
+from pipeline.tracking.observation import SECTORS
+from pipeline.tracking.table import TrackTable
 
 GATE = 5.0  # sigma; beyond it two trees are two
 SAME_COLUMN = 0.35  # m
@@ -118,21 +120,23 @@ def _moved_path(b: SavedMap, T: Pose2) -> Float:
 def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, reach: float) -> SlamState:
     """The best map of each in every particle, which stand where the second run ended."""
     P = len(a.pose)
-    known, other = a.count[a.best], b.count[b.best]
-    mean = T.apply(b.mean[b.best, :other])
+    known, other = a.map_of(a.best), b.map_of(b.best)
     C = T.rotation()
-    full = b.covariance[b.best, :other][:, [[0, 1], [1, 2]]]
+    full = other.covariance[:, [[0, 1], [1, 2]]]
     R = _flat(C @ full @ C.T + covariance[:2, :2])
-    row_of, _ = associate(mean, R, a.mean[a.best, :known], a.covariance[a.best, :known], np.inf, reach)
-    new = np.flatnonzero(row_of < 0)
-    state = a.placed(np.tile(path[-1], (P, 1))).copy().with_room(len(new))
-    rows = slice(known, known + len(new))
-    state.mean[:, rows], state.covariance[:, rows] = mean[new], R[new]
-    for name in ("hits", "score", "birth"):
-        getattr(state, name)[:, rows] = getattr(b, name)[b.best, new]
-    state.birth[:, rows] += a.detections
-    state.count[:] = known + len(new)
-    return replace(state, detections=a.detections + b.detections, genealogy=_past(path, P))
+    mean = T.apply(other.mean)
+    row_of, _ = associate(mean, R, known.mean, known.covariance, np.inf, reach)
+    new = row_of < 0
+    moved = MapColumns(mean, R, other.hits, other.score, other.birth + a.detections)
+    landmarks = MapColumns(
+        *(np.concatenate([getattr(known, name), getattr(moved, name)[new]]) for name in MapColumns._fields)
+    )
+    return replace(
+        a.placed(np.tile(path[-1], (P, 1))),
+        maps=shared_map(P, landmarks),
+        detections=a.detections + b.detections,
+        genealogy=_past(path, P),
+    )
 
 
 def _past(path: Float, particles: int) -> Genealogy:

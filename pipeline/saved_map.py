@@ -13,7 +13,7 @@ from pipeline.parameters import Parameters
 from pipeline.records import Columns, Int, Trees
 from pipeline.slam import SlamState
 from pipeline.slam.genealogy import BLOCK
-from pipeline.slam.state import FIRST_CAPACITY
+from pipeline.slam.maps import is_sound
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
 
@@ -75,18 +75,13 @@ class SavedMap:
 
 def _check_slam(slam: SlamState) -> None:
     P = len(slam.pose)
-    M = slam.mean.shape[1] if slam.mean.ndim == 3 else 0
     template = SlamState.at_origin(max(P, 1))
     for f in fields(SlamState):
         wanted = getattr(template, f.name)
-        if isinstance(wanted, np.ndarray):
-            shape = tuple(
-                M if axis == 1 and d == FIRST_CAPACITY else d for axis, d in enumerate(wanted.shape)
-            )
-            if getattr(slam, f.name).shape != shape:
-                raise ValueError(f"{f.name} of the particles has another shape")
-    if slam.count.min() < 0 or slam.count.max() > M or not 0 <= slam.best < P:
-        raise ValueError("there are more landmarks or particles than room")
+        if isinstance(wanted, np.ndarray) and getattr(slam, f.name).shape != wanted.shape:
+            raise ValueError(f"{f.name} of the particles has another shape")
+    if not is_sound(slam.maps, P) or not 0 <= slam.best < P:
+        raise ValueError("the particles' maps do not fit")
     if not np.all(np.isfinite(slam.pose)):
         raise ValueError("a pose is not finite")
     past = slam.genealogy

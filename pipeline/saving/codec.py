@@ -92,6 +92,9 @@ def _decoded(kind: Any, tree: Any, blob: bytes, name: str) -> Any:  # noqa: ANN4
         if tree not in of:
             raise ValueError(f"{name} is none of {of}")
         return tree
+    if isinstance(kind, type) and issubclass(kind, tuple):  # a NamedTuple, saved as a row
+        hints = typing.get_type_hints(kind)
+        return kind(*_tuple(tuple(hints.values()), tree, blob, name))
     if is_dataclass(kind):
         return _record(kind, tree, blob, name)
     return _number(kind, tree, name)

@@ -8,18 +8,21 @@ landmarks are independent, so each particle keeps a small Kalman filter a landma
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 
-from pipeline.geometry import Float, Pose2, mean_angle, wrap_angle
+from pipeline.geometry import Float, Pose2, wrap_angle
 from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, Int, PoseEstimate
+from pipeline.records import Detections, PoseEstimate
 from pipeline.slam.health import TOLD, ScanTold, judged, remembered, scan_told
-from pipeline.slam.motion import compound, moved_poses, step_covariance
-from pipeline.slam.resampling import low_variance_ancestors, normalised, take_ancestors
+from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
+from pipeline.slam.motion import compound, moved_poses, step_covariance, weighted_pose, wrapped
+from pipeline.slam.proposal import Room, room_for
+from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.state import SlamState
-from pipeline.slam.update import observe
+from pipeline.slam.update import Near, Rules, near_for, observe, predict
 
 PLACED = 1  # tells the draws of a placing from those of a scan
 TURN_AS_DISTANCE = 1.0  # m/rad; a robot that turns on the spot sees the trees anew as well
@@ -33,6 +36,7 @@ class FastSlam:
         self.parameters = parameters
         self._seed = seed
         self.state = SlamState.at_origin(parameters.particles)
+        self._near, self._room = near_for(0), room_for(0, 0)  # memory of the kernels, no state
 
     def process(self, index: int, motion: Pose2, detections: Detections, clear_range: Float) -> PoseEstimate:
         """Move with the odometry, weigh by the detections, and resample when it is due.
@@ -48,30 +52,20 @@ class FastSlam:
         noise = rng.standard_normal((p.particles, 3))
         offset = float(rng.random())
         state = self._moved(self.state.with_particles(p.particles), motion)
+        scan, ancestors = ScanTold(), None
         used = index == 0 or state.since_update >= p.update_distance
-        told, driven, spread = np.zeros((p.particles, TOLD)), state.since_update, state.motion_covariance
         if used:
-            state = self._observed(state, detections, clear_range, noise, told)
+            state, scan = self._observed(state, detections, clear_range, noise)
         weights = normalised(state.log_weight)
-        scan = ScanTold()
-        if used:
-            scan = scan_told(told, weights, len(detections.cluster), spread)
-            recent = remembered(state.recent, scan, driven)
-            state = replace(state, best=int(np.argmax(weights)), recent=recent)
         estimate = _estimate(state, weights, p.hits_to_weigh)
-        ancestors = None
         if used and estimate.n_eff < p.resample_below * p.particles:
             ancestors = low_variance_ancestors(weights, offset)
-            _resample(state, ancestors)
-            estimate = replace(estimate, resampled=True)
+            take_ancestors(ancestors, state.pose, state.maps)
+            state.log_weight[:] = 0.0
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
         self.state = replace(state, genealogy=genealogy)
-        return replace(
-            estimate,
-            health=judged(
-                state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.covariance
-            ),
-        )
+        health = judged(state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.covariance)
+        return replace(estimate, resampled=ancestors is not None, health=health)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """Put all particles where another source says the base is now, with the map of the best one.
@@ -94,92 +88,85 @@ class FastSlam:
     def landmarks(self) -> tuple[Float, Float]:
         """All landmarks of the best particle: positions, shape (L, 2) [m], and covariances xx, xy, yy,
         shape (L, 3) [m^2]."""
-        best, count = self.state.best, self.state.count[self.state.best]
-        return self.state.mean[best, :count], self.state.covariance[best, :count]
+        landmarks = self.state.map_of(self.state.best)
+        return landmarks.mean, landmarks.covariance
 
     def _moved(self, state: SlamState, step: Pose2) -> SlamState:
+        if step.x == step.y == step.yaw == 0.0:
+            return state
         motion, covariance = compound(
             state.motion, state.motion_covariance, step, step_covariance(step, self.parameters)
         )
-        turned = abs(float(wrap_angle(step.yaw)))
-        driven = float(np.hypot(step.x, step.y)) + TURN_AS_DISTANCE * turned
+        driven = math.hypot(step.x, step.y) + TURN_AS_DISTANCE * abs(wrapped(step.yaw))
         return replace(
             state, motion=motion, motion_covariance=covariance, since_update=state.since_update + driven
         )
 
     def _observed(
-        self, state: SlamState, detections: Detections, clear_range: Float, noise: Float, told: Float
-    ) -> SlamState:
-        p = self.parameters
-        state = state.with_room(len(detections.cluster))
+        self, state: SlamState, detections: Detections, clear_range: Float, noise: Float
+    ) -> tuple[SlamState, ScanTold]:
+        p, found = self.parameters, len(detections.cluster)
+        centre = detections.centre
+        reach = p.view_range
+        if found:
+            reach = max(reach, math.sqrt(float((centre * centre).sum(axis=1).max())) + p.distance_max)
+        rules = _rules(p)
+        moved = predict(state.pose, state.motion, state.motion_covariance, noise, rules.use_proposal)
+        blocks, lengths, rows = blocks_in_reach(state.maps, moved, reach, found)
+        maps = with_room(state.maps, found, rows)
+        known = int(lengths.max()) * ROOM
+        told = np.zeros((len(moved), TOLD))
         observe(
-            state.pose,
-            state.log_weight,
-            state.mean,
-            state.covariance,
-            state.hits,
-            state.score,
-            state.birth,
-            state.count,
-            state.motion,
-            state.motion_covariance,
-            noise,
-            detections.centre,
-            detections.covariance,
-            clear_range,
-            state.detections,
-            p.method == "fastslam2",
-            p.gate,
-            p.distance_max,
-            p.hits_to_weigh,
-            p.view_range,
-            1.0 / p.misses_per_hit,
-            p.looks,
-            p.merge_gate,
-            p.miss_weight,
-            told,
-        )
+            state.pose, moved, state.log_weight, maps, blocks, lengths, state.motion,
+            state.motion_covariance, noise, centre, detections.covariance.reshape(-1, 4)[:, [0, 1, 3]],
+            clear_range, reach, state.detections, rules, *self._memory(known + found, found), told,
+        )  # fmt: skip
         state.log_weight[:] -= state.log_weight.max()
-        return replace(
+        scan = scan_told(told, normalised(state.log_weight), found, state.motion_covariance)
+        state = replace(
             state,
+            maps=maps,
             motion=np.zeros(3),
             motion_covariance=np.zeros((3, 3)),
             since_update=0.0,
-            detections=state.detections + len(detections.cluster),
+            detections=state.detections + found,
+            best=int(np.argmax(state.log_weight)),
+            recent=remembered(state.recent, scan, state.since_update),
         )
+        return state, scan
+
+    def _memory(self, landmarks: int, found: int) -> tuple[Near, Room]:
+        """Memory for so many landmarks in reach of a particle and so many detections."""
+        if landmarks > len(self._near.hits) or found > len(self._room.best):
+            landmarks, found = 2 * landmarks, 2 * found
+            self._near, self._room = near_for(landmarks), room_for(found, landmarks)
+        return self._near, self._room
 
 
-def _resample(state: SlamState, ancestors: Int) -> None:
-    take_ancestors(
-        ancestors,
-        state.pose,
-        state.mean,
-        state.covariance,
-        state.hits,
-        state.score,
-        state.birth,
-        state.count,
+def _rules(p: Slam) -> Rules:
+    return Rules(
+        use_proposal=p.method == "fastslam2",
+        gate=p.gate,
+        distance_max=p.distance_max,
+        hits_to_weigh=p.hits_to_weigh,
+        view_range=p.view_range,
+        miss=1.0 / p.misses_per_hit,
+        miss_weight=p.miss_weight,
+        looks=p.looks,
+        merge_gate=p.merge_gate,
     )
-    state.log_weight[:] = 0.0
 
 
 def _estimate(state: SlamState, weights: Float, hits_to_show: int) -> PoseEstimate:
     pose = moved_poses(state.pose, state.motion)
-    yaw = mean_angle(pose[:, 2], weights)
-    mean = np.array([weights @ pose[:, 0], weights @ pose[:, 1], yaw])
-    deviation = pose - mean
-    deviation[:, 2] = wrap_angle(deviation[:, 2])
-    best = state.best
-    known = state.hits[best, : state.count[best]] >= hits_to_show
-    heading = yaw - state.motion[2]  # of the frame in which the covariance of the motion is
-    C = np.eye(3)
-    C[:2, :2] = Pose2(yaw=heading).rotation()
+    mean, covariance = weighted_pose(pose, weights, state.motion, state.motion_covariance)
+    landmarks = state.map_of(state.best)
     return PoseEstimate(
-        T_map_base=Pose2(float(mean[0]), float(mean[1]), yaw),
-        covariance=(deviation * weights[:, None]).T @ deviation + C @ state.motion_covariance @ C.T,
+        T_map_base=Pose2(float(mean[0]), float(mean[1]), float(mean[2])),
+        covariance=covariance,
         particles=pose,
         weights=weights,
-        n_eff=float(1.0 / np.sum(weights**2)),
-        landmarks=state.mean[best, : state.count[best]][known],
+        n_eff=1.0 / float(weights @ weights),
+        landmarks=landmarks.mean[landmarks.hits >= hits_to_show],
         resampled=False,
     )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.health import Health, HealthState
 
@@ -26,7 +28,7 @@ ALONE_WEAK = 5.0  # m without two known trees: then the heading is the odometry'
 FADING = 0.1  # of a fading mean is the newest scan
 FADING_FOUND = 0.2
 FEWEST = 2.0  # trees; fewer say nothing about shares
-SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad; an odometry that stands still has no sigma
+SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +80,6 @@ def scan_told(told: Float, weights: Float, detections: int, motion_covariance: F
     """
     mean = weights @ told
     recognised = float(mean[RECOGNISED])
-    # The landmarks take part of the blame only when the odometry leaves them any: P >= floor.
-    spread = motion_covariance + np.diag(SIGMA_FLOOR**2)
-    shift = mean[SHIFT]
     return ScanTold(
         detections=detections,
         recognised=recognised,
@@ -88,8 +87,25 @@ def scan_told(told: Float, weights: Float, detections: int, motion_covariance: F
         found=float(mean[FOUND]),
         missed=float(mean[MISSED]),
         innovation=float(mean[INNOVATION]) / (2.0 * recognised) if recognised > 0.5 else float("nan"),
-        odometry=float(np.sqrt(shift @ np.linalg.solve(spread, shift))),
+        odometry=math.sqrt(_mahalanobis2(mean[SHIFT], motion_covariance)),
     )
+
+
+@compiled
+def _mahalanobis2(shift: Float, covariance: Float) -> float:
+    """d^T P^-1 d of three numbers by elimination; P has no less than the floor on its diagonal, for an
+    odometry that stands still has no sigma."""
+    P = covariance + np.diag(SIGMA_FLOOR**2)
+    d = shift.copy()
+    square = 0.0
+    for i in range(3):
+        square += d[i] * d[i] / P[i, i]
+        for j in range(i + 1, 3):
+            factor = P[j, i] / P[i, i]
+            d[j] -= factor * d[i]
+            for k in range(i, 3):
+                P[j, k] -= factor * P[i, k]
+    return square
 
 
 def remembered(recent: Recent, scan: ScanTold, driven: float) -> Recent:

@@ -10,29 +10,25 @@ VARIANCE_MIN = 1e-4  # m^2; views of one trunk share an error of about a centime
 
 
 @compiled
-def kalman_update(m: Float, Sigma: Float, z: Float, R: Float, looks: float) -> None:
-    """m, Sigma of a resting landmark after measuring its position z with covariance R (xx, xy, yy).
+def kalman_update(
+    m: Float, Sigma: Float, j: int, z0: float, z1: float, R0: float, R1: float, R2: float, looks: float
+) -> None:
+    """m[j], Sigma[j] of a resting landmark after measuring its position z with covariance R (xx, xy, yy).
 
     Successive views of a trunk share their error, so Sigma never falls below R / looks.
     """
-    a, b, d = Sigma[0] + R[0], Sigma[1] + R[1], Sigma[2] + R[2]  # S = Sigma + R, H = I
-    det = a * d - b * b
-    k00 = (Sigma[0] * d - Sigma[1] * b) / det  # K = Sigma S^-1
-    k01 = (Sigma[1] * a - Sigma[0] * b) / det
-    k10 = (Sigma[1] * d - Sigma[2] * b) / det
-    k11 = (Sigma[2] * a - Sigma[1] * b) / det
-    y0, y1 = z[0] - m[0], z[1] - m[1]
-    m[0] += k00 * y0 + k01 * y1
-    m[1] += k10 * y0 + k11 * y1
+    S0, S1, S2 = Sigma[j, 0], Sigma[j, 1], Sigma[j, 2]
+    a, b, d = S0 + R0, S1 + R1, S2 + R2  # S = Sigma + R, H = I
+    scale = 1.0 / (a * d - b * b)
+    k00, k01 = (S0 * d - S1 * b) * scale, (S1 * a - S0 * b) * scale  # K = Sigma S^-1
+    k10, k11 = (S1 * d - S2 * b) * scale, (S2 * a - S1 * b) * scale
+    y0, y1 = z0 - m[j, 0], z1 - m[j, 1]
+    m[j, 0] += k00 * y0 + k01 * y1
+    m[j, 1] += k10 * y0 + k11 * y1
     # K R is (I - K) Sigma for K = Sigma S^-1, and stays positive in floating point.
-    xx = k00 * R[0] + k01 * R[1]
-    xy = 0.5 * (k00 * R[1] + k01 * R[2] + k10 * R[0] + k11 * R[1])
-    yy = k10 * R[1] + k11 * R[2]
-    Sigma[0], Sigma[1], Sigma[2] = (
-        max(xx, VARIANCE_MIN, R[0] / looks),
-        xy,
-        max(yy, VARIANCE_MIN, R[2] / looks),
-    )
+    Sigma[j, 0] = max(k00 * R0 + k01 * R1, VARIANCE_MIN, R0 / looks)
+    Sigma[j, 1] = 0.5 * (k00 * R1 + k01 * R2 + k10 * R0 + k11 * R1)
+    Sigma[j, 2] = max(k10 * R1 + k11 * R2, VARIANCE_MIN, R2 / looks)
 
 
 @compiled
@@ -42,53 +38,40 @@ def merge_duplicates(
     hits: Int32,
     score: Float32,
     birth: Int,
-    near: Int,
+    known: int,
     seen: Bool,
     gate: float,
 ) -> None:
     """Join each landmark that was seen with those nearby that were not, where both may be one tree.
 
     Two that this scan sees are two. Of two that are one the older keeps its birth; the other one is
-    left without score, to be removed.
+    left without score, to be removed. Only the first `known` rows are asked.
     """
-    for j in near:
+    gate2 = gate * gate
+    largest = 0.0
+    for j in range(known):
+        largest = max(largest, covariance[j, 0] + covariance[j, 2])
+    reach2 = 2.0 * gate2 * largest
+    for j in range(known):
         if not seen[j]:
             continue
-        for k in near:
-            if seen[k] or score[k] <= 0.0:
-                continue
-            a = covariance[j, 0] + covariance[k, 0]
-            b = covariance[j, 1] + covariance[k, 1]
-            d = covariance[j, 2] + covariance[k, 2]
+        for k in range(known):
             y0, y1 = mean[k, 0] - mean[j, 0], mean[k, 1] - mean[j, 1]
-            if y0 * y0 + y1 * y1 > gate * gate * (a + d):  # the trace bounds the larger eigenvalue
+            square = y0 * y0 + y1 * y1
+            if square > reach2:
                 continue
-            det = a * d - b * b
-            if d * y0 * y0 - 2.0 * b * y0 * y1 + a * y1 * y1 > gate * gate * det:
+            # The trace bounds the larger eigenvalue.
+            a, d = covariance[j, 0] + covariance[k, 0], covariance[j, 2] + covariance[k, 2]
+            if square > gate2 * (a + d) or seen[k] or score[k] <= 0.0:
                 continue
-            kalman_update(mean[j], covariance[j], mean[k].copy(), covariance[k].copy(), 1e9)
+            b = covariance[j, 1] + covariance[k, 1]
+            if d * y0 * y0 - 2.0 * b * y0 * y1 + a * y1 * y1 > gate2 * (a * d - b * b):
+                continue
+            kalman_update(
+                mean, covariance, j, mean[k, 0], mean[k, 1],
+                covariance[k, 0], covariance[k, 1], covariance[k, 2], 1e9,
+            )  # fmt: skip
             hits[j] += hits[k]
             score[j] = max(score[j], score[k])
             birth[j] = min(birth[j], birth[k])
             score[k] = 0.0
-
-
-@compiled
-def remove_gone(
-    mean: Float,
-    covariance: Float,
-    hits: Int32,
-    score: Float32,
-    birth: Int,
-    count: Int32,
-    p: int,
-    near: Int,
-) -> None:
-    """Take away landmarks without score; the last one moves to the free place."""
-    for i in range(near.shape[0] - 1, -1, -1):
-        j = near[i]
-        if score[j] <= 0.0:
-            last = count[p] - 1
-            mean[j], covariance[j] = mean[last], covariance[last]
-            hits[j], score[j], birth[j] = hits[last], score[last], birth[last]
-            count[p] = last

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from pipeline.geometry import Float, Pose2, wrap_angle
+from pipeline.compiled import compiled
+from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Slam
+
+
+def wrapped(angle: float) -> float:
+    """The same direction between -pi and pi."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def step_covariance(step: Pose2, p: Slam) -> Float:
@@ -13,10 +21,11 @@ def step_covariance(step: Pose2, p: Slam) -> Float:
 
     Variances grow with the distance and the turn, so many short steps scatter as one long one does.
     """
-    distance = float(np.hypot(step.x, step.y))
+    distance = math.hypot(step.x, step.y)
     position = p.noise_distance**2 * distance
-    yaw = np.radians(p.noise_turn_distance) ** 2 * distance + np.radians(p.noise_turn) ** 2 * abs(step.yaw)
-    return np.diag([position, position, yaw])
+    yaw = math.radians(p.noise_turn_distance) ** 2 * distance
+    yaw += math.radians(p.noise_turn) ** 2 * abs(step.yaw)
+    return np.array([[position, 0.0, 0.0], [0.0, position, 0.0], [0.0, 0.0, yaw]])
 
 
 def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -> tuple[Float, Float]:
@@ -26,22 +35,61 @@ def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -
         motion: x, y [m], yaw [rad], shape (3,); covariance: shape (3, 3).
         step: In the frame where the motion ends; step_noise: its covariance, shape (3, 3).
     """
-    c, s = np.cos(motion[2]), np.sin(motion[2])
+    yaw = float(motion[2])
+    c, s = math.cos(yaw), math.sin(yaw)
     dx, dy = c * step.x - s * step.y, s * step.x + c * step.y
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    moved = np.array([motion[0] + dx, motion[1] + dy, float(wrap_angle(motion[2] + step.yaw))])
+    moved = np.array([motion[0] + dx, motion[1] + dy, wrapped(yaw + step.yaw)])
     return moved, F @ covariance @ F.T + G @ step_noise @ G.T
 
 
+@compiled
 def moved_poses(pose: Float, motion: Float) -> Float:
     """Poses of shape (P, 3) after one and the same motion, each in its own frame."""
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    return np.stack(
-        [
-            pose[:, 0] + c * motion[0] - s * motion[1],
-            pose[:, 1] + s * motion[0] + c * motion[1],
-            wrap_angle(pose[:, 2] + motion[2]),
-        ],
-        axis=1,
-    )
+    moved = np.empty_like(pose)
+    for p in range(pose.shape[0]):
+        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+        moved[p, 0] = pose[p, 0] + c * motion[0] - s * motion[1]
+        moved[p, 1] = pose[p, 1] + s * motion[0] + c * motion[1]
+        moved[p, 2] = (pose[p, 2] + motion[2] + np.pi) % (2.0 * np.pi) - np.pi
+    return moved
+
+
+@compiled
+def weighted_pose(
+    pose: Float, weights: Float, motion: Float, motion_covariance: Float
+) -> tuple[Float, Float]:
+    """Mean x, y, yaw and covariance, shape (3, 3), of weighted poses of shape (P, 3), a yaw being a
+    direction.
+
+    Args:
+        motion, motion_covariance: What the poses were moved by since they were drawn, in their frame.
+    """
+    mean = np.zeros(3)
+    cos, sin = 0.0, 0.0
+    for p in range(pose.shape[0]):
+        mean[0] += weights[p] * pose[p, 0]
+        mean[1] += weights[p] * pose[p, 1]
+        cos += weights[p] * np.cos(pose[p, 2])
+        sin += weights[p] * np.sin(pose[p, 2])
+    mean[2] = np.arctan2(sin, cos)
+    covariance = np.zeros((3, 3))
+    for p in range(pose.shape[0]):
+        dx, dy = pose[p, 0] - mean[0], pose[p, 1] - mean[1]
+        turn = (pose[p, 2] - mean[2] + np.pi) % (2.0 * np.pi) - np.pi
+        covariance[0, 0] += weights[p] * dx * dx
+        covariance[0, 1] += weights[p] * dx * dy
+        covariance[0, 2] += weights[p] * dx * turn
+        covariance[1, 1] += weights[p] * dy * dy
+        covariance[1, 2] += weights[p] * dy * turn
+        covariance[2, 2] += weights[p] * turn * turn
+    c, s = np.cos(mean[2] - motion[2]), np.sin(mean[2] - motion[2])
+    C = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    for i in range(3):
+        for j in range(i, 3):
+            for a in range(3):
+                for b in range(3):
+                    covariance[i, j] += C[i, a] * motion_covariance[a, b] * C[j, b]
+            covariance[j, i] = covariance[i, j]
+    return mean, covariance

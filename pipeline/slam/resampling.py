@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import Float32, Int, Int32
+from pipeline.records import Int
 
 
 def normalised(log_weight: Float) -> Float:
@@ -49,30 +49,3 @@ def low_variance_ancestors(weights: Float, offset: float) -> Int:
             ancestors[i] = k
             draws[k] -= 1
     return ancestors
-
-
-@compiled
-def take_ancestors(
-    ancestors: Int,
-    pose: Float,
-    mean: Float,
-    covariance: Float,
-    hits: Int32,
-    score: Float32,
-    birth: Int,
-    count: Int32,
-) -> None:
-    """Make each particle a copy of its ancestor. Needs ancestors[ancestors] == ancestors, so that no
-    particle is read after it was overwritten."""
-    for i in range(ancestors.shape[0]):
-        a = ancestors[i]
-        if a == i:
-            continue
-        pose[i] = pose[a]
-        n = count[a]
-        count[i] = n
-        mean[i, :n] = mean[a, :n]
-        covariance[i, :n] = covariance[a, :n]
-        hits[i, :n] = hits[a, :n]
-        score[i, :n] = score[a, :n]
-        birth[i, :n] = birth[a, :n]

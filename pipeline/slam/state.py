@@ -7,26 +7,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.geometry import Float
-from pipeline.records import Float32, Int, Int32
 from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.health import Recent
+from pipeline.slam.maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
 from pipeline.slam.resampling import normalised
-
-FIRST_CAPACITY = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlamState:
-    """Columns of P particles with room for M landmarks each.
+    """Columns of P particles.
 
     Attributes:
         pose: shape (P, 3): x, y [m], yaw [rad] at the last scan that was used, frame of the map.
         log_weight: shape (P,), up to a constant.
-        mean: shape (P, M, 2) [m]; covariance: shape (P, M, 3) [m^2]: xx, xy, yy.
-        hits: int32, shape (P, M); score: float32, shape (P, M): hits less misses, the existence.
-        birth: int64, shape (P, M): serial number of the detection that began the landmark; landmarks
-            of two particles with the same birth are the same tree.
-        count: int32, shape (P,): how many of the M places are landmarks.
+        maps: The landmarks of all particles; `map_of` gives those of one.
         motion: shape (3,): motion by odometry since the last scan that was used.
         motion_covariance: shape (3, 3), of `motion`.
         since_update: Distance driven, and a metre per radian turned, since then [m].
@@ -38,16 +32,11 @@ class SlamState:
 
     pose: Float
     log_weight: Float
-    mean: Float
-    covariance: Float
-    hits: Int32
-    score: Float32
-    birth: Int
-    count: Int32
+    maps: Maps
     motion: Float
     motion_covariance: Float
-    since_update: float
-    detections: int
+    since_update: float = 0.0
+    detections: int = 0
     best: int = 0
     genealogy: Genealogy = field(default_factory=Genealogy)
     recent: Recent = field(default_factory=Recent)
@@ -55,53 +44,31 @@ class SlamState:
     @classmethod
     def at_origin(cls, particles: int) -> SlamState:
         """All particles at the origin, no landmark."""
-        m = FIRST_CAPACITY
         return cls(
             pose=np.zeros((particles, 3)),
             log_weight=np.zeros(particles),
-            mean=np.zeros((particles, m, 2)),
-            covariance=np.zeros((particles, m, 3)),
-            hits=np.zeros((particles, m), np.int32),
-            score=np.zeros((particles, m), np.float32),
-            birth=np.zeros((particles, m), np.int64),
-            count=np.zeros(particles, np.int32),
+            maps=empty_maps(particles),
             motion=np.zeros(3),
             motion_covariance=np.zeros((3, 3)),
-            since_update=0.0,
-            detections=0,
         )
+
+    @classmethod
+    def in_map(cls, pose: Float, landmarks: MapColumns) -> SlamState:
+        """Particles at poses of shape (P, 3), all with the same landmarks: to go on in a known map."""
+        return replace(
+            cls.at_origin(len(pose)),
+            pose=pose.copy(),
+            maps=shared_map(len(pose), landmarks),
+            detections=int(landmarks.birth.max(initial=-1)) + 1,
+        )
+
+    def map_of(self, particle: int) -> MapColumns:
+        """The landmarks of one particle, copied."""
+        return MapColumns(*map_of(self.maps, particle))
 
     def copy(self) -> SlamState:
         """An independent copy, without the room that no landmark uses."""
-        m = max(int(self.count.max()), 1)
-        return replace(
-            self,
-            pose=self.pose.copy(),
-            log_weight=self.log_weight.copy(),
-            mean=self.mean[:, :m].copy(),
-            covariance=self.covariance[:, :m].copy(),
-            hits=self.hits[:, :m].copy(),
-            score=self.score[:, :m].copy(),
-            birth=self.birth[:, :m].copy(),
-            count=self.count.copy(),
-            motion=self.motion.copy(),
-            motion_covariance=self.motion_covariance.copy(),
-        )
-
-    def with_room(self, landmarks: int) -> SlamState:
-        """The same state with room for so many landmarks more in every particle."""
-        need = int(self.count.max()) + landmarks
-        if need <= self.mean.shape[1]:
-            return self
-        extra = max(need, 2 * self.mean.shape[1]) - self.mean.shape[1]
-        return replace(
-            self,
-            mean=np.pad(self.mean, ((0, 0), (0, extra), (0, 0))),
-            covariance=np.pad(self.covariance, ((0, 0), (0, extra), (0, 0))),
-            hits=np.pad(self.hits, ((0, 0), (0, extra))),
-            score=np.pad(self.score, ((0, 0), (0, extra))),
-            birth=np.pad(self.birth, ((0, 0), (0, extra))),
-        )
+        return self._drawn(np.arange(len(self.pose)))
 
     def placed(self, pose: Float) -> SlamState:
         """All particles with the map and the past of the best one, at new poses, shape (P, 3)."""
@@ -110,12 +77,7 @@ class SlamState:
             self,
             pose=pose,
             log_weight=np.zeros(len(pose)),
-            mean=self.mean[rows],
-            covariance=self.covariance[rows],
-            hits=self.hits[rows],
-            score=self.score[rows],
-            birth=self.birth[rows],
-            count=self.count[rows],
+            maps=taken(self.maps, rows),
             motion=np.zeros(3),
             motion_covariance=np.zeros((3, 3)),
             best=0,
@@ -131,15 +93,18 @@ class SlamState:
         rows = np.searchsorted(np.cumsum(weights), (np.arange(particles) + 0.5) / particles)
         rows = np.minimum(rows, len(weights) - 1)
         return replace(
-            self,
-            pose=self.pose[rows],
+            self._drawn(rows),
             log_weight=np.zeros(len(rows)),
-            mean=self.mean[rows],
-            covariance=self.covariance[rows],
-            hits=self.hits[rows],
-            score=self.score[rows],
-            birth=self.birth[rows],
-            count=self.count[rows],
             best=min(int(np.searchsorted(rows, self.best)), particles - 1),
             genealogy=self.genealogy.redrawn(rows),
+        )
+
+    def _drawn(self, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> SlamState:
+        return replace(
+            self,
+            pose=self.pose[rows],
+            log_weight=self.log_weight[rows],
+            maps=taken(self.maps, rows),
+            motion=self.motion.copy(),
+            motion_covariance=self.motion_covariance.copy(),
         )

@@ -2,153 +2,296 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiled import compiled
+from pipeline.direction import direction_bin
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
 from pipeline.slam.health import MISSED, MOST_HITS, SHIFT
-from pipeline.slam.landmarks import kalman_update, merge_duplicates, remove_gone
-from pipeline.slam.proposal import draw, recognise, rotated
-from pipeline.visibility import is_in_free_view
+from pipeline.slam.landmarks import kalman_update, merge_duplicates
+from pipeline.slam.maps import ROOM, Maps, own_block
+from pipeline.slam.proposal import Room, draw, recognise, rotated
+from pipeline.visibility import BEHIND
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
+SHIFT_X, SHIFT_Y, SHIFT_YAW = range(SHIFT.start, SHIFT.stop)
+
+
+class Rules(NamedTuple):
+    """The numbers by which a scan is judged.
+
+    Attributes:
+        use_proposal: FastSLAM 2.0; else the pose was drawn before the scan is looked at.
+        gate: Largest Mahalanobis distance of an association [sigma].
+        distance_max: Largest distance of an association [m].
+        hits_to_weigh: Landmarks seen fewer times do not weigh.
+        view_range: Landmarks nearer than this can be missed [m].
+        miss: What one miss takes from the score; miss_weight: from the log weight.
+        looks: A landmark is never known better than by so many independent looks.
+        merge_gate: Two landmarks nearer than this are one [sigma].
+    """
+
+    use_proposal: bool
+    gate: float
+    distance_max: float
+    hits_to_weigh: int
+    view_range: float
+    miss: float
+    miss_weight: float
+    looks: float
+    merge_gate: float
+
+
+class Near(NamedTuple):
+    """The landmarks of one particle in reach, as columns of its own that are written back when changed.
+
+    Attributes:
+        block, place: int32, shape (L,): where each one is kept.
+        mean, covariance, hits, score, birth: As in Maps, shape (L, ...).
+        seen, changed: shape (L,).
+        free: int32, shape (L, 2): block and place of places without a landmark.
+    """
+
+    block: Int32
+    place: Int32
+    mean: Float
+    covariance: Float
+    hits: Int32
+    score: Float32
+    birth: Int
+    seen: Bool
+    changed: Bool
+    free: Int32
+
+
+def near_for(landmarks: int) -> Near:
+    """Columns with room for so many landmarks."""
+    n = landmarks
+    return Near(
+        block=np.empty(n, np.int32),
+        place=np.empty(n, np.int32),
+        mean=np.empty((n, 2)),
+        covariance=np.empty((n, 3)),
+        hits=np.empty(n, np.int32),
+        score=np.empty(n, np.float32),
+        birth=np.empty(n, np.int64),
+        seen=np.empty(n, np.bool_),
+        changed=np.empty(n, np.bool_),
+        free=np.empty((n, 2), np.int32),
+    )
+
+
+@compiled
+def predict(pose: Float, motion: Float, covariance: Float, noise: Float, use_proposal: bool) -> Float:
+    """The poses after the motion, shape (P, 3); drawn from its covariance where there is no proposal."""
+    P = np.empty((3, 3))
+    mu = np.empty(3)
+    moved = np.empty_like(pose)
+    for p in range(pose.shape[0]):
+        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+        mu[0] = pose[p, 0] + c * motion[0] - s * motion[1]
+        mu[1] = pose[p, 1] + s * motion[0] + c * motion[1]
+        mu[2] = pose[p, 2] + motion[2]
+        moved[p, 0], moved[p, 1], moved[p, 2] = mu[0], mu[1], mu[2]
+        if not use_proposal:
+            _turned_covariance(covariance, c, s, P)
+            draw(mu, P, noise, p, moved)
+    return moved
 
 
 @compiled
 def observe(
     pose: Float,
+    moved: Float,
     log_weight: Float,
-    mean: Float,
-    covariance: Float,
-    hits: Int32,
-    score: Float32,
-    birth: Int,
-    count: Int32,
+    maps: Maps,
+    near_blocks: Int32,
+    near_lengths: Int32,
     motion: Float,
     motion_covariance: Float,
     noise: Float,
     centre: Float,
     R: Float,
     clear_range: Float,
+    reach: float,
     first_birth: int,
-    use_proposal: bool,
-    gate: float,
-    distance_max: float,
-    hits_to_weigh: int,
-    view_range: float,
-    miss: float,
-    looks: float,
-    merge_gate: float,
-    miss_weight: float,
+    rules: Rules,
+    near: Near,
+    room: Room,
     told: Float,
 ) -> None:
-    """Update every particle in place; shapes as in SlamState.
+    """Update every particle in place.
 
     Args:
+        pose: Before the motion, shape (P, 3), becomes the pose after the scan; moved: see `predict`.
+        near_blocks, near_lengths: See `blocks_in_reach`; the pool has the rows that it asked for.
         motion, motion_covariance: Since the last observation, in the frame of each particle.
         noise: Standard normal numbers, shape (P, 3).
-        centre: Detections in the base frame, shape (D, 2) [m]; R: their covariance, (D, 2, 2).
+        centre: Detections in the base frame, shape (D, 2) [m]; R: their covariance xx, xy, yy, (D, 3).
         clear_range: See FastSlam.process.
+        reach: Landmarks farther than this are left alone [m].
         first_birth: Serial number of the first of the detections.
-        use_proposal: FastSLAM 2.0; else the pose is drawn before the scan is looked at.
-        gate: Largest Mahalanobis distance of an association [sigma].
-        distance_max: Largest distance of an association [m].
-        hits_to_weigh: Landmarks seen fewer times do not weigh.
-        view_range: Landmarks nearer than this can be missed [m].
-        miss: What one miss takes from the score.
-        looks: A landmark is never known better than by so many independent looks.
-        merge_gate: Two landmarks nearer than this are one [sigma].
-        miss_weight: What one miss takes from the log weight.
+        near, room: Memory for the landmarks in reach and for pairs.
         told: shape (P, TOLD), filled: what each particle tells of the scan (see health).
     """
-    detections = centre.shape[0]
-    reach = view_range
-    for d in range(detections):
-        reach = max(reach, np.hypot(centre[d, 0], centre[d, 1]) + distance_max)
-    landmark_of = np.empty(detections, np.int64)
-    near_room = np.empty(mean.shape[1], np.int64)
     mu = np.empty(3)
-    P = np.empty((3, 3))
-    before = np.empty(3)
-    told[:] = 0.0
+    P = np.zeros((3, 3))
     for p in range(pose.shape[0]):
-        _predict(pose[p], motion, motion_covariance, mu, P)
-        before[:] = mu
-        if not use_proposal:
-            draw(mu, P, noise[p], pose[p])
-            mu[:] = pose[p]
-            P[:] = 0.0
-        known = count[p]
-        near = _in_reach(mean[p, :known], mu, reach, near_room)
+        before_c, before_s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+        x, y, yaw = pose[p, 0], pose[p, 1], pose[p, 2]
+        mu[0], mu[1], mu[2] = moved[p, 0], moved[p, 1], moved[p, 2]
+        if rules.use_proposal:
+            _turned_covariance(motion_covariance, before_c, before_s, P)
+        known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, near)
         log_weight[p] += recognise(
-            mu, P, centre, R, near, mean[p, :known], covariance[p, :known], hits[p, :known],
-            gate, distance_max, hits_to_weigh, landmark_of, told[p],
+            mu, P, centre, R, known, near.mean, near.covariance, near.hits,
+            rules.gate, rules.distance_max, rules.hits_to_weigh, room, told, p,
         )  # fmt: skip
-        _shift(before, mu, motion[2], told[p])
-        if use_proposal:
-            draw(mu, P, noise[p], pose[p])
-        seen = np.zeros(known, np.bool_)
-        count[p] = _learn(
-            pose[p], mean[p], covariance[p], hits[p], score[p], birth[p], known, landmark_of,
-            centre, R, first_birth, looks, seen,
-        )  # fmt: skip
-        log_weight[p] -= miss_weight * _miss(
-            pose[p], mean[p], hits[p], score[p], near, seen, clear_range, view_range, miss, hits_to_weigh,
-            told[p],
-        )  # fmt: skip
-        merge_duplicates(mean[p], covariance[p], hits[p], score[p], birth[p], near, seen, merge_gate)
-        remove_gone(mean[p], covariance[p], hits[p], score[p], birth[p], count, p, near)
+        _shift(x, y, yaw, before_c, before_s, motion, mu, told, p)
+        if rules.use_proposal:
+            draw(mu, P, noise, p, pose)
+        else:
+            pose[p, 0], pose[p, 1], pose[p, 2] = mu[0], mu[1], mu[2]
+        all_near = _learn(pose, p, maps, near, known, free, room.landmark_of, centre, R, first_birth, rules)
+        missed = _miss(pose, p, near, known, clear_range, rules, told)
+        log_weight[p] -= rules.miss_weight * missed
+        merge_duplicates(
+            near.mean, near.covariance, near.hits, near.score, near.birth, known, near.seen, rules.merge_gate
+        )
+        _write_back(maps, p, near, all_near)
+
+
+@compiled
+def _gather(
+    maps: Maps, p: int, near_blocks: Int32, blocks: int, mu: Float, reach: float, near: Near
+) -> tuple[int, int]:
+    """Fill `near` with the landmarks of a particle in reach; how many, and how many free places."""
+    n, free = 0, 0
+    count = maps.places[p]
+    for i in range(blocks):
+        k = near_blocks[p, i]
+        b = maps.block[p, k]
+        for o in range(min(ROOM, count - k * ROOM)):
+            if maps.hits[b, o] == 0:
+                near.free[free, 0], near.free[free, 1] = k, o
+                free += 1
+                continue
+            x, y = maps.mean[b, o, 0], maps.mean[b, o, 1]
+            dx, dy = x - mu[0], y - mu[1]
+            if dx * dx + dy * dy > reach * reach:
+                continue
+            near.block[n], near.place[n] = k, o
+            near.mean[n, 0], near.mean[n, 1] = x, y
+            for a in range(3):
+                near.covariance[n, a] = maps.covariance[b, o, a]
+            near.hits[n], near.score[n], near.birth[n] = (
+                maps.hits[b, o],
+                maps.score[b, o],
+                maps.birth[b, o],
+            )
+            near.seen[n] = near.changed[n] = False
+            n += 1
+    return n, free
 
 
 @compiled
 def _learn(
     pose: Float,
-    mean: Float,
-    covariance: Float,
-    hits: Int32,
-    score: Float32,
-    birth: Int,
+    p: int,
+    maps: Maps,
+    near: Near,
     known: int,
+    free: int,
     landmark_of: Int,
     centre: Float,
     R: Float,
     first_birth: int,
-    looks: float,
-    seen: Bool,
+    rules: Rules,
 ) -> int:
-    """Sharpen the landmarks of one particle that were seen, marking them, and begin new ones; returns
-    how many there are then."""
-    z, R_map = np.empty(2), np.empty(3)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
+    """Sharpen the landmarks of one particle that were seen, marking them, and begin new ones behind them;
+    returns how many rows of `near` there are then."""
+    c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
     n = known
     for d in range(centre.shape[0]):
-        z[0] = pose[0] + c * centre[d, 0] - s * centre[d, 1]
-        z[1] = pose[1] + s * centre[d, 0] + c * centre[d, 1]
-        rotated(R[d], c, s, R_map)
+        z0 = pose[p, 0] + c * centre[d, 0] - s * centre[d, 1]
+        z1 = pose[p, 1] + s * centre[d, 0] + c * centre[d, 1]
+        R0, R1, R2 = rotated(R, d, c, s)
         j = landmark_of[d]
         if j >= 0:
-            seen[j] = True
-            kalman_update(mean[j], covariance[j], z, R_map, looks)
-            hits[j] += 1
-            score[j] = min(score[j] + 1.0, SCORE_MAX)
+            kalman_update(near.mean, near.covariance, j, z0, z1, R0, R1, R2, rules.looks)
+            near.hits[j] += 1
+            near.score[j] = min(near.score[j] + 1.0, SCORE_MAX)
+            near.seen[j] = near.changed[j] = True
+            continue
+        if n - known < free:
+            near.block[n], near.place[n] = near.free[n - known, 0], near.free[n - known, 1]
         else:
-            mean[n], covariance[n] = z, R_map
-            hits[n], score[n] = 1, 1.0
-            birth[n] = first_birth + d
-            n += 1
+            near.block[n], near.place[n] = maps.places[p] // ROOM, maps.places[p] % ROOM
+            maps.places[p] += 1
+        near.mean[n, 0], near.mean[n, 1] = z0, z1
+        near.covariance[n, 0], near.covariance[n, 1], near.covariance[n, 2] = R0, R1, R2
+        near.hits[n], near.score[n], near.birth[n] = 1, 1.0, first_birth + d
+        near.changed[n] = True
+        n += 1
     return n
 
 
 @compiled
-def _predict(pose: Float, motion: Float, covariance: Float, mu: Float, P: Float) -> None:
-    """The pose after the motion, and its covariance in the frame of the map."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    mu[0] = pose[0] + c * motion[0] - s * motion[1]
-    mu[1] = pose[1] + s * motion[0] + c * motion[1]
-    mu[2] = pose[2] + motion[2]
-    # P = C covariance C^T with the rotation C about z; written out, for the library's product of
-    # such small matrices costs more than all else here.
+def _miss(
+    pose: Float, p: int, near: Near, known: int, clear_range: Float, rules: Rules, told: Float
+) -> float:
+    """Take from the score of landmarks in free view that were not seen; returns how many well known ones
+    there are."""
+    c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+    missed = 0.0
+    for j in range(known):
+        if near.seen[j]:
+            continue
+        dx, dy = near.mean[j, 0] - pose[p, 0], near.mean[j, 1] - pose[p, 1]
+        square = dx * dx + dy * dy
+        if square > rules.view_range * rules.view_range:
+            continue
+        free = clear_range[direction_bin(c * dx + s * dy, c * dy - s * dx, clear_range.shape[0])] - BEHIND
+        if free > 0.0 and free * free > square:
+            near.score[j] -= rules.miss
+            near.changed[j] = True
+            if near.hits[j] >= rules.hits_to_weigh:
+                told[p, MISSED] += min(float(near.hits[j]), MOST_HITS)
+                missed += 1.0
+    return missed
+
+
+@compiled
+def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
+    """Keep what changed; a landmark without score leaves its place free."""
+    k, b = -1, 0
+    for j in range(all_near):
+        gone = near.score[j] <= 0.0
+        if not (near.changed[j] or gone):
+            continue
+        if near.block[j] != k:  # rows of one block stand together
+            k = near.block[j]
+            b = own_block(maps, p, k)
+        o = near.place[j]
+        if gone:
+            maps.hits[b, o] = 0
+            continue
+        x, y = near.mean[j, 0], near.mean[j, 1]
+        maps.mean[b, o, 0], maps.mean[b, o, 1] = x, y
+        for a in range(3):
+            maps.covariance[b, o, a] = near.covariance[j, a]
+        maps.hits[b, o], maps.score[b, o], maps.birth[b, o] = near.hits[j], near.score[j], near.birth[j]
+        maps.box[b, 0], maps.box[b, 1] = min(maps.box[b, 0], x), min(maps.box[b, 1], y)
+        maps.box[b, 2], maps.box[b, 3] = max(maps.box[b, 2], x), max(maps.box[b, 3], y)
+
+
+@compiled
+def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
+    """P = C covariance C^T with the rotation C about z; written out, for the library's product of such
+    small matrices costs more than all else here."""
     xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     P[0, 0] = c * c * xx - 2.0 * c * s * xy + s * s * yy
     P[0, 1] = P[1, 0] = c * s * (xx - yy) + (c * c - s * s) * xy
@@ -159,50 +302,12 @@ def _predict(pose: Float, motion: Float, covariance: Float, mu: Float, P: Float)
 
 
 @compiled
-def _miss(
-    pose: Float,
-    mean: Float,
-    hits: Int32,
-    score: Float32,
-    near: Int,
-    seen: Bool,
-    clear_range: Float,
-    view_range: float,
-    miss: float,
-    hits_to_weigh: int,
-    told: Float,
-) -> float:
-    """Take from the score of landmarks in free view that were not seen; returns how many well known ones
-    there are."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    missed = 0.0
-    for j in near:
-        if not seen[j] and is_in_free_view(mean[j], pose, c, s, clear_range, view_range):
-            score[j] -= miss
-            if hits[j] >= hits_to_weigh:
-                told[MISSED] += min(float(hits[j]), MOST_HITS)
-                missed += 1.0
-    return missed
-
-
-@compiled
-def _shift(before: Float, after: Float, turn: float, told: Float) -> None:
-    """How far the scan moved a pose, in the frame of the odometry's covariance."""
-    c, s = np.cos(before[2] - turn), np.sin(before[2] - turn)
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    shift = told[SHIFT]
-    shift[0] = c * dx + s * dy
-    shift[1] = c * dy - s * dx
-    shift[2] = (after[2] - before[2] + np.pi) % (2.0 * np.pi) - np.pi
-
-
-@compiled
-def _in_reach(mean: Float, mu: Float, reach: float, room: Int) -> Int:
-    """Rows of the landmarks nearer than `reach`, ascending."""
-    n = 0
-    for j in range(mean.shape[0]):
-        dx, dy = mean[j, 0] - mu[0], mean[j, 1] - mu[1]
-        if dx * dx + dy * dy <= reach * reach:
-            room[n] = j
-            n += 1
-    return room[:n]
+def _shift(
+    x: float, y: float, yaw: float, c: float, s: float, motion: Float, mu: Float, told: Float, p: int
+) -> None:
+    """How far the scan moved a pose from where the odometry had it, in the frame of its covariance."""
+    dx, dy = mu[0] - x, mu[1] - y
+    told[p, SHIFT_X] = c * dx + s * dy - motion[0]
+    told[p, SHIFT_Y] = c * dy - s * dx - motion[1]
+    turn = mu[2] - yaw - motion[2]
+    told[p, SHIFT_YAW] = turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))

@@ -59,7 +59,7 @@ def test_the_bytes_of_a_state_are_those_of_all_its_arrays() -> None:
     assert nbytes(7) == 0
     state = Mapper(Parameters(), sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0).snapshot()
     slam = state.slam
-    assert nbytes(state) >= slam.pose.nbytes + slam.mean.nbytes + slam.covariance.nbytes
+    assert nbytes(state) >= slam.pose.nbytes + slam.maps.block.nbytes + slam.maps.mean.nbytes
 
 
 @given(st.integers(0, 500), st.integers(0, 500))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,9 @@ from pipeline.geometry import Pose2, wrap_angle
 from pipeline.parameters import preset
 from pipeline.slam import FastSlam
 from pipeline.slam.landmarks import VARIANCE_MIN, kalman_update
+from pipeline.slam.maps import ROOM, own_block, take_ancestors, with_room
 from pipeline.slam.motion import compound, moved_poses, step_covariance
+from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.state import SlamState
 from tests.pipeline.strategies import ALL_FREE, FEW, LAW, NOTHING_SEEN, detections, seeds
 
@@ -25,6 +27,16 @@ TREES = np.array([[5.0, 2.0], [6.0, -2.0], [2.0, 4.0], [-3.0, 3.0], [1.0, -4.0],
 def fresh(seed=0, **changes: Any):
     """A filter at the origin."""
     return FastSlam(FOREST.model_copy(update=changes), seed)
+
+
+def maps_of(slam):
+    """The landmarks of each particle."""
+    return [slam.state.map_of(p) for p in range(len(slam.state.pose))]
+
+
+def landmarks_of(slam):
+    """How many landmarks each particle has."""
+    return [len(m.hits) for m in maps_of(slam)]
 
 
 def seen_from(pose, world=TREES, rng=None, sigma=0.0, reach=8.0):
@@ -115,8 +127,10 @@ def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
     m, z = rng.normal(size=2), rng.normal(size=2)
     wanted_m, wanted_P = update(m.copy(), _full(Sigma), z, R=_full(R), H=np.eye(2))
     precision = np.linalg.inv(np.linalg.inv(_full(Sigma)) + np.linalg.inv(_full(R)))
-    told_m, told = m.copy(), Sigma.copy()
-    kalman_update(told_m, told, z, R, 1e9)
+    rows_m, rows = np.stack([m, m]), np.stack([Sigma, Sigma])
+    kalman_update(rows_m, rows, 1, z[0], z[1], R[0], R[1], R[2], 1e9)
+    told_m, told = rows_m[1], rows[1]
+    np.testing.assert_array_equal(rows[0], Sigma)
     np.testing.assert_allclose(told_m, wanted_m, atol=1e-9)
     wanted = np.array([max(wanted_P[0, 0], VARIANCE_MIN), wanted_P[0, 1], max(wanted_P[1, 1], VARIANCE_MIN)])
     np.testing.assert_allclose(told, wanted, atol=1e-9)
@@ -126,9 +140,10 @@ def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
 @LAW
 @given(covariances, covariances, st.integers(1, 400))
 def test_a_landmark_s_covariance_stays_positive(Sigma, R, times):
-    m, P = np.zeros(2), Sigma.copy()
+    m, rows = np.zeros((1, 2)), Sigma[None].copy()
     for _ in range(times):
-        kalman_update(m, P, np.zeros(2), R, 1e9)
+        kalman_update(m, rows, 0, 0.0, 0.0, R[0], R[1], R[2], 1e9)
+    P = rows[0]
     assert np.all(np.linalg.eigvalsh(_full(P)) > 0)
     assert min(P[0], P[2]) >= VARIANCE_MIN
 
@@ -136,8 +151,7 @@ def test_a_landmark_s_covariance_stays_positive(Sigma, R, times):
 def test_a_tree_seen_often_is_one_landmark_at_its_place():
     slam = fresh(view_range=0.0)
     told = [slam.process(k, Pose2(), detections([[4.0, 1.0]]), NOTHING_SEEN) for k in range(30)]
-    np.testing.assert_array_equal(slam.state.count, 1)
-    np.testing.assert_array_equal(slam.state.hits[:, 0], 30)
+    assert [m.hits.tolist() for m in maps_of(slam)] == 100 * [[30]]
     np.testing.assert_allclose(told[-1].landmarks, [[4.0, 1.0]], atol=1e-6)
 
 
@@ -146,7 +160,7 @@ def test_room_grows_with_the_landmarks():
     for k in range(20):
         rows = [[3.0 * j, 5.0 * k] for j in range(1, 6)]
         slam.process(k, Pose2(), detections(rows), NOTHING_SEEN)
-    np.testing.assert_array_equal(slam.state.count, 100)
+    assert landmarks_of(slam) == 5 * [100]
 
 
 def test_a_missed_landmark_goes_and_the_others_stay():
@@ -154,12 +168,12 @@ def test_a_missed_landmark_goes_and_the_others_stay():
     both = detections([[4.0, 1.0], [6.0, -3.0], [3.0, 5.0]])
     for k in range(3):
         slam.process(k, Pose2(), both, ALL_FREE)
-    np.testing.assert_array_equal(slam.state.count, 3)
+    assert landmarks_of(slam) == 4 * [3]
     for k in range(3, 7):
         slam.process(k, Pose2(), detections([[6.0, -3.0], [3.0, 5.0]]), ALL_FREE)
-    np.testing.assert_array_equal(slam.state.count, 2)
-    for p in range(4):
-        left = {tuple(row) for row in np.round(slam.state.mean[p, :2], 3).tolist()}
+    assert landmarks_of(slam) == 4 * [2]
+    for landmarks in maps_of(slam):
+        left = {tuple(row) for row in np.round(landmarks.mean, 3).tolist()}
         assert left == {(6.0, -3.0), (3.0, 5.0)}
 
 
@@ -170,7 +184,7 @@ def test_what_could_not_be_seen_is_not_missed(hidden):
     free = NOTHING_SEEN if hidden == "where nothing was seen" else ALL_FREE
     for k in range(1, 30):
         slam.process(k, Pose2(), detections([]), free)
-    np.testing.assert_array_equal(slam.state.count, 1)
+    assert landmarks_of(slam) == 4 * [1]
 
 
 # --- weights --------------------------------------------------------------------------------------
@@ -233,39 +247,105 @@ def test_the_estimate_is_the_weighted_mean_and_its_spread():
 # --- particles share nothing ----------------------------------------------------------------------
 
 
-def _columns(state):
-    """What each particle has of its own."""
-    arrays = {f.name: getattr(state, f.name) for f in fields(SlamState)}
-    return {name: a for name, a in arrays.items() if isinstance(a, np.ndarray) and "motion" not in name}
+def frozen(state):
+    """All that each particle knows, as bytes."""
+    return [
+        (state.pose[p].tobytes(), *(column.tobytes() for column in state.map_of(p)))
+        for p in range(len(state.pose))
+    ]
 
 
-@pytest.mark.parametrize("how", ["process", "with_particles", "copy", "with_room"])
-def test_editing_the_map_of_one_particle_changes_no_other(how):
+def resampled():
+    """A filter of 100 particles that all come from 3."""
     slam = fresh(particles=100)
     slam.process(0, Pose2(), detections(TREES), NOTHING_SEEN)
     slam.state.log_weight[:] = -1e9
     slam.state.log_weight[[3, 50, 97]] = 0.0
-    if how == "process":
-        estimate = slam.process(1, Pose2(), detections(TREES), NOTHING_SEEN)
-        assert estimate.resampled
-        state = slam.state
-    else:
-        state = getattr(slam.state, how)(*{"with_particles": (150,), "with_room": (300,)}.get(how, ()))
-    for column in _columns(state).values():
-        before = column.copy()
-        column[7] += 1
-        changed = np.flatnonzero((column != before).reshape(len(column), -1).any(axis=1))
-        assert changed.tolist() == [7]
+    assert slam.process(1, Pose2(), detections(TREES), NOTHING_SEEN).resampled
+    return slam
+
+
+def held_well(maps):
+    """Whether the pool knows who holds what, and no row is free and held."""
+    held = np.bincount(maps.block[maps.block >= 0], minlength=len(maps.owners))
+    free = maps.free[: maps.free_count[0]].tolist()
+    return (
+        np.array_equal(held, maps.owners)
+        and len(set(free)) == len(free)
+        and set(free) == set(np.flatnonzero(held == 0).tolist())
+    )
+
+
+@pytest.mark.parametrize("how", ["process", "with_particles", "copy"])
+def test_editing_the_map_of_one_particle_changes_no_other(how):
+    slam = resampled()
+    state = {
+        "process": lambda: slam.state,
+        "with_particles": lambda: slam.state.with_particles(150),
+        "copy": slam.state.copy,
+    }[how]()
+    assert state.maps.owners.max() > 1, "they are shared until one writes"
+    before = frozen(state)
+    maps = with_room(state.maps, 0, 1)
+    maps.mean[own_block(maps, 7, 0)] += 1.0
+    after = frozen(replace(state, maps=maps))
+    assert [p for p, (a, b) in enumerate(zip(before, after, strict=True)) if a != b] == [7]
+
+
+def test_what_particles_share_changes_nothing_of_what_they_learn():
+    rng = np.random.default_rng(4)
+    shared = resampled()
+    apart = fresh(particles=100)
+    for k in range(2, 12):
+        maps = with_room(shared.state.copy().maps, 0, 5000)
+        for p in range(100):
+            for b in range(-(-maps.places[p] // ROOM)):
+                own_block(maps, p, b)
+        apart.state = replace(shared.state.copy(), maps=maps)
+        scan = detections(TREES + rng.normal(0, 0.03, TREES.shape) - [0.2 * (k - 1), 0.0])
+        for slam in (shared, apart):
+            slam.process(k, Pose2(0.2), scan, ALL_FREE)
+        assert held_well(shared.state.maps)
+        assert held_well(apart.state.maps)
+        assert frozen(shared.state) == frozen(apart.state)
+
+
+@FEW
+@given(seeds)
+def test_resampling_gives_each_particle_its_ancestor_s_map_and_loses_no_row(seed):
+    rng = np.random.default_rng(seed)
+    slam = resampled()
+    for k in range(2, 6):
+        scan = detections(rng.uniform(-9.0, 9.0, (rng.integers(0, 8), 2)))
+        slam.process(k, Pose2(0.3), scan, ALL_FREE)
+        before = frozen(slam.state)
+        ancestors = low_variance_ancestors(normalised(rng.normal(0, 3, 100)), rng.random())
+        take_ancestors(ancestors, slam.state.pose, slam.state.maps)
+        assert frozen(slam.state) == [before[a] for a in ancestors]
+        assert held_well(slam.state.maps)
+
+
+def test_a_known_map_is_the_start_of_every_particle():
+    slam = resampled()
+    known = slam.state.map_of(slam.state.best)
+    started = SlamState.in_map(np.zeros((5, 3)), known)
+    assert held_well(started.maps)
+    for p in range(5):
+        for told, wanted in zip(started.map_of(p), known, strict=True):
+            np.testing.assert_array_equal(told, wanted)
+    again = fresh(particles=5)
+    again.state = started
+    assert again.process(1, Pose2(), detections(TREES), NOTHING_SEEN).health.detections == len(TREES)
+    assert landmarks_of(again) == 5 * [len(TREES)], "all of them are known"
 
 
 def test_a_copy_and_its_original_share_nothing():
     slam = fresh(particles=10)
     slam.process(0, Pose2(), detections(TREES), NOTHING_SEEN)
     copy = slam.state.copy()
-    before = {name: column.copy() for name, column in _columns(copy).items()}
+    before = frozen(copy)
     slam.process(1, Pose2(0.5, 0.1, 0.1), detections(TREES - 0.5), ALL_FREE)
-    for name, column in _columns(copy).items():
-        np.testing.assert_array_equal(column, before[name])
+    assert frozen(copy) == before
 
 
 @FEW
@@ -279,7 +359,7 @@ def test_another_number_of_particles_keeps_the_belief(before, after):
     changed = state.with_particles(after)
     if before == after:
         return
-    assert len(changed.pose) == len(changed.count) == after
+    assert len(changed.pose) == len(changed.maps.places) == after
     for row, weight in enumerate(weights):
         drawn = np.count_nonzero((changed.pose == state.pose[row]).all(axis=1))
         assert np.floor(after * weight - 1e-9) <= drawn <= np.ceil(after * weight + 1e-9)
@@ -315,7 +395,7 @@ def test_a_closed_loop_is_mapped_better_than_the_wheels_say():
     assert wheels > 0.5
     assert ours < 0.35 * wheels
     best = int(np.argmax(slam.state.log_weight))
-    known = slam.state.hits[best, : slam.state.count[best]] >= FOREST.hits_to_weigh
+    known = slam.state.map_of(best).hits >= FOREST.hits_to_weigh
     assert 21 <= np.count_nonzero(known) <= 25, "21 trees stand there"
 
 
@@ -353,7 +433,7 @@ def test_scans_between_two_updates_only_move():
     for k in range(11):
         motion = Pose2(0.3) if k else Pose2()
         slam.process(k, motion, detections([[4.0 - 0.3 * k, 1.0]]), NOTHING_SEEN)
-    assert slam.state.hits[0, 0] == 1 + 2  # at 0, 1.2 and 2.4 m
+    assert slam.state.map_of(0).hits[0] == 1 + 2  # at 0, 1.2 and 2.4 m
 
 
 def test_no_detection_at_all_is_no_harm():
@@ -367,17 +447,17 @@ def test_two_landmarks_that_are_one_tree_become_one():
     """A tree was begun twice; both lie within each other's uncertainty and only one is seen now."""
     slam = fresh(particles=3, view_range=0.0, merge_gate=1.0)
     slam.process(0, Pose2(), detections([[4.0, 1.0], [4.04, 1.0]], sigma=0.05), NOTHING_SEEN)
-    assert slam.state.count.tolist() == [2, 2, 2]
+    assert landmarks_of(slam) == [2, 2, 2]
     slam.process(1, Pose2(), detections([[4.0, 1.0]], sigma=0.05), NOTHING_SEEN)
-    assert slam.state.count.tolist() == [1, 1, 1]
-    assert slam.state.birth[:, 0].tolist() == [0, 0, 0], "the older one stays"
+    assert landmarks_of(slam) == [1, 1, 1]
+    assert [m.birth.tolist() for m in maps_of(slam)] == 3 * [[0]], "the older one stays"
 
 
 def test_two_trees_seen_in_one_scan_stay_two():
     slam = fresh(particles=3, view_range=0.0, merge_gate=5.0)
     for k in range(9):
         slam.process(k, Pose2(), detections([[4.0, 1.0], [4.1, 1.0]]), NOTHING_SEEN)
-    assert slam.state.count.tolist() == [2, 2, 2]
+    assert landmarks_of(slam) == [2, 2, 2]
 
 
 def test_the_path_goes_back_through_the_particles_that_were_chosen():

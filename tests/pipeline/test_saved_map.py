@@ -102,14 +102,20 @@ def _with(state, **changes: Any):
     return replace(state, slam=replace(state.slam, **changes))
 
 
+def _with_maps(state, **changes: Any):
+    return _with(state, maps=state.slam.maps._replace(**changes))
+
+
 @pytest.mark.parametrize(
     "change",
     [
         lambda s: replace(s, stamp_ns=s.stamp_ns[:-1]),
         lambda s: replace(s, next_number=0),
-        lambda s: _with(s, count=s.slam.count + 10_000),
+        lambda s: _with_maps(s, places=s.slam.maps.places + 10_000),
+        lambda s: _with_maps(s, block=s.slam.maps.block + 1),
+        lambda s: _with_maps(s, owners=s.slam.maps.owners + 1),
         lambda s: _with(s, best=100),
-        lambda s: _with(s, mean=s.slam.mean[:, :, :1]),
+        lambda s: _with_maps(s, mean=s.slam.maps.mean[:, :, :1]),
         lambda s: _with(s, pose=s.slam.pose * np.nan),
         lambda s: replace(s, columns=replace(s.columns, axis=s.columns.axis[:, :3])),
         lambda s: replace(s, memory=replace(s.memory, room=3)),
