@@ -5,6 +5,7 @@ Joins the worker, the parameters, the 3D scene and the browsers. Everything runs
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import replace
 from typing import Protocol
 
@@ -16,9 +17,12 @@ from app.live_payload import map_payload, truth_payload
 from app.messages import Open, Play, SetParameters, Status
 from app.parameter_state import ParameterState
 from app.scores import Scores
+from app.selection import Selection
+from app.story.questions import NoStoryError, Questions
+from app.story.records import ClusterStory, TreeStory
 from app.throttle import Throttle
 from app.worker_mailbox import joined
-from app.worker_messages import Begin, FromWorker, Opened, Report, Shown, ToWorker
+from app.worker_messages import Answer, Begin, FromWorker, Opened, Report, Shown, ToWorker
 from pipeline.parameters import Parameters
 from pipeline.parameters.model import Value
 from pipeline.records import Frame, Path, TruthTrees
@@ -38,7 +42,7 @@ class SceneLike(Protocol):
     def show(self, frame: Frame, path: NDArray[np.float64], /) -> None: ...
     def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None: ...
     def show_truth(self, trees: TruthTrees | None, /) -> None: ...
-    def select(self, number: int | None, /) -> None: ...
+    def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None: ...
     def clear(self) -> None: ...
     def close(self) -> None: ...
 
@@ -76,7 +80,9 @@ class Dashboard:
         self.path: Path | None = None
         self.path_xy = np.zeros((0, 2))
         self.truth: TruthTrees | None = None
-        self.selected: int | None = None
+        self.selection = Selection()
+        self.questions = Questions(lambda question: self.worker.send(question))
+        self._selecting: asyncio.Task[None] | None = None
         self.scene_viewers = 0
         self._run: int | None = None
         self._notice = ""
@@ -99,6 +105,7 @@ class Dashboard:
     async def close(self) -> None:
         """End the worker and the scene."""
         self.scores.close()
+        self._leave_selecting()
         self._show_scene.cancel()
         await self.worker.close()
         self.scene.close()
@@ -148,9 +155,67 @@ class Dashboard:
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree everywhere; None selects nothing."""
-        self.selected = number
-        self.scene.select(number)
-        self.live.tell("selection", {"tree": number})
+        self._leave_selecting()
+        self._select(Selection(number))
+
+    async def select_cluster(self, scan: int, cluster: int) -> None:
+        """Select a cluster everywhere, as it stands in a scan that was shown lately, with its tree.
+
+        Raises:
+            NoStoryError: It is not known any more.
+        """
+        run = self._run
+        story = await self.cluster_story(scan, cluster)
+        if run == self._run:  # else it was left meanwhile
+            self._select(Selection(story.tree, story))
+
+    def select_cluster_soon(self, scan: int, cluster: int) -> None:
+        """The same without waiting, for who cannot be told that it is not known any more; of clicks that
+        follow one another the last counts."""
+        self._leave_selecting()
+        self._selecting = asyncio.create_task(self._select_if_known(scan, cluster), name="select")
+
+    def _leave_selecting(self) -> None:
+        if self._selecting is not None:
+            self._selecting.cancel()
+
+    async def _select_if_known(self, scan: int, cluster: int) -> None:
+        try:
+            await self.select_cluster(scan, cluster)
+        except NoStoryError as error:
+            self.live.tell("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
+
+    async def cluster_story(self, scan: int | None, cluster: int) -> ClusterStory:
+        """The story of a cluster: the selected one as it was when it was selected, others of scans that were
+        shown lately; None is the newest scan.
+
+        Raises:
+            NoStoryError: There is none.
+        """
+        kept = self.selection.cluster
+        if kept is not None and (kept.scan, kept.cluster) == (scan, cluster):
+            return kept
+        if self._run is None or self.shown is None:
+            raise NoStoryError("nothing is mapped yet", remedy="Press play, or open a run")
+        return await self.questions.cluster(
+            self._run, self.shown.frame.index if scan is None else scan, cluster
+        )
+
+    async def tree_story(self, number: int) -> TreeStory:
+        """The story of a tree as it stands.
+
+        Raises:
+            NoStoryError: There is none.
+        """
+        if self._run is None:
+            raise NoStoryError("nothing is mapped yet", remedy="Press play, or open a run")
+        return await self.questions.tree(self._run, number)
+
+    def _select(self, selection: Selection) -> None:
+        self.selection = selection
+        self.scene.select(selection.tree, selection.ring)
+        self.live.tell("selection", selection.as_plain())
+        self.live.tell("missing", None)
 
     async def _tell_parameters(self) -> None:
         self._show_parameters()
@@ -176,6 +241,8 @@ class Dashboard:
                 await self._begin(message)
             case Shown():
                 self._show(message)
+            case Answer():
+                self.questions.take(message)
 
     async def _begin(self, opened: Opened) -> None:
         """A source is open and waits: parameters that suit it first, then it plays."""

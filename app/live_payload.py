@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.story.history import half_axes
 from app.worker_messages import Shown
 from pipeline.health import Health
 from pipeline.records import Frame, TruthTrees, Verdict
@@ -35,6 +36,7 @@ def map_payload(shown: Shown) -> dict[str, Any]:
         "health": health_payload(frame.health),
         "trees": trees_payload(frame, start_ns=frame.stamp_ns - round(shown.time_s * _NS)),
         "verdicts": verdict_counts(frame.clusters.verdict),
+        "clusters": clusters_payload(frame),
         "counts": dict(frame.counts),
     }
 
@@ -54,6 +56,22 @@ def health_payload(health: Health) -> dict[str, Any]:
         "sigma_xy_m": _known(health.sigma_xy),
         "sigma_yaw_deg": _known(math.degrees(health.sigma_yaw)),
         "odometry_sigmas": _known(health.odometry),
+    }
+
+
+def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
+    """The clusters of the scan as columns, in the frame of the map; what is not known is None."""
+    clusters = frame.clusters
+    base = clusters.centre + frame.sensor_offset[:2]
+    place = frame.estimate.T_map_base.apply(base)
+    return {
+        "x": np.round(place[:, 0], 2).tolist(),
+        "y": np.round(place[:, 1], 2).tolist(),
+        "distance": np.round(np.hypot(*clusters.centre.T), 1).tolist(),
+        "verdict": [Verdict(verdict).label for verdict in clusters.verdict.tolist()],
+        "size": clusters.size.tolist(),
+        "eccentricity": _finite(clusters.eccentricity),
+        "radius_cm": _finite(100.0 * clusters.radius),
     }
 
 
@@ -79,10 +97,7 @@ def trees_payload(frame: Frame, start_ns: int) -> list[dict[str, Any]]:
 
 def ellipses(covariance: Float) -> list[list[float]]:
     """Half axes [m] and direction of the longer one [rad] of the 1-sigma ellipses of (T, 2, 2)."""
-    values, vectors = np.linalg.eigh(covariance)
-    minor, major = np.sqrt(np.maximum(values, 0.0)).T
-    angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
-    rows: list[list[float]] = np.round(np.stack([major, minor, angle], axis=1), _DIGITS).tolist()
+    rows: list[list[float]] = np.round(half_axes(covariance), _DIGITS).tolist()
     return rows
 
 

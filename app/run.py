@@ -12,6 +12,7 @@ from typing import Any, Protocol
 from app.cursor import Cursor, Synchroniser
 from app.history import ParameterHistory, Snapshots
 from app.stopwatch import Stopwatch
+from app.story.history import TreeHistory
 from pipeline.errors import SourceError
 from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path, Step
@@ -56,9 +57,10 @@ class Run:
         self.stopwatch = stopwatch
         self.frame: Frame | None = None
         self.standing = -1
+        self.history = TreeHistory()
         self._mapper = mapper
         self._cursor = Cursor(source, synchronise)
-        self._history = ParameterHistory(parameters)
+        self._parameters = ParameterHistory(parameters)
         self._snapshots: Snapshots[Any] = Snapshots(mapper.snapshot())
         self._step: Step | None = None
         self._before: Any = None
@@ -99,7 +101,7 @@ class Run:
         return self._map(self._step)
 
     def _map(self, step: Step) -> Frame:
-        wanted = self._history.at(step.index)
+        wanted = self._parameters.at(step.index)
         if self._mapper.parameters is not wanted:
             self._mapper.parameters = wanted
         self._broken = True
@@ -107,7 +109,12 @@ class Run:
             self.frame = self._mapper.process(step)
         self._broken = False
         self._step, self.standing = step, step.index
+        self.history.record(self.frame, self.start_ns)
         return self.frame
+
+    def parameters_at(self, index: int) -> Parameters:
+        """What a scan was or will be mapped with."""
+        return self._parameters.at(index)
 
     def prepare(self) -> None:
         """Map the first scan and forget it again: what is compiled at its first use is ready then.
@@ -120,7 +127,7 @@ class Run:
             uri = self.source.description.uri
             raise SourceError("there is no scan in it", where=uri, remedy="Choose another source")
         before = self._mapper.snapshot()
-        self._mapper.parameters = self._history.at(step.index)  # those of other methods compile other code
+        self._mapper.parameters = self._parameters.at(step.index)  # those of other methods compile other code
         self._mapper.process(step)
         self._mapper.restore(before)
         self.stopwatch.clear()
@@ -156,7 +163,7 @@ class Run:
 
     def use(self, parameters: Parameters, index: int) -> bool:
         """From a scan on, map with other parameters. Returns whether that changes anything."""
-        changes = self._history.set_from(index, parameters)
+        changes = self._parameters.set_from(index, parameters)
         if changes:
             self._snapshots.forget_after(index)
         return changes

@@ -18,14 +18,14 @@ from app.live import Live
 from app.messages import Open
 from app.parameter_state import ParameterState
 from app.replies import BadRequestError, error_reply, failure_reply
-from app.routes import page, parameters, results, run, sockets
+from app.routes import page, parameters, results, run, sockets, story
 from app.security import BodyTooLargeError, Guard
 from app.settings import Settings
 from pipeline.errors import ParameterError, StemmapError
 
 _log = logging.getLogger(__name__)
 
-ROUTERS = tuple(module.router for module in (page, run, parameters, results, sockets))
+ROUTERS = tuple(module.router for module in (page, run, parameters, results, story, sockets))
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
 MakeWorker = Callable[[Dashboard], WorkerLike]

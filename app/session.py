@@ -8,14 +8,18 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Literal
 
+import numpy as np
+
 from app.cursor import Synchroniser
 from app.messages import LONGEST_S, State, Status
 from app.odometry import odometry_warnings
 from app.run import MakeMapper, Run
 from app.session_status import clock, describe
 from app.stopwatch import Stopwatch
+from app.story.records import ClusterStory, TreeStory
+from app.story.telling import tell_cluster, tell_tree
 from app.worker_messages import Opened
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, StemmapError
 from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path
 from pipeline.sources.base import Source
@@ -203,6 +207,34 @@ class Session:
         stands = self._state != "playing" and run.standing >= 0
         run.use(parameters, run.standing + (0 if stands else 1))
         return run.map_again() if stands and self._state != "failed" else None
+
+    def cluster_story(self, frame: Frame, cluster: int) -> ClusterStory:
+        """The story of a cluster of a frame of this run, which may have lost its raw points.
+
+        Raises:
+            StemmapError: There is no such cluster.
+        """
+        run = self._run
+        if run is None or not 0 <= cluster < len(frame.clusters.size):
+            raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
+        parameters = run.parameters_at(frame.index)
+        return tell_cluster(frame, cluster, parameters, run.source.description.sensor, run.start_ns)
+
+    def tree_story(self, number: int) -> TreeStory:
+        """The story of a tree as the standing scan knows it.
+
+        Raises:
+            StemmapError: There is no such tree now.
+        """
+        run = self._run
+        frame = run.frame if run else None
+        row = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
+        if run is None or frame is None or not len(row):
+            raise StemmapError(
+                f"tree {number} is not known at this time of the run", remedy="Play on, or select another"
+            )
+        parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
+        return tell_tree(frame, int(row[0]), parameters, sensor, run.start_ns, run.history)
 
     def fail(self, detail: str) -> None:
         """Say that the run cannot go on, and why."""

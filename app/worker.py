@@ -16,6 +16,7 @@ from typing import BinaryIO
 
 from app.session import Session
 from app.stopwatch import Stopwatch
+from app.story.recent import Recent
 from app.wire import WireError, to_worker
 from app.worker_driver import Driver
 from app.worker_mailbox import Mailbox
@@ -55,8 +56,9 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     finished = threading.Event()
     reader = threading.Thread(target=_read, args=(incoming, commands, finished), daemon=True)
     reader.start()
-    mailbox = Mailbox(outgoing)
-    Driver(session, commands, mailbox.put).run()
+    recent = Recent()
+    mailbox = Mailbox(outgoing, recent)
+    Driver(session, commands, mailbox.put, recent=recent).run()
     mailbox.close()
     finished.set()
 

@@ -16,10 +16,21 @@ from typing import TypeVar
 
 import msgspec
 
-from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
+from app.messages import Advance, Command, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
 from app.pacer import Pacer
 from app.session import Session
-from app.worker_messages import Begin, FromWorker, Opened, Report, Shown, ToWorker
+from app.story.recent import Recent
+from app.worker_messages import (
+    Answer,
+    AskCluster,
+    AskTree,
+    Begin,
+    FromWorker,
+    Opened,
+    Report,
+    Shown,
+    ToWorker,
+)
 from pipeline.errors import StemmapError
 from pipeline.parameters.model import validated
 from pipeline.records import Frame
@@ -41,6 +52,7 @@ class Driver:
         commands: Filled by another thread; None ends the loop.
         put: Sends a message to the web process without waiting.
         clock: Seconds from any start.
+        recent: The pictures that were sent, of which people may ask.
     """
 
     def __init__(
@@ -49,11 +61,13 @@ class Driver:
         commands: queue.Queue[ToWorker | None],
         put: Put,
         clock: Callable[[], float] = time.monotonic,
+        recent: Recent | None = None,
     ) -> None:
         self._session = session
         self._commands = commands
         self._put = put
         self._clock = clock
+        self._recent = recent or Recent()
         self._taken: deque[ToWorker | None] = deque()
         self._pacer = Pacer()
         self._run = 0
@@ -75,7 +89,10 @@ class Driver:
             if command is None:
                 self._session.close()
                 return
-            self._obey(command)
+            if isinstance(command, AskCluster | AskTree):
+                self._put(self._answer(command))  # nobody who asks changes how the run goes
+            else:
+                self._obey(command)
 
     def _next_command(self) -> ToWorker | None:
         """The next command; of parameters that follow one another (a slider that moves) the last."""
@@ -120,13 +137,13 @@ class Driver:
         if standing or self._reported is None or now >= self._reported[1] + _REPORT_S:
             self._report()
 
-    def _obey(self, command: ToWorker) -> None:
+    def _obey(self, command: Command | Begin) -> None:
         self._pacer.release()
         self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
         self._guarded(lambda: self._carry_out(command))
         self._report()
 
-    def _carry_out(self, command: ToWorker) -> None:
+    def _carry_out(self, command: Command | Begin) -> None:
         session = self._session
         match command:
             case Play():
@@ -147,6 +164,26 @@ class Driver:
                 self._open(command)
             case Begin():
                 self._begin(command)
+
+    def _answer(self, question: AskCluster | AskTree) -> Answer:
+        ticket = question.ticket
+        try:
+            if question.run != self._run:
+                raise StemmapError("the run was left")
+            if isinstance(question, AskTree):
+                return Answer(ticket, tree=self._session.tree_story(question.tree))
+            frame = self._recent.find(question.run, question.scan)
+            if frame is None:
+                raise StemmapError(
+                    f"scan {question.scan} was shown too long ago", remedy="Click a cluster of the newest one"
+                )
+            return Answer(ticket, cluster=self._session.cluster_story(frame, question.cluster))
+        except StemmapError as error:
+            return Answer(ticket, missing=str(error))
+        except Exception as error:  # a story that fails must not stop the run
+            traceback.print_exc(file=sys.stderr)
+            fault = f"this is a fault in stemmap: {type(error).__name__}: {error}"
+            return Answer(ticket, missing=f"{fault}. The terminal shows where")
 
     def _open(self, command: Open) -> None:
         self._run += 1

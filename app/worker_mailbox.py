@@ -11,6 +11,7 @@ from typing import BinaryIO
 import numpy as np
 
 from app.picture import picture_of
+from app.story.recent import Recent
 from app.wire import WireError, from_worker
 from app.worker_messages import FromWorker, Opened, Report, Shown
 from pipeline.records import Path
@@ -28,10 +29,12 @@ class Mailbox:
 
     Args:
         stream: Where the bytes go; closed by nobody here.
+        recent: Remembers the pictures that are sent.
     """
 
-    def __init__(self, stream: BinaryIO) -> None:
+    def __init__(self, stream: BinaryIO, recent: Recent | None = None) -> None:
         self._stream = stream
+        self._recent = recent or Recent()
         self._channel = from_worker()
         self._changed = threading.Condition()
         self._messages: deque[FromWorker] = deque()
@@ -85,6 +88,7 @@ class Mailbox:
     def _made_ready(self, message: FromWorker) -> FromWorker:
         if isinstance(message, Shown):
             self._sent_at = time.monotonic()
+            self._recent.keep(message.run, message.frame)
             return self._with_new_path_only(message)
         if isinstance(message, Opened):
             self._refused = ""

@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from app.messages import Command, Status
+from app.story.records import ClusterStory, TreeStory
 from pipeline.records import Frame, Path, TruthTrees
 
 
@@ -74,5 +75,48 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
     play: bool
 
 
-FromWorker = Opened | Shown | Report
-ToWorker = Command | Begin
+class AskCluster(msgspec.Struct, frozen=True, tag="ask_cluster"):
+    """Tell the story of a cluster of a scan that was shown lately.
+
+    Attributes:
+        ticket: Comes back with the answer.
+        run: That the scan is of.
+        scan, cluster: Number of the scan, and of the cluster in it.
+    """
+
+    ticket: int
+    run: int
+    scan: int
+    cluster: int
+
+
+class AskTree(msgspec.Struct, frozen=True, tag="ask_tree"):
+    """Tell the story of a tree as it stands.
+
+    Attributes:
+        ticket, run: As in `AskCluster`.
+        tree: Its number.
+    """
+
+    ticket: int
+    run: int
+    tree: int
+
+
+class Answer(msgspec.Struct, frozen=True, tag="answer"):
+    """The story that was asked for.
+
+    Attributes:
+        ticket: Of the question.
+        cluster, tree: One of them is told, unless `missing` says why there is none.
+        missing: Why there is none, and what to do.
+    """
+
+    ticket: int
+    cluster: ClusterStory | None = None
+    tree: TreeStory | None = None
+    missing: str = ""
+
+
+FromWorker = Opened | Shown | Report | Answer
+ToWorker = Command | Begin | AskCluster | AskTree

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -125,3 +126,72 @@ def _seen_from_base(
         R[1, 1] = C[1, 1] + along * uy * uy + across * ux * ux
         place[d, 0], place[d, 1] = x + sensor_offset[0], y + sensor_offset[1]
     return place, spread
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Check:
+    """One question that every cluster is asked.
+
+    Attributes:
+        verdict: Of a cluster that fails, when no earlier check failed.
+        figure: What is looked at, in words.
+        unit: Of `value` and `limit`.
+        value: shape (K,), NaN where it cannot be told.
+        relation: "at least" or "at most" the limit; empty where yes (1) fails and no (0) passes.
+        limit: NaN where there is none.
+        parameter: Dotted name of the limit, empty where there is none.
+        fails: shape (K,); what cannot be told does not fail.
+    """
+
+    verdict: Verdict
+    figure: str
+    unit: str
+    value: Float
+    relation: Literal["at least", "at most", ""]
+    limit: float
+    parameter: str
+    fails: Bool
+
+
+def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
+    """What `judge` asks, in its order, with every figure and limit: for who wants to know why."""
+    p, c = parameters, clusters
+    has_circle = np.isfinite(c.radius)
+    radius = np.where(has_circle, c.radius, np.nan)
+    arc = np.where(has_circle, c.arc, np.nan)
+    width, up = np.maximum(c.extent[:, 0], c.extent[:, 1]), c.extent[:, 2]
+    return (
+        Check(Verdict.HIDDEN, "edge hidden", "", c.hidden.astype(np.float64), "", np.nan, "", c.hidden),
+        _at_most(Verdict.TOO_THICK, "width", "m", width, p.size_max, "size_max"),
+        _at_least(Verdict.TOO_LOW, "visible height", "m", up, p.height_extent_min, "height_extent_min"),
+        _at_least(Verdict.TOO_ROUND, "eccentricity", "", c.eccentricity, p.e_min, "e_min"),
+        _at_most(Verdict.TOO_LONG, "eccentricity", "", c.eccentricity, p.e_max, "e_max"),
+        _at_most(
+            Verdict.NOT_ROUND,
+            "radial deviation",
+            "m",
+            c.radial_std,
+            p.cylindrical_stddev_thresh,
+            "cylindrical_stddev_thresh",
+        ),
+        Check(
+            Verdict.NO_ARC,
+            "visible arc",
+            "deg",
+            np.degrees(arc),
+            "at least",
+            p.arc_min,
+            "detection.arc_min",
+            arc < np.radians(p.arc_min),
+        ),
+        _at_least(Verdict.TOO_THIN, "radius", "m", radius, p.radius_min, "radius_min"),
+        _at_most(Verdict.TOO_THICK, "radius", "m", radius, p.radius_max, "radius_max"),
+    )
+
+
+def _at_least(verdict: Verdict, figure: str, unit: str, value: Float, limit: float, name: str) -> Check:
+    return Check(verdict, figure, unit, value, "at least", limit, f"detection.{name}", value < limit)
+
+
+def _at_most(verdict: Verdict, figure: str, unit: str, value: Float, limit: float, name: str) -> Check:
+    return Check(verdict, figure, unit, value, "at most", limit, f"detection.{name}", value > limit)

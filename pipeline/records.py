@@ -167,6 +167,8 @@ class Trees:
         coverage: Part of its circumference that was seen [rad].
         first_seen_ns, last_seen_ns: int64.
         confirmed: Whether it was seen often enough to be shown and exported.
+        sides: int64: bit k is set when the k-th of 36 sectors around the trunk was seen, counted from x
+            to y of the map; None where only the coverage is known.
     """
 
     number: Int
@@ -181,6 +183,7 @@ class Trees:
     first_seen_ns: Int
     last_seen_ns: Int
     confirmed: Bool
+    sides: Int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,13 +23,23 @@ _MOST_BROWSERS = 50
 _TRY_AGAIN_LATER = 1013
 
 
+_Number = Annotated[int, Meta(ge=0, lt=2**31)]
+
+
 class _Select(msgspec.Struct, frozen=True, tag="select"):
     """Select a tree everywhere; null selects nothing."""
 
-    tree: Annotated[int, Meta(ge=0, lt=2**31)] | None
+    tree: _Number | None
 
 
-_decoder = msgspec.json.Decoder(_Select)
+class _SelectCluster(msgspec.Struct, frozen=True, tag="select_cluster"):
+    """Select a cluster of a scan everywhere, with the tree that it is a view of."""
+
+    scan: _Number
+    cluster: _Number
+
+
+_decoder: msgspec.json.Decoder[_Select | _SelectCluster] = msgspec.json.Decoder(_Select | _SelectCluster)
 
 
 @router.websocket("/api/live")
@@ -61,7 +71,10 @@ async def _receive(browser: WebSocket, dashboard: Dashboard) -> None:
         except (msgspec.MsgspecError, UnicodeDecodeError):
             await browser.close(_REFUSED, "not a message of the page")
             return
-        await dashboard.select_tree(wanted.tree)
+        if isinstance(wanted, _SelectCluster):
+            dashboard.select_cluster_soon(wanted.scan, wanted.cluster)
+        else:
+            await dashboard.select_tree(wanted.tree)
 
 
 @router.websocket("/viser")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from pipeline.geometry import Pose2
 
@@ -33,6 +34,11 @@ class Follower:
         """Bring the robot at this pose to the origin, if the picture is to follow it."""
         if follow:
             self._world.position = (-pose.x, -pose.y, 0.0)
+
+    @property
+    def shift(self) -> NDArray[np.float64]:
+        """Where the origin of the map stands in viser's world, shape (3,) [m]."""
+        return np.array(self._world.position, dtype=np.float64)
 
     def look(self, client: viser.ClientHandle, pose: Pose2, *, from_above: bool) -> None:
         """Turn one browser's camera to the robot at this pose."""

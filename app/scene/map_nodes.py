@@ -16,6 +16,8 @@ from app.scene.lines import Circles
 from app.scene.view import View
 from pipeline.records import Frame, Trees, TruthTrees
 
+Ring = tuple[float, float, float] | None
+
 TREE_HEIGHT = 2.2  # what a robot sees of a trunk; the map knows no heights [m]
 UNKNOWN_RADIUS = 0.08  # drawn where no arc carried a diameter [m]
 NUMBERS = 20  # nearest trees that carry their number
@@ -43,7 +45,7 @@ class MapNodes:
             if event.instance_index is not None and 0 <= event.instance_index < len(numbers):
                 on_tree(numbers[event.instance_index])
 
-    def show(self, frame: Frame, selected: int | None, view: View) -> None:
+    def show(self, frame: Frame, selected: int | None, ring: Ring, view: View) -> None:
         """Show the map after a scan; what moved by less than a centimetre stays where it is."""
         trees = confirmed(frame.trees)
         radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh, UNKNOWN_RADIUS)
@@ -52,15 +54,16 @@ class MapNodes:
         if not np.array_equal(place, self._shown) or numbers != self._numbers:
             self._shown, self._numbers = place, numbers
             self._show_trees(place, np.isfinite(trees.dbh))
-        self.repaint(frame, selected, view)
+        self.repaint(frame, selected, ring, view)
 
-    def repaint(self, frame: Frame, selected: int | None, view: View) -> None:
-        """Show the same map after a choice of layers or of a tree."""
+    def repaint(self, frame: Frame, selected: int | None, ring: Ring, view: View) -> None:
+        """Show the same map after a choice of layers, of a tree, or of a cluster that stands at `ring`: x, y
+        and radius [m] in the frame of the map."""
         self._trees.wanted = view.layers["trees"]
         self._truth.wanted = view.layers["truth"]
         trees = confirmed(frame.trees)
         pose = frame.estimate.T_map_base
-        self._show_mark(trees, selected)
+        self._show_mark(trees, selected, ring)
         self._labels.show(
             tree_labels(trees, np.array([pose.x, pose.y]), selected) if view.layers["trees"] else []
         )
@@ -90,25 +93,22 @@ class MapNodes:
             colours.choose(measured, colours.TREE, colours.UNMEASURED),
         )
 
-    def _show_mark(self, trees: Trees, selected: int | None) -> None:
-        row = trees.number == selected
-        if selected is None or not row.any():
-            self._mark.show(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3), dtype=np.uint8))
-            return
-        dbh = float(trees.dbh[row][0])
-        radius = 0.4 + (0.5 * dbh if np.isfinite(dbh) else UNKNOWN_RADIUS)
-        self._mark.show(
-            np.round(trees.position[row], 2),
-            np.array([radius]),
-            np.array([colours.SELECTION], dtype=np.uint8),
-        )
+    def _show_mark(self, trees: Trees, selected: int | None, ring: Ring) -> None:
+        # Around a cluster there is its own ring; a second one around its tree would only cover it.
+        row = trees.number == (-1 if selected is None or ring is not None else selected)
+        places, radii = np.round(trees.position[row], 2), []
+        for dbh in trees.dbh[row]:
+            radii.append(0.4 + (0.5 * dbh if np.isfinite(dbh) else UNKNOWN_RADIUS))
+        if ring is not None:
+            places, radii = np.vstack([places, ring[:2]]), [*radii, ring[2] + 0.12]
+        each = np.tile(np.array([colours.SELECTION], dtype=np.uint8), (len(radii), 1))
+        self._mark.show(places, np.array(radii), each)
 
 
 def confirmed(trees: Trees) -> Trees:
     """The trees that are shown to people."""
-    keep = trees.confirmed
-    columns = {name: getattr(trees, name)[keep] for name in Trees.__slots__}
-    return Trees(**columns)
+    known = {name: column for name in Trees.__slots__ if (column := getattr(trees, name)) is not None}
+    return Trees(**{name: column[trees.confirmed] for name, column in known.items()})
 
 
 def tree_labels(trees: Trees, robot: NDArray[np.float64], selected: int | None) -> list[Label]:

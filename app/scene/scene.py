@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from app.scene.camera import WORLD, Follower
 from app.scene.layers_panel import add_layers_panel
-from app.scene.map_nodes import MapNodes
+from app.scene.map_nodes import MapNodes, Ring
 from app.scene.robot_nodes import ROBOT, RobotNodes
-from app.scene.scan_nodes import ScanNodes
+from app.scene.scan_nodes import ScanNodes, Vector
 from app.scene.server import silenced, start_server
 from app.scene.tune_panel import TunePanel
 from app.scene.tuning import SceneCommands, Tuning, Value
@@ -53,6 +53,7 @@ class Scene:
         self._path: Float = np.zeros((0, 2))
         self._truth: TruthTrees | None = None
         self._selected: int | None = None
+        self._ring: Ring = None
         self._build()
 
     @property
@@ -90,17 +91,18 @@ class Scene:
         with self._server.atomic():
             self._map.show_truth(trees)
 
-    def select(self, number: int | None) -> None:
-        """Mark a tree by its number; None marks none."""
-        self._selected = number
+    def select(self, tree: int | None, ring: Ring = None) -> None:
+        """Mark a tree by its number and a cluster by a ring around it: x, y and radius [m] in the frame of
+        the map. None marks none."""
+        self._selected, self._ring = tree, ring
         if self._frame is not None:  # the scan is large and does not change by this
             with self._server.atomic():
-                self._map.repaint(self._frame, number, self._view)
+                self._map.repaint(self._frame, tree, ring, self._view)
 
     def clear(self) -> None:
         """Forget the run: an empty scene, the panel as it is."""
         self._frame, self._path = None, np.zeros((0, 2))
-        self._truth = self._selected = None
+        self._truth = self._selected = self._ring = None
         with self._server.atomic():
             self._server.scene.reset()
             self._add_nodes()
@@ -146,7 +148,7 @@ class Scene:
             shadow_opacity=0.0,
         )
         self._robot = RobotNodes(scene)
-        self._scan = ScanNodes(scene, ROBOT)
+        self._scan = ScanNodes(scene, ROBOT, functools.partial(self._cross, self._on_cluster))
         self._map = MapNodes(scene, functools.partial(self._cross, self._on_tree))
 
     def _renew(self) -> None:
@@ -171,7 +173,7 @@ class Scene:
             self._follower.show(self._pose, self._view.follow)
             self._robot.show(self._frame, self._path, self._view)
             self._scan.show(self._frame, self._view)
-            self._map.show(self._frame, self._selected, self._view)
+            self._map.show(self._frame, self._selected, self._ring, self._view)
 
     def _repaint(self) -> None:
         if self._frame is None:
@@ -180,7 +182,7 @@ class Scene:
             self._follower.show(self._pose, self._view.follow)
             self._robot.repaint(self._view)
             self._scan.repaint(self._frame, self._view)
-            self._map.repaint(self._frame, self._selected, self._view)
+            self._map.repaint(self._frame, self._selected, self._ring, self._view)
 
     # --- what people do; each runs in viser's thread and crosses over ---------------------------
 
@@ -199,6 +201,14 @@ class Scene:
 
     def _on_tree(self, number: int) -> None:
         self._tuning.ask(self._commands.select_tree(None if number == self._selected else number), None)
+
+    def _on_cluster(self, instance: int | None, origin: Vector, direction: Vector) -> None:
+        if self._frame is None:
+            return
+        shift = self._follower.shift
+        cluster = self._scan.meant(instance, np.array(origin) - shift, np.array(direction))
+        if cluster is not None:
+            self._tuning.ask(self._commands.select_cluster(self._frame.index, cluster), None)
 
     def _on_view(self, name: str, value: str | bool) -> None:
         self._cross(self._choose, name, value)

@@ -32,6 +32,13 @@ class SceneCommands(Protocol):
     async def select_tree(self, number: int | None) -> None:
         """Select a tree everywhere; None selects nothing."""
 
+    async def select_cluster(self, scan: int, cluster: int) -> None:
+        """Select a cluster of a scan everywhere.
+
+        Raises:
+            StemmapError: It is not known any more.
+        """
+
 
 class Tuning:
     """Carries what people do to the commands, one change after the other, on the server's loop.

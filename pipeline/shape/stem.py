@@ -26,7 +26,7 @@ ENOUGH = 60  # points, of which a third still is an arc
 ITERATIONS = 16
 NEARLY, CONVERGED = 5e-3, 3e-4  # m; the latter is a tenth of what the best arc allows
 NEGLIGIBLE = 0.1  # sigma; a step so short against what the points tell gains nothing
-COLUMNS = 9  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc
+COLUMNS = 11  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc, lean x, lean y
 
 
 @compiled
@@ -40,9 +40,10 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
         azimuth_step: [rad].
 
     Returns:
-        Shape (K, 9): centre x, y; its variances xx, xy, yy; radius; its sigma; standard deviation of
-        the residuals; visible arc [rad]. Below five points radius and sigma are NaN, and
-        the centre lies behind the points by the radius that their angular width tells.
+        Shape (K, 11): centre x, y; its variances xx, xy, yy; radius; its sigma; standard deviation of
+        the residuals; visible arc [rad]; shift of the axis in x and y per metre of height. Below five
+        points radius and sigma are NaN, and the centre lies behind the points by the radius that
+        their angular width tells.
     """
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
@@ -92,7 +93,7 @@ def _start_from_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> 
     stem[3] = c * s * (sigma_along**2 - sigma_across**2)
     stem[4] = (s * sigma_along) ** 2 + (c * sigma_across) ** 2
     stem[5], stem[6] = r, np.nan
-    stem[7], stem[8] = 0.0, 0.0
+    stem[7:] = 0.0
 
 
 @compiled
@@ -125,6 +126,7 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, stem: Float) -> None:
     # A poor fit knows less than the sensor's sigma promises.
     _write(p, L, max(1.0, scale) ** 2, stem)
     stem[7], stem[8] = np.sqrt(squares / n), visible_arc(rays, n, p)
+    stem[9], stem[10] = p[2], p[3]
 
 
 @compiled

@@ -140,6 +140,7 @@ class Tracker:
             first_seen_ns=t.first_ns.copy(),
             last_seen_ns=t.stamp_ns.copy(),
             confirmed=confirmed,
+            sides=t.sides.copy(),
         )
 
 

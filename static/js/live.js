@@ -12,7 +12,8 @@ const takers = {
   parameters(message) { state.parameters = message; },
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
-  selection(message) { state.selected = message.tree ?? null; },
+  selection(message) { Object.assign(state, { selected: message.tree ?? null, selectedCluster: message.cluster ?? null }); },
+  missing(message) { state.missing = message; },
 };
 
 function takeMap({ path, ...map }) {
@@ -55,6 +56,9 @@ export function connect() {
   };
 }
 
-export function select(tree) {
-  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ type: "select", tree }));
+function send(message) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
 }
+
+export const select = (tree) => send({ type: "select", tree });
+export const selectCluster = (scan, cluster) => send({ type: "select_cluster", scan, cluster });

@@ -1,5 +1,6 @@
 // Starts every part of the page, then connects.
 
+import { startClusters } from "./clusters.js";
 import { startDrawer } from "./drawer.js";
 import { startKeys } from "./keys.js";
 import { connect } from "./live.js";
@@ -9,13 +10,13 @@ import { startScene } from "./scene.js";
 import { startScores } from "./scores.js";
 import { startSources } from "./sources.js";
 import { startStatus } from "./status.js";
+import { startStory } from "./story.js";
 import { startTable } from "./table.js";
 import { startTabs } from "./tabs.js";
 import { startTheme } from "./theme.js";
 import { startTimeline } from "./timeline.js";
 import { startWelcome } from "./welcome.js";
-import { startWhy } from "./why.js";
 
-for (const start of [startTheme, startStatus, startTabs, startMap, startTable, startScores, startPlots, startWhy,
+for (const start of [startTheme, startStatus, startTabs, startMap, startTable, startScores, startPlots, startClusters, startStory,
   startTimeline, startSources, startScene, startKeys, startDrawer, startWelcome]) start();
 connect();

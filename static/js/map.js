@@ -2,13 +2,14 @@
 
 import { byId, setText } from "./dom.js";
 import { figure, NONE } from "./format.js";
-import { select } from "./live.js";
+import { select, selectCluster } from "./live.js";
 import { drawMap, symbolRadius } from "./map_draw.js";
 import { MapView } from "./map_view.js";
 import { on, state } from "./state.js";
+import { openStory } from "./story.js";
 import { colour } from "./theme.js";
 
-const NAMES = ["tree", "truth", "path", "odometry", "robot", "selection", "text", "surface", "grid", "axis", "font"];
+const NAMES = ["tree", "pole", "person", "bush", "other", "uncertain", "truth", "path", "odometry", "robot", "selection", "text", "surface", "grid", "axis", "font"];
 const canvas = byId("map");
 const view = new MapView();
 const pointers = new Map(); // fingers and mouse that are down
@@ -55,6 +56,18 @@ function nearest(px, py) {
   return best;
 }
 
+// The cluster of this scan at a place on the canvas; trees lie above it.
+function clusterAt(px, py) {
+  const { x = [], y = [] } = state.map?.clusters ?? {};
+  let best = null, least = 9;
+  for (let k = 0; k < x.length; k += 1) {
+    const [sx, sy] = view.toScreen(x[k], y[k]);
+    const gap = Math.hypot(px - sx, py - sy);
+    if (gap < least) [best, least] = [k, gap];
+  }
+  return best;
+}
+
 function truthAt(px, py) {
   return (state.truth ?? []).find((truth) => {
     const [x, y] = view.toScreen(truth.x, truth.y);
@@ -62,22 +75,24 @@ function truthAt(px, py) {
   });
 }
 
-function describe(tree, truth) {
+function describe(tree, truth, cluster) {
   const lines = [];
   if (tree) {
     const dbh = tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm${tree.sigma_dbh_cm === null ? "" : ` ± ${figure(tree.sigma_dbh_cm, 2)}`}`;
     lines.push(`Tree ${tree.number}, ${dbh}`, `seen in ${tree.observations} scans, e ${figure(tree.eccentricity)}`);
   }
+  if (cluster !== null && !tree) lines.push(`Cluster: ${state.map.clusters.verdict[cluster]}, ${state.map.clusters.size[cluster]} points`);
   if (truth) lines.push(`Truth: ${truth.kind}${truth.dbh_cm === null ? "" : `, ${figure(truth.dbh_cm)} cm`}`);
   return lines.join("\n") || NONE;
 }
 
 function hover(px, py) {
   const tip = byId("map-tip");
-  const [tree, truth] = [nearest(px, py), truthAt(px, py)];
-  tip.hidden = !(tree || truth) || pointers.size > 0;
+  const [tree, truth, cluster] = [nearest(px, py), truthAt(px, py), clusterAt(px, py)];
+  tip.hidden = !(tree || truth || cluster !== null) || pointers.size > 0;
+  canvas.classList.toggle("over", Boolean(tree) || cluster !== null);
   if (tip.hidden) return;
-  setText(tip, describe(tree, truth));
+  setText(tip, describe(tree, truth, cluster));
   tip.style.left = `${Math.min(px + 14, view.width - tip.offsetWidth - 6)}px`;
   tip.style.top = `${Math.min(py + 14, view.height - tip.offsetHeight - 6)}px`;
 }
@@ -108,11 +123,20 @@ function move(event) {
 
 function up(event) {
   if (event.type === "pointerup" && pointers.size === 1 && travelled <= 4) {
-    const tree = nearest(...place(event));
-    select(!tree || tree.number === state.selected ? null : tree.number);
+    choose(nearest(...place(event)), clusterAt(...place(event)));
   }
   pointers.delete(event.pointerId);
   canvas.classList.toggle("dragging", pointers.size > 0);
+}
+
+function choose(tree, cluster) {
+  if (tree && tree.number !== state.selected) {
+    openStory("tree");
+    select(tree.number);
+  } else if (!tree && cluster !== null) {
+    openStory("cluster");
+    selectCluster(state.map.index, cluster);
+  } else select(null);
 }
 
 export function startMap() {

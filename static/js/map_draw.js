@@ -1,5 +1,7 @@
 // Paints the 2D map of Fig. 5: path grey, robot a red triangle, trees as circles with their number.
 
+import { verdictOf } from "./verdicts.js";
+
 const TURN = 2 * Math.PI;
 
 export const symbolRadius = (tree, scale) =>
@@ -12,8 +14,10 @@ export function drawMap(pen, view, state, colours) {
   drawLine(pen, view, state.path, colours.path, 2);
   for (const truth of state.truth ?? []) drawTruth(pen, view, truth, colours);
   const trees = state.map?.trees ?? [];
+  drawClusters(pen, view, state.map?.clusters, colours);
   for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected, colours);
   drawNumbers(pen, view, trees, state.selected, colours);
+  if (state.selectedCluster) drawRing(pen, view, state.selectedCluster, colours);
   if (state.map) drawRobot(pen, view, state.map, colours);
   drawScaleBar(pen, view, colours);
 }
@@ -84,6 +88,22 @@ function drawTruth(pen, view, truth, colours) {
     for (const [dx, dy] of [[5, 0], [0, 5], [-5, 0], [0, -5]]) pen.lineTo(px + dx, py + dy);
   }
   pen.stroke();
+}
+
+// Small squares: what this scan took for something else than a tree.
+function drawClusters(pen, view, clusters, colours) {
+  for (let k = 0; k < (clusters?.x.length ?? 0); k += 1) {
+    if (clusters.verdict[k] === "tree") continue; // the tree itself is drawn, or will be
+    const [px, py] = view.toScreen(clusters.x[k], clusters.y[k]);
+    pen.fillStyle = colours[verdictOf(clusters.verdict[k])[1]];
+    pen.fillRect(px - 2.5, py - 2.5, 5, 5);
+  }
+}
+
+function drawRing(pen, view, { x, y }, colours) {
+  const [px, py] = view.toScreen(x, y);
+  Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });
+  pen.strokeRect(px - 8, py - 8, 16, 16);
 }
 
 function drawTree(pen, view, tree, selected, colours) {

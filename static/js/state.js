@@ -9,6 +9,7 @@ export const state = {
   evaluation: null,
   parameters: null,
   selected: null,    // number of a tree
+  selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when it was selected
   connected: false,
   lostAt: 0,         // when the connection was lost [ms], 0 if it stands
   heardAt: 0,        // when the server was last heard [ms]

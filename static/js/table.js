@@ -4,6 +4,7 @@ import { byId, el, setText } from "./dom.js";
 import { count, figure, fixed, NONE } from "./format.js";
 import { select } from "./live.js";
 import { on, state } from "./state.js";
+import { openStory } from "./story.js";
 import { visible } from "./tabs.js";
 
 const EVERY = 400; // [ms] between two fillings; nobody reads faster
@@ -66,7 +67,10 @@ function rowOf(tree) {
   return row;
 }
 
-const toggle = (number) => select(number === state.selected ? null : number);
+function toggle(number) {
+  if (number !== state.selected) openStory("tree");
+  select(number === state.selected ? null : number);
+}
 
 function fill() {
   planned = 0;
@@ -88,7 +92,7 @@ function fill() {
 
 function emptyText(all, wanted) {
   if (all) return `No tree number begins with “${wanted}”.`;
-  return state.map ? "No tree yet. A tree is listed when it was seen in enough scans; the tab Why tells what became of the clusters."
+  return state.map ? "No tree yet. A tree is listed when it was seen in enough scans; the tab Clusters tells what became of the clusters."
     : "Nothing mapped yet. Press play, or open a run.";
 }
 
@@ -102,8 +106,9 @@ export function startTable() {
   on("map", later);
   on("tab", fill);
   on("selection", () => {
+    for (const [number, row] of rows) row.setAttribute("aria-selected", String(number === state.selected));
     fill();
-    rows.get(state.selected)?.scrollIntoView({ block: "nearest" });
+    if (visible("trees")) rows.get(state.selected)?.scrollIntoView({ block: "nearest" });
   });
   fill();
 }

@@ -282,8 +282,8 @@ class FakeScene:
     def show_truth(self, trees: TruthTrees | None, /) -> None:
         self.calls.append(("truth", trees is not None))
 
-    def select(self, number: int | None, /) -> None:
-        self.calls.append(("select", number))
+    def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None:
+        self.calls.append(("select", tree if ring is None else (tree, ring)))
 
     def clear(self) -> None:
         self.calls.append(("clear", None))

@@ -15,10 +15,11 @@ from app.dashboard import Dashboard
 from app.live import Live
 from app.messages import Open, Play, SetParameters, Status
 from app.parameter_state import ParameterState
-from app.worker_messages import Begin, Report, Shown
+from app.worker_messages import Answer, AskCluster, Begin, Report, Shown
 from pipeline.errors import ParameterError
 from pipeline.parameters import preset
 from tests.app.fakes import FakeScene, FakeWorker, frame, opened, path, truth_trees
+from tests.story.stories import cluster_story
 
 
 @pytest_asyncio.fixture
@@ -183,6 +184,45 @@ async def test_playing_a_dead_worker_plays_once_it_is_back(dashboard: Dashboard)
 async def test_a_selection_is_one_everywhere(dashboard: Dashboard) -> None:
     await dashboard.select_tree(4)
     assert scene_calls(dashboard)[-1] == ("select", 4)
-    assert browser_knows(dashboard)["selection"] == {"type": "selection", "tree": 4}
+    assert browser_knows(dashboard)["selection"] == {"type": "selection", "tree": 4, "cluster": None}
     await dashboard.receive(opened())
     assert browser_knows(dashboard)["selection"]["tree"] is None
+
+
+async def test_a_cluster_is_selected_with_its_tree_and_stands_while_the_run_goes_on(
+    dashboard: Dashboard,
+) -> None:
+    await dashboard.receive(opened())
+    await dashboard.receive(Shown(1, 0.0, frame(231, 0), 0, path([0.0])))
+    dashboard.select_cluster_soon(231, 4)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    (question,) = [m for m in worker(dashboard).commands if isinstance(m, AskCluster)]
+    await dashboard.receive(Answer(question.ticket, cluster=cluster_story()))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert scene_calls(dashboard)[-1] == ("select", (12, (3.0, 4.0, 0.5)))
+    told = browser_knows(dashboard)["selection"]
+    assert told["tree"] == 12
+    assert told["cluster"] == {"scan": 231, "cluster": 4, "verdict": "too long", "x": 3.0, "y": 4.0}
+    await dashboard.receive(Shown(1, 9.0, frame(900, 9), 0, path([0.0])))
+    assert await dashboard.cluster_story(231, 4) == cluster_story()  # the worker is not asked again
+    await dashboard.select_tree(None)
+    assert browser_knows(dashboard)["selection"]["cluster"] is None
+
+
+async def test_a_cluster_that_is_not_known_any_more_selects_nothing_and_says_so(
+    dashboard: Dashboard,
+) -> None:
+    await dashboard.receive(opened())
+    await dashboard.receive(Shown(1, 0.0, frame(231, 0), 0, path([0.0])))
+    await dashboard.select_tree(4)
+    dashboard.select_cluster_soon(2, 4)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    (question,) = [m for m in worker(dashboard).commands if isinstance(m, AskCluster)]
+    await dashboard.receive(Answer(question.ticket, missing="scan 2 was shown too long ago"))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert browser_knows(dashboard)["missing"]["detail"] == "scan 2 was shown too long ago"
+    assert dashboard.selection.tree == 4

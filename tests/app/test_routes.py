@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import tomllib
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -15,10 +16,11 @@ from app.dashboard import Dashboard
 from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
 from app.routes.run import what_may_be_opened
 from app.settings import Settings
-from app.worker_messages import Report, Shown
+from app.worker_messages import Answer, AskCluster, Report, Shown
 from pipeline.parameters import field_specs, preset
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, running
+from tests.story.stories import cluster_story
 
 Running = tuple[httpx.AsyncClient, Dashboard]
 
@@ -353,3 +355,22 @@ def dashboard_app(both: Running) -> Any:
     transport = both[0]._transport
     assert isinstance(transport, httpx.ASGITransport)
     return transport.app
+
+
+async def test_stories_are_told_and_refused_in_words(both: Running) -> None:
+    client, dashboard = both
+    refused = await client.get("/api/story/tree/3")
+    assert refused.status_code == 404
+    assert "nothing is mapped yet" in refused.json()["error"]["what"]
+    await show(dashboard)
+    asking = asyncio.create_task(client.get("/api/story/cluster/4?scan=231"))
+    while not (asked := [m for m in told(dashboard) if isinstance(m, AskCluster)]):
+        await asyncio.sleep(0.01)
+    assert (asked[0].scan, asked[0].cluster) == (231, 4)
+    await dashboard.receive(Answer(asked[0].ticket, cluster=cluster_story(eccentricity=float("inf"))))
+    story = (await asking).json()
+    assert story["verdict"] == "too long"
+    assert story["eccentricity"] is None
+    assert story["checks"][0]["title"] == "Eccentricity max"
+    for wrong in ("cluster/-1", "cluster/4?scan=x", "tree/99999999999", "tree/first"):
+        assert (await client.get(f"/api/story/{wrong}")).status_code == 422

@@ -37,6 +37,8 @@ ROUTES = [
     ("GET", "/api/path.csv"),
     ("GET", "/api/evaluation"),
     ("GET", "/api/pairs"),
+    ("GET", "/api/story/cluster/{number}"),
+    ("GET", "/api/story/tree/{number}"),
     ("GET", "/no/such/route"),
 ]
 MISSES = {("GET", "/static/index.html"), ("GET", "/static/no-such-file.js")}

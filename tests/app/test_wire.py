@@ -27,10 +27,11 @@ from app.messages import (
     Status,
 )
 from app.wire import LARGEST_MESSAGE, LENGTH_BYTES, WireError, from_worker, to_worker
-from app.worker_messages import Opened, Report, Shown
+from app.worker_messages import Answer, AskCluster, AskTree, Opened, Report, Shown
 from pipeline.parameters import Parameters
 from pipeline.records import Path, TruthTrees
 from tests.app.fakes import frame, path, truth_trees
+from tests.story.stories import cluster_story, tree_story
 
 
 def assert_same(a: Any, b: Any) -> None:
@@ -78,9 +79,23 @@ def test_truth_and_status_survive_the_journey(x: Any) -> None:
     assert from_worker().decode(body(report)) == report
 
 
+def test_stories_survive_the_journey() -> None:
+    nan = float("nan")
+    cluster = Answer(3, cluster=cluster_story(eccentricity=float("inf"), tree=None))
+    assert from_worker().decode(body(cluster)) == cluster
+    tree = Answer(4, tree=tree_story(7))
+    assert from_worker().decode(body(tree)) == tree
+    unmeasured = from_worker().decode(body(Answer(5, tree=msgspec.structs.replace(tree_story(7), dbh=nan))))
+    assert isinstance(unmeasured, Answer)
+    assert unmeasured.tree is not None
+    assert np.isnan(unmeasured.tree.dbh)
+
+
 @given(
     st.one_of(
         st.builds(Play),
+        st.builds(AskCluster, st.integers(0, 2**40), st.integers(0, 99), st.integers(0, 99), st.just(1)),
+        st.builds(AskTree, st.integers(0, 2**40), st.integers(0, 99), st.integers(0, 99)),
         st.builds(Advance, st.integers(-MOST_SCANS, MOST_SCANS)),
         st.builds(Seek, st.floats(0.0, LONGEST_S)),
         st.builds(SetSpeed, st.floats(0.0, FASTEST)),

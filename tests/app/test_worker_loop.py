@@ -14,13 +14,25 @@ import pytest
 
 from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed
 from app.picture import MOST_POINTS, picture_of
+from app.story.recent import Recent
 from app.wire import from_worker
 from app.worker_driver import Driver
 from app.worker_mailbox import Mailbox, joined, rows_in_common
-from app.worker_messages import Begin, FromWorker, Opened, Report, Shown, ToWorker
+from app.worker_messages import (
+    Answer,
+    AskCluster,
+    AskTree,
+    Begin,
+    FromWorker,
+    Opened,
+    Report,
+    Shown,
+    ToWorker,
+)
 from pipeline.parameters import Parameters
 from pipeline.records import Path
 from tests.app.fakes import FakeSource, frame, make_session, opened, path
+from tests.story.stories import cluster_story
 
 
 def driven(source: FakeSource, *commands: ToWorker) -> list[FromWorker]:
@@ -292,3 +304,61 @@ def test_a_reader_that_is_gone_does_not_stop_the_loop() -> None:
     mailbox.close(5.0)
     assert not mailbox._thread.is_alive()
     writing.close()
+
+
+def test_who_asks_is_answered_and_the_run_goes_on_as_it_did() -> None:
+    waiting: queue.Queue[ToWorker | None] = queue.Queue()
+    said: list[FromWorker] = []
+
+    def put(message: FromWorker) -> None:
+        said.append(message)
+        if isinstance(message, Report) and message.status.state == "finished":
+            waiting.put(None)
+
+    begin = Begin(1, Parameters().model_dump(), 1, play=True)
+    for message in (SetSpeed(0.0), Open("fake:"), begin, AskTree(1, 1, 9), AskCluster(2, 1, 0, 0)):
+        waiting.put(message)
+    waiting.put(AskCluster(3, 7, 0, 0))
+    Driver(make_session(FakeSource(6)), waiting, put).run()
+    assert shown(said) == list(range(6))
+    answers = {message.ticket: message for message in said if isinstance(message, Answer)}
+    assert set(answers) == {1, 2, 3}
+    assert "tree 9 is not known" in answers[1].missing
+    assert "shown too long ago" in answers[2].missing  # nothing was sent to anybody
+    assert "the run was left" in answers[3].missing
+    assert all(answer.tree is None and answer.cluster is None for answer in answers.values())
+
+
+def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    recent = Recent()
+    mailbox = Mailbox(io.BytesIO(), recent)
+    mailbox.put(Shown(1, 0.0, frame(0, 0), 0, path([0.0])))
+    mailbox.close(timeout_s=5.0)
+    waiting: queue.Queue[ToWorker | None] = queue.Queue()
+    said: list[FromWorker] = []
+    for message in (Open("fake:"), AskCluster(1, 1, 0, 0), AskCluster(2, 1, 0, 7), None):
+        waiting.put(message)
+    monkeypatch.setattr("app.session.tell_cluster", lambda *_: cluster_story())
+    Driver(make_session(FakeSource(3)), waiting, said.append, recent=recent).run()
+    answers = [message for message in said if isinstance(message, Answer)]
+    assert answers[0].cluster == cluster_story()
+    assert "no cluster 7" in answers[1].missing
+
+
+def test_a_story_that_fails_is_logged_and_stops_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(_number: int) -> None:
+        raise ZeroDivisionError("on purpose")
+
+    session = make_session(FakeSource(3))
+    monkeypatch.setattr(session, "tree_story", fail)
+    waiting: queue.Queue[ToWorker | None] = queue.Queue()
+    said: list[FromWorker] = []
+    for message in (Open("fake:"), AskTree(1, 1, 1), None):
+        waiting.put(message)
+    Driver(session, waiting, said.append).run()
+    (answer,) = [message for message in said if isinstance(message, Answer)]
+    assert "fault in stemmap" in answer.missing
+    assert "on purpose" in capsys.readouterr().err
+    assert last_status(said).state != "failed"

@@ -90,8 +90,8 @@ class Dashboard:
         return self.page.locator(f"#panel-{name.lower()}")
 
     def clusters(self) -> int:
-        """How many clusters the standing scan has, as the tab Why says."""
-        panel = self.tab("Why")
+        """How many clusters the standing scan has, as the tab Clusters says."""
+        panel = self.tab("Clusters")
         # The status comes before the picture of the scan.
         self.until_server(
             "/api/status", "it.scan_index === Number(document.querySelector('[data-scan]').dataset.scan)"

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.detection import detections, judge
-from pipeline.parameters import preset
+from pipeline.detection import checks, detections, judge
+from pipeline.parameters import Parameters, preset
 from pipeline.records import Clusters, Verdict
 from tests.pipeline.strategies import clusters
 
@@ -123,3 +123,26 @@ def test_a_tree_without_a_circle_gives_no_radius():
 def test_no_clusters_give_no_detections():
     none = Clusters(*(getattr(_many(), name)[:0] for name in Clusters.__dataclass_fields__))
     assert len(detections(judge(none, FOREST), np.zeros(3), FOREST).cluster) == 0
+
+
+@pytest.mark.parametrize(("verdict", "columns"), REASONS, ids=lambda v: getattr(v, "label", str(v)))
+def test_each_check_holds_its_value_against_its_limit(verdict, columns):
+    table = clusters(**columns)
+    for check in checks(table, FOREST):
+        (value,) = check.value
+        if check.relation:
+            assert check.limit == Parameters().flat()[check.parameter]
+            fails = value > check.limit if check.relation == "at most" else value < check.limit
+        else:
+            fails = value != 0.0
+        assert check.fails.tolist() == [bool(fails)]
+    failing = [check.verdict for check in checks(table, FOREST) if check.fails[0]]
+    assert [verdict] == (failing[:1] or [Verdict.TREE])
+
+
+def test_without_a_circle_nothing_is_asked_of_it():
+    table = clusters(radius=[np.nan], arc=[0.0])
+    asked = {
+        (check.figure, bool(check.fails[0])) for check in checks(table, FOREST) if np.isnan(check.value[0])
+    }
+    assert asked == {("visible arc", False), ("radius", False)}

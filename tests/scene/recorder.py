@@ -34,6 +34,9 @@ class Recorder:
     async def select_tree(self, number: int | None) -> None:
         self.asked.append(("select", number))
 
+    async def select_cluster(self, scan: int, cluster: int) -> None:
+        self.asked.append(("cluster", (scan, cluster)))
+
 
 class Refusing(Recorder):
     """Refuses every change."""

@@ -1,0 +1,102 @@
+"""How the estimate of each tree came to where it is: a bounded memory of what each scan made of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.story.records import History
+from pipeline.records import Frame
+
+_WIDTH = 11  # scan, number, observations, time, x, y, var x, cov xy, var y, DBH, its sigma
+_SCAN, _NUMBER, _OBSERVATIONS, _TIME = range(4)
+_MOST_ROWS = 200_000
+_ALL_OF_FIRST = 10  # observations; there the ellipse shrinks fastest
+_MOST_TOLD = 200
+_NS = 1_000_000_000
+
+
+class TreeHistory:
+    """What each scan made of the trees that it saw.
+
+    The first ten estimates of each tree are kept, and the later ones of every scan; when all together are
+    more than 200,000, the later ones of every second scan are forgotten, again and again.
+    """
+
+    def __init__(self) -> None:
+        self._rows = np.zeros((1024, _WIDTH))
+        self._count = 0
+        self._spacing = 1
+
+    def __len__(self) -> int:
+        return self._count
+
+    def record(self, frame: Frame, start_ns: int) -> None:
+        """Take a scan. What was known of this and later scans is forgotten: the run went back.
+
+        Args:
+            frame: The scan's results.
+            start_ns: Time of the run's first scan.
+        """
+        scans = self._rows[: self._count, _SCAN]
+        self._count = int(np.searchsorted(scans, frame.index))
+        trees = frame.trees
+        seen = np.flatnonzero(trees.last_seen_ns == frame.stamp_ns)
+        if frame.index % self._spacing:
+            seen = seen[trees.observations[seen] <= _ALL_OF_FIRST]
+        self._append(
+            np.column_stack(
+                [
+                    np.full(len(seen), frame.index),
+                    trees.number[seen],
+                    trees.observations[seen],
+                    np.full(len(seen), (frame.stamp_ns - start_ns) / _NS),
+                    trees.position[seen],
+                    trees.covariance[seen][:, [0, 0, 1], [0, 1, 1]],
+                    trees.dbh[seen],
+                    trees.dbh_sigma[seen],
+                ]
+            )
+        )
+
+    def of(self, number: int) -> History:
+        """The story of one tree: at most 200 rows, the first and the last among them."""
+        known = self._rows[: self._count]
+        mine = known[known[:, _NUMBER] == number]
+        if len(mine) > _MOST_TOLD:  # closer together where it is young
+            place = np.unique(np.geomspace(1, len(mine), _MOST_TOLD).astype(np.int64) - 1)
+            mine = mine[place]
+        ellipse = half_axes(_matrices(mine[:, 6:9]))
+        return History(
+            time_s=mine[:, _TIME].tolist(),
+            x=mine[:, 4].tolist(),
+            y=mine[:, 5].tolist(),
+            major=ellipse[:, 0].tolist(),
+            minor=ellipse[:, 1].tolist(),
+            angle=ellipse[:, 2].tolist(),
+            dbh=mine[:, 9].tolist(),
+            dbh_sigma=mine[:, 10].tolist(),
+        )
+
+    def _append(self, rows: NDArray[np.float64]) -> None:
+        while self._count + len(rows) > len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._rows[self._count : self._count + len(rows)] = rows
+        self._count += len(rows)
+        while self._count > _MOST_ROWS and self._spacing < _MOST_ROWS:
+            self._spacing *= 2
+            known = self._rows[: self._count]
+            keep = (known[:, _OBSERVATIONS] <= _ALL_OF_FIRST) | (known[:, _SCAN] % self._spacing == 0)
+            self._count = int(keep.sum())
+            self._rows[: self._count] = known[keep]
+
+
+def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Half axes [m] and direction of the longer one [rad] of the 1-sigma ellipses of (T, 2, 2): (T, 3)."""
+    values, vectors = np.linalg.eigh(covariance)
+    minor, major = np.sqrt(np.maximum(values, 0.0)).T
+    return np.stack([major, minor, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])], axis=1)
+
+
+def _matrices(xx_xy_yy: NDArray[np.float64]) -> NDArray[np.float64]:
+    return xx_xy_yy[:, [[0, 1], [1, 2]]]
