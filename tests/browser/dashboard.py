@@ -117,3 +117,26 @@ class Dashboard:
         """How many points a cloud of the scene has."""
         read = "name => (window.__viserSceneTree?.getState()[name]?.message?.props?.points?.length ?? 0)"
         return int(self.scene.evaluate(read, name)) // 3
+
+    def places_in_scene(self, name: str) -> list[tuple[float, float]]:
+        """Where the middles of a node's copies are seen, in pixels of the page; by the number of the copy."""
+        frame = self.page.locator("#scene").bounding_box()
+        assert frame is not None
+        found = self.scene.evaluate(PROJECTED, name)
+        return [(frame["x"] + x, frame["y"] + y) for x, y in found]
+
+
+PROJECTED = """name => {
+  const { props } = window.__viserSceneTree.getState()[name].message;
+  const floats = values => new Float32Array(values.buffer.slice(values.byteOffset, values.byteOffset + values.byteLength));
+  const { scene, camera, canvas, nodeRefFromName } = window.__viserMutable;
+  scene.updateMatrixWorld();
+  const [at, size] = [floats(props.batched_positions), floats(props.batched_scales)];
+  const box = canvas.getBoundingClientRect();
+  return Array.from({ length: at.length / 3 }, (_, k) => {
+    const v = camera.position.clone().set(at[3 * k], at[3 * k + 1], at[3 * k + 2] + size[3 * k + 2] / 2);
+    v.applyMatrix4(nodeRefFromName[name].matrixWorld).project(camera);
+    if (v.z > 1) return [-1, -1];
+    return [box.x + box.width * (v.x + 1) / 2, box.y + box.height * (1 - v.y) / 2];
+  });
+}"""

@@ -1,0 +1,136 @@
+"""A person clicks what they see, wherever they see it, and reads why it is what it is."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.browser.dashboard import Dashboard
+
+MARKERS = "/world/robot/scan/markers"
+
+
+@pytest.fixture(autouse=True)
+def _standing(dashboard: Dashboard):
+    dashboard.pause()
+    dashboard.command({"type": "seek", "time_s": 22.55})
+    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 22.47 && it.time_s < 22.56")
+    dashboard.page.locator("#map").press("Escape")
+
+
+def test_a_click_on_a_cluster_in_the_scene_tells_why_it_is_no_tree(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    scan = dashboard.ask("/api/status")["scan_index"]
+    dashboard.until_server("/api/story/cluster/0", f"it.scan === {scan}")
+    page.locator("#map").press("t")  # from above nothing hides anything
+    page.wait_for_timeout(1500)
+    box = page.locator("#scene").bounding_box()
+    assert box is not None
+    panel = page.locator("#panel-story")
+    read: dict[str, int] = {}
+    for cluster, (x, y) in enumerate(dashboard.places_in_scene(MARKERS)):
+        # Not below viser's own panel and notices.
+        if not (
+            box["x"] + 20 < x < box["x"] + box["width"] - 360 and 250 < y < box["y"] + box["height"] - 30
+        ):
+            continue
+        page.mouse.click(x, y)
+        expect(panel).to_be_visible()
+        expect(panel).to_have_attribute("data-story", f"cluster {scan} {cluster}")
+        story = dashboard.ask(f"/api/story/cluster/{cluster}?scan={scan}")
+        expect(panel.locator(".verdict b")).to_have_text(story["verdict"])
+        expect(panel.locator("table.checks tr")).to_have_count(len(story["checks"]))
+        expect(panel.locator(".story-fit circle.point")).to_have_count(len(story["points"]))
+        if story["circle"] is not None:
+            radius = f"{100 * story['circle']['radius']:#.3g}"
+            expect(panel.locator(".story-fit .list")).to_contain_text(f"{radius} ±")
+        for check in story["checks"]:
+            if check["fails"]:
+                expect(panel.locator("tr.decides")).to_contain_text(story["verdict"])
+                expect(panel.locator(".verdict p")).to_contain_text(check["title"] or "hides its edge")
+                break
+        read[story["verdict"]] = cluster
+        if len(read) >= 2:
+            break
+    assert read, "no cluster was in sight"
+    expect(panel.locator(".story-head")).to_contain_text(f"of scan {scan}")
+
+
+def test_a_tree_from_the_table_stays_selected_and_its_story_goes_on(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    page.locator("#trees tbody tr").nth(3).click()
+    panel = page.locator("#panel-story")
+    number = dashboard.page.locator("#trees tr[aria-selected=true]").get_attribute("data-tree")
+    expect(panel).to_have_attribute("data-story", f"tree {number}")
+    story = dashboard.ask(f"/api/story/tree/{number}")
+    expect(panel.locator("[data-gathered]")).to_have_attribute("data-gathered", "tree")
+    expect(panel.locator(".picture path.side")).to_have_count(sum(story["sides"]))
+    if story["dbh"] is not None:
+        expect(panel.locator(".story-fit .list")).to_contain_text(f"{100 * story['dbh']:#.3g} ±")
+    assert len(story["history"]["x"]) > 5
+    assert panel.locator("ellipse.sigma").count() >= 3
+    expect(panel.locator(".told > div").first).to_be_visible()
+    before = int(panel.get_attribute("data-scan") or -1)
+    page.get_by_role("button", name="Play", exact=True).click()
+    dashboard.until("was => Number(document.querySelector('#panel-story').dataset.scan) > was + 5", before)
+    expect(panel).to_have_attribute("data-story", f"tree {number}")
+    page.locator("#map").press("Escape")
+    expect(panel.locator(".empty")).to_contain_text("Nothing is selected")
+
+
+def test_a_cluster_of_the_list_stands_while_the_run_plays_on(dashboard: Dashboard):
+    page = dashboard.page
+    panel = dashboard.tab("Clusters")
+    scan = dashboard.ask("/api/status")["scan_index"]
+    dashboard.until("scan => Number(document.querySelector('[data-scan]').dataset.scan) === scan", scan)
+    row = panel.locator("#cluster-table tbody tr", has_text="tree").first
+    cluster = row.get_attribute("data-cluster")
+    row.click()
+    story = page.locator("#panel-story")
+    expect(story).to_have_attribute("data-story", f"cluster {scan} {cluster}")
+    expect(story.locator("svg.picture").nth(1)).to_be_visible()  # the residuals
+    page.get_by_role("button", name="Play", exact=True).click()
+    dashboard.until_server("/api/status", f"it.scan_index > {scan} + 8")
+    expect(story).to_have_attribute("data-story", f"cluster {scan} {cluster}")
+    expect(story.locator(".story-head [aria-pressed=true]")).to_contain_text(f"scan {scan}")
+    # One that comes late reads the same standing picture.
+    page.reload()
+    dashboard.tab("Story")
+    expect(story).to_have_attribute("data-story", f"cluster {scan} {cluster}")
+    tree = story.locator(".story-head button", has_text="Tree")
+    tree.click()
+    expect(story).to_have_attribute("data-story", (tree.text_content() or "").lower())
+
+
+def test_a_cluster_is_clicked_on_the_map(dashboard: Dashboard):
+    page = dashboard.page
+    page.get_by_role("button", name="Fit").click()
+    page.wait_for_timeout(300)
+    places = page.evaluate(SQUARES)
+    assert places, "no cluster that is no tree is drawn"
+    page.locator("#map").click(position={"x": places[0][0], "y": places[0][1]})
+    panel = page.locator("#panel-story")
+    expect(panel).to_be_visible()
+    expect(panel.locator("[data-verdict]")).not_to_have_attribute("data-verdict", "tree")
+    assert dashboard.errors == []
+
+
+# Middles of the squares of clusters that are no trees.
+SQUARES = """() => {
+  const canvas = document.querySelector('#map');
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  const colours = [[0x88, 0x88, 0x88], [0x99, 0x99, 0x33], [0xF0, 0xE4, 0x42], [0xD5, 0x5E, 0x00], [0xCC, 0x79, 0xA7]];
+  const is = (x, y) => {
+    const i = 4 * (y * canvas.width + x);
+    return colours.findIndex(([r, g, b]) => data[i] === r && data[i + 1] === g && data[i + 2] === b);
+  };
+  const places = [];
+  for (let y = 45; y < canvas.height - 30; y += 1) for (let x = 30; x < canvas.width - 30; x += 1) {
+    const colour = is(x, y);
+    if (colour < 0) continue;
+    if ([-1, 0, 1].every(dy => [-1, 0, 1].every(dx => is(x + dx, y + dy) === colour))) places.push([x / devicePixelRatio, y / devicePixelRatio]);
+  }
+  return places;
+}"""
