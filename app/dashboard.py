@@ -12,9 +12,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from app.events import Events
 from app.live import Live
 from app.live_payload import map_payload, truth_payload
-from app.messages import Open, Play, SetParameters, Status
+from app.messages import Open, Play, Seek, SetParameters, Status
 from app.parameter_state import ParameterState
 from app.scores import Scores
 from app.selection import Selection
@@ -84,6 +85,9 @@ class Dashboard:
         self.questions = Questions(lambda question: self.worker.send(question))
         self._selecting: asyncio.Task[None] | None = None
         self.scene_viewers = 0
+        self.events = Events()
+        self.loop: tuple[float, float] | None = None
+        self._turning = False
         self._run: int | None = None
         self._notice = ""
         self._restarts = 0
@@ -119,6 +123,14 @@ class Dashboard:
         self._go = isinstance(command, Play | Open) and self.worker.pid is None
         await self.worker.send(command)
 
+    def play_in_loop(self, loop: tuple[float, float] | None) -> None:
+        """Play from the first to the second time [s] again and again; None plays on at the end."""
+        self._tell_loop(loop)
+
+    def _tell_loop(self, loop: tuple[float, float] | None) -> None:
+        self.loop, self._turning = loop, False
+        self.live.tell("loop", None if loop is None else {"from_s": loop[0], "to_s": loop[1]})
+
     async def open(self, source: Open) -> None:
         """Leave the run and open another source."""
         self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
@@ -132,8 +144,9 @@ class Dashboard:
         Raises:
             ParameterError: A value does not fit; nothing is changed.
         """
+        before = self.parameters.parameters
         self.parameters.change(changes)
-        await self._tell_parameters()
+        await self._tell_parameters(before)
 
     async def use_preset(self, name: str) -> None:
         """Take all values of a preset.
@@ -141,8 +154,9 @@ class Dashboard:
         Raises:
             ParameterError: There is none of this name.
         """
+        before = self.parameters.parameters
         self.parameters.use_preset(name)
-        await self._tell_parameters()
+        await self._tell_parameters(before)
 
     async def reset_parameters(self, names: list[str]) -> None:
         """Give parameters (none named: all) the preset's values again.
@@ -150,8 +164,9 @@ class Dashboard:
         Raises:
             ParameterError: A name is unknown.
         """
+        before = self.parameters.parameters
         self.parameters.reset(names)
-        await self._tell_parameters()
+        await self._tell_parameters(before)
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree everywhere; None selects nothing."""
@@ -217,14 +232,20 @@ class Dashboard:
         self.live.tell("selection", selection.as_plain())
         self.live.tell("missing", None)
 
-    async def _tell_parameters(self) -> None:
+    async def _tell_parameters(self, before: Parameters) -> None:
         self._show_parameters()
+        if self.shown is not None:
+            self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
+            self._tell_events()
         await self._send_parameters()
         self._score()
 
     def _show_parameters(self) -> None:
         self.live.tell("parameters", self.parameters.as_plain())
         self.scene.show_parameters(self.parameters.parameters, self.parameters.preset)
+
+    def _tell_events(self) -> None:
+        self.live.tell("events", self.events.as_plain())
 
     async def _send_parameters(self) -> None:
         state = self.parameters
@@ -241,6 +262,7 @@ class Dashboard:
                 await self._begin(message)
             case Shown():
                 self._show(message)
+                await self._go_round(message)
             case Answer():
                 self.questions.take(message)
 
@@ -266,6 +288,9 @@ class Dashboard:
         self.truth = truth
         self.live.forget_map()
         self.scores.forget()
+        self.events.forget()
+        self._tell_events()
+        self._tell_loop(None)
         self._show_scene.cancel()
         self.scene.clear()
         self.scene.show_truth(truth)
@@ -279,8 +304,22 @@ class Dashboard:
         self.shown = shown
         self.path_xy = np.column_stack([self.path.x, self.path.y])
         self.live.show(map_payload(shown), self.path_xy)
+        if self.events.shown(shown.frame, shown.time_s):
+            self._tell_events()
         self._score()
         self._show_scene(shown.frame, self.path_xy)
+
+    async def _go_round(self, shown: Shown) -> None:
+        """At the end of the loop go to its beginning, while the run plays."""
+        if self.loop is None or shown.run != self._run:
+            return
+        if shown.time_s < self.loop[1]:
+            self._turning = False
+        elif not self._turning and self.status.state in ("playing", "finished"):
+            self._turning = True  # pictures that are under way must not turn it once more
+            await self.worker.send(Seek(self.loop[0]))
+            if self.status.state == "finished":
+                await self.worker.send(Play())
 
     def _score(self) -> None:
         if self.shown is not None and self.truth is not None:
@@ -292,3 +331,5 @@ class Dashboard:
             status = replace(status, detail=self._notice)
         self.status = status
         self.live.tell("status", status)
+        if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
+            self._tell_events()

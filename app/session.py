@@ -17,7 +17,7 @@ from app.run import MakeMapper, Run
 from app.session_status import clock, describe
 from app.stopwatch import Stopwatch
 from app.story.records import ClusterStory, TreeStory
-from app.story.telling import tell_cluster, tell_tree
+from app.story.telling import make_ready, tell_cluster, tell_tree
 from app.worker_messages import Opened
 from pipeline.errors import SourceError, StemmapError
 from pipeline.parameters import Parameters
@@ -126,6 +126,7 @@ class Session:
         """
         if self._run is not None:
             self._run.prepare()
+            make_ready(self._run.source.description.sensor)
 
     def work(self) -> Frame | None:
         """Map one scan if one is wanted. None when there was none: the run is at its end, or the

@@ -10,8 +10,8 @@ from fastapi import APIRouter, Request
 from msgspec import Meta
 from starlette.responses import Response
 
-from app.messages import Advance, Open, Pause, Play, Seek, SetSpeed
-from app.replies import body_of, error_reply, json_reply
+from app.messages import LONGEST_S, Advance, Open, Pause, Play, Seek, SetSpeed
+from app.replies import BadRequestError, body_of, error_reply, json_reply
 from app.routes.access import Dash
 from app.settings import Settings
 
@@ -20,6 +20,7 @@ router = APIRouter(prefix="/api")
 _MOST_RECORDINGS = 500
 # A path or address; far longer ones are no mistake of typing.
 _LONGEST_URI = 4096
+SHORTEST_LOOP_S = 0.5
 
 _Command = Play | Pause | Advance | Seek | SetSpeed
 
@@ -43,6 +44,26 @@ async def command(request: Request, dashboard: Dash) -> Response:
     """Play, pause, advance, seek or set the speed."""
     wanted: _Command = await body_of(request, _Command)
     await dashboard.command(wanted)
+    return json_reply({}, 202)
+
+
+class _Loop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """From where to where the run is played again and again [s since the first scan]; both null: not so."""
+
+    from_s: Annotated[float, Meta(ge=0.0, le=LONGEST_S)] | None
+    to_s: Annotated[float, Meta(ge=0.0, le=LONGEST_S)] | None
+
+
+@router.post("/loop")
+async def loop(request: Request, dashboard: Dash) -> Response:
+    """Play a part of the run again and again, or no more."""
+    wanted: _Loop = await body_of(request, _Loop)
+    if wanted.from_s is None or wanted.to_s is None:
+        dashboard.play_in_loop(None)
+    elif wanted.to_s - wanted.from_s < SHORTEST_LOOP_S:
+        raise BadRequestError("the loop is too short", remedy=f"Make it {SHORTEST_LOOP_S} s or longer")
+    else:
+        dashboard.play_in_loop((wanted.from_s, wanted.to_s))
     return json_reply({}, 202)
 
 

@@ -114,9 +114,9 @@ class ScanNodes:
     def _show_markers(self, frame: Frame) -> None:
         """A cylinder about each cluster, because point clouds take no clicks."""
         c = frame.clusters
-        height = np.maximum(c.extent[:, 2], 0.2) + 0.06
-        width = 0.5 * np.hypot(c.extent[:, 0], c.extent[:, 1])
-        radius = np.maximum(width, 0.06) + 0.03
+        height = shown_height(c.extent[:, 2]) + 0.06
+        width = np.fmax(0.5 * np.hypot(c.extent[:, 0], c.extent[:, 1]), c.radius)
+        radius = np.fmax(width, 0.06) + 0.03  # fmax: a ready stem has no extent, a cluster may have no circle
         foot = np.column_stack([c.centroid[:, :2], c.centroid[:, 2] - 0.5 * height])
         self._markers.show(foot, np.column_stack([radius, radius, height]), colours.by_verdict(c.verdict))
         low = foot + frame.sensor_offset

@@ -10,7 +10,7 @@ from app.story.records import ClusterStory, TreeStory
 from app.worker_messages import Answer, AskCluster, AskTree
 from pipeline.errors import StemmapError
 
-PATIENCE_S = 5.0
+PATIENCE_S = 15.0
 _MOST_WAITING = 100
 
 Send = Callable[[AskCluster | AskTree], Awaitable[None]]

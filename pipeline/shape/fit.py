@@ -36,8 +36,10 @@ class StemFit:
 
 def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
     """The fit of `describe` for the points (N, 3) of one cluster; None where they are too few for it."""
+    if not len(points):
+        return None
     stem = fit_stems(points, np.array([0, len(points)]), sensor.range_sigma, sensor.azimuth_step)[0]
-    if not np.isfinite(stem[5]) or not np.isfinite(stem[6]):
+    if not np.isfinite(stem[5]):
         return None
     lean = stem[9:11]
     n = min(len(points), MOST_POINTS)

@@ -19,7 +19,7 @@ function wording(body, status) {
   return `${error.what}${place}. ${error.remedy ?? ""}`.trim();
 }
 
-const post = (path, body) =>
+export const post = (path, body) =>
   request(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
 
 export const get = (path) => request(path);

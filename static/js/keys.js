@@ -2,14 +2,16 @@
 
 import { byId, el } from "./dom.js";
 import { select } from "./live.js";
+import { setLoop } from "./marks.js";
 import { onSceneLoad, pressInScene } from "./scene.js";
 import { openTab } from "./tabs.js";
+import { stopMeasuring, toggleMeasure } from "./measure.js";
 import { advance, togglePlay } from "./timeline.js";
 
 const LIST = [
   ["space", "play or pause"], ["← →", "one scan back or forward"], ["shift ← →", "ten scans back or forward"],
   ["f", "follow the robot in the scene, or stop following"], ["t", "look at the robot from above"], ["b", "look at it from behind"],
-  ["/", "find a tree"], ["esc", "select no tree"], ["?", "this list"],
+  ["l", "begin, end and leave a loop"], ["m", "measure a distance on the map"], ["/", "find a tree"], ["esc", "select nothing"], ["?", "this list"],
 ];
 const TYPES = "input:not([type=range]), textarea, select, [contenteditable], [role=slider], [role=combobox], [role=option]";
 const PRESSED = "button, a, summary, [role=tab], [role=checkbox], input[type=checkbox], input[type=range]";
@@ -18,9 +20,11 @@ const actions = {
   " ": togglePlay,
   ArrowLeft: (event) => advance(event.shiftKey ? -10 : -1),
   ArrowRight: (event) => advance(event.shiftKey ? 10 : 1),
+  l: setLoop,
+  m: toggleMeasure,
   "/": () => { openDrawer(); openTab("trees"); byId("find").focus(); },
   "?": () => byId("keys-dialog").showModal(),
-  Escape: () => select(null),
+  Escape: () => { stopMeasuring(); select(null); },
 };
 
 function openDrawer() {

@@ -13,6 +13,8 @@ const takers = {
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   selection(message) { Object.assign(state, { selected: message.tree ?? null, selectedCluster: message.cluster ?? null }); },
+  events(message) { state.events = message.events; },
+  loop(message) { state.loop = message.to_s === undefined ? null : message; },
   missing(message) { state.missing = message; },
 };
 

@@ -5,6 +5,8 @@ import { startDrawer } from "./drawer.js";
 import { startKeys } from "./keys.js";
 import { connect } from "./live.js";
 import { startMap } from "./map.js";
+import { startMarks } from "./marks.js";
+import { startMeasure } from "./measure.js";
 import { startPlots } from "./plots.js";
 import { startScene } from "./scene.js";
 import { startScores } from "./scores.js";
@@ -17,6 +19,6 @@ import { startTheme } from "./theme.js";
 import { startTimeline } from "./timeline.js";
 import { startWelcome } from "./welcome.js";
 
-for (const start of [startTheme, startStatus, startTabs, startMap, startTable, startScores, startPlots, startClusters, startStory,
-  startTimeline, startSources, startScene, startKeys, startDrawer, startWelcome]) start();
+for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory,
+  startTimeline, startMarks, startSources, startScene, startKeys, startDrawer, startWelcome]) start();
 connect();

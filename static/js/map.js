@@ -3,6 +3,7 @@
 import { byId, setText } from "./dom.js";
 import { figure, NONE } from "./format.js";
 import { select, selectCluster } from "./live.js";
+import { measureAt, measureTowards, measuring } from "./measure.js";
 import { drawMap, symbolRadius } from "./map_draw.js";
 import { MapView } from "./map_view.js";
 import { on, state } from "./state.js";
@@ -43,6 +44,7 @@ function resize() {
   const { clientWidth, clientHeight } = canvas.parentElement;
   Object.assign(view, { width: clientWidth, height: clientHeight });
   Object.assign(canvas, { width: clientWidth * devicePixelRatio, height: clientHeight * devicePixelRatio });
+  if (!view.moved) view.fit(bounds(), true);
   redraw();
 }
 
@@ -110,6 +112,7 @@ function move(event) {
   const now = place(event);
   const before = pointers.get(event.pointerId);
   hover(...now);
+  if (measuring()) measureTowards(snapped(now));
   if (!before) return;
   travelled += Math.hypot(now[0] - before[0], now[1] - before[1]);
   const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
@@ -123,13 +126,28 @@ function move(event) {
 
 function up(event) {
   if (event.type === "pointerup" && pointers.size === 1 && travelled <= 4) {
-    choose(nearest(...place(event)), clusterAt(...place(event)));
+    if (measuring()) measureAt(snapped(place(event)));
+    else choose(nearest(...place(event)), clusterAt(...place(event)), place(event));
   }
   pointers.delete(event.pointerId);
   canvas.classList.toggle("dragging", pointers.size > 0);
 }
 
-function choose(tree, cluster) {
+// The middle of a tree where one is near, else the place itself [m].
+function snapped([px, py]) {
+  const tree = nearest(px, py);
+  return tree ? { x: tree.x, y: tree.y, tree: tree.number } : (([x, y]) => ({ x, y }))(view.toMap(px, py));
+}
+
+// Whether a place is meant for the square of a cluster that is no tree, beside a tree's symbol.
+function isNearer(cluster, tree, px, py) {
+  const { x, y, verdict } = state.map.clusters;
+  const gap = (at) => Math.hypot(px - at[0], py - at[1]);
+  return verdict[cluster] !== "tree" && gap(view.toScreen(x[cluster], y[cluster])) < gap(view.toScreen(tree.x, tree.y));
+}
+
+function choose(tree, cluster, [px, py]) {
+  if (tree && cluster !== null && isNearer(cluster, tree, px, py)) tree = null;
   if (tree && tree.number !== state.selected) {
     openStory("tree");
     select(tree.number);
@@ -153,6 +171,6 @@ export function startMap() {
     redraw();
   }, { passive: false });
   byId("map-fit").addEventListener("click", () => { view.moved = false; view.fit(bounds(), true); redraw(); });
-  on("map truth selection", redraw);
+  on("map truth selection measure", redraw);
   on("theme", repaint);
 }

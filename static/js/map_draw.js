@@ -19,6 +19,7 @@ export function drawMap(pen, view, state, colours) {
   drawNumbers(pen, view, trees, state.selected, colours);
   if (state.selectedCluster) drawRing(pen, view, state.selectedCluster, colours);
   if (state.map) drawRobot(pen, view, state.map, colours);
+  if (state.measure?.to) drawMeasure(pen, view, state.measure, colours);
   drawScaleBar(pen, view, colours);
 }
 
@@ -165,6 +166,24 @@ function drawRobot(pen, view, { pose: [x, y, yaw], sigma_xy: sigma }, colours) {
   pen.closePath();
   pen.stroke();
   pen.fill();
+}
+
+function drawMeasure(pen, view, { from, to }, colours) {
+  const [a, b] = [view.toScreen(from.x, from.y), view.toScreen(to.x, to.y)];
+  Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 2, font: `bold 13px ${colours.font}`, textAlign: "center" });
+  pen.beginPath();
+  pen.moveTo(...a);
+  pen.lineTo(...b);
+  for (const [x, y] of [a, b]) {
+    pen.moveTo(x + 4, y);
+    pen.arc(x, y, 4, 0, TURN);
+  }
+  pen.stroke();
+  const at = [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 8];
+  const text = `${Math.hypot(to.x - from.x, to.y - from.y).toFixed(2)} m${from.tree && to.tree ? `, tree ${from.tree} to tree ${to.tree}` : ""}`;
+  Object.assign(pen, { strokeStyle: colours.surface, fillStyle: colours.text, lineWidth: 4 });
+  pen.strokeText(text, ...at);
+  pen.fillText(text, ...at);
 }
 
 function drawScaleBar(pen, view, colours) {

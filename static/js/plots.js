@@ -9,7 +9,8 @@ import { colour } from "./theme.js";
 
 const EVERY = 2000; // [ms] between two drawings
 const LONGEST = 1200; // samples kept of each curve
-const history = { time: [], n_eff: [], stages: {}, stageTime: [] };
+const none = () => ({ time: [], n_eff: [], sigma: [], yaw: [], stages: {}, stageTime: [] });
+const history = none();
 let plotly = null, busy = false;
 
 function load() {
@@ -51,12 +52,23 @@ async function matrix(kind) {
 
 function curve(kind) {
   if (history.time.length < 2) return "Nothing to draw yet. Press play.";
-  const figure = layout({ showlegend: kind === "time", legend: { orientation: "h", y: 1.02, yanchor: "bottom" } });
+  const figure = layout({ showlegend: kind !== "n_eff", legend: { orientation: "h", y: 1.02, yanchor: "bottom" } });
   if (kind === "time") figure.margin.t = 74;
+  if (kind === "sigma") return pose(figure);
   figure.xaxis.title = { text: "time in the run, s" };
   Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: kind === "time" ? "ms a scan" : "effective particles" } });
   if (kind === "n_eff") return [[line(history.time, history.n_eff, "N_eff")], figure];
   return [Object.entries(history.stages).map(([name, values]) => ({ ...line(history.stageTime, values, name), stackgroup: "one" })), figure];
+}
+
+// Position on the left axis, heading on the right one.
+function pose(figure) {
+  const right = { ...figure.yaxis, overlaying: "y", side: "right", rangemode: "tozero", showgrid: false, title: { text: "heading, °" } };
+  Object.assign(figure, { yaxis2: right });
+  Object.assign(figure.margin, { t: 30, r: 46 });
+  Object.assign(figure.xaxis, { title: { text: "time in the run, s" } });
+  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "position, cm" } });
+  return [[line(history.time, history.sigma, "position, cm"), { ...line(history.time, history.yaw, "heading, °"), yaxis: "y2" }], figure];
 }
 
 const line = (x, y, name) => ({ type: "scatter", mode: "lines", x, y, name, line: { width: 1.5 }, hovertemplate: `%{y:.3~r}<extra>${name}</extra>` });
@@ -71,7 +83,7 @@ async function draw() {
     byId("plot").hidden = said;
     byId("plot-empty").hidden = !said;
     setText(byId("plot-empty"), said ? drawing : "");
-    if (!said) await show(Plotly, ...drawing);
+    if (!said) await show(Plotly, kind, ...drawing);
   } catch (error) {
     byId("plot-empty").hidden = false;
     setText(byId("plot-empty"), error.message);
@@ -80,8 +92,10 @@ async function draw() {
   }
 }
 
-async function show(Plotly, traces, figure) {
+async function show(Plotly, kind, traces, figure) {
   const plot = byId("plot");
+  if (plot.data && plot.dataset.kind !== kind) Plotly.purge(plot); // an axis of one figure is not that of another
+  plot.dataset.kind = kind;
   const fresh = !plot.data;
   await Plotly.react(plot, traces, figure, { displayModeBar: false, responsive: true });
   if (fresh) plot.on("plotly_click", ({ points }) => points[0].data.type === "heatmap" && select(Number(points[0].y)));
@@ -97,6 +111,8 @@ function recordMap({ map }) {
   if (history.time.length && map.time_s < history.time.at(-1)) clearHistory();
   push(history.time, map.time_s);
   push(history.n_eff, map.n_eff);
+  push(history.sigma, 100 * (map.health?.sigma_xy_m ?? map.sigma_xy));
+  push(history.yaw, map.health?.sigma_yaw_deg ?? null);
 }
 
 function recordStatus({ status }) {
@@ -106,16 +122,13 @@ function recordStatus({ status }) {
 }
 
 function clearHistory() {
-  Object.assign(history, { time: [], n_eff: [], stages: {}, stageTime: [] });
+  Object.assign(history, none());
 }
 
 export function startPlots() {
   on("map", recordMap);
   on("status", recordStatus);
   on("tab theme", draw);
-  byId("plot-choice").addEventListener("change", () => {
-    if (byId("plot").data) window.Plotly.purge(byId("plot"));
-    draw();
-  });
+  byId("plot-choice").addEventListener("change", draw);
   setInterval(() => state.status?.state !== "failed" && draw(), EVERY);
 }

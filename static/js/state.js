@@ -10,6 +10,9 @@ export const state = {
   parameters: null,
   selected: null,    // number of a tree
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when it was selected
+  measure: null,     // {from, to, fixed} while a distance is measured on the map
+  events: [],        // [{t, kind, text}] in the order of time
+  loop: null,        // {from_s, to_s}: the part that is played again and again
   connected: false,
   lostAt: 0,         // when the connection was lost [ms], 0 if it stands
   heardAt: 0,        // when the server was last heard [ms]

@@ -13,9 +13,9 @@ const OLD_AFTER = 3000; // [ms] without a word while a run plays
 // name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
 const FIGURES = {
   trees: ["trees", "", (s) => [String(s.trees)]],
-  health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health]]],
+  health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health], reason(s)]],
   rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
-  mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE], "minor"],
+  mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `mapping, of ${figure(budget(s))} ms`], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
   sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
@@ -23,13 +23,33 @@ const FIGURES = {
 };
 const cells = {};
 
+// Time from scan to scan [ms]: mapping that takes longer falls behind.
+function budget({ scans, end_s: end }) {
+  return scans > 1 && end > 0 ? (1000 * end) / (scans - 1) : 100;
+}
+
+function reason({ health }) {
+  const told = state.map?.health;
+  return told && told.state === health && told.reason ? told.reason : "SLAM health";
+}
+
+function healthFigures() {
+  const h = state.map?.health;
+  if (!h) return "";
+  return [h.reason && `${h.state}: ${h.reason}`, `N_eff ${figure(h.n_eff)}, ${h.ancestors} ancestors`,
+    `${h.detections} detections, ${figure(h.recognised)} of them known, ${figure(h.ambiguous)} ambiguous`,
+    `innovation ${figure(h.innovation)} (1 is as expected)`, `pose sigma ${figure(100 * h.sigma_xy_m)} cm, ${figure(h.sigma_yaw_deg)}°`,
+    `moved ${figure(h.odometry_sigmas)} sigma away from the odometry`].filter(Boolean).join("\n");
+}
+
 function build() {
   const list = byId("figures");
   for (const [name, [title, unit, , rank]] of Object.entries(FIGURES)) {
     const value = el("span", { text: NONE });
-    const cell = el("div", { class: rank ?? "", "data-figure": name }, el("dt", { text: title }),
+    const label = el("dt", { text: title });
+    const cell = el("div", { class: rank ?? "", "data-figure": name }, label,
       el("dd", {}, value, unit ? el("small", { text: unit }) : ""));
-    cells[name] = { cell, value, rank: rank ?? "" };
+    cells[name] = { cell, value, label, title, rank: rank ?? "" };
     list.append(cell);
   }
 }
@@ -38,10 +58,12 @@ function show() {
   const status = state.status;
   if (!status) return;
   for (const [name, [, , read]] of Object.entries(FIGURES)) {
-    const [text, meaning] = NO_FIGURES.includes(status.state) ? [NONE] : read(status);
+    const [text, meaning, title] = NO_FIGURES.includes(status.state) ? [NONE] : read(status);
     setText(cells[name].value, text);
+    setText(cells[name].label, title ?? cells[name].title);
     cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
   }
+  cells.health.cell.title = healthFigures();
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   setText(byId("source-name"), shortSource(status.source) || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;

@@ -10,6 +10,7 @@ import { treeStory } from "./story_tree.js";
 import { openTab, visible } from "./tabs.js";
 
 const EVERY = 1000; // [ms] between two tellings of a tree while the run plays
+const AGAIN = 3000; // [ms] after which a story that could not be told is asked for once more
 const CLICK = 6000; // [ms] after a click in the scene in which a selection is the answer to it
 const panel = () => byId("panel-story");
 let wants = "cluster"; // which of the two is read when both are selected
@@ -17,14 +18,14 @@ let shown = "", busy = false, again = false, askedAt = 0, clickedAt = -CLICK;
 
 const wanted = () => (state.selectedCluster && (wants === "cluster" || state.selected === null) ? "cluster" : state.selected !== null ? "tree" : null);
 
-async function show(force = false) {
+async function show() {
   if (!visible("story")) return;
   const kind = wanted();
   head(kind);
   if (!kind) return empty();
   const { scan, cluster } = state.selectedCluster ?? {};
   const key = kind === "cluster" ? `cluster ${scan} ${cluster}` : `tree ${state.selected} ${state.map?.index} ${state.parameters?.revision}`;
-  if (key === shown && !force) return;
+  if (key === shown) return;
   if (busy) { again = true; return; }
   busy = true;
   askedAt = performance.now();
@@ -34,6 +35,7 @@ async function show(force = false) {
   } catch (error) {
     shown = "";
     body().replaceChildren(el("p", { class: "empty", text: capital(error.message) }));
+    setTimeout(show, AGAIN);
   } finally {
     busy = false;
     if (again) { again = false; show(); }

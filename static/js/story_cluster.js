@@ -29,6 +29,7 @@ function verdict(story) {
 }
 
 function why(story) {
+  if (!story.checks.length) return "Another program found it; it is taken as it is.";
   const failed = story.checks.find((check) => check.fails);
   if (!failed) return "It passed every check below, so it was taken as a stem and feeds SLAM.";
   if (!failed.relation) return "Something nearer hides its edge, so its middle cannot be told.";
@@ -78,7 +79,7 @@ function axes(story, at) {
 
 function figures(story) {
   const fit = story.circle;
-  const rows = [["points", String(story.size)], ["λ1/λ2", story.eccentricity === null ? "∞" : figure(story.eccentricity)], ["from sensor", `${figure(story.distance)} m`]];
+  const rows = [["points", String(story.size)], ["λ1/λ2", story.eccentricity === null && story.size > 1 ? "∞" : figure(story.eccentricity)], ["from sensor", `${figure(story.distance)} m`]];
   if (fit) {
     rows.push(["radius", `${figure(100 * fit.radius)} ± ${figure(100 * fit.radius_sigma, 2)} cm`], ["visible arc", `${figure(fit.arc_deg)}°`],
       ["axis leans", `${figure(fit.lean_deg, 2)}°`], ["centre ±", `${figure(100 * fit.ellipse[0], 2)} × ${figure(100 * fit.ellipse[1], 2)} cm`]);
@@ -104,6 +105,7 @@ function residuals(story) {
 }
 
 function checks(story) {
+  if (!story.checks.length) return "";
   let decided = false;
   const rows = story.checks.map((check) => {
     const decides = check.fails && !decided;

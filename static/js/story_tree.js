@@ -72,5 +72,5 @@ function shrinking(history, width, height) {
   const y = (k) => bottom - (history.major[k] / most) * (bottom - top);
   return [line(left, bottom, right, bottom, "zero"), line(left, top, left, bottom, "zero"),
     svg("polyline", { points: history.major.map((_, k) => `${x(k)},${y(k)}`).join(" "), class: "curve" }),
-    text(left, top - 8, `position sigma, ${figure(100 * most, 2)} cm at most`, "small"), text(left, bottom + 14, clock(first), "small"), text(right, bottom + 14, clock(end), "small", "end")];
+    text(left, top - 8, `sigma, at most ${figure(100 * most, 2)} cm`, "small"), text(left, bottom + 14, clock(first), "small"), text(right, bottom + 14, clock(end), "small", "end")];
 }

@@ -13,7 +13,7 @@ import pytest_asyncio
 
 from app.dashboard import Dashboard
 from app.live import Live
-from app.messages import Open, Play, SetParameters, Status
+from app.messages import Open, Play, Seek, SetParameters, Status
 from app.parameter_state import ParameterState
 from app.worker_messages import Answer, AskCluster, Begin, Report, Shown
 from pipeline.errors import ParameterError
@@ -226,3 +226,26 @@ async def test_a_cluster_that_is_not_known_any_more_selects_nothing_and_says_so(
     await asyncio.sleep(0)
     assert browser_knows(dashboard)["missing"]["detail"] == "scan 2 was shown too long ago"
     assert dashboard.selection.tree == 4
+
+
+async def test_a_loop_goes_round_once_at_its_end_and_again_after_its_beginning(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened())
+    dashboard.play_in_loop((1.0, 2.0))
+    assert browser_knows(dashboard)["loop"]["to_s"] == 2.0
+
+    async def played(state: Any, *times: float) -> list[Any]:
+        before = len(worker(dashboard).commands)
+        await dashboard.receive(Report(Status(state)))
+        for index, time_s in enumerate(times):
+            await dashboard.receive(Shown(1, time_s, frame(index, index), 0, path([0.0])))
+        return worker(dashboard).commands[before:]
+
+    assert await played("playing", 1.5, 2.0, 2.1) == [Seek(1.0)]
+    assert await played("playing", 1.0, 1.9, 2.3) == [Seek(1.0)]
+    assert await played("paused", 1.0, 2.5) == []  # who stands beyond the end stays there
+    assert await played("finished", 1.0, 2.5) == [Seek(1.0), Play()]
+    dashboard.play_in_loop(None)
+    assert await played("playing", 1.0, 9.0) == []
+    dashboard.play_in_loop((1.0, 2.0))
+    await dashboard.open(Open("other:"))
+    assert browser_knows(dashboard)["loop"]["value"] is None

@@ -374,3 +374,19 @@ async def test_stories_are_told_and_refused_in_words(both: Running) -> None:
     assert story["checks"][0]["title"] == "Eccentricity max"
     for wrong in ("cluster/-1", "cluster/4?scan=x", "tree/99999999999", "tree/first"):
         assert (await client.get(f"/api/story/{wrong}")).status_code == 422
+
+
+async def test_a_loop_is_set_and_left_and_a_wrong_one_refused(both: Running) -> None:
+    client, dashboard = both
+    assert (await client.post("/api/loop", json={"from_s": 1.0, "to_s": 4.0})).status_code == 202
+    assert dashboard.loop == (1.0, 4.0)
+    for wrong in (
+        {"from_s": 4.0, "to_s": 4.2},
+        {"from_s": 9.0, "to_s": 1.0},
+        {"from_s": -1.0, "to_s": 5.0},
+        {},
+    ):
+        assert (await client.post("/api/loop", json=wrong)).status_code == 422
+    assert dashboard.loop == (1.0, 4.0)
+    assert (await client.post("/api/loop", json={"from_s": None, "to_s": None})).status_code == 202
+    assert dashboard.loop is None

@@ -31,6 +31,7 @@ ROUTES = [
     ("GET", "/api/parameters.toml"),
     ("POST", "/api/command"),
     ("POST", "/api/open"),
+    ("POST", "/api/loop"),
     ("GET", "/api/sources"),
     ("GET", "/api/trees"),
     ("GET", "/api/trees.csv"),

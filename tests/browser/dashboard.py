@@ -128,7 +128,8 @@ class Dashboard:
 
 PROJECTED = """name => {
   const { props } = window.__viserSceneTree.getState()[name].message;
-  const floats = values => new Float32Array(values.buffer.slice(values.byteOffset, values.byteOffset + values.byteLength));
+  const floats = ({ buffer, byteOffset, byteLength }) =>
+    new Float32Array(buffer.slice(byteOffset, byteOffset + byteLength));
   const { scene, camera, canvas, nodeRefFromName } = window.__viserMutable;
   scene.updateMatrixWorld();
   const [at, size] = [floats(props.batched_positions), floats(props.batched_scales)];

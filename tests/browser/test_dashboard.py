@@ -226,7 +226,7 @@ def test_the_columns_say_which_way_the_axes_point(dashboard: Dashboard):
         assert words in (button.get_attribute("title") or "")
 
 
-@pytest.mark.parametrize("choice", ["distance", "error", "time", "n_eff"])
+@pytest.mark.parametrize("choice", ["distance", "error", "time", "n_eff", "sigma"])
 def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
     dashboard.tab("Plots")
     dashboard.page.locator("#plot-choice").select_option(choice)

@@ -113,6 +113,7 @@ def test_a_cluster_is_clicked_on_the_map(dashboard: Dashboard):
     page.locator("#map").click(position={"x": places[0][0], "y": places[0][1]})
     panel = page.locator("#panel-story")
     expect(panel).to_be_visible()
+    expect(panel.locator("table.checks .decides")).to_be_visible()
     expect(panel.locator("[data-verdict]")).not_to_have_attribute("data-verdict", "tree")
     assert dashboard.errors == []
 
@@ -121,16 +122,18 @@ def test_a_cluster_is_clicked_on_the_map(dashboard: Dashboard):
 SQUARES = """() => {
   const canvas = document.querySelector('#map');
   const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
-  const colours = [[0x88, 0x88, 0x88], [0x99, 0x99, 0x33], [0xF0, 0xE4, 0x42], [0xD5, 0x5E, 0x00], [0xCC, 0x79, 0xA7]];
-  const is = (x, y) => {
-    const i = 4 * (y * canvas.width + x);
-    return colours.findIndex(([r, g, b]) => data[i] === r && data[i + 1] === g && data[i + 2] === b);
-  };
+  const colours = ['888888', '999933', 'f0e442', 'd55e00', 'cc79a7'];
+  const hex = i => [0, 1, 2].map(k => data[i + k].toString(16).padStart(2, '0')).join('');
+  const is = (x, y) => colours.indexOf(hex(4 * (y * canvas.width + x)));
+  const around = [-1, 0, 1].flatMap(dx => [-1, 0, 1].map(dy => [dx, dy]));
   const places = [];
-  for (let y = 45; y < canvas.height - 30; y += 1) for (let x = 30; x < canvas.width - 30; x += 1) {
-    const colour = is(x, y);
-    if (colour < 0) continue;
-    if ([-1, 0, 1].every(dy => [-1, 0, 1].every(dx => is(x + dx, y + dy) === colour))) places.push([x / devicePixelRatio, y / devicePixelRatio]);
+  for (let y = 45; y < canvas.height - 30; y += 1) {
+    for (let x = 30; x < canvas.width - 30; x += 1) {
+      const colour = is(x, y);
+      if (colour >= 0 && around.every(([dx, dy]) => is(x + dx, y + dy) === colour)) {
+        places.push([x / devicePixelRatio, y / devicePixelRatio]);
+      }
+    }
   }
   return places;
 }"""

@@ -1,0 +1,100 @@
+"""What happened in the run and when, for the marks on the timeline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from pipeline.parameters.model import Value
+from pipeline.records import Frame
+
+Kind = Literal["tree", "warning", "change", "health"]
+
+_MOST = 400
+_LONGEST = 300
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One mark.
+
+    Attributes:
+        time_s: Since the run's first scan.
+        kind: A tree was confirmed, a warning came, parameters were changed, the pose became better or worse.
+        text: For people.
+    """
+
+    time_s: float
+    kind: Kind
+    text: str
+
+
+class Events:
+    """The events of a run, at most 400; of more the oldest are forgotten."""
+
+    def __init__(self) -> None:
+        self._events: dict[str, Event] = {}
+        self._warnings: frozenset[str] = frozenset()
+        self._health = "good"
+        self._base: tuple[str, dict[str, Value]] | None = None
+
+    def forget(self) -> None:
+        """Another run begins."""
+        self._events.clear()
+        self._warnings, self._health, self._base = frozenset(), "good", None
+
+    def shown(self, frame: Frame, time_s: float) -> bool:
+        """Take a scan's results; returns whether anything happened. A tree that is confirmed again after the
+        run went back has its mark where it was confirmed first."""
+        known = set(self._events)
+        for number in np.sort(frame.trees.number[frame.trees.confirmed]).tolist():
+            self._note(f"tree {number}", Event(time_s, "tree", f"Tree {number} confirmed"))
+        health = frame.health
+        if health.state != self._health:
+            self._health = health.state
+            text = f"SLAM {health.state}: {health.reason}" if health.reason else f"SLAM {health.state}"
+            self._note(f"health {frame.index}", Event(time_s, "health", text))
+        return self._events.keys() != known
+
+    def warned(self, warnings: list[str], time_s: float) -> bool:
+        """Take the warnings that stand; returns whether there is a new one."""
+        new = [warning for warning in warnings if warning not in self._warnings]
+        self._warnings = frozenset(warnings)
+        for warning in new:
+            self._note(f"warning {time_s:.1f} {warning}", Event(time_s, "warning", warning[:_LONGEST]))
+        return bool(new)
+
+    def changed(self, before: dict[str, Value], after: dict[str, Value], time_s: float) -> None:
+        """Parameters were changed. What came after this time in the run came under other parameters, and
+        will come anew. Of changes at one time (a slider that moves) what they make together is told.
+
+        Args:
+            before, after: All values by dotted name.
+            time_s: Of the standing scan.
+        """
+        self._events = {
+            key: event
+            for key, event in self._events.items()
+            if event.time_s <= time_s or event.kind in ("change", "warning")
+        }
+        key = f"change {time_s:.1f}"
+        if self._base is None or self._base[0] != key:
+            self._base = (key, before)
+        old = self._base[1]
+        texts = [f"{name}: {old[name]} → {value}" for name, value in after.items() if value != old[name]]
+        self._events.pop(key, None)
+        if texts:
+            more = f" and {len(texts) - 3} more" if len(texts) > 3 else ""
+            self._note(key, Event(time_s, "change", f"{', '.join(texts[:3])}{more}"[:_LONGEST]))
+
+    def as_plain(self) -> dict[str, Any]:
+        """For the browsers, in the order of time."""
+        ordered = sorted(self._events.values(), key=lambda event: event.time_s)
+        return {"events": [{"t": round(e.time_s, 2), "kind": e.kind, "text": e.text} for e in ordered]}
+
+    def _note(self, key: str, event: Event) -> None:
+        self._events.setdefault(key, event)
+        while len(self._events) > _MOST:
+            del self._events[next(iter(self._events))]
