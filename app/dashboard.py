@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,9 @@ class SceneLike(Protocol):
     def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None: ...
     def show_truth(self, trees: TruthTrees | None, /) -> None: ...
     def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None: ...
+    def choose(self, name: str, value: str | bool, /) -> None: ...
+    @property
+    def view(self) -> dict[str, Any]: ...
     def clear(self) -> None: ...
     def close(self) -> None: ...
 
@@ -102,6 +105,7 @@ class Dashboard:
     async def start(self, source: Open) -> None:
         """Start the worker with a source; it plays as soon as it is open."""
         self._show_parameters()
+        self.live.tell("view", self.scene.view)
         await self.worker.start()
         await self._send_parameters()
         await self.open(source)
@@ -122,6 +126,15 @@ class Dashboard:
         # A worker that is down comes back with the source closed; then this is still to be done.
         self._go = isinstance(command, Play | Open) and self.worker.pid is None
         await self.worker.send(command)
+
+    async def choose_view(self, name: str, value: str | bool) -> None:
+        """Show or hide a layer of the scene, or colour, label or follow otherwise.
+
+        Raises:
+            ParameterError: There is no such choice.
+        """
+        self.scene.choose(name, value)
+        self.live.tell("view", self.scene.view)
 
     def play_in_loop(self, loop: tuple[float, float] | None) -> None:
         """Play from the first to the second time [s] again and again; None plays on at the end."""

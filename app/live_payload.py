@@ -38,6 +38,19 @@ def map_payload(shown: Shown) -> dict[str, Any]:
         "verdicts": verdict_counts(frame.clusters.verdict),
         "clusters": clusters_payload(frame),
         "counts": dict(frame.counts),
+        "layers": layer_counts(frame),
+    }
+
+
+def layer_counts(frame: Frame) -> dict[str, int]:
+    """How much each layer of the scene shows; the path and the truth the page counts itself."""
+    return {
+        "raw": len(frame.raw),
+        "filtered": len(frame.filtered),
+        "clusters": len(frame.clusters.size),
+        "fits": int(np.count_nonzero(np.isfinite(frame.clusters.radius[frame.detections.cluster]))),
+        "particles": len(frame.estimate.particles),
+        "trees": int(np.count_nonzero(frame.trees.confirmed)),
     }
 
 

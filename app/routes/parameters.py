@@ -61,6 +61,19 @@ async def reset(request: Request, dashboard: Dash) -> Response:
     return await read(dashboard)
 
 
+class _Choice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    name: _Name
+    value: bool | _Name
+
+
+@router.patch("/view")
+async def choose_view(request: Request, dashboard: Dash) -> Response:
+    """Show or hide a layer of the scene, or colour, label or follow otherwise."""
+    wanted: _Choice = await body_of(request, _Choice)
+    await dashboard.choose_view(wanted.name, wanted.value)
+    return json_reply(dashboard.scene.view)
+
+
 @router.get("/parameters.toml")
 async def download(dashboard: Dash) -> Response:
     """All values as a file that `--config` takes."""

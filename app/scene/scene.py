@@ -14,14 +14,14 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene.camera import WORLD, Follower
-from app.scene.layers_panel import add_layers_panel
+from app.scene.hotkeys import add_hotkeys
 from app.scene.map_nodes import MapNodes, Ring
 from app.scene.robot_nodes import ROBOT, RobotNodes
 from app.scene.scan_nodes import ScanNodes, Vector
 from app.scene.server import silenced, start_server
 from app.scene.tune_panel import TunePanel
 from app.scene.tuning import SceneCommands, Tuning, Value
-from app.scene.view import LAYERS, View
+from app.scene.view import View
 from pipeline.geometry import Pose2
 from pipeline.parameters import Parameters, preset
 from pipeline.records import Frame, TruthTrees
@@ -99,6 +99,20 @@ class Scene:
             with self._server.atomic():
                 self._map.repaint(self._frame, tree, ring, self._view)
 
+    @property
+    def view(self) -> dict[str, Any]:
+        """What people chose to see, for the page."""
+        return self._view.as_plain()
+
+    def choose(self, name: str, value: str | bool) -> None:
+        """Show or hide a layer, follow the robot or not, or colour and label by something else.
+
+        Raises:
+            ParameterError: There is no such choice.
+        """
+        self._view.choose(name, value)
+        self._repaint()
+
     def clear(self) -> None:
         """Forget the run: an empty scene, the panel as it is."""
         self._frame, self._path = None, np.zeros((0, 2))
@@ -121,13 +135,10 @@ class Scene:
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 105, 78))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
-        tabs = gui.add_tab_group()
-        with tabs.add_tab("Tune"):
-            self._tune = TunePanel(
-                gui, self._parameters, self._preset, self._on_change, self._on_preset, self._on_reset
-            )
-        with tabs.add_tab("Layers"):
-            add_layers_panel(gui, self._view, self._on_view, self._on_camera)
+        self._tune = TunePanel(
+            gui, self._parameters, self._preset, self._on_change, self._on_preset, self._on_reset
+        )
+        add_hotkeys(gui, self._on_camera, functools.partial(self._cross, self._on_follow))
         self._add_nodes()
 
     def _add_nodes(self) -> None:
@@ -210,18 +221,11 @@ class Scene:
         if cluster is not None:
             self._tuning.ask(self._commands.select_cluster(self._frame.index, cluster), None)
 
-    def _on_view(self, name: str, value: str | bool) -> None:
-        self._cross(self._choose, name, value)
+    def _on_follow(self) -> None:
+        self._tuning.ask(self._commands.choose_view("follow", not self._view.follow), None)
 
     def _on_camera(self, name: str, client: viser.ClientHandle) -> None:
         self._cross(self._aim, name, client)
-
-    def _choose(self, name: str, value: str | bool) -> None:
-        if name in LAYERS:
-            self._view.layers[name] = bool(value)
-        else:
-            setattr(self._view, name, value)
-        self._repaint()
 
     def _aim(self, name: str, client: viser.ClientHandle) -> None:
         self._follower.look(client, self._pose, from_above=name == "top")

@@ -29,6 +29,13 @@ class SceneCommands(Protocol):
     async def reset_parameters(self, names: list[str]) -> None:
         """Bring parameters back to the preset; an empty list means all."""
 
+    async def choose_view(self, name: str, value: str | bool) -> None:
+        """Choose what is seen in the scene.
+
+        Raises:
+            ParameterError: There is no such choice.
+        """
+
     async def select_tree(self, number: int | None) -> None:
         """Select a tree everywhere; None selects nothing."""
 

@@ -22,6 +22,9 @@ function wording(body, status) {
 export const post = (path, body) =>
   request(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
 
+export const patch = (path, body) =>
+  request(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+
 export const get = (path) => request(path);
 export const open = (uri, odometry) => post("/api/open", { uri, odometry, seed: 0 });
 

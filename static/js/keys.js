@@ -1,6 +1,7 @@
 // Keyboard shortcuts, also while the scene has the focus.
 
 import { byId, el } from "./dom.js";
+import { toggleLayer } from "./layers.js";
 import { select } from "./live.js";
 import { setLoop } from "./marks.js";
 import { onSceneLoad, pressInScene } from "./scene.js";
@@ -11,7 +12,7 @@ import { advance, togglePlay } from "./timeline.js";
 const LIST = [
   ["space", "play or pause"], ["← →", "one scan back or forward"], ["shift ← →", "ten scans back or forward"],
   ["f", "follow the robot in the scene, or stop following"], ["t", "look at the robot from above"], ["b", "look at it from behind"],
-  ["l", "begin, end and leave a loop"], ["m", "measure a distance on the map"], ["/", "find a tree"], ["esc", "select nothing"], ["?", "this list"],
+  ["1 … 0", "show or hide a layer of the scene"], ["l", "begin, end and leave a loop"], ["m", "measure a distance on the map"], ["/", "find a tree"], ["esc", "select nothing"], ["?", "this list"],
 ];
 const TYPES = "input:not([type=range]), textarea, select, [contenteditable], [role=slider], [role=combobox], [role=option]";
 const PRESSED = "button, a, summary, [role=tab], [role=checkbox], input[type=checkbox], input[type=range]";
@@ -20,6 +21,7 @@ const actions = {
   " ": togglePlay,
   ArrowLeft: (event) => advance(event.shiftKey ? -10 : -1),
   ArrowRight: (event) => advance(event.shiftKey ? 10 : 1),
+  ...Object.fromEntries([..."1234567890"].map((key, place) => [key, () => toggleLayer(place)])),
   l: setLoop,
   m: toggleMeasure,
   "/": () => { openDrawer(); openTab("trees"); byId("find").focus(); },

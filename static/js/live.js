@@ -14,6 +14,7 @@ const takers = {
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   selection(message) { Object.assign(state, { selected: message.tree ?? null, selectedCluster: message.cluster ?? null }); },
   events(message) { state.events = message.events; },
+  view(message) { state.view = message; },
   loop(message) { state.loop = message.to_s === undefined ? null : message; },
   missing(message) { state.missing = message; },
 };

@@ -3,6 +3,7 @@
 import { startClusters } from "./clusters.js";
 import { startDrawer } from "./drawer.js";
 import { startKeys } from "./keys.js";
+import { startLayers } from "./layers.js";
 import { connect } from "./live.js";
 import { startMap } from "./map.js";
 import { startMarks } from "./marks.js";
@@ -20,5 +21,5 @@ import { startTimeline } from "./timeline.js";
 import { startWelcome } from "./welcome.js";
 
 for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory,
-  startTimeline, startMarks, startSources, startScene, startKeys, startDrawer, startWelcome]) start();
+  startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startDrawer, startWelcome]) start();
 connect();

@@ -10,6 +10,7 @@ export const state = {
   parameters: null,
   selected: null,    // number of a tree
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when it was selected
+  view: null,        // layers and choices of the 3D scene
   measure: null,     // {from, to, fixed} while a distance is measured on the map
   events: [],        // [{t, kind, text}] in the order of time
   loop: null,        // {from_s, to_s}: the part that is played again and again

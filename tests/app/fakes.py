@@ -13,7 +13,7 @@ import numpy as np
 from app.session import Session
 from app.stopwatch import Stopwatch
 from app.worker_messages import Opened, ToWorker
-from pipeline.errors import SourceError
+from pipeline.errors import ParameterError, SourceError
 from pipeline.geometry import Pose2, Pose3
 from pipeline.parameters import Parameters
 from pipeline.records import (
@@ -284,6 +284,15 @@ class FakeScene:
 
     def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None:
         self.calls.append(("select", tree if ring is None else (tree, ring)))
+
+    @property
+    def view(self) -> dict[str, Any]:
+        return {"follow": True}
+
+    def choose(self, name: str, value: str | bool, /) -> None:
+        if name == "nothing":
+            raise ParameterError("there is no such layer")
+        self.calls.append(("choose", (name, value)))
 
     def clear(self) -> None:
         self.calls.append(("clear", None))

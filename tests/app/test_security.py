@@ -32,6 +32,7 @@ ROUTES = [
     ("POST", "/api/command"),
     ("POST", "/api/open"),
     ("POST", "/api/loop"),
+    ("PATCH", "/api/view"),
     ("GET", "/api/sources"),
     ("GET", "/api/trees"),
     ("GET", "/api/trees.csv"),

@@ -250,26 +250,37 @@ def test_keys_work_on_the_page_and_in_the_scene(dashboard: Dashboard):
 
 def test_following_is_switched_by_a_key_of_the_page(dashboard: Dashboard):
     scene = dashboard.scene
-    scene.get_by_role("tab", name="Layers").click()
-    follow = scene.get_by_role("checkbox", name="Follow robot")
-    expect(follow).to_be_checked()
+    follow = dashboard.page.locator("#follow")
+    expect(follow).to_have_attribute("aria-pressed", "true")
     dashboard.page.locator("#map").press("f")
-    expect(follow).not_to_be_checked()
-    dashboard.page.locator("#map").press("f")
-    expect(follow).to_be_checked()
-    scene.get_by_role("tab", name="Tune").click()
+    expect(follow).to_have_attribute("aria-pressed", "false")
+    scene.locator("canvas").first.press("f")
+    expect(follow).to_have_attribute("aria-pressed", "true")
 
 
 def test_a_layer_is_switched_off(dashboard: Dashboard):
     scene = dashboard.scene
-    scene.get_by_role("tab", name="Layers").click()
-    switch = scene.get_by_role("checkbox", name="Raw scan")
+    page = dashboard.page
+    page.get_by_role("button", name="Layers").click()
+    switch = page.locator("#layer-list").get_by_role("checkbox", name="Raw scan")
+    expect(page.locator("#layer-list label", has_text="Raw scan").locator(".count")).to_have_text(
+        f"{dashboard.node_points('/world/robot/scan/raw'):,}"
+    )
     hidden = "name => window.__viserSceneTree.getState()[name].visibility === false"
     switch.click()
     scene.wait_for_function(hidden, arg="/world/robot/scan/raw")
     switch.click()
     scene.wait_for_function(f"name => !({hidden})(name)", arg="/world/robot/scan/raw")
-    scene.get_by_role("tab", name="Tune").click()
+    page.get_by_role("combobox", name="Labels").select_option("DBH")
+    centimetres = "() => Object.values(window.__viserSceneTree.getState())"
+    centimetres += ".some(node => / cm$/.test(node?.message?.props?.text ?? '') && node.visibility !== false)"
+    scene.wait_for_function(centimetres)
+    page.get_by_role("combobox", name="Labels").select_option("eccentricity")
+    page.get_by_role("button", name="Layers").click()
+    page.locator("#map").press("1")
+    scene.wait_for_function(hidden, arg="/world/robot/scan/raw")
+    page.locator("#map").press("1")
+    scene.wait_for_function(f"name => !({hidden})(name)", arg="/world/robot/scan/raw")
 
 
 def test_a_run_that_is_not_there_is_told_with_what_to_do(dashboard: Dashboard):

@@ -31,6 +31,9 @@ class Recorder:
     async def reset_parameters(self, names: list[str]) -> None:
         self.asked.append(("reset", names))
 
+    async def choose_view(self, name: str, value: str | bool) -> None:
+        self.asked.append(("view", (name, value)))
+
     async def select_tree(self, number: int | None) -> None:
         self.asked.append(("select", number))
 

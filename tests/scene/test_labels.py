@@ -25,7 +25,7 @@ def test_labels_say_eccentricity_and_verdict(scene: Scene):
 )
 def test_labels_say_what_was_chosen(scene: Scene, label_by: str, expected: str | None):
     scene.show(make_frame(0), PATH)
-    scene._choose("label_by", label_by)
+    scene.choose("label_by", label_by)
     assert scene._scan.texts == [] if expected is None else expected in scene._scan.texts
 
 
@@ -58,7 +58,7 @@ def test_a_stem_of_another_program_is_labelled_and_drawn_without_eccentricity_an
     ready = replace(frame.clusters, eccentricity=unknown, extent=extent)
     scene.show(replace(frame, clusters=ready), PATH)
     assert set(scene._scan.texts) == {"tree", "too long"}
-    scene._choose("colour_by", "eccentricity")
+    scene.choose("colour_by", "eccentricity")
     fits = scene._server.scene.get_handle_by_name("/world/robot/scan/fits")
     assert fits is not None
     assert np.isfinite(fits.batched_scales).all()  # type: ignore[attr-defined]

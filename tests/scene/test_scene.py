@@ -99,7 +99,7 @@ def test_trees_that_are_not_confirmed_are_not_shown(scene: Scene):
 
 def test_colours_are_as_many_as_points(scene: Scene):
     for name in ("verdict", "stage", "cluster", "height", "eccentricity"):
-        scene._choose("colour_by", name)
+        scene.choose("colour_by", name)
         scene.show(make_frame(2, clusters=5), PATH[:3])
         for cloud in ("raw", "filtered", "clusters"):
             handle = node(scene, f"/world/robot/scan/{cloud}")
@@ -124,20 +124,20 @@ def test_a_scan_without_points_or_clusters_is_shown(scene: Scene):
 
 def test_a_hidden_layer_sends_nothing_and_comes_back_with_the_newest_scan(scene: Scene):
     scene.show(make_frame(0), PATH[:1])
-    scene._choose("raw", False)
+    scene.choose("raw", False)
     raw = node(scene, "/world/robot/scan/raw")
     old = raw.points.copy()
     frame = make_frame(1)
     scene.show(frame, PATH[:2])
     np.testing.assert_array_equal(raw.points, old)
-    scene._choose("raw", True)
+    scene.choose("raw", True)
     np.testing.assert_allclose(raw.points, frame.raw, atol=0.01)
     assert raw.visible
 
 
 def test_the_picture_stays_where_it_is_when_following_ends(scene: Scene):
     scene.show(make_frame(0, pose=Pose2(4.0, 1.0, 0.0)), PATH[:1])
-    scene._choose("follow", False)
+    scene.choose("follow", False)
     scene.show(make_frame(1, pose=Pose2(6.0, 1.0, 0.0)), PATH[:2])
     np.testing.assert_allclose(node(scene, "/world").position, [-4.0, -1.0, 0.0])
 
@@ -167,9 +167,9 @@ def test_a_click_or_a_look_around_sends_no_points(scene: Scene, monkeypatch: pyt
         queue(self, name, value)
 
     monkeypatch.setattr(handle, "_queue_update", remember)
-    scene._choose("follow", False)
+    scene.choose("follow", False)
     assert touched == []
-    scene._choose("colour_by", "height")
+    scene.choose("colour_by", "height")
     assert "points" not in touched
     assert "colors" in touched
 
@@ -210,7 +210,7 @@ def test_the_server_is_renewed_before_message_numbers_hurt(scene: Scene, monkeyp
 
 
 def test_the_path_by_odometry_begins_with_the_path_and_follows_a_jump_back(scene: Scene):
-    scene._choose("odometry", True)
+    scene.choose("odometry", True)
     for index in (0, 1, 2, 3, 1):
         scene.show(make_frame(index), PATH[: index + 1])
     last = make_frame(1)
