@@ -147,6 +147,8 @@ def test_a_tree_is_found_and_selected_everywhere(dashboard: Dashboard):
         ".some(node => node?.message?.props?.text?.startsWith(`tree ${number}, DBH`))",
         arg=number,
     )
+    expect(page.locator("#panel-story")).to_have_attribute("data-story", f"tree {number}")
+    dashboard.tab("Trees")
     page.locator("#find").fill("")
     page.locator("#map").press("Escape")
     expect(row).to_have_attribute("aria-selected", "false")

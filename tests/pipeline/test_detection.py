@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pipeline.detection import checks, detections, judge
-from pipeline.parameters import Parameters, preset
+from pipeline.parameters import PRESETS, Parameters, preset
 from pipeline.records import Clusters, Verdict
 from tests.pipeline.strategies import clusters
 
@@ -145,3 +147,22 @@ def test_without_a_circle_nothing_is_asked_of_it():
     untold = [check for check in checks(table, FOREST) if np.isnan(check.value[0])]
     assert [check.figure for check in untold] == ["visible arc", "radius", "radius"]
     assert not any(check.fails[0] for check in untold)
+
+
+figures = st.one_of(st.floats(0.0, 5.0), st.just(np.nan), st.just(np.inf))
+
+
+@given(st.lists(figures, min_size=6, max_size=6), st.booleans(), st.sampled_from(sorted(PRESETS)))
+def test_the_checks_decide_as_the_judge_does(row, hidden, name):
+    along, up, eccentricity, radial_std, radius, arc = row
+    table = clusters(
+        extent=[[along, 0.1, up]],
+        eccentricity=[20.0 * eccentricity],
+        radial_std=[0.05 * radial_std],
+        radius=[0.3 * radius],
+        arc=[arc],
+        hidden=[hidden],
+    )
+    p = preset(name).detection
+    failing = [check.verdict for check in checks(table, p) if check.fails[0]]
+    assert judge(table, p).verdict.tolist() == (failing[:1] or [Verdict.TREE])
