@@ -29,7 +29,7 @@ from pipeline.records import (
     Step,
 )
 from pipeline.shape import describe
-from pipeline.slam import FastSlam, SlamState
+from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.stems import take_stems
 from pipeline.terrain import Terrain, height_above
 from pipeline.tracking import Tracker
@@ -117,7 +117,8 @@ class Mapper:
 
         with watch("slam"):
             motion, odometry = self._motion(step)
-            estimate = self._slam.process(step.index, motion, found, free)
+            known = Motion(motion, step.slack, step.doubt, step.measured)
+            estimate = self._slam.process(step.index, known, found, free)
 
         with watch("tracking"):
             self._tracker.process(

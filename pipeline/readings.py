@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry import Pose3
+from pipeline.geometry import Pose2, Pose3
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -65,6 +65,28 @@ class Odometry:
 
     stamp_ns: int
     T_odom_base: Pose3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseMeasurement:
+    """Where another source (GNSS, another SLAM) says the base is, in the frame of the map.
+
+    Attributes:
+        stamp_ns: Time of the pose.
+        T_map_base: The pose.
+        covariance: shape (3, 3) of x, y [m], yaw [rad]; a large variance says nothing of the heading.
+    """
+
+    stamp_ns: int
+    T_map_base: Pose2
+    covariance: Float
+
+    def is_sound(self) -> bool:
+        """Whether all numbers are finite and the covariance is symmetric and positive definite."""
+        C, pose = self.covariance, self.T_map_base.as_array()
+        if C.shape != (3, 3) or not (np.all(np.isfinite(C)) and np.all(np.isfinite(pose))):
+            return False
+        return bool(np.allclose(C, C.T) and np.all(np.linalg.eigvalsh(C) > 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

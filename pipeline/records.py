@@ -17,6 +17,7 @@ from pipeline.readings import Imu as Imu
 from pipeline.readings import Int as Int
 from pipeline.readings import Int32 as Int32
 from pipeline.readings import Odometry as Odometry
+from pipeline.readings import PoseMeasurement as PoseMeasurement
 from pipeline.readings import Record as Record
 from pipeline.readings import Scan as Scan
 from pipeline.readings import Sensor as Sensor
@@ -41,6 +42,9 @@ class Step:
         tilt_known: Whether roll and pitch were measured.
         twist: Velocity of the base at the scan: forward, left [m/s], turn [rad/s]; zero when unknown.
         warnings: What the synchroniser noticed on the way to this scan.
+        doubt: Why the motion to this scan may be wrong, for people; empty when nothing says so.
+        slack: What that adds to its standard deviations: position [m] and heading [rad].
+        measured: The pose by another source at this scan, None where there is none.
     """
 
     index: int
@@ -51,6 +55,9 @@ class Step:
     tilt_known: bool = False
     twist: tuple[float, float, float] = (0.0, 0.0, 0.0)
     warnings: tuple[str, ...] = ()
+    doubt: str = ""
+    slack: tuple[float, float] = (0.0, 0.0)
+    measured: PoseMeasurement | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.geometry import Float, Pose2, Pose3, interpolate, wrap_angle
-from pipeline.records import Imu, Odometry, Record, Scan, Step
+from pipeline.records import Imu, Odometry, PoseMeasurement, Record, Scan, Step
 
 OdometryChoice = Literal["auto", "wheels", "static"]
 WAIT = 5  # scans that wait for the odometry that follows them before they go without
@@ -18,10 +18,15 @@ KEEP_NS = 2_000_000_000
 STALE_NS = 250_000_000  # a reading farther away in time than this says nothing of a scan
 JUMP_SPEED, JUMP_TURN = 15.0, 6.0  # m/s, rad/s; nothing that maps trees moves this fast
 STILL = (0.0, 0.0, 0.0)
+JUMP_SLACK = (0.2, 0.05)  # m, rad; what the robot may have moved while its odometry jumped
+WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion that no odometry told
+WALK_MOST = (3.0, 0.5)  # m, rad; beyond it the trees around are others
+SAME_TIME_NS = 50_000_000
+MOST_POSES = 64
 
 
 def steps(
-    records: Iterable[Record],
+    records: Iterable[Record | PoseMeasurement],
     *,
     odometry: OdometryChoice = "auto",
     first_index: int = 0,
@@ -46,6 +51,8 @@ def steps(
             joiner.add_scan(record)
         elif isinstance(record, Odometry):
             joiner.add_odometry(record)
+        elif isinstance(record, PoseMeasurement):
+            joiner.add_pose(record)
         else:
             joiner.add_imu(record)
         yield from joiner.ready()
@@ -70,6 +77,10 @@ class _Joiner:
         self._odometry: deque[_Reading] = deque()
         self._T_odom_jumped = Pose2()
         self._imu: deque[Imu] = deque()
+        self._poses: deque[PoseMeasurement] = deque(maxlen=MOST_POSES)
+        self._slack = (0.0, 0.0)
+        self._doubt = ""
+        self._stepped_ns: int | None = None
         self._last_stamp: int | None = None
         self._warnings: list[str] = []
 
@@ -105,7 +116,25 @@ class _Joiner:
                     "that is not taken as motion"
                 )
                 self._T_odom_jumped = last.pose @ raw.inverse()
+                self._suspect("the odometry jumped", JUMP_SLACK)
         return _Reading(odometry.stamp_ns, self._T_odom_jumped @ raw, _tilt(odometry.T_odom_base))
+
+    def add_pose(self, pose: PoseMeasurement) -> None:
+        if not pose.is_sound():
+            self._leave_out("measured poses without finite numbers or a positive definite covariance")
+        elif self._poses and pose.stamp_ns <= self._poses[-1].stamp_ns:
+            self._leave_out("measured poses that were not later than the one before")
+        else:
+            self._poses.append(pose)
+
+    def _suspect(self, why: str, slack: tuple[float, float]) -> None:
+        self._doubt = why
+        self._slack = (float(np.hypot(self._slack[0], slack[0])), float(np.hypot(self._slack[1], slack[1])))
+
+    def _pose_at(self, stamp_ns: int) -> PoseMeasurement | None:
+        """The measured pose of a scan; one that lies farther away in time is of another place."""
+        near = min(self._poses, key=lambda pose: abs(pose.stamp_ns - stamp_ns), default=None)
+        return near if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS else None
 
     def add_imu(self, imu: Imu) -> None:
         if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
@@ -144,7 +173,11 @@ class _Joiner:
             tilt_known=tilt is not None,
             twist=twist,
             warnings=tuple(self._warnings),
+            doubt=self._doubt,
+            slack=self._slack,
+            measured=self._pose_at(scan.stamp_ns),
         )
+        self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
         self._index += 1
         self._warnings.clear()
         return step
@@ -158,6 +191,7 @@ class _Joiner:
         before, after = _around(self._odometry, stamp_ns)
         if stamp_ns > after.stamp_ns + STALE_NS:
             self._warn("there is no odometry for some scans: the robot stands still in them")
+            self._bridge(stamp_ns)
             return after.pose, STILL, None
         span = (after.stamp_ns - before.stamp_ns) * 1e-9
         if span <= 0.0:
@@ -167,6 +201,15 @@ class _Joiner:
         twist = (step.x / span, step.y / span, step.yaw / span)
         tilt = _tilt_between(before, after, fraction)
         return interpolate(before.pose, after.pose, fraction), twist, tilt
+
+    def _bridge(self, stamp_ns: int) -> None:
+        """Nothing told the motion since the scan before: it may have been any walk of a robot."""
+        since = self._stepped_ns if self._stepped_ns is not None else stamp_ns
+        seconds = (stamp_ns - since) * 1e-9
+        self._suspect(
+            "there is no odometry",
+            (min(WALK_SPEED * seconds, WALK_MOST[0]), min(WALK_TURN * seconds, WALK_MOST[1])),
+        )
 
     def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
         if not self._imu:

@@ -15,10 +15,11 @@ import numpy as np
 
 from pipeline.geometry import Float, Pose2, wrap_angle
 from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, PoseEstimate
+from pipeline.records import Detections, PoseEstimate, PoseMeasurement
+from pipeline.slam import slip
 from pipeline.slam.health import TOLD, ScanTold, judged, remembered, scan_told
 from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
-from pipeline.slam.motion import compound, moved_poses, step_covariance, weighted_pose, wrapped
+from pipeline.slam.motion import Motion, compound, moved_poses, step_covariance, weighted_pose, wrapped
 from pipeline.slam.proposal import Room, room_for
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.state import SlamState
@@ -38,12 +39,14 @@ class FastSlam:
         self.state = SlamState.at_origin(parameters.particles)
         self._near, self._room = near_for(0), room_for(0, 0)  # memory of the kernels, no state
 
-    def process(self, index: int, motion: Pose2, detections: Detections, clear_range: Float) -> PoseEstimate:
+    def process(
+        self, index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
+    ) -> PoseEstimate:
         """Move with the odometry, weigh by the detections, and resample when it is due.
 
         Args:
             index: Number of the scan.
-            motion: T_base(t-1)_base(t) by the odometry.
+            motion: T_base(t-1)_base(t) by the odometry, alone or with what else is known of it.
             detections: Trees in the base frame.
             clear_range: shape (bins,) [m]: how far the view is free by direction (see visibility).
         """
@@ -51,11 +54,14 @@ class FastSlam:
         rng = np.random.default_rng([self._seed, index])
         noise = rng.standard_normal((p.particles, 3))
         offset = float(rng.random())
+        motion = Motion(motion) if isinstance(motion, Pose2) else motion
         state = self._moved(self.state.with_particles(p.particles), motion)
-        scan, ancestors = ScanTold(), None
+        scan, ancestors, doubt = ScanTold(), None, motion.doubt
         used = index == 0 or state.since_update >= p.update_distance
         if used:
-            state, scan = self._observed(state, detections, clear_range, noise)
+            state, slipped = self._against_slip(state, detections)
+            doubt = doubt or ("the trees contradict the odometry: corrected by them" if slipped else "")
+            state, scan = self._observed(state, detections, clear_range, noise, motion.measured)
         weights = normalised(state.log_weight)
         estimate = _estimate(state, weights, p.hits_to_weigh)
         if used and estimate.n_eff < p.resample_below * p.particles:
@@ -64,7 +70,9 @@ class FastSlam:
             state.log_weight[:] = 0.0
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
         self.state = replace(state, genealogy=genealogy)
-        health = judged(state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.covariance)
+        health = judged(
+            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.covariance, doubt
+        )
         return replace(estimate, resampled=ancestors is not None, health=health)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
@@ -91,19 +99,48 @@ class FastSlam:
         landmarks = self.state.map_of(self.state.best)
         return landmarks.mean, landmarks.covariance
 
-    def _moved(self, state: SlamState, step: Pose2) -> SlamState:
-        if step.x == step.y == step.yaw == 0.0:
+    def _moved(self, state: SlamState, motion: Motion) -> SlamState:
+        step, slack = motion.step, motion.slack
+        if step.x == step.y == step.yaw == 0.0 and slack == (0.0, 0.0) and motion.measured is None:
             return state
-        motion, covariance = compound(
-            state.motion, state.motion_covariance, step, step_covariance(step, self.parameters)
-        )
+        noise = step_covariance(step, self.parameters)
+        noise += np.diag([slack[0] ** 2, slack[0] ** 2, slack[1] ** 2])
+        moved, covariance = compound(state.motion, state.motion_covariance, step, noise)
         driven = math.hypot(step.x, step.y) + TURN_AS_DISTANCE * abs(wrapped(step.yaw))
+        if motion.measured is not None or slack != (0.0, 0.0):
+            driven = max(driven, self.parameters.update_distance)  # news that must not wait
         return replace(
-            state, motion=motion, motion_covariance=covariance, since_update=state.since_update + driven
+            state, motion=moved, motion_covariance=covariance, since_update=state.since_update + driven
         )
 
+    def _against_slip(self, state: SlamState, detections: Detections) -> tuple[SlamState, bool]:
+        """Put the motion right where the scan contradicts the map that the best particle knows well."""
+        if len(detections.cluster) < slip.FEWEST or not state.recent.mapped:
+            return state, False
+        p = self.parameters
+        before = state.pose[state.best]
+        pose = moved_poses(before[None], state.motion)[0]
+        known = state.map_of(state.best)
+        away = np.hypot(known.mean[:, 0] - pose[0], known.mean[:, 1] - pose[1])
+        landmarks = known.mean[(known.hits >= p.hits_to_weigh) & (away < p.view_range + slip.SEARCH)]
+        sigma = np.sqrt(0.5 * np.trace(detections.covariance, axis1=1, axis2=2))
+        spread = np.sqrt(np.maximum(np.diag(state.motion_covariance), 0.0))
+        if not slip.contradicts(pose, detections.centre, sigma, landmarks, spread, p.gate):
+            return state, False
+        sure, place = slip.offset(pose, detections.centre, sigma, landmarks)
+        if not sure:
+            return state, False
+        found = Pose2(*before).inverse() @ Pose2(*place)
+        covariance = state.motion_covariance + np.diag(slip.SIGMA**2)
+        return replace(state, motion=found.as_array(), motion_covariance=covariance), True
+
     def _observed(
-        self, state: SlamState, detections: Detections, clear_range: Float, noise: Float
+        self,
+        state: SlamState,
+        detections: Detections,
+        clear_range: Float,
+        noise: Float,
+        measured: PoseMeasurement | None,
     ) -> tuple[SlamState, ScanTold]:
         p, found = self.parameters, len(detections.cluster)
         centre = detections.centre
@@ -120,6 +157,7 @@ class FastSlam:
             state.pose, moved, state.log_weight, maps, blocks, lengths, state.motion,
             state.motion_covariance, noise, centre, detections.covariance.reshape(-1, 4)[:, [0, 1, 3]],
             clear_range, reach, state.detections, rules, *self._memory(known + found, found), told,
+            *_arrays(measured),
         )  # fmt: skip
         state.log_weight[:] -= state.log_weight.max()
         scan = scan_told(told, normalised(state.log_weight), found, state.motion_covariance)
@@ -141,6 +179,12 @@ class FastSlam:
             landmarks, found = 2 * landmarks, 2 * found
             self._near, self._room = near_for(landmarks), room_for(found, landmarks)
         return self._near, self._room
+
+
+def _arrays(measured: PoseMeasurement | None) -> tuple[Float, Float]:
+    if measured is None:
+        return np.zeros(0), np.eye(3)
+    return measured.T_map_base.as_array(), measured.covariance
 
 
 def _rules(p: Slam) -> Rules:

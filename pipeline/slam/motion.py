@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Slam
+from pipeline.records import PoseMeasurement
 
 
 def wrapped(angle: float) -> float:
@@ -42,6 +44,40 @@ def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -
     G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     moved = np.array([motion[0] + dx, motion[1] + dy, wrapped(yaw + step.yaw)])
     return moved, F @ covariance @ F.T + G @ step_noise @ G.T
+
+
+class Motion(NamedTuple):
+    """What is known of the motion from one scan to the next.
+
+    Attributes:
+        step: T_base(t-1)_base(t) by the odometry.
+        slack: Added to its standard deviations where the odometry is doubtful: position [m], heading [rad].
+        doubt: Why, for people; empty when nothing is.
+        measured: The pose by another source.
+    """
+
+    step: Pose2
+    slack: tuple[float, float] = (0.0, 0.0)
+    doubt: str = ""
+    measured: PoseMeasurement | None = None
+
+
+@compiled
+def correct_by_pose(mu: Float, P: Float, z: Float, R: Float) -> float:
+    """Kalman update of a pose by a measured one, in place; returns the log likelihood of the measurement.
+
+    Args:
+        mu: shape (3,): x, y [m], yaw [rad]; P: its covariance, shape (3, 3).
+        z, R: Likewise of the measurement; R is positive definite.
+    """
+    S_inv = np.linalg.inv(P + R)
+    y = z - mu
+    y[2] = (y[2] + np.pi) % (2.0 * np.pi) - np.pi
+    K = P @ S_inv
+    mu += K @ y
+    P[:] = P - K @ P
+    P[:] = 0.5 * (P + P.T)
+    return float(-0.5 * (y @ (S_inv @ y)) + 0.5 * np.log(np.linalg.det(S_inv)))
 
 
 @compiled

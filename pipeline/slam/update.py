@@ -13,6 +13,7 @@ from pipeline.records import Bool, Float32, Int, Int32
 from pipeline.slam.health import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.maps import ROOM, Maps, own_block
+from pipeline.slam.motion import correct_by_pose
 from pipeline.slam.proposal import Room, draw, recognise, rotated
 from pipeline.visibility import BEHIND
 
@@ -122,6 +123,8 @@ def observe(
     near: Near,
     room: Room,
     told: Float,
+    measured: Float,
+    measured_covariance: Float,
 ) -> None:
     """Update every particle in place.
 
@@ -136,6 +139,7 @@ def observe(
         first_birth: Serial number of the first of the detections.
         near, room: Memory for the landmarks in reach and for pairs.
         told: shape (P, TOLD), filled: what each particle tells of the scan (see health).
+        measured: x, y, yaw by another source, shape (3,), or of no length; measured_covariance: (3, 3).
     """
     mu = np.empty(3)
     P = np.zeros((3, 3))
@@ -145,6 +149,8 @@ def observe(
         mu[0], mu[1], mu[2] = moved[p, 0], moved[p, 1], moved[p, 2]
         if rules.use_proposal:
             _turned_covariance(motion_covariance, before_c, before_s, P)
+        if measured.shape[0] > 0:
+            log_weight[p] += correct_by_pose(mu, P, measured, measured_covariance)
         known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, near)
         log_weight[p] += recognise(
             mu, P, centre, R, known, near.mean, near.covariance, near.hits,
