@@ -10,6 +10,7 @@ from tests.benchmarks.machine import peak_mib, resident_mib
 from tests.benchmarks.table import Cell, Table, verdict
 
 if TYPE_CHECKING:
+    from pipeline.gathering.memory import Memory
     from pipeline.mapper import Mapper
 
 NAME = "memory"
@@ -66,8 +67,16 @@ def follow(uri: str, every: int) -> list[tuple[int, float, float, int]]:
 
 def _known_mib(mapper: Mapper) -> float:
     # The gathered voxels are there twice: as they are, and as they were at the last fold.
-    voxels = array_bytes(mapper._gathering.memory)
+    voxels = in_use_bytes(mapper._gathering.memory)
     return (array_bytes(mapper.snapshot()) + array_bytes(mapper.path) + voxels) / 2**20
+
+
+def in_use_bytes(memory: Memory) -> int:
+    """Bytes of the rows of a memory that are in use and of its tables: room that was never filled has no
+    pages."""
+    rows = (memory.key, memory.mean, memory.returns, memory.scans, memory.latest, memory.following)
+    used = sum(column[: memory.used].nbytes for column in (*rows, memory.home))
+    return used + memory.slot.nbytes + memory.tile_slot.nbytes
 
 
 def array_bytes(record: Any) -> int:
