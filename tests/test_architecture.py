@@ -18,6 +18,7 @@ FOUNDATION = (
     "errors",
     "geometry",
     "compiled",
+    "pages",
     "files",
     "saving",
     "health",

@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from pipeline.compiled import compiled
+from pipeline.pages import zeros
 from pipeline.records import Float32, Int, Int32
 
 SIDE = 0.1  # m, of a voxel seen from above
@@ -67,19 +68,19 @@ class Memory:
         costs nothing before it is filled, and a map that grows need never move.
         """
         return cls(
-            key=np.zeros(room, np.int64),
-            slot=np.zeros(2 * room, np.int32),
-            mean=np.zeros((room, 3), np.float32),
-            returns=np.zeros(room, np.int32),
-            scans=np.zeros(room, np.int32),
-            latest=np.zeros(room, np.int32),
-            following=np.zeros(room, np.int32),
-            home=np.zeros(room, np.int32),
-            tile_key=np.zeros(tile_room, np.int64),
-            tile_slot=np.zeros(2 * tile_room, np.int32),
-            tile_first=np.zeros(tile_room, np.int32),
-            tile_returns=np.zeros(tile_room, np.int64),
-            tile_judged=np.zeros(tile_room, np.int64),
+            key=zeros(room, np.int64),
+            slot=zeros(2 * room, np.int32),
+            mean=zeros((room, 3), np.float32),
+            returns=zeros(room, np.int32),
+            scans=zeros(room, np.int32),
+            latest=zeros(room, np.int32),
+            following=zeros(room, np.int32),
+            home=zeros(room, np.int32),
+            tile_key=zeros(tile_room, np.int64),
+            tile_slot=zeros(2 * tile_room, np.int32),
+            tile_first=zeros(tile_room, np.int32),
+            tile_returns=zeros(tile_room, np.int64),
+            tile_judged=zeros(tile_room, np.int64),
             used=0,
             tiles=0,
             added=0,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.gathering.memory import KEPT, TILE_CELLS, Memory, index
+from pipeline.pages import copied
 from pipeline.records import Float32, Int, Int32
 
 LARGEST_ROOM = 1 << 25  # more than the parameters allow
@@ -32,7 +33,7 @@ class PackedMemory:
     @classmethod
     def of(cls, memory: Memory) -> PackedMemory:
         """What cannot be found again from the rest, copied."""
-        columns = {name: getattr(memory, name)[: memory.used].copy() for name in KEPT}
+        columns = {name: copied(getattr(memory, name)[: memory.used]) for name in KEPT}
         judged = memory.tile_judged[: memory.tiles].copy()
         return cls(
             **columns,

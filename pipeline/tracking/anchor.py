@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.association import associate
+from pipeline.compiled import compiled
 from pipeline.geometry import Float, Pose2
 from pipeline.tracking.table import TrackTable
 
@@ -33,11 +34,37 @@ def anchor(
         distance_max: A landmark farther from a tree than this is another tree's [m].
         miss: What a tree without a landmark loses of its score.
     """
-    rows = np.flatnonzero(np.hypot(tracks.x[:, 0] - T_map_base.x, tracks.x[:, 1] - T_map_base.y) < reach)
-    P = tracks.P[:, [0, 0, 1], [0, 1, 1]][rows]
-    landmark_of, distance2 = associate(tracks.x[rows, :2], P, landmarks, covariance, np.inf, distance_max)
-    tracks.score[rows[landmark_of < 0]] -= miss
-    moved = (landmark_of >= 0) & (distance2 > AGREE * AGREE)
-    to, of = rows[moved], landmark_of[moved]
-    tracks.x[to, :2] = landmarks[of]
-    tracks.P[to, :2, :2] = covariance[of][:, [[0, 1], [1, 2]]]
+    here = T_map_base.as_array()
+    _anchor(tracks.x, tracks.P, tracks.score, landmarks, covariance, here, reach, distance_max, miss)
+
+
+@compiled
+def _anchor(
+    x: Float,
+    P: Float,
+    score: Float,
+    landmarks: Float,
+    covariance: Float,
+    here: Float,
+    reach: float,
+    distance_max: float,
+    miss: float,
+) -> None:
+    rows, place, spread = np.empty(len(x), np.int64), np.empty((len(x), 2)), np.empty((len(x), 3))
+    n = 0
+    for t in range(len(x)):
+        dx, dy = x[t, 0] - here[0], x[t, 1] - here[1]
+        if dx * dx + dy * dy < reach * reach:
+            rows[n] = t
+            place[n, 0], place[n, 1] = x[t, 0], x[t, 1]
+            spread[n, 0], spread[n, 1], spread[n, 2] = P[t, 0, 0], P[t, 0, 1], P[t, 1, 1]
+            n += 1
+    landmark_of, distance2 = associate(place[:n], spread[:n], landmarks, covariance, np.inf, distance_max)
+    for k in range(n):
+        t, landmark = rows[k], landmark_of[k]
+        if landmark < 0:
+            score[t] -= miss
+        elif distance2[k] > AGREE * AGREE:
+            C = covariance[landmark]
+            x[t, 0], x[t, 1] = landmarks[landmark, 0], landmarks[landmark, 1]
+            P[t, 0, 0], P[t, 0, 1], P[t, 1, 0], P[t, 1, 1] = C[0], C[1], C[1], C[2]

@@ -14,38 +14,6 @@ SHARED_RADIUS_SIGMA = 0.01  # m; bark and taper, which more scans of one side do
 
 
 @compiled
-def in_map(
-    centre: Float, covariance: Float, pose: Float, pose_covariance: Float
-) -> tuple[Float, Float, Float]:
-    """Detections in the frame of the map: centres, shape (D, 2) [m], their covariances, shape (D, 2, 2),
-    and the same as xx, xy, yy, shape (D, 3).
-
-    The covariance is the detection's own, turned, and the pose's, J Sigma J^T with J = d(position) /
-    d(x, y, yaw).
-
-    Args:
-        centre: Base frame, shape (D, 2) [m]; covariance: shape (D, 2, 2).
-        pose: x, y [m], yaw [rad], shape (3,); pose_covariance: shape (3, 3).
-    """
-    D, Sigma = centre.shape[0], pose_covariance
-    place, R, packed = np.empty((D, 2)), np.empty((D, 2, 2)), np.empty((D, 3))
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    for d in range(D):
-        x, y = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
-        a, b, e = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
-        xx = c * c * a - 2.0 * c * s * b + s * s * e
-        xy = c * s * (a - e) + (c * c - s * s) * b
-        yy = s * s * a + 2.0 * c * s * b + c * c * e
-        xx += Sigma[0, 0] - 2.0 * y * Sigma[0, 2] + y * y * Sigma[2, 2]
-        xy += Sigma[0, 1] + x * Sigma[0, 2] - y * Sigma[1, 2] - x * y * Sigma[2, 2]
-        yy += Sigma[1, 1] + 2.0 * x * Sigma[1, 2] + x * x * Sigma[2, 2]
-        place[d, 0], place[d, 1] = pose[0] + x, pose[1] + y
-        packed[d, 0], packed[d, 1], packed[d, 2] = xx, xy, yy
-        R[d, 0, 0], R[d, 0, 1], R[d, 1, 0], R[d, 1, 1] = xx, xy, xy, yy
-    return place, R, packed
-
-
-@compiled
 def add_observations(
     rows: Int,
     place: Float,

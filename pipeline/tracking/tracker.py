@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.association import associate
 from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Tracking
-from pipeline.records import Bool, Columns, Detections, Int, Trees, Verdict
+from pipeline.records import Columns, Detections, Int, Trees, Verdict
 from pipeline.tracking.anchor import anchor
+from pipeline.tracking.assignment import assign
 from pipeline.tracking.judging import assign_verdicts, tree_columns
-from pipeline.tracking.kalman import ENGINES, expected_positions
+from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.merge import merge_near
-from pipeline.tracking.observation import add_observations, in_map, table_figures
+from pipeline.tracking.observation import add_observations, table_figures
 from pipeline.tracking.table import TrackTable
-from pipeline.visibility import in_free_view
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
 SCORE_STANDING = 5.0  # at least, of a tree that what was gathered stands for
@@ -50,21 +49,34 @@ class Tracker:
             clear_range: How far the view was free by direction.
             view_range: A tree nearer than this can be missed [m].
         """
-        p = self.parameters
-        t = self.tracks
-        pose = T_map_base.as_array()
-        position, R, R3 = in_map(detections.centre, detections.covariance, pose, pose_covariance)
-        expected, spread = expected_positions(t.x, t.P, t.stamp_ns, stamp_ns, p.acceleration_sigma)
-        row_of, _ = associate(position, R3, expected, spread, p.gate, p.distance_max)
-        old, fresh = np.flatnonzero(row_of >= 0), np.flatnonzero(row_of < 0)
-        touched = np.zeros(len(self.tracks), np.bool_)
-        touched[row_of[old]] = True
-        self._miss(~touched, T_map_base, clear_range, view_range)
-        self._update(row_of[old], stamp_ns, position[old], R[old])
-        row_of[fresh] = len(self.tracks) + np.arange(len(fresh))
-        self._begin(stamp_ns, position[fresh], R[fresh])
+        p, t = self.parameters, self.tracks
+        row_of, touched, position, R = assign(
+            detections.centre,
+            detections.covariance,
+            T_map_base.as_array(),
+            pose_covariance,
+            t.x,
+            t.P,
+            t.stamp_ns,
+            t.score,
+            clear_range,
+            view_range,
+            stamp_ns,
+            p.acceleration_sigma,
+            p.gate,
+            p.distance_max,
+            1.0 / p.misses_per_hit,
+        )
+        fresh = np.flatnonzero(row_of < 0)
+        if len(fresh):
+            old = np.flatnonzero(row_of >= 0)
+            self._update(row_of[old], stamp_ns, position[old], R[old])
+            row_of[fresh] = len(t) + np.arange(len(fresh))
+            self._begin(stamp_ns, position[fresh], R[fresh])
+            touched = np.concatenate([touched, np.ones(len(fresh), np.bool_)])
+        else:
+            self._update(row_of, stamp_ns, position, R)
         _gather(self.tracks, row_of, position, T_map_base, detections)
-        touched = np.concatenate([touched, np.ones(len(fresh), np.bool_)])
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius).with_score()
 
     def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
@@ -107,10 +119,6 @@ class Tracker:
         new.stamp_ns[:] = new.first_ns[:] = stamp_ns
         new.score[:] = 1.0
         self.tracks = self.tracks.extended(new)
-
-    def _miss(self, unseen: Bool, T_map_base: Pose2, clear_range: Float, view_range: float) -> None:
-        missed = unseen & in_free_view(self.tracks.x[:, :2], T_map_base.as_array(), clear_range, view_range)
-        self.tracks.score[missed] -= 1.0 / self.parameters.misses_per_hit
 
     def trees(self) -> Trees:
         """The map as it stands (Table 2)."""

@@ -1,0 +1,32 @@
+"""Large arrays on pages of their own.
+
+The system gives a page when it is first written to and takes all back when the array goes. From the
+allocator's heap, arrays of ever other sizes that live long leave holes behind, which a process keeps.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+SMALL = 1 << 16  # bytes; such arrays fill holes instead of making them
+
+
+def zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """As numpy.zeros; of a large array only the pages that were written to take memory."""
+    kind = np.dtype(dtype)
+    count = shape if isinstance(shape, int) else math.prod(shape)
+    if count * kind.itemsize < SMALL:
+        return np.zeros(shape, kind)
+    return np.frombuffer(mmap.mmap(-1, count * kind.itemsize), kind, count).reshape(shape)
+
+
+def copied(array: NDArray[Any]) -> NDArray[Any]:
+    """A copy on pages of its own."""
+    copy = zeros(array.shape, array.dtype)
+    copy[...] = array
+    return copy
