@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import mmap
+import sys
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,13 @@ def zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     count = shape if isinstance(shape, int) else math.prod(shape)
     if count * kind.itemsize < SMALL:
         return np.zeros(shape, kind)
-    return np.frombuffer(mmap.mmap(-1, count * kind.itemsize), kind, count).reshape(shape)
+    return np.frombuffer(_mapped(count * kind.itemsize), kind, count).reshape(shape)
+
+
+def _mapped(size: int) -> mmap.mmap:
+    if sys.platform == "win32":
+        return mmap.mmap(-1, size)
+    return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
 
 
 def copied(array: NDArray[Any]) -> NDArray[Any]:
