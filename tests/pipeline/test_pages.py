@@ -24,9 +24,7 @@ def test_they_are_zeros_that_can_be_written_and_copied(shape, dtype):
     assert (copy == 1).all()
 
 
-@pytest.mark.skipif(
-    not Path("/proc/self/status").exists(), reason="the system does not tell what is resident"
-)
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell")
 def test_untouched_pages_take_no_memory_and_dropped_ones_are_given_back():
     before = resident_mib()
     array = zeros(1 << 25, np.float64)  # 256 MiB
