@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import parse_qsl, urlencode
 
 import msgspec
 from fastapi import APIRouter, Request
@@ -119,10 +120,25 @@ def what_may_be_opened(uri: str, settings: Settings) -> str | None:
         return uri
     try:
         if uri.startswith("sim:") and not Path(uri).exists():
-            return uri
+            return _simulated_that_may_be_opened(uri, settings)
         if settings.recordings is None:
             return None
         path = Path(uri.removeprefix("file://")).expanduser().resolve()
         return str(path) if path.is_relative_to(settings.recordings.resolve()) else None
     except (OSError, ValueError, RuntimeError):  # RuntimeError: a home of nobody
         return None
+
+
+def _simulated_that_may_be_opened(uri: str, settings: Settings) -> str | None:
+    """The files that a virtual scan reads must lie where other files must."""
+    name, _, query = uri.removeprefix("sim:").partition("?")
+    if name != "cloud":
+        return uri
+    values = dict(parse_qsl(query, keep_blank_values=True))
+    for key in ("file", "truth"):
+        if key in values:
+            path = what_may_be_opened(values[key].removeprefix("sim:"), settings)
+            if path is None:
+                return None
+            values[key] = path
+    return f"sim:cloud?{urlencode(values)}"

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from pipeline.geometry import Pose3
 from pipeline.records import Float
 from pipeline.simulation.drive import RATE_HZ, Drive
-from pipeline.simulation.terrain import Terrain
 
 _VIBRATION_HZ = np.array([1.3, 2.9, 5.3, 8.7])
 _VIBRATION_ANGLE = np.radians(np.array([0.20, 0.10, 0.06, 0.03]))
+
+
+class Ground(Protocol):
+    """What the robot stands on."""
+
+    def evaluate(self, x: Float, y: Float) -> Float:
+        """Height, dz/dx and dz/dy at places of shape (N,) [m]; shape (N, 3)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +54,7 @@ class Motion:
         return np.ascontiguousarray(R @ T_base_lidar.R), p + R @ T_base_lidar.t
 
 
-def lay_on_terrain(drive: Drive, terrain: Terrain, rng: np.random.Generator) -> Motion:
+def lay_on_terrain(drive: Drive, terrain: Ground, rng: np.random.Generator) -> Motion:
     """The base stands on the ground, upright to it, and shakes while it moves."""
     z, gx, gy = terrain.evaluate(drive.x, drive.y).T
     c, s = np.cos(drive.yaw), np.sin(drive.yaw)

@@ -24,7 +24,7 @@ from pipeline.simulation.wheels import ODOMETRY_HZ, wheel_odometry
 VERSION = 1
 START_NS = 1_700_000_000_000_000_000
 MOUNTING = Pose3(np.eye(3), np.array([0.1, 0.0, 0.8]))
-_SCENE, _SHAKE, _WHEELS, _INERTIAL, _SCAN = range(5)
+SCENE, SHAKE, WHEELS, INERTIAL, SCAN = range(5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,7 @@ class SimulatedRun:
         begin = k * self.lidar.period_ns
         times = (begin + self.lidar.column_offsets_ns().astype(np.int64)) / 1e9
         R, o = self.motion.sensor_at(times, self.T_base_lidar)
-        rng = _stream(_SCAN, self.request, k)
+        rng = stream(SCAN, self.request, k)
         solids = self._solids(times, R, o)
         return sweep_scene(self.lidar, solids, self.scene.terrain, R, o, START_NS + begin, rng)
 
@@ -115,24 +115,28 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
     lidar = SpinningLidar(range_sigma=request.sigma)
     course = lay_course(np.array(scenario.waypoints), scenario.closed)
     drive = drive_course(course, scenario.speed, request.duration_s)
-    scene = build_scene(scenario, course, _stream(_SCENE, request))
-    motion = lay_on_terrain(drive, scene.terrain, _stream(_SHAKE, request))
-    if request.odometry == EXACT:
-        odometry = np.stack([drive.x, drive.y, drive.yaw], axis=1)[:: RATE_HZ // ODOMETRY_HZ]
-    else:
-        odometry = wheel_odometry(motion, QUALITIES[request.odometry], _stream(_WHEELS, request))
+    scene = build_scene(scenario, course, stream(SCENE, request))
+    motion = lay_on_terrain(drive, scene.terrain, stream(SHAKE, request))
     return SimulatedRun(
         request=request,
         T_base_lidar=MOUNTING if T_base_lidar is None else T_base_lidar,
         lidar=lidar,
         scene=scene,
         motion=motion,
-        odometry=odometry,
-        inertial=inertial_readings(motion, _stream(_INERTIAL, request)),
+        odometry=odometry_of(motion, request),
+        inertial=inertial_readings(motion, stream(INERTIAL, request)),
         scans=round(request.duration_s * 1e9) // lidar.period_ns,
     )
 
 
-def _stream(part: int, request: RunRequest, k: int = 0) -> np.random.Generator:
+def odometry_of(motion: Motion, request: RunRequest) -> Float:
+    """x, y [m] and yaw [rad] by wheels of the quality that was asked for, at 50 Hz, shape (N, 3)."""
+    if request.odometry == EXACT:
+        drive = motion.drive
+        return np.stack([drive.x, drive.y, drive.yaw], axis=1)[:: RATE_HZ // ODOMETRY_HZ]
+    return wheel_odometry(motion, QUALITIES[request.odometry], stream(WHEELS, request))
+
+
+def stream(part: int, request: RunRequest, k: int = 0) -> np.random.Generator:
     """A generator of its own for each part and scan, so that none shifts the numbers of another."""
     return np.random.default_rng([part, zlib.crc32(request.name.encode()), request.seed, k])

@@ -20,6 +20,12 @@ _KEYS = {
     "duration": "seconds, 1 to 3600",
     "trees": "how many, 0 to 2000",
 }
+CLOUD = "cloud"
+_CLOUD_KEYS = {
+    "file": "the cloud of a plot, .laz or .las",
+    "truth": "a table (CSV) of its trees in the coordinates of the cloud",
+    **{key: meaning for key, meaning in _KEYS.items() if key != "trees"},
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +39,7 @@ class RunRequest:
         odometry: Quality of the wheels, or "exact".
         duration_s: [s].
         trees: How many stand there.
+        file, truth: Of a run through a real cloud: its file, and the table of its trees, or empty.
     """
 
     name: str
@@ -41,6 +48,8 @@ class RunRequest:
     odometry: str
     duration_s: float
     trees: int
+    file: str = ""
+    truth: str = ""
 
     @property
     def scenario(self) -> Scenario:
@@ -59,10 +68,12 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
         SourceError: No such scenario or key, a key twice, a value that is no number or out of bounds.
     """
     name, _, query = uri.removeprefix(SCHEME).partition("?")
+    if name == CLOUD:
+        return _parse_cloud(uri, query, seed)
     if name not in SCENARIOS:
         known = ", ".join(SCHEME + scenario for scenario in SCENARIOS)
         raise SourceError(f"there is no scenario {name!r}", where=uri, remedy=f"Scenarios: {known}")
-    values = _pairs(uri, query)
+    values = _pairs(uri, query, _KEYS)
     scenario = SCENARIOS[name]
     odometry = values.get("odometry", "normal")
     if odometry not in (*QUALITIES, EXACT):
@@ -78,25 +89,47 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
     )
 
 
-def _pairs(uri: str, query: str) -> dict[str, str]:
+def _parse_cloud(uri: str, query: str, seed: int) -> RunRequest:
+    """A run through a real cloud; a duration of 0 stands for one loop."""
+    values = _pairs(uri, query, _CLOUD_KEYS)
+    if not values.get("file"):
+        raise SourceError(
+            "the cloud to be driven through is not named", where=uri, remedy="sim:cloud?file=plot.laz"
+        )
+    odometry = values.get("odometry", "normal")
+    if odometry not in (*QUALITIES, EXACT):
+        raise _refusal(uri, "odometry", odometry)
+    return RunRequest(
+        name=CLOUD,
+        seed=_whole(uri, "seed", values.get("seed", str(seed)), 2**63 - 1),
+        sigma=_real(uri, "sigma", values.get("sigma", "0.02"), 0.0, 0.2),
+        odometry=odometry,
+        duration_s=_real(uri, "duration", values["duration"], 1.0, 3600.0) if "duration" in values else 0.0,
+        trees=0,
+        file=values["file"],
+        truth=values.get("truth", ""),
+    )
+
+
+def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
     except ValueError:
         raise SourceError(
-            "the part after ? must be key=value, joined by &", where=uri, remedy=_allowed()
+            "the part after ? must be key=value, joined by &", where=uri, remedy=_allowed(keys)
         ) from None
     values: dict[str, str] = {}
     for key, value in pairs:
-        if key not in _KEYS:
-            raise SourceError(f"a simulated run has no option {key!r}", where=uri, remedy=_allowed())
+        if key not in keys:
+            raise SourceError(f"a simulated run has no option {key!r}", where=uri, remedy=_allowed(keys))
         if key in values:
             raise SourceError(f"option {key!r} is given twice", where=uri, remedy="Give it once")
         values[key] = value
     return values
 
 
-def _allowed() -> str:
-    return "Options: " + "; ".join(f"{key} ({meaning})" for key, meaning in _KEYS.items())
+def _allowed(keys: dict[str, str]) -> str:
+    return "Options: " + "; ".join(f"{key} ({meaning})" for key, meaning in keys.items())
 
 
 def _refusal(uri: str, key: str, text: str) -> SourceError:

@@ -8,7 +8,7 @@ from pipeline.records import Record, Truth
 from pipeline.simulation.inertial import IMU_HZ
 from pipeline.simulation.run import START_NS, SimulatedRun, open_run
 from pipeline.simulation.scenarios import scenarios
-from pipeline.simulation.uri import parse_uri
+from pipeline.simulation.uri import CLOUD, RunRequest, parse_uri
 from pipeline.simulation.wheels import ODOMETRY_HZ
 from pipeline.sources.base import SourceDescription, SourceOptions
 
@@ -20,8 +20,9 @@ _TICK_NS = 1_000_000_000 // IMU_HZ
 class SimulatedSource:
     """A simulated run, read like any recording (see `pipeline.sources.base.Source`)."""
 
-    def __init__(self, uri: str, run: SimulatedRun) -> None:
+    def __init__(self, uri: str, run: SimulatedRun, *, knows_trees: bool = True) -> None:
         self.run = run
+        self._knows_trees = knows_trees
         last = START_NS + (run.scans - 1) * run.lidar.period_ns
         self.description = SourceDescription(
             uri=uri,
@@ -55,7 +56,8 @@ class SimulatedSource:
 
     def truth(self) -> Truth:
         """All trees and what else stands there, and the true path."""
-        return Truth(trees=self.run.scene.truth, path=self.run.true_path())
+        trees = self.run.scene.truth if self._knows_trees else None
+        return Truth(trees=trees, path=self.run.true_path())
 
     def close(self) -> None:
         """Nothing is held open."""
@@ -67,8 +69,26 @@ def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedS
     `options.seed` is taken where the URI names no seed; `options.T_base_lidar` mounts the simulated
     LiDAR elsewhere on the robot.
 
+    `sim:cloud?file=&truth=` drives through the real cloud of a plot instead.
+
     Raises:
-        SourceError: No such scenario or option, or a value out of bounds.
+        SourceError: No such scenario or option, a value out of bounds, or a file that cannot be read.
     """
     chosen = SourceOptions() if options is None else options
-    return SimulatedSource(uri, open_run(parse_uri(uri, chosen.seed), chosen.T_base_lidar))
+    request = parse_uri(uri, chosen.seed)
+    if request.name == CLOUD:
+        return _open_cloud(uri, request, chosen)
+    return SimulatedSource(uri, open_run(request, chosen.T_base_lidar))
+
+
+def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> SimulatedSource:
+    """A run through the real cloud of a plot."""
+    from pathlib import Path
+
+    from pipeline.simulation.cloud_run import open_cloud_run
+    from pipeline.sources.clouds import open_cloud
+    from pipeline.truth_table import read_truth_trees
+
+    trees = read_truth_trees(Path(request.truth).expanduser()) if request.truth else None
+    run = open_cloud_run(request, open_cloud(request.file), trees, options.T_base_lidar)
+    return SimulatedSource(uri, run, knows_trees=trees is not None)

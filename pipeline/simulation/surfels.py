@@ -1,0 +1,175 @@
+"""A real cloud as something that beams meet: each point a small disc in the surface that its neighbours show.
+
+What is measured must be where points are: where the surface bends, as on a trunk, a disc is much smaller
+than the gaps between points, so that a trunk grows no thicker; only flat ground has discs as wide as its
+gaps. In foliage a point is a small ball. So that no beam sees through the gaps of a trunk to the bark on
+its far side, each point of a surface also blocks the beams around it: what lies well behind gives no return.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.records import Float, Float32, Int
+
+NEIGHBOURS = 10
+SURFACE, FLAT = 0.35, 0.03  # smallest against middle eigenvalue of the neighbours' covariance
+WIDE, SMALL = 1.0, 0.4  # radius as a part of the distance to its sixth neighbour
+LEAST, WIDEST, SMALLEST = 0.006, 0.10, 0.015  # m; of all, of flat discs, of the others
+BEHIND = 0.06  # m; what lies farther behind a blocking point is hidden
+GRAZING = 0.15  # sine of the angle between beam and disc below which it is not met
+MELT = 0.04  # m; what a beam meets so close together it measures as one
+_PART = 1 << 17
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surfels:
+    """Discs and balls as columns of length N, float32, in the frame of the world.
+
+    Attributes:
+        points: shape (N, 3) [m]; normals: shape (N, 3), zero for balls; radius: shape (N,) [m].
+        blocks: shape (N,) [m]: how far around it a point hides what lies behind, 0 in foliage.
+    """
+
+    points: Float32
+    normals: Float32
+    radius: Float32
+    blocks: Float32
+
+
+def lay_surfels(points: Float32) -> Surfels:
+    """Surfels on the points of a cloud, shape (N, 3) [m]."""
+    from scipy.spatial import cKDTree
+
+    n = len(points)
+    normals, blocks = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
+    radius = np.full(n, SMALLEST, np.float32)
+    if n > NEIGHBOURS:
+        tree = cKDTree(points)
+        for k in range(0, n, _PART):
+            distance, near = tree.query(points[k : k + _PART], k=NEIGHBOURS + 1)
+            part = slice(k, k + _PART)
+            _lay(points, near, distance, normals[part], radius[part], blocks[part])
+    return Surfels(points, normals, radius, blocks)
+
+
+@compiled
+def _lay(
+    points: Float32, near: Int, distance: Float, normals: Float32, radius: Float32, blocks: Float32
+) -> None:
+    C, mean = np.empty((3, 3)), np.empty(3)
+    for i in range(near.shape[0]):
+        mean[:] = 0.0
+        C[:] = 0.0
+        for j in near[i]:
+            for a in range(3):
+                mean[a] += points[j, a] / near.shape[1]
+        for j in near[i]:
+            for a in range(3):
+                for b in range(3):
+                    C[a, b] += (points[j, a] - mean[a]) * (points[j, b] - mean[b])
+        spacing = distance[i, 6]
+        values, vectors = np.linalg.eigh(C)
+        radius[i] = min(max(SMALL * spacing, LEAST), SMALLEST)
+        if values[0] < SURFACE * values[1]:
+            normals[i, 0], normals[i, 1], normals[i, 2] = vectors[0, 0], vectors[1, 0], vectors[2, 0]
+            blocks[i] = min(max(WIDE * spacing, LEAST), WIDEST)
+            if values[0] < FLAT * values[1]:
+                radius[i] = blocks[i]
+
+
+@compiled
+def first_surfels(
+    points: Float32,
+    normals: Float32,
+    radius: Float32,
+    blocks: Float32,
+    R: Float,
+    o: Float,
+    beams: Float,
+    lowest: float,
+    ring_step: float,
+    farthest: float,
+) -> Float:
+    """Range [m] of each beam of a sweep, inf where it meets nothing, shape (C, K).
+
+    Each surfel is looked at from where the sensor is when it turns past it, and only the beams within
+    its angle are tested; of what a beam meets the nearest counts, and what lies within MELT behind it
+    is averaged with it, the middle of a disc more than its rim.
+
+    Args:
+        points, normals, radius, blocks: See `Surfels`.
+        R, o: Pose of the sensor at each column, shapes (C, 3, 3) and (C, 3) [m].
+        beams: In the sensor's frame, shape (C, K, 3); column c looks along the azimuth pi - c 2 pi / C.
+        lowest, ring_step: Elevation of ring 0 and between rings [rad].
+        farthest: [m].
+    """
+    columns, rings = beams.shape[0], beams.shape[1]
+    nearest, hidden = np.full((columns, rings), np.inf), np.full((columns, rings), np.inf)
+    beam, met, weight = np.empty(1 << 16, np.int64), np.empty(1 << 16), np.empty(1 << 16)
+    n, step, middle = 0, 2.0 * np.pi / columns, columns // 2
+    v, m = np.empty(3), np.empty(3)
+    for i in range(points.shape[0]):
+        c = middle
+        for _ in range(2):  # where it stands in the sweep decides from which pose it is seen
+            _turn(points[i], R[c], o[c], v)
+            c = int((np.pi - np.arctan2(v[1], v[0])) / step + 0.5) % columns
+        _turn(points[i], R[c], o[c], v)
+        flat = np.sqrt(v[0] * v[0] + v[1] * v[1])
+        reach, s = np.sqrt(flat * flat + v[2] * v[2]), radius[i]
+        widest = max(s, blocks[i])
+        if reach > farthest or flat < 2.0 * widest:
+            continue
+        ring, tall = (np.arctan2(v[2], flat) - lowest) / ring_step, widest / reach / ring_step
+        first, last = max(int(np.ceil(ring - tall)), 0), min(int(np.floor(ring + tall)), rings - 1)
+        if first > last:
+            continue
+        for a in range(3):
+            m[a] = R[c, 0, a] * normals[i, 0] + R[c, 1, a] * normals[i, 1] + R[c, 2, a] * normals[i, 2]
+        disc = normals[i, 0] != 0.0 or normals[i, 1] != 0.0 or normals[i, 2] != 0.0
+        at, wide = (np.pi - np.arctan2(v[1], v[0])) / step, widest / flat / step
+        for column in range(int(np.ceil(at - wide)), int(np.floor(at + wide)) + 1):
+            for k in range(first, last + 1):
+                d = beams[column % columns, k]
+                t = d[0] * v[0] + d[1] * v[1] + d[2] * v[2]
+                if reach * reach - t * t < blocks[i] * blocks[i]:
+                    hidden[column % columns, k] = min(hidden[column % columns, k], t + BEHIND)
+                if disc:
+                    facing = d[0] * m[0] + d[1] * m[1] + d[2] * m[2]
+                    if abs(facing) < GRAZING:
+                        continue
+                    t = (v[0] * m[0] + v[1] * m[1] + v[2] * m[2]) / facing
+                off2 = (t * d[0] - v[0]) ** 2 + (t * d[1] - v[1]) ** 2 + (t * d[2] - v[2]) ** 2
+                if off2 >= s * s or t <= 0.0:
+                    continue
+                if n == beam.shape[0]:
+                    beam = np.append(beam, np.empty_like(beam))
+                    met, weight = np.append(met, np.empty_like(met)), np.append(weight, np.empty_like(weight))
+                b = (column % columns) * rings + k
+                beam[n], met[n], weight[n] = b, t, 1.0 - off2 / (s * s)
+                n += 1
+                nearest[column % columns, k] = min(nearest[column % columns, k], t)
+    ranges = _melt(nearest, beam[:n], met[:n], weight[:n])
+    return np.where(nearest <= hidden, ranges, np.inf)
+
+
+@compiled
+def _turn(point: Float32, R: Float, o: Float, v: Float) -> None:
+    x, y, z = point[0] - o[0], point[1] - o[1], point[2] - o[2]
+    for a in range(3):
+        v[a] = R[0, a] * x + R[1, a] * y + R[2, a] * z
+
+
+@compiled
+def _melt(nearest: Float, beam: Int, met: Float, weight: Float) -> Float:
+    rings = nearest.shape[1]
+    total, share = np.zeros(nearest.shape), np.zeros(nearest.shape)
+    for i in range(beam.shape[0]):
+        c, k = beam[i] // rings, beam[i] % rings
+        if met[i] <= nearest[c, k] + MELT:
+            total[c, k] += weight[i] * met[i]
+            share[c, k] += weight[i]
+    return np.where(share > 0.0, total / np.maximum(share, 1e-12), np.inf)

@@ -1,0 +1,120 @@
+"""Whole clouds of real plots, mapped at once and scanned virtually by a robot that drives through them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from tests.benchmarks.table import Table
+
+NAME = "plot"
+LINE = "Real plots: the whole cloud mapped, and a VLP-16 driven through it (needs STEMMAP_DATA)"
+SEEDS = range(3)
+SPREAD = 4.0  # cm; a diameter is scored where the tools that told it agree so far
+MATCH = 0.5  # m
+
+
+def run() -> list[Table]:
+    """Both tables."""
+    from pipeline.errors import StemmapError
+
+    folder = Path(os.environ.get("STEMMAP_DATA", "../shared/data")) / "forest"
+    if not (folder / "pine_plot.laz").is_file():
+        raise StemmapError("there is no real data", where=str(folder), remedy="Set STEMMAP_DATA")
+    return [_whole(folder), _driven(folder)]
+
+
+def _whole(folder: Path) -> Table:
+    import time
+
+    from pipeline.parameters import preset
+    from pipeline.plot import map_plot
+    from pipeline.sources.clouds import open_cloud
+
+    rows = []
+    for name in ("pine_plot", "MLS_Clip"):
+        file = str(folder / f"{name}.laz")
+        map_plot(open_cloud(file), preset("forest"))  # warm
+        began = time.process_time()
+        cloud = open_cloud(file)
+        plot = map_plot(cloud, preset("forest"))
+        seconds = time.process_time() - began
+        place = plot.trees.position + cloud.description.offset[:2]
+        scores = _scores(place, plot.trees.dbh, folder / f"{name}_stems.csv")
+        rows.append((name, plot.counts["read"], len(place), *scores, seconds))
+    columns = ("cloud", "points", "trees", *_SCORES, "CPU [s]")
+    return Table("The whole cloud", columns, tuple(rows))
+
+
+_SCORES = ("found", "of", "position RMSE [cm]", "DBH RMSE [cm]", "DBH bias [cm]", "DBH scored")
+_NO_SCORES = (None, None, None, None, None, None)
+
+
+def _scores(place, dbh, table: Path) -> tuple[int | float | None, ...]:
+    """Found stems of the table, error of place and of those diameters that can be scored."""
+    import csv
+
+    import numpy as np
+
+    from pipeline.evaluation.matching import match
+
+    if not table.is_file():
+        return _NO_SCORES
+    with table.open(newline="") as file:
+        stems = list(csv.DictReader(file))
+    truth = np.array([[float(s["x_m"]), float(s["y_m"])] for s in stems])
+    return _against(place, dbh, truth, stems, match(place, truth, MATCH))
+
+
+def _against(place, dbh, truth, stems, truth_of) -> tuple[int | float | None, ...]:
+    import numpy as np
+
+    found = truth_of >= 0
+    off = np.hypot(*(place[found] - truth[truth_of[found]]).T)
+    tape = np.array([float(s["dbh_cm"]) if 0.0 < float(s["spread_cm"]) <= SPREAD else np.nan for s in stems])
+    wider = 100.0 * dbh[found] - tape[truth_of[found]]
+    wider = wider[np.isfinite(wider)]
+    return (
+        int(found.sum()),
+        len(truth),
+        100.0 * float(np.sqrt(np.mean(off**2))),
+        float(np.sqrt(np.mean(wider**2))) if len(wider) else None,
+        float(wider.mean()) if len(wider) else None,
+        len(wider),
+    )
+
+
+def _driven(folder: Path) -> Table:
+    import csv
+    from contextlib import closing
+
+    import numpy as np
+
+    from pipeline.evaluation.matching import match
+    from pipeline.mapper import Mapper
+    from pipeline.parameters import preset
+    from pipeline.sources import open_source
+    from pipeline.steps import steps
+
+    table = folder / "pine_plot_stems.csv"
+    with table.open(newline="") as file:
+        stems = list(csv.DictReader(file))
+    rows = []
+    for odometry in ("exact", "normal"):
+        for seed in SEEDS:
+            uri = f"sim:cloud?file={folder / 'pine_plot.laz'}&truth={table}&odometry={odometry}&seed={seed}"
+            with closing(open_source(uri)) as source:
+                about, known = source.description, source.truth()
+                mapper = Mapper(
+                    preset("forest"), sensor=about.sensor, T_base_lidar=about.T_base_lidar, seed=seed
+                )
+                frame = [mapper.process(step) for step in steps(source.records())][-1]
+            assert known is not None
+            assert known.trees is not None
+            truth = np.stack([known.trees.x, known.trees.y], axis=1)
+            kept = frame.trees.confirmed
+            place = frame.trees.position[kept]
+            scores = _against(place, frame.trees.dbh[kept], truth, stems, match(place, truth, MATCH))
+            rows.append((odometry, seed, len(place), *scores))
+    columns = ("odometry", "seed", "trees", *_SCORES)
+    return Table("pine_plot.laz scanned virtually", columns, tuple(rows))
