@@ -17,8 +17,8 @@ from pipeline.records import Float, Float32, Int
 
 NEIGHBOURS = 10
 SURFACE, FLAT = 0.35, 0.03  # smallest against middle eigenvalue of the neighbours' covariance
-WIDE, SMALL = 1.0, 0.4  # radius as a part of the distance to its sixth neighbour
-LEAST, WIDEST, SMALLEST = 0.006, 0.10, 0.015  # m; of all, of flat discs, of the others
+WIDE, SMALL = 1.0, 0.6  # radius as a part of the distance to its sixth neighbour
+LEAST, WIDEST, SMALLEST, BALL = 0.006, 0.10, 0.025, 0.015  # m; of all, of flat discs, of others, of balls
 BEHIND = 0.06  # m; what lies farther behind a blocking point is hidden
 GRAZING = 0.15  # sine of the angle between beam and disc below which it is not met
 MELT = 0.04  # m; what a beam meets so close together it measures as one
@@ -46,7 +46,7 @@ def lay_surfels(points: Float32) -> Surfels:
 
     n = len(points)
     normals, blocks = np.zeros((n, 3), np.float32), np.zeros(n, np.float32)
-    radius = np.full(n, SMALLEST, np.float32)
+    radius = np.full(n, BALL, np.float32)
     if n > NEIGHBOURS:
         tree = cKDTree(points)
         for k in range(0, n, _PART):
@@ -73,9 +73,10 @@ def _lay(
                     C[a, b] += (points[j, a] - mean[a]) * (points[j, b] - mean[b])
         spacing = distance[i, 6]
         values, vectors = np.linalg.eigh(C)
-        radius[i] = min(max(SMALL * spacing, LEAST), SMALLEST)
+        radius[i] = min(max(SMALL * spacing, LEAST), BALL)
         if values[0] < SURFACE * values[1]:
             normals[i, 0], normals[i, 1], normals[i, 2] = vectors[0, 0], vectors[1, 0], vectors[2, 0]
+            radius[i] = min(max(SMALL * spacing, LEAST), SMALLEST)
             blocks[i] = min(max(WIDE * spacing, LEAST), WIDEST)
             if values[0] < FLAT * values[1]:
                 radius[i] = blocks[i]
