@@ -8,16 +8,25 @@ from pipeline.compiled import compiled
 
 
 @compiled
-def direction_bin(x: float, y: float, bins: int) -> int:
-    """Which of `bins` sectors around the origin the direction (x, y) lies in, from -x over -y on.
+def direction_turn(x: float, y: float) -> float:
+    """The direction (x, y) as part of a whole turn, 0 to 1, from -x over -y, +x and +y on.
 
-    The sectors are cut by the diamond |x| + |y| = 1 instead of the circle, which needs no
-    arctangent; the widest is twice as wide as the narrowest. The origin counts as the direction +x.
+    It runs evenly along the diamond |x| + |y| = 1 instead of the circle, which needs no arctangent.
+    The origin counts as the direction +x.
     """
     length = abs(x) + abs(y)
     if length == 0.0:
-        return bins // 2
+        return 0.5
     side = y / length
     turn = 1.0 + side if x >= 0.0 else (-1.0 - side if y < 0.0 else 3.0 - side)
     # turn runs from -1 (-x, coming from -y) over 0 (-y), 1 (+x), 2 (+y) to 3 (-x).
-    return min(int(np.floor((turn + 1.0) * 0.25 * bins)), bins - 1)
+    return float((turn + 1.0) * 0.25)
+
+
+@compiled
+def direction_bin(x: float, y: float, bins: int) -> int:
+    """Which of `bins` sectors around the origin the direction (x, y) lies in, from -x over -y on.
+
+    The sectors are cut by the diamond of `direction_turn`; the widest is twice as wide as the narrowest.
+    """
+    return min(int(np.floor(direction_turn(x, y) * bins)), bins - 1)

@@ -7,26 +7,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.compiled import compiled
-from pipeline.direction import direction_bin
+from pipeline.direction import direction_turn
 from pipeline.geometry import Float
-from pipeline.records import Float32
+from pipeline.records import Bool, Float32
 
 SECTORS = 72
-BIN = 0.5  # m
+RINGS = 48  # would reach to infinity
+HALF_WAY = 20.0  # m; half of them lie nearer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terrain:
     """Heights of the ground around the sensor, in the level sensor frame.
 
+    The nodes stand in the middle of the cells of a polar grid, whose rings grow wider with the distance as
+    its sectors do: 0.4 m at the sensor, 0.9 m at 10 m, 1.7 m at 20 m.
+
     Attributes:
-        height: shape (SECTORS, bins) [m]: the ground in each polar cell.
-        seen: shape (SECTORS, bins): whether a return of the ground lay in the cell; elsewhere the
-            height goes on from the nearest cell nearer to the sensor.
+        height: shape (SECTORS, rings) [m]: the ground at each node.
+        seen: shape (SECTORS, rings): whether returns of the ground lay in the cell; elsewhere the height
+            goes on smoothly from the cells around.
     """
 
     height: Float
-    seen: np.ndarray[tuple[int, int], np.dtype[np.bool_]]
+    seen: Bool
 
 
 def height_above(points: Float32, terrain: Terrain) -> Float32:
@@ -35,20 +39,82 @@ def height_above(points: Float32, terrain: Terrain) -> Float32:
 
 
 @compiled
+def ring_at(distance: float) -> float:
+    """How many rings lie within a distance from the sensor [m]; never as many as RINGS."""
+    return float(RINGS * distance / (distance + HALF_WAY))
+
+
+@compiled
+def ring_distance(ring: float) -> float:
+    """The distance from the sensor [m] within which so many rings lie, the inverse of `ring_at`."""
+    return float(HALF_WAY * ring / (RINGS - ring))
+
+
+@compiled
 def ground_at(height: Float, x: float, y: float) -> float:
-    """Height of the ground at a place [m] of the level sensor frame; `height` is a Terrain's."""
-    sector, position = direction_bin(x, y, SECTORS), np.sqrt(x * x + y * y) / BIN
-    # A cell's lowest return lies anywhere in it; interpolating between the centres of two
-    # cells keeps a slope from becoming a staircase.
-    bins = height.shape[1]
-    k = min(max(int(position - 0.5), 0), bins - 1)
-    f = min(max(position - 0.5 - k, 0.0), 1.0)
-    return float((1.0 - f) * height[sector, k] + f * height[sector, min(k + 1, bins - 1)])
+    """Height of the ground at a place [m] of the level sensor frame; `height` is a Terrain's.
+
+    Between nodes it is interpolated along both directions; beyond the last ring it stays as it is there.
+    """
+    sectors, rings = height.shape
+    turn = direction_turn(x, y) * sectors - 0.5
+    before = int(np.floor(turn))
+    f = turn - before
+    after = before + 1 if before + 1 < sectors else 0
+    before = before if before >= 0 else sectors - 1
+    ring = min(max(ring_at(np.sqrt(x * x + y * y)) - 0.5, 0.0), rings - 1.0)
+    k = int(ring)
+    g, beyond = ring - k, min(k + 1, rings - 1)
+    near = (1.0 - f) * height[before, k] + f * height[after, k]
+    far = (1.0 - f) * height[before, beyond] + f * height[after, beyond]
+    return float((1.0 - g) * near + g * far)
+
+
+@compiled
+def on_the_grid(points: Float32) -> tuple[Float32, Float32]:
+    """Of each point how many sectors and how many rings lie before it, both float32, shape (N,).
+
+    Two plain loops over plain rows, so that the processor takes eight points at once. What is not finite
+    or farther than a number can tell has no ring: NaN, or all RINGS of them.
+    """
+    n = points.shape[0]
+    xs, ys = np.empty(n, np.float32), np.empty(n, np.float32)
+    for i in range(n):
+        xs[i], ys[i] = points[i, 0], points[i, 1]
+    sector, ring = np.empty(n, np.float32), np.empty(n, np.float32)
+    one, quarter = np.float32(1.0), np.float32(0.25 * SECTORS)
+    rings, half_way = np.float32(RINGS), np.float32(HALF_WAY)
+    for i in range(n):
+        x, y = xs[i], ys[i]
+        side = y / (abs(x) + abs(y) + np.float32(1e-30))
+        behind = -one - side if y < np.float32(0.0) else np.float32(3.0) - side
+        turn = one + side if x >= np.float32(0.0) else behind  # see `direction_turn`
+        sector[i] = (turn + one) * quarter
+        distance = np.sqrt(x * x + y * y)
+        ring[i] = rings * distance / (distance + half_way)
+    return sector, ring
 
 
 @compiled
 def _height_above(points: Float32, height: Float) -> Float32:
+    sectors, rings = height.shape
+    h = height.astype(np.float32)
     above = np.empty(points.shape[0], np.float32)
+    sector, ring = on_the_grid(points)
+    half, one, last = np.float32(0.5), np.float32(1.0), np.float32(rings - 1)
     for i in range(points.shape[0]):
-        above[i] = points[i, 2] - ground_at(height, points[i, 0], points[i, 1])
+        if not ring[i] >= np.float32(0.0):
+            above[i] = np.nan
+            continue
+        turn = sector[i] + np.float32(sectors - 0.5)
+        around = np.int32(turn)
+        f = turn - np.float32(around)
+        before = around - sectors if around >= sectors else around
+        after = before + 1 if before + 1 < sectors else 0
+        out = min(max(ring[i] - half, np.float32(0.0)), last)
+        k = np.int32(out)
+        g, beyond = out - np.float32(k), min(k + 1, rings - 1)
+        near = (one - f) * h[before, k] + f * h[after, k]
+        far = (one - f) * h[before, beyond] + f * h[after, beyond]
+        above[i] = points[i, 2] - ((one - g) * near + g * far)
     return above
