@@ -18,7 +18,7 @@ from app.tally import Tally
 from app.version import version
 from pipeline.errors import SourceError
 from pipeline.evaluation import Evaluation, PathError, Rate, evaluate, path_error
-from pipeline.export import RunFiles
+from pipeline.export import RunFiles, terrain_text
 from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path, Truth, TruthTrees
@@ -145,7 +145,8 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
         scan_ms=stopwatch.scan_ms,
         stage_ms=stopwatch.stage_ms,
     )
-    files.finish(frame.trees, path, start_ns, record, state)
+    further = {"terrain.csv": terrain_text(mapper.height_map)}
+    files.finish(frame.trees, path, start_ns, record, state, further)
     return outcome
 
 

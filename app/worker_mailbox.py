@@ -14,7 +14,7 @@ from app.picture import picture_of
 from app.story.recent import Recent
 from app.wire import WireError, from_worker
 from app.worker_messages import FromWorker, Opened, Report, Shown
-from pipeline.records import Path
+from pipeline.records import HeightMap, Path
 
 # Faster pictures nobody sees; they would only fill the pipe and the browsers' sockets.
 _SHORTEST_PAUSE_S = 0.05
@@ -42,6 +42,7 @@ class Mailbox:
         self._closing = False
         self._sent_run = -1
         self._sent_path: Path | None = None
+        self._sent_ground: HeightMap | None = None
         self._sent_at = -_SHORTEST_PAUSE_S
         self._report: Report | None = None
         self._refused = ""
@@ -81,7 +82,7 @@ class Mailbox:
             return [self._channel.encode(self._made_ready(message))]
         except WireError as error:
             if isinstance(message, Shown):
-                self._sent_path = None  # what was in it did not arrive
+                self._sent_path = self._sent_ground = None  # what was in it did not arrive
             self._refused = f"a picture could not be shown: {error}"
             return [] if self._report is None else [self._channel.encode(self._with_refusal(self._report))]
 
@@ -119,8 +120,12 @@ class Mailbox:
         """The same picture with the path cut to what was not sent before."""
         old, self._sent_path = self._sent_path, shown.path
         start = 0 if old is None or shown.run != self._sent_run else rows_in_common(old, shown.path)
-        self._sent_run = shown.run
         picture = picture_of(shown.frame)
+        if picture.ground is self._sent_ground and shown.run == self._sent_run:
+            picture = replace(picture, ground=None)
+        else:
+            self._sent_ground = picture.ground
+        self._sent_run = shown.run
         return Shown(shown.run, shown.time_s, picture, start, rows_from(shown.path, start))
 
 

@@ -8,14 +8,14 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
 from pipeline.geometry import Float
-from pipeline.records import Frame, Path, Trees, Verdict
+from pipeline.records import Frame, HeightMap, Path, Trees, Verdict
 
 TREE_COLUMNS = (
     "tree",
@@ -32,6 +32,7 @@ TREE_COLUMNS = (
     "last_seen_s",
 )
 PATH_COLUMNS = ("t_s", "x_m", "y_m", "yaw_rad", "sigma_xy_m")
+TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
 DETECTION_COLUMNS = (
     "scan",
     "t_s",
@@ -84,6 +85,21 @@ def path_rows(path: Path, start_ns: int) -> list[list[str]]:
             path.stamp_ns, path.x, path.y, path.yaw, path.sigma_xy, strict=True
         )
     ]
+
+
+def terrain_text(ground: HeightMap) -> str:
+    """The file terrain.csv."""
+    return csv_text(TERRAIN_COLUMNS, terrain_rows(ground))
+
+
+def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
+    """The known cells of the height map as rows of TERRAIN_COLUMNS, from west to east; x and y are their
+    middles."""
+    order = np.lexsort((ground.place[:, 1], ground.place[:, 0]))
+    middle = (ground.place[order] + 0.5) * ground.cell
+    columns = (middle, ground.height[order], ground.sigma[order], ground.views[order])
+    for (x, y), z, sigma, views in zip(*columns, strict=True):
+        yield [_number(x, 3), _number(y, 3), _number(z, 3), _number(sigma, 3), str(views)]
 
 
 def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:

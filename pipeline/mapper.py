@@ -14,12 +14,14 @@ from pipeline.clustering import cluster
 from pipeline.detection import detections, judge
 from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
+from pipeline.height_map import HeightMapper, HeightMapState
 from pipeline.parameters import Parameters
 from pipeline.records import (
     Clusters,
     Detections,
     Float32,
     Frame,
+    HeightMap,
     Int,
     Int32,
     Path,
@@ -52,6 +54,7 @@ class MapperState:
 
     slam: SlamState
     gathering: GatheringState
+    ground: HeightMapState
     tracks: TrackTable
     next_number: int
     odometry: Pose2 | None
@@ -86,6 +89,7 @@ class Mapper:
         self._watch = watch
         self._slam = FastSlam(parameters.slam, seed)
         self._gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=forest)
+        self._ground = HeightMapper()
         self._tracker = Tracker(parameters.tracking)
         self._odometry: Pose2 | None = None
         self._path = _PathColumns()
@@ -107,6 +111,11 @@ class Mapper:
         """The path so far, one row a scan. A scan may change its past: it is that of the particle which
         explains the scans best now, as the trees are."""
         return self._path.columns(self._slam.path())
+
+    @property
+    def height_map(self) -> HeightMap:
+        """The ground as all scans so far saw it."""
+        return self._ground.record()
 
     def process(self, step: Step) -> Frame:
         """Map one scan."""
@@ -141,6 +150,10 @@ class Mapper:
                 columns = self._gathering.columns
                 self._tracker.judge(step.scan.stamp_ns, columns)
 
+        if seen.above is not None and self._is_gathered(step.index):
+            with watch("height map"):
+                self._ground.add(seen.above[2], estimate.T_map_base, seen.sensor_offset)
+
         trees = self._tracker.trees()
 
         self._path.append(step.scan.stamp_ns, estimate)
@@ -164,6 +177,10 @@ class Mapper:
             },
             warnings=step.warnings,
             columns=columns,
+            ground=None if p.ground.method == "none" else self._ground.state.record,
+            base_z=(self._ground.state.sensor_z or 0.0) - float(seen.sensor_offset[2])
+            if self._ground.state.scans
+            else 0.0,
         )
 
     def _perceive(self, step: Step) -> _Seen:
@@ -259,6 +276,7 @@ class Mapper:
         return MapperState(
             self._slam.state.copy(),
             self._gathering.snapshot(),
+            self._ground.state,
             self._tracker.tracks.copy(),
             self._tracker.next_number,
             self._odometry,
@@ -283,6 +301,7 @@ class Mapper:
         """Go back to a snapshot of this mapper's own past; the state itself is left untouched."""
         self._slam.state = state.slam.copy()
         self._gathering.restore(state.gathering)
+        self._ground.state = state.ground
         self._tracker.tracks = state.tracks.copy()
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry

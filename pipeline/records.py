@@ -217,6 +217,25 @@ class Columns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class HeightMap:
+    """The ground as all scans saw it; columns of length K, one a known cell, in the frame of the map.
+
+    Attributes:
+        cell: Side of the square cells [m].
+        place: int32, shape (K, 2): the cell spans from place * cell to (place + 1) * cell [m].
+        height: float32 [m], above the ground where the run began.
+        sigma: float32 [m], how far one view's height lies from it.
+        views: int32, how many scans saw it.
+    """
+
+    cell: float
+    place: Int32
+    height: Float32
+    sigma: Float32
+    views: Int32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
     """What SLAM believes after a scan.
 
@@ -277,6 +296,9 @@ class Frame:
         counts: How many points each stage let pass and how many it refused, by name.
         warnings: For people.
         columns: What was gathered over the scans, None where nothing is.
+        ground: The height map, made anew every some scans; None where no ground is looked for, or where it
+            is the same as in the picture before.
+        base_z: Height of the base in the height map [m].
     """
 
     index: int
@@ -293,6 +315,8 @@ class Frame:
     counts: Mapping[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     columns: Columns | None = None
+    ground: HeightMap | None = None
+    base_z: float = 0.0
 
     @property
     def health(self) -> Health:

@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.gathering import GatheringState, PackedMemory, no_columns
 from pipeline.geometry import Float, Pose2
+from pipeline.height_map import PackedHeightMap
 from pipeline.mapper import Mapper, MapperState
 from pipeline.parameters import Parameters
 from pipeline.records import Columns, Int, Trees
@@ -25,6 +26,7 @@ class SavedMap:
     slam: SlamState
     memory: PackedMemory
     columns: Columns
+    ground: PackedHeightMap
     tracks: TrackTable
     next_number: int
     odometry: Pose2 | None
@@ -39,6 +41,7 @@ class SavedMap:
             state.slam,
             PackedMemory.of(state.gathering.folded()),
             state.gathering.columns,
+            PackedHeightMap.of(state.ground),
             state.tracks,
             state.next_number,
             state.odometry,
@@ -64,7 +67,9 @@ class SavedMap:
         ):
             raise ValueError("the numbers of the trees are out of order")
         gathering = GatheringState(self.memory.checked(), (), self.columns)
-        return MapperState(self.slam, gathering, self.tracks, self.next_number, self.odometry, n)
+        return MapperState(
+            self.slam, gathering, self.ground.unpacked(), self.tracks, self.next_number, self.odometry, n
+        )
 
     def trees(self, parameters: Parameters) -> Trees:
         """The trees of the map, by these parameters."""

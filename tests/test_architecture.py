@@ -40,6 +40,7 @@ STAGES = (
     "detection",
     "stems",
     "gathering",
+    "height_map",
     "slam",
     "relocalisation",
     "tracking",

@@ -54,7 +54,7 @@ def trend(lowest: Float, slope: float) -> Float:
             b[1] += w * x * z
             b[2] += w * y * z
         A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
-        plane = np.linalg.solve(A, b)
+        plane[:] = np.linalg.solve(A, b)
     steep = np.sqrt(plane[1] ** 2 + plane[2] ** 2)
     if steep > slope:
         plane[1] *= slope / steep
