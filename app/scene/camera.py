@@ -30,19 +30,19 @@ class Follower:
         server.initial_camera.position = BEHIND
         server.initial_camera.look_at = (0.0, 0.0, 0.5)
 
-    def show(self, pose: Pose2, follow: bool) -> None:
-        """Bring the robot at this pose to the origin, if the picture is to follow it."""
+    def show(self, pose: Pose2, z: float, follow: bool) -> None:
+        """Bring the robot at this pose and height [m] to the origin, if the picture is to follow it."""
         if follow:
-            self._world.position = (-pose.x, -pose.y, 0.0)
+            self._world.position = (-pose.x, -pose.y, -z)
 
     @property
     def shift(self) -> NDArray[np.float64]:
         """Where the origin of the map stands in viser's world, shape (3,) [m]."""
         return np.array(self._world.position, dtype=np.float64)
 
-    def look(self, client: viser.ClientHandle, pose: Pose2, *, from_above: bool) -> None:
-        """Turn one browser's camera to the robot at this pose."""
-        target = np.array([pose.x, pose.y, 0.0]) + self._world.position
+    def look(self, client: viser.ClientHandle, pose: Pose2, z: float, *, from_above: bool) -> None:
+        """Turn one browser's camera to the robot at this pose and height [m]."""
+        target = np.array([pose.x, pose.y, z]) + self._world.position
         with client.atomic():
             client.camera.up_direction = np.array([0.0, 0.0, 1.0])
             client.camera.position = target + (ABOVE if from_above else BEHIND)

@@ -12,8 +12,6 @@ from pipeline.records import HeightMap
 Float = NDArray[np.float64]
 
 MOST_CELLS = 40_000  # that one mesh shows; above, cells are joined two by two
-SUN = np.array([-0.4, -0.5, 0.77])  # where the shading's light comes from
-LOW, HIGH = np.array([74.0, 70.0, 66.0]), np.array([150.0, 142.0, 124.0])  # colours of valley and crest
 NOTHING = np.full((1, 1), np.nan)
 
 
@@ -24,8 +22,17 @@ class GroundNode:
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._scene = scene
-        self._node: viser.GlbHandle | None = None
+        self._node = scene.add_mesh_simple(
+            "/world/surface",
+            np.eye(3, dtype=np.float32),
+            np.array([[0, 1, 2]], dtype=np.uint32),
+            color=colours.GROUND,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=False,
+        )
+        self._faces = 0
         self._shown: HeightMap | None = None
         self._raster, self._low, self._cell = NOTHING, np.zeros(2), 1.0
         self._visible = True
@@ -38,8 +45,8 @@ class GroundNode:
     @visible.setter
     def visible(self, visible: bool) -> None:
         self._visible = visible
-        if self._node is not None and self._node.visible != visible:
-            self._node.visible = visible
+        if self._node.visible != (visible and self._faces > 0):
+            self._node.visible = visible and self._faces > 0
 
     @property
     def area(self) -> float:
@@ -52,17 +59,13 @@ class GroundNode:
             return False
         self._shown = ground
         self._raster, self._low, self._cell = raster(ground)
-        vertices, faces, shades = surface(self._raster, self._low, self._cell)
-        if len(faces) == 0:
-            if self._node is not None:
-                self._node.remove()
-                self._node = None
-            return True
-        # A node of the same name takes the place of the one before.
-        self._node = self._scene.add_mesh_trimesh(
-            "/world/ground", mesh=_painted(vertices, faces, shades), visible=self._visible,
-            cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+        vertices, faces = surface(self._raster, self._low, self._cell)
+        self._faces = len(faces)
+        if self._faces:
+            self._node.vertices = vertices
+            if not np.array_equal(faces, self._node.faces):
+                self._node.faces = faces
+        self.visible = self._visible
         return True
 
     def heights(self, places: NDArray[np.floating], otherwise: float) -> Float:
@@ -90,17 +93,13 @@ def raster(ground: HeightMap) -> tuple[Float, Float, float]:
     return grid, low * cell, cell
 
 
-def surface(
-    grid: Float, low: Float, cell: float
-) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.uint8]]:
-    """A mesh through the middles of the known cells: vertices (V, 3) [m], faces (F, 3), colours (V, 3).
+def surface(grid: Float, low: Float, cell: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """A mesh through the middles of the known cells: vertices (V, 3) [m] and faces (F, 3).
 
-    A square of four known middles becomes two triangles. The colour follows the height and the slope.
+    A square of four known middles becomes two triangles. The scene's light shades them by their slope.
     """
     known = np.isfinite(grid)
     square = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
-    if not square.any():
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), np.zeros((0, 3), np.uint8)
     used = np.zeros_like(known)
     i, j = np.nonzero(square)
     for di, dj in ((0, 0), (1, 0), (0, 1), (1, 1)):
@@ -111,16 +110,4 @@ def surface(
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     at = np.stack(np.nonzero(used), axis=1)
     vertices = np.column_stack([low + (at + 0.5) * cell, grid[used]])
-    return vertices.astype(np.float32), faces.astype(np.uint32), _shades(grid, cell)[used]
-
-
-def _shades(grid: Float, cell: float) -> NDArray[np.uint8]:
-    """Earth colours: lighter with the height, and shaded as by a low sun."""
-    filled = np.where(np.isfinite(grid), grid, np.nanmedian(grid))
-    gx, gy = (np.gradient(filled, cell, axis=axis) if filled.shape[axis] > 1 else 0.0 * filled for axis in (0, 1))
-    light = (SUN[2] - SUN[0] * gx - SUN[1] * gy) / np.sqrt(1.0 + gx**2 + gy**2)
-    low, high = np.nanquantile(grid, [0.02, 0.98])
-    part = np.clip((filled - low) / max(high - low, 0.5), 0.0, 1.0)[..., None]
-    rgb = (LOW + part * (HIGH - LOW)) * np.clip(0.35 + 0.85 * light, 0.3, 1.2)[..., None]
-    shade: NDArray[np.uint8] = np.clip(rgb, 0, 255).astype(np.uint8)
-    return shade
+    return vertices.astype(np.float32), faces.astype(np.uint32)

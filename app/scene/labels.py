@@ -85,7 +85,7 @@ def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Lab
     clusters, pose = frame.clusters, frame.estimate.T_map_base
     base = clusters.centroid + frame.sensor_offset
     places = pose.apply(base[:, :2])
-    tops = base[:, 2] + 0.5 * shown_height(clusters.extent[:, 2]) + 0.1
+    tops = frame.base_z + base[:, 2] + 0.5 * shown_height(clusters.extent[:, 2]) + 0.1
     order = np.lexsort((np.linalg.norm(base[:, :2], axis=1), clusters.verdict != Verdict.TREE))
     return [
         Label(int(numbers[k]), text, (float(places[k, 0]), float(places[k, 1]), float(tops[k])))

@@ -20,12 +20,15 @@ class Line:
         self._scene, self._name, self._height = scene, name, height
         self._colour = colours.of_lines(np.array(colour, dtype=np.uint8))
         self._chunks: list[viser.LineSegmentsHandle] = []
-        self._sent: Float = np.zeros((0, 2))
+        self._sent: Float = np.zeros((0, 3))
         self._visible = True
 
-    def show(self, points: Float) -> None:
-        """Show the line through points of shape (N, 2) [m]."""
-        points = np.array(points, dtype=np.float64).reshape(-1, 2)
+    def show(self, places: Float, ground: Float | None = None) -> None:
+        """Show the line through places of shape (N, 2) [m], above the ground's heights there, (N,) [m]."""
+        places = np.array(places, dtype=np.float64).reshape(-1, 2)
+        points = np.column_stack(
+            [places, self._height + (np.zeros(len(places)) if ground is None else ground)]
+        )
         shared = min(len(points), len(self._sent))
         changed = np.nonzero(np.any(points[:shared] != self._sent[:shared], axis=1))[0]
         first = int(changed[0]) if len(changed) else shared
@@ -51,7 +54,7 @@ class Line:
             chunk.visible = visible
 
     def _send(self, number: int, points: Float) -> None:
-        segments = meshes.polyline(points, self._height)
+        segments = meshes.polyline(points)
         if number < len(self._chunks):
             self._chunks[number].points = segments
             self._chunks[number].visible = self._visible
@@ -83,11 +86,14 @@ class Circles:
         )
         self._wanted, self._count = True, 0
 
-    def show(self, centres: Float, radii: Float, each: colours.Colours) -> None:
-        """Show circles at centres (N, 2) [m] with radii (N,) [m] in N colours."""
+    def show(self, centres: Float, radii: Float, each: colours.Colours, ground: Float | None = None) -> None:
+        """Show circles at centres (N, 2) [m] with radii (N,) [m] in N colours, over the ground of heights (N,)
+        [m]."""
         self._count = len(centres)
         if self._count:
-            self._node.points = meshes.circles(centres, radii, self._height)
+            self._node.points = meshes.circles(
+                centres, radii, self._height + (np.zeros(len(centres)) if ground is None else ground)
+            )
             self._node.colors = np.repeat(colours.of_lines(each), 2 * meshes.SIDES, axis=0).reshape(-1, 2, 3)
         self.wanted = self._wanted
 

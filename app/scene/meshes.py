@@ -25,13 +25,15 @@ def cylinder(sides: int = 20) -> Mesh:
     return vertices.astype(np.float32), np.array(faces, dtype=np.uint32)
 
 
-def circles(centres: NDArray[np.floating], radii: NDArray[np.floating], z: float) -> NDArray[np.float32]:
+def circles(
+    centres: NDArray[np.floating], radii: NDArray[np.floating], z: NDArray[np.floating]
+) -> NDArray[np.float32]:
     """Circles as segments, `SIDES` for each.
 
     Args:
         centres: shape (N, 2) [m].
         radii: shape (N,) [m].
-        z: Height [m].
+        z: Heights, shape (N,) [m].
 
     Returns:
         shape (N * SIDES, 2, 3) [m].
@@ -39,11 +41,11 @@ def circles(centres: NDArray[np.floating], radii: NDArray[np.floating], z: float
     angle = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     xy = centres[:, None, :] + radii[:, None, None] * rim[None, :, :]
-    xyz = np.concatenate([xy, np.full((*xy.shape[:2], 1), z)], axis=2)
+    xyz = np.concatenate([xy, np.broadcast_to(z[:, None, None], (*xy.shape[:2], 1))], axis=2)
     return np.stack([xyz[:, :-1], xyz[:, 1:]], axis=2).reshape(-1, 2, 3).astype(np.float32)
 
 
-def polyline(points: NDArray[np.floating], z: float) -> NDArray[np.float32]:
-    """Segments that join points of shape (N, 2) at height z [m], shape (N - 1, 2, 3)."""
-    xyz = np.column_stack([points, np.full(len(points), z)]).astype(np.float32)
+def polyline(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Segments that join points of shape (N, 3), shape (N - 1, 2, 3)."""
+    xyz = points.astype(np.float32)
     return np.stack([xyz[:-1], xyz[1:]], axis=1)

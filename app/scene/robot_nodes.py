@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from app.scene import colours
 from app.scene.cloud import Cloud
+from app.scene.ground_node import GroundNode
 from app.scene.lines import Line
 from app.scene.view import View
 from pipeline.geometry import Pose2
@@ -16,6 +17,7 @@ from pipeline.records import Frame
 Float = NDArray[np.float64]
 
 ROBOT = "/world/robot"
+STEP = 0.05  # m
 
 
 class RobotNodes:
@@ -29,23 +31,27 @@ class RobotNodes:
         self._odometry = Line(scene, "/world/odometry", colours.ODOMETRY, 0.03)
         self._dead_reckoning: list[tuple[int, float, float]] = []
         self._start = Pose2()
+        self._ground: GroundNode | None = None
 
-    def show(self, frame: Frame, path: Float, view: View) -> None:
+    def show(self, frame: Frame, path: Float, view: View, ground: GroundNode) -> None:
         """Show a new pose.
 
         Args:
             frame: The scan's results.
             path: shape (N, 2) [m], all poses so far in the frame of the map.
             view: What is to be seen.
+            ground: On which all of it stands.
         """
+        self._ground = ground
         pose = frame.estimate.T_map_base
-        self._frame.position = (pose.x, pose.y, 0.0)
+        self._frame.position = (pose.x, pose.y, frame.base_z)
         self._frame.wxyz = (np.cos(pose.yaw / 2), 0.0, 0.0, np.sin(pose.yaw / 2))
         particles = frame.estimate.particles
         self._particles.show(
-            np.column_stack([particles[:, :2], np.full(len(particles), 0.05)]), colours.PARTICLES
+            np.column_stack([particles[:, :2], np.full(len(particles), frame.base_z + 0.05)]),
+            colours.PARTICLES,
         )
-        self._path.show(path)
+        self._path.show(path, self._stepped(path))
         self._follow_odometry(frame)
         self.repaint(view)
 
@@ -55,7 +61,14 @@ class RobotNodes:
         self._path.visible = view.layers["path"]
         self._odometry.visible = view.layers["odometry"]
         if self._odometry.visible:
-            self._odometry.show(np.array(self._dead_reckoning)[:, 1:])
+            places = np.array(self._dead_reckoning)[:, 1:]
+            self._odometry.show(places, self._stepped(places))
+
+    def _stepped(self, places: Float) -> Float:
+        """Heights of the ground, in steps, so that a line is not sent again for a centimetre."""
+        if self._ground is None:
+            return np.zeros(len(places))
+        return np.round(self._ground.heights(places, 0.0) / STEP) * STEP
 
     def _follow_odometry(self, frame: Frame) -> None:
         while self._dead_reckoning and self._dead_reckoning[-1][0] >= frame.index:  # played back

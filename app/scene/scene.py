@@ -177,20 +177,25 @@ class Scene:
     def _pose(self) -> Pose2:
         return Pose2() if self._frame is None else self._frame.estimate.T_map_base
 
+    @property
+    def _base_z(self) -> float:
+        return 0.0 if self._frame is None else self._frame.base_z
+
     def _show_frame(self) -> None:
         if self._frame is None:
             return
         with self._server.atomic():  # or the points would run ahead of the robot
-            self._follower.show(self._pose, self._view.follow)
-            self._robot.show(self._frame, self._path, self._view)
-            self._scan.show(self._frame, self._view)
+            self._follower.show(self._pose, self._base_z, self._view.follow)
+            # First, because all else stands on its ground.
             self._map.show(self._frame, self._selected, self._ring, self._view)
+            self._robot.show(self._frame, self._path, self._view, self._map.ground)
+            self._scan.show(self._frame, self._view)
 
     def _repaint(self) -> None:
         if self._frame is None:
             return
         with self._server.atomic():
-            self._follower.show(self._pose, self._view.follow)
+            self._follower.show(self._pose, self._base_z, self._view.follow)
             self._robot.repaint(self._view)
             self._scan.repaint(self._frame, self._view)
             self._map.repaint(self._frame, self._selected, self._ring, self._view)
@@ -228,7 +233,7 @@ class Scene:
         self._cross(self._aim, name, client)
 
     def _aim(self, name: str, client: viser.ClientHandle) -> None:
-        self._follower.look(client, self._pose, from_above=name == "top")
+        self._follower.look(client, self._pose, self._base_z, from_above=name == "top")
 
     def _put_back(self) -> None:
         self.show_parameters(self._parameters, self._preset)

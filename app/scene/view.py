@@ -11,6 +11,7 @@ from pipeline.errors import ParameterError
 COLOUR_BY = ("verdict", "stage", "cluster", "height", "eccentricity")
 LABEL_BY = ("eccentricity", "verdict", "DBH", "none")
 LAYERS = {
+    "ground": "Ground",
     "raw": "Raw scan",
     "filtered": "Filtered",
     "clusters": "Clusters",
