@@ -19,9 +19,7 @@ def make_ground(side: int, slope: float = 0.2) -> HeightMap:
     i, j = (axis.ravel() - side // 2 for axis in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
     place = np.stack([i, j], axis=1).astype(np.int32)
     height = (slope * 0.5 * (i + 0.5)).astype(np.float32)
-    return HeightMap(
-        0.5, place, height, np.full(len(i), 0.03, np.float32), np.ones(len(i), np.int32)
-    )
+    return HeightMap(0.5, place, height, np.full(len(i), 0.03, np.float32), np.ones(len(i), np.int32))
 
 
 def node(scene: Scene, name: str):
