@@ -87,8 +87,8 @@ class Circles:
         self._wanted, self._count = True, 0
 
     def show(self, centres: Float, radii: Float, each: colours.Colours, ground: Float | None = None) -> None:
-        """Show circles at centres (N, 2) [m] with radii (N,) [m] in N colours, over the ground of heights (N,)
-        [m]."""
+        """Show circles at centres (N, 2) [m] with radii (N,) [m] in N colours, above the ground at heights
+        (N,) [m]."""
         self._count = len(centres)
         if self._count:
             self._node.points = meshes.circles(

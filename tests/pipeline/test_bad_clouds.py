@@ -15,8 +15,8 @@ RNG = np.random.default_rng(7)
 FOREST = preset("forest")
 
 
-def _grid(*axes):
-    return np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=1).astype(np.float32)
+def _grid(x, y, z):
+    return np.stack([axis.ravel() for axis in np.meshgrid(x, y, z)], axis=1).astype(np.float32)
 
 
 WALL = _grid([6.0], np.arange(-8.0, 8.0, 0.05), np.arange(-0.8, 3.0, 0.1))
@@ -51,11 +51,10 @@ def _steps(points, scans):
 def test_no_tree_is_invented_and_no_number_is_lost(name):
     points = CLOUDS[name]
     run = mapper()
-    for step in _steps(points, 12):
-        frame = run.process(step)
+    for frame in [run.process(step) for step in _steps(points, 12)]:
         assert np.all(np.isfinite(frame.estimate.T_map_base.as_array()))
         assert np.isfinite(frame.base_z)
-    assert not frame.trees.confirmed.any()
+        assert not frame.trees.confirmed.any()
     assert np.all(np.isfinite(run.height_map.height))
     above = height_above(points, find_terrain(points, FOREST.ground))
     assert above.shape == (len(points),)

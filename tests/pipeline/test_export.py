@@ -21,12 +21,13 @@ from pipeline.export import (
     detection_rows,
     geojson,
     path_rows,
+    terrain_text,
     tree_rows,
 )
 from pipeline.geometry import Pose2
 from pipeline.mapper import Mapper
 from pipeline.parameters import preset
-from pipeline.records import Path
+from pipeline.records import HeightMap, Path
 from tests.pipeline.strategies import LAW, SENSOR, arc, step, trees
 
 NAMES = {"trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json", "state.zip"}
@@ -222,3 +223,16 @@ def test_a_file_in_the_place_of_the_folder_is_an_os_error(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OSError, match="file"):
         RunFiles(tmp_path / "file")
+
+
+def test_the_ground_is_a_table_of_its_known_cells():
+    ground = HeightMap(
+        cell=0.5,
+        place=np.array([[1, -1], [-3, 4]], np.int32),
+        height=np.array([0.25, -1.0], np.float32),
+        sigma=np.array([0.04, 0.05], np.float32),
+        views=np.array([3, 12], np.int32),
+    )
+    assert terrain_text(ground) == (
+        "x_m,y_m,z_m,sigma_m,views\n-1.250,2.250,-1.000,0.050,12\n0.750,-0.250,0.250,0.040,3\n"
+    )

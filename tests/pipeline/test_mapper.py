@@ -132,7 +132,7 @@ def test_the_stages_are_watched_in_order():
     m = Mapper(preset("forest"), sensor=d.sensor, T_base_lidar=d.T_base_lidar, seed=0, watch=Watch)
     m.process(run()[0][0])
     assert entered[0] == "acquisition"
-    assert entered[-3:] == ["slam", "tracking", "gathering"]
+    assert entered[-4:] == ["slam", "tracking", "gathering", "height map"]
     assert len(entered) == len(set(entered))
 
 
