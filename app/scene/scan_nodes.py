@@ -119,7 +119,7 @@ class ScanNodes:
         radius = np.fmax(width, 0.06) + 0.03  # fmax: a ready stem has no extent, a cluster may have no circle
         foot = np.column_stack([c.centroid[:, :2], c.centroid[:, 2] - 0.5 * height])
         self._markers.show(foot, np.column_stack([radius, radius, height]), colours.by_verdict(c.verdict))
-        low = foot + frame.sensor_offset
+        low = foot + frame.sensor_offset + np.array([0.0, 0.0, frame.base_z])
         low[:, :2] = frame.estimate.T_map_base.apply(low[:, :2])
         self._axes = (low, low + np.column_stack([np.zeros((len(height), 2)), height]), radius)
 

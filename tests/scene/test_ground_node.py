@@ -66,9 +66,9 @@ def test_trees_and_robot_stand_on_the_ground_and_the_surface_is_sent_once(scene:
 
 def test_the_switch_hides_the_surface(scene: Scene):
     scene.show(dataclasses.replace(make_frame(0), ground=make_ground(40)), PATH[:1])
-    scene._choose("ground", False)
+    scene.choose("ground", False)
     assert not node(scene, "/world/surface").visible
-    scene._choose("ground", True)
+    scene.choose("ground", True)
     assert node(scene, "/world/surface").visible
 
 
