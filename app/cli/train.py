@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 HELP = "make the decision trees anew that say what is a tree"
 SCENES = "stand,slope,dense"
 SEEDS = "11,12,13,14"
+STREETS = 120
 REACH = 25.0  # m, of labelled scans
 
 
@@ -30,6 +31,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--scenes", default=SCENES, help=f"simulated scenes (default: {SCENES})")
     parser.add_argument("--seeds", default=SEEDS, help=f"of the simulated scenes (default: {SEEDS})")
+    parser.add_argument(
+        "--streets", type=int, default=STREETS, help=f"simulated streets (default: {STREETS})"
+    )
     parser.add_argument(
         "--every", type=int, default=3, help="take every so many-th simulated scan (default: 3)"
     )
@@ -53,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise StemmapError("there is nothing to learn from", remedy="Name scenes, or folders with labels")
     for line in leave_one_out(examples, preset("forest").gathering.tree_share):
         print(line)
-    scenes = sorted({e.scene if e.simulated else Path(e.scene).name for e in examples})
+    scenes = _scenes(arguments)
     grown = {kind: grow(examples, kind) for kind in PLANS if can_grow(examples, kind)}
     text = json.dumps(as_json(grown, scenes), separators=(",", ":"))
     with write_beside(arguments.out) as file:
@@ -62,11 +66,17 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _scenes(arguments: argparse.Namespace) -> list[str]:
+    """What was learned from, in a few lines of the JSON."""
+    names = [f"sim:{name}, seeds {arguments.seeds}" for name in arguments.scenes.split(",") if name]
+    return [*names, f"{arguments.streets} streets and parks", *(folder.name for folder in arguments.labelled)]
+
+
 def _examples(arguments: argparse.Namespace) -> list[Examples]:
     from functools import partial
 
     from app.training.keeping import kept_or_made
-    from app.training.scenes import labelled_examples, simulated_examples
+    from app.training.scenes import labelled_examples, simulated_examples, street_examples
     from pipeline.parameters import preset
 
     forest = preset("forest")
@@ -78,6 +88,11 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
             uri = f"sim:{name}?seed={seed}&odometry=exact&sigma={sigma[n % 3]}"
             make = partial(simulated_examples, uri, forest, arguments.every)
             found += kept_or_made(arguments.examples, uri, make)
+    for seed in range(arguments.streets):
+        # Parks seen one way teach the all-around sensors too.
+        for one_way in (False, True):
+            make = partial(street_examples, seed, one_way, forest, REACH)
+            found += kept_or_made(arguments.examples, f"{'park' if one_way else 'street'} {seed}", make)
     for folder in arguments.labelled:
         found += kept_or_made(
             arguments.examples, str(folder), partial(labelled_examples, folder, forest, REACH)

@@ -40,10 +40,10 @@ class Plan:
     upright: float = 1.0
 
 
-# A sensor that looks one way sees a trunk from one side and no higher than its field of view; examples
-# that were driven around teach it to expect more (docs/trunks.md has the figures).
+# A sensor that looks one way sees a trunk from one side and no higher than its field of view: trained on
+# simulated parks too, it finds fewer real ones (docs/trunks.md has the figures).
 PLANS = {
-    ALL_AROUND: Plan("best", 16, 9, 3, 0.3, same=0.3, other=0.1, simulated=0.1, upright=5.0),
+    ALL_AROUND: Plan("best", 24, 12, 20, 0.3, same=5.0, other=1.0, simulated=1.0, upright=2.0),
     ONE_WAY: Plan("extra", 40, 9, 3, 0.5, same=1.0, other=1.0, simulated=0.0),
 }
 
@@ -90,7 +90,7 @@ def grow(examples: list[Examples], kind: str, seed: int = 0) -> Grown:
     plan = PLANS[kind]
     figures = np.concatenate([e.figures for e in examples]).astype(np.float32)
     label = np.concatenate([e.label for e in examples])
-    weight = np.concatenate([np.full(len(e.label), _weight(e, kind, plan)) for e in examples])
+    weight = np.concatenate([np.full(len(e.label), float(_weight(e, kind, plan))) for e in examples])
     weight[np.isin(label, UPRIGHT)] *= plan.upright
     used = (label != DOUBTFUL) & (weight > 0.0)
     figures, label, weight = figures[used], label[used], weight[used]

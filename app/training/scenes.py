@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 
 from app.training.growing import DOUBTFUL, Examples
+from app.training.streets import simulate_street
 from pipeline import ground
 from pipeline.acquisition import acquire
 from pipeline.gathering import Gathering, View, steepest_by_direction
 from pipeline.gathering.forest import CLASSES, Forest
-from pipeline.geometry import Pose2
+from pipeline.geometry import Pose2, Pose3
 from pipeline.parameters import Parameters
-from pipeline.records import Columns, Float, Int, TruthTrees, Verdict
+from pipeline.records import Columns, Float, Int, Sensor, Step, TruthTrees, Verdict
 from pipeline.sources import open_source
 from pipeline.steps import steps
 from pipeline.terrain import height_above
@@ -29,6 +30,7 @@ MARKS = (
     40,
     100,
 )  # scans after which examples are taken too: a map is judged from its first scan on
+LEAST_RETURNS = 30  # of a trunk that counts as one
 SAME, DOUBT = 0.3, 0.6  # m: a column so near to a trunk is it; up to there nobody can tell
 KIND_OF_LABEL = {71: Verdict.TREE, 80: Verdict.POLE, 81: Verdict.POLE, 30: Verdict.PERSON, 70: Verdict.BUSH,
                  50: Verdict.WALL, 51: Verdict.WALL, 52: Verdict.WALL}  # fmt: skip
@@ -38,31 +40,49 @@ _VERDICT_OF_KIND = {
 }  # fmt: skip
 
 
-def gathered(uri: str, parameters: Parameters, *, every: int, static: bool) -> Iterator[Columns]:
+def gathered(
+    run: Iterable[Step], sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, every: int
+) -> Iterator[Columns]:
     """The columns of a run mapped with the poses it tells, after each of MARKS scans and at the end."""
     taken = 0
-    with closing(open_source(uri)) as source:
-        sensor, T_base_lidar = source.description.sensor, source.description.T_base_lidar
-        gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=_no_forest())
-        before = b""
-        for step in steps(source.records(), odometry="static" if static else "auto"):
-            repeated = step.scan.points.tobytes()
-            if step.index % every or repeated == before:
-                continue
-            before = repeated
-            raw, offset = acquire(step, T_base_lidar, parameters.acquisition)
-            terrain = ground.find_terrain(raw, parameters.ground)
-            height = height_above(raw, terrain)
-            free = clear_range(raw, ground.in_band(raw, height, parameters.ground), offset)
-            steepest = steepest_by_direction(raw, offset, sensor.rings > 0)
-            pose = step.T_odom_base or Pose2()
-            view = View(pose, offset, free, steepest, terrain.height)
-            gathering.add(raw, height, step.index, view)
-            taken += 1
-            if taken in MARKS:
-                yield gathering.columns
+    gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=_no_forest())
+    before = b""
+    for step in run:
+        repeated = step.scan.points.tobytes()
+        if step.index % every or repeated == before:
+            continue
+        before = repeated
+        raw, offset = acquire(step, T_base_lidar, parameters.acquisition)
+        terrain = ground.find_terrain(raw, parameters.ground)
+        height = height_above(raw, terrain)
+        free = clear_range(raw, ground.in_band(raw, height, parameters.ground), offset)
+        steepest = steepest_by_direction(raw, offset, sensor.rings > 0)
+        view = View(step.T_odom_base or Pose2(), offset, free, steepest, terrain.height)
+        gathering.add(raw, height, step.index, view)
+        taken += 1
+        if taken in MARKS:
+            yield gathering.columns
     if taken not in MARKS:
         yield gathering.columns
+
+
+def _gathered_from(uri: str, parameters: Parameters, *, every: int, static: bool) -> Iterator[Columns]:
+    with closing(open_source(uri)) as source:
+        about = source.description
+        run = steps(source.records(), odometry="static" if static else "auto")
+        yield from gathered(run, about.sensor, about.T_base_lidar, parameters, every)
+
+
+def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: float) -> Iterator[Examples]:
+    """Of a simulated street or park; see `simulate_street`."""
+    street = simulate_street(seed, one_way=one_way)
+    name = f"{'park' if one_way else 'street'} {seed}"
+    sure, any_trunk = street.trunk[street.seen >= LEAST_RETURNS], street.trunk[street.seen > 0]
+    for columns in gathered(street.steps, street.sensor, street.T_base_lidar, parameters, 1):
+        near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
+        axis, figures = columns.axis[near], columns.figures[near]
+        label = _label_by_points(axis, street.points, street.label, sure, any_trunk)
+        yield Examples(name, True, not one_way, axis, figures, label)
 
 
 def simulated_examples(uri: str, parameters: Parameters, every: int) -> Iterator[Examples]:
@@ -71,7 +91,7 @@ def simulated_examples(uri: str, parameters: Parameters, every: int) -> Iterator
         truth = source.truth()
     assert truth is not None  # noqa: S101 - simulated runs know all
     assert truth.trees is not None  # noqa: S101
-    for columns in gathered(uri, parameters, every=every, static=False):
+    for columns in _gathered_from(uri, parameters, every=every, static=False):
         yield Examples(
             uri, True, True, columns.axis, columns.figures, label_by_truth(columns.axis, truth.trees)
         )
@@ -96,10 +116,12 @@ def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Ite
     points, label = labelled_points(folder)
     with closing(open_source(str(folder))) as source:
         all_around = source.description.sensor.rings > 0
-    for columns in gathered(str(folder), parameters, every=1, static=True):
+    sure, any_trunk = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
+    for columns in _gathered_from(str(folder), parameters, every=1, static=True):
         near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
-        yield Examples(str(folder), False, all_around, axis, figures, _label_by_points(axis, points, label))
+        kind = _label_by_points(axis, points, label, sure, any_trunk)
+        yield Examples(str(folder), False, all_around, axis, figures, kind)
 
 
 def labelled_points(folder: Path) -> tuple[Float, Int]:
@@ -131,7 +153,13 @@ def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
     return np.asarray(middle[(size >= least) & (np.hypot(middle[:, 0], middle[:, 1]) <= reach)])
 
 
-def _label_by_points(axis: Float, points: Float, label: Int) -> Int:
+def _label_by_points(axis: Float, points: Float, label: Int, sure: Float, any_trunk: Float) -> Int:
+    """What stands at each column, as places in CLASSES: a trunk, or what most points around it are.
+
+    Args:
+        axis: Columns; points, label: see `labelled_points`.
+        sure, any_trunk: Places (T, 2) [m] of trunks of LEAST_RETURNS returns, and of all.
+    """
     from scipy.spatial import cKDTree
 
     kind = np.full(len(axis), CLASSES.index(Verdict.OTHER), np.int64)
@@ -142,8 +170,7 @@ def _label_by_points(axis: Float, points: Float, label: Int) -> Int:
         order = [name for name in order if name != 71]
         if order:
             kind[k] = CLASSES.index(KIND_OF_LABEL[order[0]])
-    to_tree = _distance(axis, trunks(points, label, 30, np.inf))
-    to_any = _distance(axis, trunks(points, label, 1, np.inf))
+    to_tree, to_any = _distance(axis, sure), _distance(axis, any_trunk)
     kind[(to_tree >= SAME) & (to_any < 0.5)] = DOUBTFUL
     kind[(to_tree >= SAME) & (to_tree < DOUBT)] = DOUBTFUL
     kind[to_tree < SAME] = CLASSES.index(Verdict.TREE)

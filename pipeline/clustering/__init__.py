@@ -6,6 +6,7 @@ import numpy as np
 
 from pipeline.clustering.engines import ENGINES
 from pipeline.clustering.range_jump import range_jump
+from pipeline.clustering.weights import weigh
 from pipeline.parameters.stages import Clustering
 from pipeline.records import Float32, Labels, Sensor
 
@@ -16,9 +17,10 @@ def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
         label, hidden = range_jump(points, parameters.eps, parameters.min_points, sensor.azimuth_step)
         return Labels(label, len(hidden), hidden)
     plane = np.ascontiguousarray(points[:, : parameters.dimensions])
-    label = ENGINES[parameters.engine](plane, parameters.eps, parameters.min_points).label
+    weight = weigh(points, sensor, parameters) if parameters.stem_area > 0.0 else None
+    label = ENGINES[parameters.engine](plane, parameters.eps, parameters.min_points, weight).label
     clusters = int(label.max(initial=-1)) + 1
     return Labels(label, clusters, np.zeros(clusters, np.bool_))
 
 
-__all__ = ["ENGINES", "cluster"]
+__all__ = ["ENGINES", "cluster", "weigh"]

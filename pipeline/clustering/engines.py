@@ -2,6 +2,8 @@
 
 A border point in reach of two clusters goes to either of them, depending on the order of points, in
 scikit-learn and Open3D; ours gives it to its nearest core.
+
+Each takes a weight per point, a whole number: for how many neighbours it counts.
 """
 
 from __future__ import annotations
@@ -22,36 +24,39 @@ class Dbscan(NamedTuple):
     core: Bool | None
 
 
-def _grid(points: Float32, eps: float, min_points: int) -> Dbscan:
-    return Dbscan(*dbscan_grid(points.astype(np.float64), eps, min_points))
+def _grid(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
+    return Dbscan(*dbscan_grid(points.astype(np.float64), eps, min_points, weight))
 
 
-def _sklearn(points: Float32, eps: float, min_points: int) -> Dbscan:
+def _sklearn(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
     from sklearn.cluster import DBSCAN
 
     if len(points) == 0:
         return Dbscan(np.zeros(0, np.int32), np.zeros(0, np.bool_))
-    fitted = DBSCAN(eps=eps, min_samples=min_points).fit(points.astype(np.float64))
+    fitted = DBSCAN(eps=eps, min_samples=min_points).fit(points.astype(np.float64), sample_weight=weight)
     core = np.zeros(len(points), np.bool_)
     core[fitted.core_sample_indices_] = True
     return Dbscan(in_order_of_first_point(fitted.labels_.astype(np.int32)), core)
 
 
-def _open3d(points: Float32, eps: float, min_points: int) -> Dbscan:
+def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
     import open3d
 
     if len(points) == 0:
         return Dbscan(np.zeros(0, np.int32), None)
     space = np.zeros((len(points), 3))
     space[:, : points.shape[1]] = points
+    # It knows no weights, but a point that is there twice counts twice.
+    times = np.ones(len(points), np.int32) if weight is None else weight
+    space, first = np.repeat(space, times, axis=0), np.cumsum(times) - times
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(space))
     # Its neighbours are nearer than the radius, those of the others at most as far away.
     radius = float(np.nextafter(eps, np.inf))
-    label = np.asarray(cloud.cluster_dbscan(radius, min_points), np.int32)
+    label = np.asarray(cloud.cluster_dbscan(radius, min_points), np.int32)[first]
     return Dbscan(in_order_of_first_point(label), None)
 
 
-ENGINES: dict[str, Callable[[Float32, float, int], Dbscan]] = {
+ENGINES: dict[str, Callable[[Float32, float, int, Int32 | None], Dbscan]] = {
     "grid": _grid,
     "sklearn": _sklearn,
     "open3d": _open3d,

@@ -20,8 +20,15 @@ _AXIS_BITS = 21
 _ROUNDING = 1.0 - 1e-9  # keeps the diagonal of a cell below eps in floating point
 
 
-def dbscan_grid(points: Float, eps: float, min_points: int) -> tuple[Int32, Bool]:
+def dbscan_grid(
+    points: Float, eps: float, min_points: int, weight: Int32 | None = None
+) -> tuple[Int32, Bool]:
     """Cluster points of shape (N, 2) or (N, 3) [m]; neighbours are at most `eps` apart.
+
+    Args:
+        points, eps, min_points: As DBSCAN has them.
+        weight: int32, shape (N,), at least 1: for how many points each counts among the neighbours of a
+            core; None for 1 each. The result is that of a cloud which repeats the points so often.
 
     Returns:
         Labels, int32, shape (N,), in the order of first points, -1 for noise; and which are cores.
@@ -53,6 +60,7 @@ def dbscan_grid(points: Float, eps: float, min_points: int) -> tuple[Int32, Bool
         eps * eps,
         min_points,
         order,
+        np.ones(n, np.int32) if weight is None else weight[order],
     )
     return label, core
 
@@ -103,10 +111,12 @@ def _neighbours(keys: Int, offsets: Int) -> NDArray[np.int64]:
 
 
 @compiled
-def _find_cores(points: Float, bounds: Int, near: Int, eps2: float, min_points: int) -> Bool:
+def _find_cores(points: Float, bounds: Int, near: Int, eps2: float, min_points: int, weight: Int32) -> Bool:
     core = np.zeros(points.shape[0], np.bool_)
     for c in range(near.shape[0]):
-        count_here = bounds[c + 1] - bounds[c]
+        count_here = 0
+        for i in range(bounds[c], bounds[c + 1]):
+            count_here += weight[i]
         for i in range(bounds[c], bounds[c + 1]):
             count = count_here
             for o in range(near.shape[1]):
@@ -116,7 +126,7 @@ def _find_cores(points: Float, bounds: Int, near: Int, eps2: float, min_points: 
                 if d >= 0:
                     for j in range(bounds[d], bounds[d + 1]):
                         if _close(points, i, j, eps2):
-                            count += 1
+                            count += weight[j]
             core[i] = count >= min_points
     return core
 
@@ -133,10 +143,17 @@ def _touch(points: Float, bounds: Int, core: Bool, c: int, d: int, eps2: float) 
 
 @compiled
 def _label(
-    points: Float, bounds: Int, keys: Int, offsets: Int, eps2: float, min_points: int, order: Int
+    points: Float,
+    bounds: Int,
+    keys: Int,
+    offsets: Int,
+    eps2: float,
+    min_points: int,
+    order: Int,
+    weight: Int32,
 ) -> tuple[Int32, Bool]:
     near = _neighbours(keys, offsets)
-    core = _find_cores(points, bounds, near, eps2, min_points)
+    core = _find_cores(points, bounds, near, eps2, min_points, weight)
     cells = keys.shape[0]
     parent = np.arange(cells)
     for c in range(cells):

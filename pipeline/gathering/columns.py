@@ -17,10 +17,12 @@ BUCKET = 0.9  # m; as far as a column's neighbourhood reaches
 MARGIN = 1.2  # m around a tile; a column looks so far for its neighbours
 LOW, LOW_HIGH, HIGH = 1, 7, 15  # slices: 0.2 to 1.4 m and to 3 m, where a column must show
 LEAST = 3  # of them hold returns
+TWIN = 0.02  # m; two axes nearer than that are one
 APART = 0.3  # m; of two columns nearer than that the weaker one is the same thing
 INSIDE, RING_NEAR, RING_FAR = 0.3, 0.45, 0.9  # m around the axis
 OCTANTS = 8
-PROFILE = 11  # figures of a slice, see `profile`
+ARC = 11  # where the moments of a slice's arc begin, see `profile`
+PROFILE = 20  # figures of a slice, see `profile`
 
 
 @compiled
@@ -151,13 +153,23 @@ def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Flo
         for turn in range(4):
             runs = near_rows(axis[0], axis[1], low, bounds)
             _fit_line(axis, sorted_mean, sorted_returns, runs, 0.35 if turn < 2 else 0.25)
-        if low[0] <= axis[0] < low[0] + side and low[1] <= axis[1] < low[1] + side:
+        here = low[0] <= axis[0] < low[0] + side and low[1] <= axis[1] < low[1] + side
+        if here and not _is_known(axis, found, kept):
             found[kept] = axis
             profile(
                 axis, sorted_mean, sorted_returns, near_rows(axis[0], axis[1], low, bounds), profiles[kept]
             )
             kept += 1
     return found[:kept].copy(), profiles[:kept].copy()
+
+
+@compiled
+def _is_known(axis: Float, found: Float, kept: int) -> bool:
+    """Whether the search over other heights has led to the same axis before."""
+    known = False
+    for k in range(kept):
+        known |= abs(axis[0] - found[k, 0]) < TWIN and abs(axis[1] - found[k, 1]) < TWIN
+    return known
 
 
 @compiled
@@ -208,7 +220,9 @@ def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) 
 
     Columns: returns inside, returns between, returns in the ring, voxels inside, filled octants of the
     ring, middle of the inside (x, y from the axis) [m], rms distance of the inside from the axis [m],
-    and the second moments xx, xy, yy of the inside about its middle [m^2].
+    and the second moments xx, xy, yy of the inside about its middle [m^2]. From ARC on, of what lies
+    nearer than RING_NEAR, sums from which a circle is fitted (Kasa 1976), with z = x^2 + y^2 from the
+    axis: 1, x, y, xx, xy, yy, xz, yz, zz.
 
     Args:
         axis: See `find_columns`; mean, returns: voxels, bucket by bucket; runs: see `near_rows`.
@@ -227,7 +241,7 @@ def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) 
     for s in range(SLICES):
         rows[s, 4] = octants[s].sum()
         if rows[s, 0] > 0.0:
-            for a in range(5, PROFILE):
+            for a in range(5, ARC):
                 rows[s, a] /= rows[s, 0]
             rows[s, 7] = np.sqrt(rows[s, 7])
             rows[s, 8] -= rows[s, 5] * rows[s, 5]
@@ -238,6 +252,9 @@ def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) 
 @compiled
 def _count(dx: float, dy: float, n: float, row: Float, octant: Bool) -> None:
     r2 = dx * dx + dy * dy
+    if r2 < RING_NEAR * RING_NEAR:
+        for a, v in enumerate((1.0, dx, dy, dx * dx, dx * dy, dy * dy, dx * r2, dy * r2, r2 * r2)):
+            row[ARC + a] += n * v
     if r2 < INSIDE * INSIDE:
         row[0] += n
         row[3] += 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiled import compiled
+from pipeline.gathering.columns import ARC
 from pipeline.gathering.memory import SLICE, SLICES
 from pipeline.geometry import Float
 
@@ -37,7 +38,13 @@ NAMES = tuple(
         "wide",
         "uneven",
         "part of the view filled",
+        "radius",
+        "residual",
+        "residual of the radius",
+        "thick above",
+        "wide above",
     ]
+    + [f"alone beyond 0.45 m {band} m" for band in _BAND_WORDS[:4]]
 )
 COUNT = len(NAMES)
 UNSEEN = -1.0  # of a figure of a band that no return tells anything of
@@ -97,6 +104,14 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
     out[k + 15] = np.log(1.0 + inside / some)
     _shape(rows, last, out[k + 16 : k + 19])
     out[k + 19] = last * SLICE / max(out[k + 6], SLICE)
+    _circle(rows, last, out[k + 20 : k + 23])
+    _above(rows, last, out[k + 23 : k + 25])
+    for b in range(4):
+        near, ring = 0.0, 0.0
+        for s in range(BANDS[b, 0], BANDS[b, 1]):
+            near += rows[s, 0] + rows[s, 1]
+            ring += rows[s, 2]
+        out[k + 25 + b] = near / (near + ring) if near > 0.0 else UNSEEN
 
 
 @compiled
@@ -118,6 +133,53 @@ def _shape(rows: Float, last: int, out: Float) -> None:
     out[0] = np.sqrt(max(middle - half, 0.0)) if n > 0.0 else UNSEEN
     out[1] = np.sqrt(max(middle + half, 0.0)) if n > 0.0 else UNSEEN
     out[2] = np.sqrt(max(squares / some - (total / some) ** 2, 0.0)) / max(total / some, 0.01)
+
+
+@compiled
+def _circle(rows: Float, last: int, out: Float) -> None:
+    """Radius of the circle through the clean slices laid upon one another, rms distance from it [m], and
+    their ratio; UNSEEN where the returns do not tell (Kasa 1976: z + B x + C y + D = 0 by least squares)."""
+    m = np.zeros(9)
+    for s in range(1, min(last + 1, SLICES)):
+        if rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2]):
+            m += rows[s, ARC : ARC + 9]
+    out[:] = UNSEEN
+    if m[0] < 6.0:
+        return
+    m /= m[0]
+    x, y, z = m[1], m[2], m[3] + m[5]
+    xx, xy, yy = m[3] - x * x, m[4] - x * y, m[5] - y * y
+    xz, yz, zz = m[6] - x * z, m[7] - y * z, m[8] - z * z
+    det = xx * yy - xy * xy
+    if det < 1e-12:
+        return
+    B, C = -(yy * xz - xy * yz) / det, -(xx * yz - xy * xz) / det
+    D = -(z + B * x + C * y)
+    square = 0.25 * (B * B + C * C) - D
+    if square <= 1e-6:
+        return
+    radius = np.sqrt(square)
+    misfit = zz + 2.0 * (B * xz + C * yz) + B * B * xx + 2.0 * B * C * xy + C * C * yy
+    out[0] = min(radius, 1.0)
+    out[1] = np.sqrt(max(misfit, 0.0)) / (2.0 * radius)
+    out[2] = out[1] / out[0]
+
+
+@compiled
+def _above(rows: Float, last: int, out: Float) -> None:
+    """Standard deviations of what lies above the clean slices, across its long side and along it [m]:
+    the plate of a sign is flat, foliage is not."""
+    n, xx, xy, yy = 0.0, 0.0, 0.0, 0.0
+    for s in range(last + 1, SLICES):
+        if rows[s, 3] >= 2.0:
+            n += 1.0
+            xx += rows[s, 8]
+            xy += rows[s, 9]
+            yy += rows[s, 10]
+    some = max(n, 1.0)
+    middle, half = 0.5 * (xx + yy) / some, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy) / some
+    out[0] = np.sqrt(max(middle - half, 0.0)) if n > 0.0 else UNSEEN
+    out[1] = np.sqrt(max(middle + half, 0.0)) if n > 0.0 else UNSEEN
 
 
 @compiled

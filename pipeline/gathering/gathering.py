@@ -20,12 +20,8 @@ from pipeline.records import Bool, Columns, Float32, Int, Verdict
 GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
 SAME = 0.35  # m; a column found again so near is the one of before
 FOLD = 25  # scans after which a snapshot no longer repeats them one by one; as many are kept
-ALONE = [NAMES.index(name) for name in NAMES if name.startswith("alone")]
-THICK, WIDE = NAMES.index("thick"), NAMES.index("wide")
 VOXELS, CLEAN_SLICES = NAMES.index("voxels a slice"), NAMES.index("clean slices")
 LEAST_VOXELS = 6.0
-WALL_ALONE = 0.55  # part of the returns; half of a wall's end lies at its last column
-WALL_WIDE, WALL_THIN = 0.12, 0.2  # m, and part of the width; a wall fills the 0.6 m of the inside: 0.17 m
 GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
 
 
@@ -132,9 +128,7 @@ class Gathering:
         tree = c.share[:, 0] >= self.parameters.tree_share
         verdict[~tree & (verdict == Verdict.TREE)] = Verdict.OTHER
         verdict[tree] = Verdict.TREE
-        flat, few = _part_of_a_wall(c.figures), _too_few(c.figures)
-        verdict[flat] = Verdict.WALL
-        verdict[few] = Verdict.TOO_FEW_POINTS
+        verdict[_too_few(c.figures)] = Verdict.TOO_FEW_POINTS
         gone = (c.absent >= GONE_SCANS) & (c.absent > GONE * (c.present + c.absent))
         verdict[gone] = Verdict.MOVING
         self.columns = replace(c, verdict=verdict.astype(np.int32))
@@ -143,16 +137,6 @@ class Gathering:
 def no_columns() -> Columns:
     """A table of columns without rows."""
     return _rows(np.zeros((0, 5)), np.zeros((0, 2), np.int64))
-
-
-def _part_of_a_wall(figures: Float) -> Bool:
-    """Columns that go on sideways: rarely alone, and wide but not thick. Training has too few walls."""
-    bands = figures[:, ALONE]
-    told = bands >= 0.0
-    alone = np.where(told, bands, 0.0).sum(axis=1) / np.maximum(told.sum(axis=1), 1)
-    thick, wide = figures[:, THICK], figures[:, WIDE]
-    flat: Bool = (alone < WALL_ALONE) & (wide > WALL_WIDE) & (thick < WALL_THIN * wide)
-    return flat
 
 
 def _too_few(figures: Float) -> Bool:

@@ -23,6 +23,7 @@ _PAPER: dict[str, object] = {
     "clustering.dimensions": 3,
     "clustering.eps": 0.25,
     "clustering.min_points": 20,
+    "clustering.stem_area": 0.0,
     "shape.plane": 2,
     "shape.centre": "centroid",
     "detection.e_min": 1.0,

@@ -97,6 +97,16 @@ class Clustering(Stage):
     min_points: int = count(
         8, "Points of a core", "", 1, 500, "A point with so many neighbours (itself too) is a core."
     )
+    stem_area: float = number(
+        0.1,
+        "Area of a stem",
+        "m²",
+        0.0,
+        10.0,
+        0.01,
+        "Where so much of a stem returns fewer points than a core needs, each counts for more; 0 is off.",
+    )
+    weight_max: int = count(2, "Weight max", "", 1, 100, "No return counts for more neighbours than this.")
 
 
 class Shape(Stage):
@@ -314,7 +324,7 @@ class Gathering(Stage):
         "Room for 2 to this power voxels; when full, the oldest half is forgotten.",
     )
     tree_share: float = number(
-        0.45, "Votes for a tree", "", 0.0, 1.0, 0.05, "A column is a tree from this share of the votes on."
+        0.4, "Votes for a tree", "", 0.0, 1.0, 0.05, "A column is a tree from this share of the votes on."
     )
 
 
