@@ -43,8 +43,8 @@ class Plan:
 # A sensor that looks one way sees a trunk from one side and no higher than its field of view: trained on
 # simulated parks too, it finds fewer real ones (docs/trunks.md has the figures).
 PLANS = {
-    ALL_AROUND: Plan("best", 24, 12, 20, 0.3, same=5.0, other=1.0, simulated=1.0, upright=2.0),
-    ONE_WAY: Plan("extra", 40, 9, 3, 0.5, same=1.0, other=1.0, simulated=0.0),
+    ALL_AROUND: Plan("best", 20, 12, 20, 0.3, same=5.0, other=1.0, simulated=1.0, upright=2.0),
+    ONE_WAY: Plan("extra", 80, 9, 8, 0.3, same=1.0, other=1.0, simulated=0.0),
 }
 
 

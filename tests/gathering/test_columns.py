@@ -69,3 +69,37 @@ def test_nothing_and_what_is_low_have_no_column():
 
 def test_the_margin_belongs_to_the_neighbours():
     assert len(examined(trunk(-0.5, 2.0, 0.1))[0]) == 0
+
+
+@pytest.mark.parametrize("radius", [0.08, 0.15, 0.25])
+def test_the_circle_through_the_slices_is_the_trunk(radius):
+    axis, profiles = examined(trunk(2.03, 1.52, radius))
+    nearest = np.hypot(*(axis[:, :2] - [2.03, 1.52]).T).argmin()
+    figures = dict(zip(NAMES, figures_of(axis, profiles)[nearest], strict=True))
+    assert figures["radius"] == pytest.approx(radius, abs=0.02)
+    assert figures["residual"] < 0.03
+    assert figures["residual of the radius"] == pytest.approx(figures["residual"] / figures["radius"])
+
+
+def test_leaves_lie_on_no_circle():
+    axis, profiles = examined(bush(2.0, 2.0, 0.35))
+    figures = figures_of(axis, profiles)[:, NAMES.index("residual")]
+    assert figures.max() > 0.05
+
+
+def test_a_plate_above_the_clean_slices_is_flat():
+    post = trunk(2.0, 2.0, 0.04, top=1.4)
+    rng = np.random.default_rng(0)
+    side, up = rng.uniform(-0.85, 0.85, 3000), rng.uniform(1.6, 2.4, 3000)
+    plate = np.stack([np.full(3000, 2.0), 2.0 + side, up], axis=1).astype(np.float32)
+    axis, profiles = examined(np.concatenate([post, plate]))
+    nearest = np.hypot(*(axis[:, :2] - 2.0).T).argmin()
+    figures = dict(zip(NAMES, figures_of(axis, profiles)[nearest], strict=True))
+    assert figures["thick above"] < 0.02
+    assert figures["wide above"] > 0.1
+
+
+def test_no_axis_is_examined_twice():
+    axis, _ = examined(trunk(2.03, 1.52, 0.15))
+    apart = np.abs(axis[:, None, :2] - axis[None, :, :2]).max(axis=2)
+    assert (apart[~np.eye(len(axis), dtype=bool)] >= 0.02).all()

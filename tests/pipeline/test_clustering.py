@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from pipeline.clustering import cluster
+from pipeline.clustering import cluster, weigh
 from pipeline.clustering.engines import ENGINES, in_order_of_first_point
 from pipeline.clustering.grid import dbscan_grid
 from pipeline.parameters import preset
@@ -173,3 +173,41 @@ def test_an_empty_scan_has_no_clusters(method):
     labels = cluster(np.zeros((0, 3), np.float32), SENSOR, FOREST.model_copy(update={"method": method}))
     assert labels.clusters == 0
     assert len(labels.label) == len(labels.hidden) == 0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_weight_is_a_repeated_point(engine):
+    @FEW
+    @given(clouds(2, lattice), st.integers(1, 9), st.data())
+    def law(points, min_points, data):
+        weight = data.draw(arrays.arrays(np.int32, len(points), elements=st.integers(1, 3)))
+        first = np.cumsum(weight) - weight
+        core, _, square = brute_force(np.repeat(points, weight, axis=0), EPS, min_points)
+        told = ENGINES[engine](points, EPS, min_points, weight)
+        if told.core is not None:
+            np.testing.assert_array_equal(told.core, core[first])
+        reached = (square[first] <= EPS * EPS) & core[None]
+        np.testing.assert_array_equal(told.label < 0, ~reached.any(axis=1))
+        repeated = ENGINES["sklearn"](np.repeat(points, weight, axis=0), EPS, min_points).label[first]
+        at_core = core[first]
+        pairs = {(a, b) for a, b in zip(told.label[at_core], repeated[at_core], strict=True)}
+        assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
+
+    law()
+
+
+def test_a_return_weighs_as_much_as_a_far_stem_lacks():
+    reach = np.array([1.0, 5.0, 10.0, 15.0, 20.0, 25.0])
+    points = np.stack([reach * 0.6, reach * 0.8, np.full(6, 9.0)], axis=1).astype(np.float32)
+    wanted = FOREST.model_copy(update={"stem_area": 0.1, "weight_max": 5})
+    returns = 0.1 / (reach**2 * SENSOR.azimuth_step * SENSOR.ring_step)
+    expected = np.clip(np.floor(FOREST.min_points / returns), 1, 5)
+    np.testing.assert_array_equal(weigh(points, SENSOR, wanted), expected)
+    assert weigh(points, SENSOR, FOREST).max() == FOREST.weight_max
+
+
+def test_a_far_thin_stem_is_a_cluster_and_the_paper_weighs_nothing():
+    far = np.array([[18.0, 0.05 * k, z] for k in range(3) for z in (0.5, 1.1)], np.float32)
+    assert cluster(far, SENSOR, FOREST).clusters == 1
+    assert cluster(far, SENSOR, FOREST.model_copy(update={"stem_area": 0.0})).clusters == 0
+    assert preset("paper").clustering.stem_area == 0.0
