@@ -8,8 +8,7 @@ Each takes a weight per point, a whole number: for how many neighbours it counts
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -22,6 +21,14 @@ class Dbscan(NamedTuple):
 
     label: Int32
     core: Bool | None
+
+
+class Engine(Protocol):
+    """Clusters points (N, 2 or 3) [m]; the weights are int32, shape (N,), None for 1 each."""
+
+    def __call__(
+        self, points: Float32, eps: float, min_points: int, weight: Int32 | None = None
+    ) -> Dbscan: ...
 
 
 def _grid(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
@@ -56,7 +63,7 @@ def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None =
     return Dbscan(in_order_of_first_point(label), None)
 
 
-ENGINES: dict[str, Callable[[Float32, float, int, Int32 | None], Dbscan]] = {
+ENGINES: dict[str, Engine] = {
     "grid": _grid,
     "sklearn": _sklearn,
     "open3d": _open3d,
