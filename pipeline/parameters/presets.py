@@ -38,6 +38,7 @@ _PAPER: dict[str, object] = {
     "slam.particles": 100,
     "slam.view_range": 0.0,
     "slam.looks": 10000.0,
+    "slam.weight_power": 1.0,
     "slam.merge_gate": 0.0,
     # The centroid's error is the same in each scan from one side; only a step aside brings news.
     "slam.update_distance": 1.0,
@@ -74,6 +75,7 @@ _LASER2D: dict[str, object] = {
     "slam.noise_turn": 0.7,
     "slam.distance_max": 4.0,
     "slam.view_range": 35.0,
+    "slam.weight_power": 0.3,
     "slam.miss_weight": 1.0,
     "tracking.hits_to_confirm": 5,
     "slam.update_distance": 0.5,

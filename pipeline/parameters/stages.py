@@ -253,6 +253,15 @@ class Slam(Stage):
         0.05,
         "What a well known landmark in free view that is not detected takes from a particle's log weight.",
     )
+    weight_power: float = number(
+        0.1,
+        "Weight power",
+        "",
+        0.01,
+        1.0,
+        0.05,
+        "Power of a scan's likelihood in the weights; 1 takes the views of one trunk as independent.",
+    )
     looks: float = number(
         100.0,
         "Independent looks",

@@ -196,6 +196,7 @@ def _rules(p: Slam) -> Rules:
         view_range=p.view_range,
         miss=1.0 / p.misses_per_hit,
         miss_weight=p.miss_weight,
+        weight_power=p.weight_power,
         looks=p.looks,
         merge_gate=p.merge_gate,
     )

@@ -31,6 +31,7 @@ class Rules(NamedTuple):
         hits_to_weigh: Landmarks seen fewer times do not weigh.
         view_range: Landmarks nearer than this can be missed [m].
         miss: What one miss takes from the score; miss_weight: from the log weight.
+        weight_power: Power of a scan's likelihood in the weights.
         looks: A landmark is never known better than by so many independent looks.
         merge_gate: Two landmarks nearer than this are one [sigma].
     """
@@ -42,6 +43,7 @@ class Rules(NamedTuple):
     view_range: float
     miss: float
     miss_weight: float
+    weight_power: float
     looks: float
     merge_gate: float
 
@@ -152,7 +154,7 @@ def observe(
         if measured.shape[0] > 0:
             log_weight[p] += correct_by_pose(mu, P, measured, measured_covariance)
         known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, near)
-        log_weight[p] += recognise(
+        likelihood = recognise(
             mu, P, centre, R, known, near.mean, near.covariance, near.hits,
             rules.gate, rules.distance_max, rules.hits_to_weigh, room, told, p,
         )  # fmt: skip
@@ -163,7 +165,7 @@ def observe(
             pose[p, 0], pose[p, 1], pose[p, 2] = mu[0], mu[1], mu[2]
         all_near = _learn(pose, p, maps, near, known, free, room.landmark_of, centre, R, first_birth, rules)
         missed = _miss(pose, p, near, known, clear_range, rules, told)
-        log_weight[p] -= rules.miss_weight * missed
+        log_weight[p] += rules.weight_power * (likelihood - rules.miss_weight * missed)
         merge_duplicates(
             near.mean, near.covariance, near.hits, near.score, near.birth, known, near.seen, rules.merge_gate
         )

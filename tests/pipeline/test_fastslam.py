@@ -192,7 +192,9 @@ def test_what_could_not_be_seen_is_not_missed(hidden):
 
 def a_step_on(method):
     """400 particles that know the trees well, after a step of a metre with poor odometry."""
-    slam = fresh(method=method, particles=400, resample_below=0.0, view_range=0.0, noise_distance=0.2)
+    slam = fresh(
+        method=method, particles=400, resample_below=0.0, view_range=0.0, noise_distance=0.2, weight_power=1.0
+    )
     for k in range(5):
         slam.process(k, Pose2(), detections(TREES), NOTHING_SEEN)
     motion = Pose2(1.0, 0.0, 0.0)
@@ -218,7 +220,7 @@ def test_particles_that_agree_with_the_trees_win():
 
 def test_a_particle_that_recognises_nothing_does_not_win():
     """Had a new landmark no price, the particle that is lost would see only new ones and win."""
-    slam = fresh(particles=2, resample_below=0.0, view_range=0.0)
+    slam = fresh(particles=2, resample_below=0.0, view_range=0.0, weight_power=1.0)
     for k in range(5):
         slam.process(k, Pose2(), detections(TREES), NOTHING_SEEN)
     slam.state.pose[1] = [30.0, 30.0, 0.0]
@@ -468,3 +470,18 @@ def test_the_path_goes_back_through_the_particles_that_were_chosen():
     np.testing.assert_allclose(path[-1], told[-1].particles[slam.state.best], atol=1e-5)
     for row, estimate in zip(path, told, strict=True):
         assert np.abs(estimate.particles - row).max(axis=1).min() < 1e-5, "one of that scan's particles"
+
+
+def test_the_power_of_the_weights_is_that_of_the_likelihood():
+    """Two particles that disagree: their weights' ratio to this power, and to no other."""
+    ratios = {}
+    for power in (1.0, 0.25):
+        slam = fresh(particles=2, resample_below=0.0, view_range=0.0, weight_power=power)
+        for k in range(5):
+            slam.process(k, Pose2(), detections(TREES), NOTHING_SEEN)
+        slam.state.pose[1] = [0.03, 0.0, 0.0]
+        slam.state.log_weight[:] = 0.0
+        slam.process(5, Pose2(), detections(TREES), NOTHING_SEEN)
+        ratios[power] = slam.state.log_weight[1] - slam.state.log_weight[0]
+    assert ratios[1.0] < -0.5
+    assert ratios[0.25] == pytest.approx(0.25 * ratios[1.0])

@@ -123,18 +123,19 @@ def _ours(particles: int) -> Feed:
     nothing_missed = np.zeros(BINS)
 
     def feed(index: int, motion: float, seen: Float) -> None:
-        slam.process(index, Pose2(motion, 0.0, 0.0), _detections(seen), nothing_missed)
+        slam.process(index, Pose2(motion, 0.0, 0.0), detections_of(seen, SIGMA), nothing_missed)
 
     return feed
 
 
-def _detections(seen: Float) -> Detections:
+def detections_of(seen: Float, sigma: float) -> Detections:
+    """Detections at places in the base frame, shape (D, 2) [m], with an error of this sigma [m]."""
     import numpy as np
 
     from pipeline.records import Detections
 
     unknown = np.full(len(seen), np.nan)
-    covariance = np.tile(SIGMA**2 * np.eye(2), (len(seen), 1, 1))
+    covariance = np.tile(sigma**2 * np.eye(2), (len(seen), 1, 1))
     return Detections(np.arange(len(seen)), seen, covariance, unknown, unknown, np.zeros(len(seen)), unknown)
 
 
