@@ -26,6 +26,7 @@ from pipeline.slam.state import SlamState
 from pipeline.slam.update import Near, Rules, near_for, observe, predict
 
 PLACED = 1  # tells the draws of a placing from those of a scan
+DISTRUST = (0.1, 0.03)  # m, rad; added to a step of wheels that just slipped, for they slip again
 TURN_AS_DISTANCE = 1.0  # m/rad; a robot that turns on the spot sees the trees anew as well
 
 
@@ -100,7 +101,8 @@ class FastSlam:
         return landmarks.mean, landmarks.covariance
 
     def _moved(self, state: SlamState, motion: Motion) -> SlamState:
-        step, slack = motion.step, motion.slack
+        step, distrust = motion.step, state.recent.distrust
+        slack = motion.slack[0] + distrust * DISTRUST[0], motion.slack[1] + distrust * DISTRUST[1]
         if step.x == step.y == step.yaw == 0.0 and slack == (0.0, 0.0) and motion.measured is None:
             return state
         noise = step_covariance(step, self.parameters)
@@ -132,7 +134,8 @@ class FastSlam:
             return state, False
         found = Pose2(*before).inverse() @ Pose2(*place)
         covariance = state.motion_covariance + np.diag(slip.SIGMA**2)
-        return replace(state, motion=found.as_array(), motion_covariance=covariance), True
+        recent = replace(state.recent, distrust=1.0)
+        return replace(state, motion=found.as_array(), motion_covariance=covariance, recent=recent), True
 
     def _observed(
         self,

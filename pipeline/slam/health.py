@@ -42,6 +42,7 @@ class Recent:
         odometry: Largest disagreement with the odometry, fading [sigma].
         alone: Distance driven since two known trees were recognised in a scan [m].
         mapped: Whether any landmark is well known.
+        distrust: 1 when the trees overruled the odometry, fading.
     """
 
     innovation: float = 1.0
@@ -50,6 +51,7 @@ class Recent:
     odometry: float = 0.0
     alone: float = 0.0
     mapped: bool = False
+    distrust: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +124,7 @@ def remembered(recent: Recent, scan: ScanTold, driven: float) -> Recent:
         odometry=max(scan.odometry, (1.0 - FADING) * recent.odometry),
         alone=0.0 if scan.recognised >= FEWEST else recent.alone + driven,
         mapped=recent.mapped or scan.recognised > 0.5,
+        distrust=(1.0 - FADING) * recent.distrust if recent.distrust > 0.01 else 0.0,
     )
 
 
