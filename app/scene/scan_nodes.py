@@ -25,6 +25,7 @@ OnCluster = Callable[[int | None, Vector, Vector], None]
 
 # The lengths that the ramps span: about what trunks and ground of a stand reach.
 HEIGHT_LOW, HEIGHT_HIGH = -1.0, 3.0
+WIDEST_MARKER = 0.6  # m; as thick as a trunk may be
 
 
 class ScanNodes:
@@ -112,11 +113,13 @@ class ScanNodes:
         )
 
     def _show_markers(self, frame: Frame) -> None:
-        """A cylinder about each cluster, because point clouds take no clicks."""
+        """A cylinder about each cluster, because point clouds take no clicks; a post in the middle of a wide
+        one, which must not cover what stands beside it."""
         c = frame.clusters
         height = shown_height(c.extent[:, 2]) + 0.06
+        # fmax: a ready stem has no extent, and a cluster may have no circle.
         width = np.fmax(0.5 * np.hypot(c.extent[:, 0], c.extent[:, 1]), c.radius)
-        radius = np.fmax(width, 0.06) + 0.03  # fmax: a ready stem has no extent, a cluster may have no circle
+        radius = np.minimum(np.fmax(width, 0.06), WIDEST_MARKER) + 0.03
         foot = np.column_stack([c.centroid[:, :2], c.centroid[:, 2] - 0.5 * height])
         self._markers.show(foot, np.column_stack([radius, radius, height]), colours.by_verdict(c.verdict))
         low = foot + frame.sensor_offset + np.array([0.0, 0.0, frame.base_z])

@@ -3,7 +3,7 @@
 import { byId, setText } from "./dom.js";
 import { figure, NONE } from "./format.js";
 import { select, selectCluster } from "./live.js";
-import { measureAt, measureTowards, measuring } from "./measure.js";
+import { measureAt, measuredText, measureTowards, measuring } from "./measure.js";
 import { drawMap, symbolRadius } from "./map_draw.js";
 import { MapView } from "./map_view.js";
 import { on, state } from "./state.js";
@@ -25,7 +25,8 @@ function redraw() {
     const pen = canvas.getContext("2d");
     pen.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
     drawMap(pen, view, state, colours);
-    canvas.setAttribute("aria-label", `Map: ${state.map?.trees.length ?? 0} trees and the robot's path. The table below lists the trees.`);
+    const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
+    canvas.setAttribute("aria-label", `Map: ${state.map?.trees.length ?? 0} trees and the robot's path. The table below lists the trees.${measured}`);
   });
 }
 

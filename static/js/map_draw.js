@@ -1,5 +1,6 @@
 // Paints the 2D map of Fig. 5: path grey, robot a red triangle, trees as circles with their number.
 
+import { measuredText } from "./measure.js";
 import { verdictOf } from "./verdicts.js";
 
 const TURN = 2 * Math.PI;
@@ -168,7 +169,8 @@ function drawRobot(pen, view, { pose: [x, y, yaw], sigma_xy: sigma }, colours) {
   pen.fill();
 }
 
-function drawMeasure(pen, view, { from, to }, colours) {
+function drawMeasure(pen, view, measure, colours) {
+  const { from, to } = measure;
   const [a, b] = [view.toScreen(from.x, from.y), view.toScreen(to.x, to.y)];
   Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 2, font: `bold 13px ${colours.font}`, textAlign: "center" });
   pen.beginPath();
@@ -180,7 +182,7 @@ function drawMeasure(pen, view, { from, to }, colours) {
   }
   pen.stroke();
   const at = [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 8];
-  const text = `${Math.hypot(to.x - from.x, to.y - from.y).toFixed(2)} m${from.tree && to.tree ? `, tree ${from.tree} to tree ${to.tree}` : ""}`;
+  const text = measuredText(measure);
   Object.assign(pen, { strokeStyle: colours.surface, fillStyle: colours.text, lineWidth: 4 });
   pen.strokeText(text, ...at);
   pen.fillText(text, ...at);

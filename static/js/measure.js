@@ -26,6 +26,9 @@ export function measureTowards(place) {
   changed("measure");
 }
 
+export const measuredText = ({ from, to }) =>
+  `${Math.hypot(to.x - from.x, to.y - from.y).toFixed(2)} m${from.tree && to.tree ? `, tree ${from.tree} to tree ${to.tree}` : ""}`;
+
 export function startMeasure() {
   byId("map-measure").addEventListener("click", toggleMeasure);
 }

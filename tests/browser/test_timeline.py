@@ -1,0 +1,79 @@
+"""Marks of what happened, a part that is played again and again, and a distance on the map."""
+
+from __future__ import annotations
+
+import re
+
+from playwright.sync_api import expect
+
+from tests.browser.dashboard import Dashboard
+
+
+def test_marks_lead_to_what_happened_and_a_loop_goes_round(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.pause()
+    dashboard.command({"type": "seek", "time_s": 12.05})
+    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 11.97 && it.time_s < 12.06")
+    confirmed = page.locator("#marks .mark.tree")
+    expect(confirmed.first).to_be_attached()
+    expect(confirmed.first).to_have_attribute("title", re.compile(r"Tree \d+ confirmed"))
+    page.evaluate(CHANGE)
+    change = page.locator("#marks .mark.change")
+    expect(change).to_have_attribute("title", re.compile("clustering.eps: .* → 0.2"))
+    page.get_by_role("button", name="Ten scans forward").click()
+    dashboard.until_server("/api/status", "it.time_s > 12.9")
+    change.click()
+    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 11.9 && it.time_s < 12.1")
+
+    loop = page.locator("#loop")
+    loop.click()
+    expect(loop).to_contain_text("Loop from 0:12.0")
+    page.get_by_role("button", name="Ten scans forward").click()
+    dashboard.until_server("/api/status", "it.time_s > 12.9")
+    loop.click()
+    expect(loop).to_have_text("Loop 0:12.0 to 0:13.0 ✕")
+    expect(page.locator("#loop-bar")).to_be_visible()
+    page.get_by_role("button", name="Play", exact=True).click()
+    page.evaluate("window.latest = 0")
+    dashboard.until(GOES_ROUND)
+    assert dashboard.ask("/api/status")["time_s"] < 14.5
+    page.locator("#map").press("l")
+    expect(loop).to_have_text("Loop")
+    dashboard.until_server("/api/status", "it.time_s > 13.6")
+    dashboard.pause()
+
+
+CHANGE = """() => fetch('/api/parameters', { method: 'PATCH', body: '{"changes": {"clustering.eps": 0.2}}',
+  headers: { 'Content-Type': 'application/json' } })"""
+
+RESET = """() => fetch('/api/parameters/reset', { method: 'POST', body: '{}',
+  headers: { 'Content-Type': 'application/json' } })"""
+
+GOES_ROUND = """() => {
+  const now = Number(document.querySelector('#timeline').value);
+  window.latest = Math.max(window.latest, now);
+  return window.latest > 12.7 && now < window.latest - 0.4;
+}"""
+
+
+def test_a_distance_is_measured_between_two_trees(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.pause()
+    page.get_by_role("button", name="Fit").click()
+    page.locator("#map").press("m")
+    expect(page.locator("#map-measure")).to_have_attribute("aria-pressed", "true")
+    box = page.locator("#map").bounding_box()
+    assert box is not None
+    page.mouse.click(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.6 * box["height"])
+    page.mouse.click(box["x"] + 0.7 * box["width"], box["y"] + 0.6 * box["height"])
+    told = re.compile(r"Measured: (\d+\.\d\d) m")
+    expect(page.locator("#map")).to_have_attribute("aria-label", told)
+    found = told.search(page.locator("#map").get_attribute("aria-label") or "")
+    assert found is not None
+    assert float(found.group(1)) > 1.0
+    expect(page.locator("#panel-story")).not_to_be_visible()  # measuring selects nothing
+    page.locator("#map").press("Escape")
+    expect(page.locator("#map-measure")).to_have_attribute("aria-pressed", "false")
+    page.evaluate(RESET)
+    assert dashboard.errors == []
