@@ -51,6 +51,7 @@ function count() {
 function open(shown) {
   byId("layer-list").hidden = !shown;
   byId("layers-button").setAttribute("aria-expanded", String(shown));
+  if (shown) count();
 }
 
 export function startLayers() {
