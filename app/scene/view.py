@@ -25,6 +25,7 @@ LAYERS = {
 }
 # What a layer is drawn in while people colour by verdict; those that are not named have many colours.
 COLOURS = {
+    "ground": colours.GROUND,
     "raw": colours.RAW,
     "filtered": colours.FILTERED,
     "clusters": colours.TREE,
