@@ -55,7 +55,7 @@ def main() -> None:
 def _stands() -> Iterator[Place]:
     for scene in ("stand", "slope", "dense"):
         for seed in (21, 22):
-            with closing(open_source(f"sim:{scene}?seed={seed}&odometry=exact&duration=40")) as source:
+            with closing(open_source(f"sim:{scene}?seed={seed}&odometry=exact&duration=41")) as source:
                 truth = source.truth()
                 assert truth is not None
                 assert truth.trees is not None
