@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pipeline.clustering import cluster
 from pipeline.detection import detections, judge
 from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
+from pipeline.growing_path import GrowingPath
 from pipeline.height_map import HeightMapper, HeightMapState
 from pipeline.parameters import Parameters
 from pipeline.records import (
@@ -29,15 +30,23 @@ from pipeline.records import (
     Sensor,
     Stems,
     Step,
+    nothing_found,
 )
+from pipeline.recovery import Recovery, RecoveryState
 from pipeline.shape import describe
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.stems import take_stems
 from pipeline.terrain import Terrain, height_above
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
-from pipeline.visibility import clear_range
+from pipeline.visibility import BINS, clear_range
 
+ASTRAY = (
+    "the robot is lost: what was mapped since the known trees were last seen is taken back, and the map is "
+    "searched for the stems around"
+)
+NOT_FOUND = "the stems around were not found in the map; it goes on where the odometry leads"
+NOTHING_FREE: Float = np.zeros(BINS)
 ALWAYS_GATHERED = 10  # first scans, so that a short recording is judged on all it has
 
 Watch = Callable[[str], AbstractContextManager[None]]
@@ -59,6 +68,7 @@ class MapperState:
     next_number: int
     odometry: Pose2 | None
     path_length: int
+    recovery: RecoveryState[MapperState] = field(default_factory=RecoveryState)
 
 
 class Mapper:
@@ -92,7 +102,8 @@ class Mapper:
         self._ground = HeightMapper()
         self._tracker = Tracker(parameters.tracking)
         self._odometry: Pose2 | None = None
-        self._path = _PathColumns()
+        self._path = GrowingPath()
+        self._recovery: Recovery[MapperState] = Recovery(seed)
 
     @property
     def parameters(self) -> Parameters:
@@ -126,22 +137,24 @@ class Mapper:
 
         with watch("slam"):
             motion, odometry = self._motion(step)
-            known = Motion(motion, step.slack, step.doubt, step.measured)
-            estimate = self._slam.process(step.index, known, found, free)
+            moved = Motion(motion, step.slack, step.doubt, step.measured)
+            estimate, told = self._locate(step.index, moved, found, free)
+            known = not self._recovery.searching  # while it is lost, the map stays as it is
 
         with watch("tracking"):
-            self._tracker.process(
-                step.scan.stamp_ns,
-                estimate.T_map_base,
-                estimate.covariance,
-                found,
-                free,
-                p.slam.view_range,
-            )
-            self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
+            if known:
+                self._tracker.process(
+                    step.scan.stamp_ns,
+                    estimate.T_map_base,
+                    estimate.covariance,
+                    found,
+                    free,
+                    p.slam.view_range,
+                )
+                self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
 
         columns = self._gathering.columns if p.gathering.method == "columns" else None
-        if columns is not None and self._is_gathered(step.index) and seen.above is not None:
+        if known and columns is not None and self._is_gathered(step.index) and seen.above is not None:
             boxed, height, terrain = seen.above
             with watch("gathering"):
                 steepest = steepest_by_direction(seen.raw, seen.sensor_offset, self._sensor.rings > 0)
@@ -150,7 +163,7 @@ class Mapper:
                 columns = self._gathering.columns
                 self._tracker.judge(step.scan.stamp_ns, columns)
 
-        if seen.above is not None and self._is_gathered(step.index):
+        if known and seen.above is not None and self._is_gathered(step.index):
             with watch("height map"):
                 self._ground.add(seen.above[2], estimate.T_map_base, seen.sensor_offset)
 
@@ -175,13 +188,57 @@ class Mapper:
                 "out of range": len(step.scan.points) - len(seen.raw),
                 **seen.counts,
             },
-            warnings=step.warnings,
+            warnings=(*step.warnings, *told),
             columns=columns,
             ground=None if p.ground.method == "none" else self._ground.state.record,
             base_z=(self._ground.state.sensor_z or 0.0) - float(seen.sensor_offset[2])
             if self._ground.state.scans
             else 0.0,
         )
+
+    def _locate(
+        self, index: int, motion: Motion, found: Detections, free: Float
+    ) -> tuple[PoseEstimate, tuple[str, ...]]:
+        """The pose after a scan, and what a person should know of how it was found."""
+        p, recovery = self._parameters, self._recovery
+        if p.relocalisation.method == "none":
+            recovery.end()
+            return self._slam.process(index, motion, found, free), ()
+        if not recovery.searching:
+            recovery.remember(index, motion, self._known)
+            estimate = self._slam.process(index, motion, found, free)
+            if not self._slam.is_astray:
+                return estimate, ()
+            estimate = self._take_back(estimate, found)
+            recovery.search(index, Motion(Pose2()), found, free, self._tracker.trees(), p)
+            return estimate, (ASTRAY,)
+        estimate = self._slam.process(index, motion, nothing_found(found), np.zeros_like(free))
+        at = recovery.search(index, motion, found, free, self._tracker.trees(), p)
+        if at is not None:
+            self._slam.place(index, at.T_map_base, at.covariance)
+            recovery.end()
+            return self._slam.estimate(estimate), (f"found again in the map by {at.stems} stems that agree",)
+        if recovery.is_over:
+            self._slam.give_up()
+            recovery.end()
+            return estimate, (NOT_FOUND,)
+        return estimate, ()
+
+    def _take_back(self, estimate: PoseEstimate, found: Detections) -> PoseEstimate:
+        """Go back to the map before the robot went astray, and follow the odometry from there."""
+        before, motions = self._recovery.begin(self._parameters)
+        recent = self._slam.state.recent
+        self._slam.state = before.slam.copy()
+        self._gathering.restore(before.gathering)
+        self._ground.state = before.ground
+        self._tracker.tracks = before.tracks.copy()
+        for index, motion in motions:
+            estimate = self._slam.process(index, motion, nothing_found(found), NOTHING_FREE)
+        self._slam.state = replace(self._slam.state, recent=recent)
+        return replace(estimate, health=self._slam.lost(estimate))
+
+    def _known(self) -> MapperState:
+        return replace(self.snapshot(), recovery=RecoveryState())
 
     def _perceive(self, step: Step) -> _Seen:
         """From the scan to detections: sections 3.1 to 3.3."""
@@ -281,11 +338,12 @@ class Mapper:
             self._tracker.next_number,
             self._odometry,
             len(self._path),
+            self._recovery.state.copy(),
         )
 
     def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float) -> None:
         """Go on from a state of another mapper; `stamp_ns` and `sigma_xy` are its path's, one a scan."""
-        self._path = _PathColumns(stamp_ns, sigma_xy)
+        self._path = GrowingPath(stamp_ns, sigma_xy)
         self.restore(state)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
@@ -306,6 +364,7 @@ class Mapper:
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
         self._path.cut(state.path_length)
+        self._recovery.state = state.recovery.copy()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -326,37 +385,3 @@ class _Seen:
     sensor_offset: Float
     above: tuple[Float32, Float32, Terrain] | None
     counts: dict[str, int]
-
-
-class _PathColumns:
-    """Stamps and sigmas of a path that grows by doubling."""
-
-    def __init__(self, stamp_ns: Int | None = None, sigma: Float | None = None) -> None:
-        self._stamp = np.zeros(64, np.int64) if stamp_ns is None else stamp_ns.copy()
-        self._sigma: Float = np.zeros(64) if sigma is None else sigma.copy()
-        self._length = 0 if stamp_ns is None else len(stamp_ns)
-
-    def __len__(self) -> int:
-        return self._length
-
-    def append(self, stamp_ns: int, estimate: PoseEstimate) -> None:
-        if self._length == len(self._stamp):
-            self._stamp = np.concatenate([self._stamp, np.zeros_like(self._stamp)])
-            self._sigma = np.concatenate([self._sigma, np.zeros_like(self._sigma)])
-        self._stamp[self._length] = stamp_ns
-        self._sigma[self._length] = np.sqrt(0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]))
-        self._length += 1
-
-    def cut(self, length: int) -> None:
-        self._length = length
-
-    def columns(self, poses: Float) -> Path:
-        """With the poses, shape (N, 3): x, y [m], yaw [rad]."""
-        n = self._length
-        return Path(
-            self._stamp[:n].copy(),
-            poses[:, 0].copy(),
-            poses[:, 1].copy(),
-            poses[:, 2].copy(),
-            self._sigma[:n].copy(),
-        )

@@ -5,7 +5,7 @@ angles radians. Tables are kept as columns of equal length, never as lists of ob
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 
 from pipeline.geometry import Pose2
@@ -156,6 +156,11 @@ class Detections:
     radius_sigma: Float
     arc: Float
     eccentricity: Float
+
+
+def nothing_found(like: Detections) -> Detections:
+    """No detection at all, with the columns of others."""
+    return Detections(*(getattr(like, f.name)[:0] for f in fields(like)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

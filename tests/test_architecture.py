@@ -29,6 +29,7 @@ FOUNDATION = (
     "association",
     "visibility",
     "terrain",
+    "growing_path",
 )
 # One stage each: they never know one another.
 STAGES = (
@@ -56,7 +57,8 @@ AROUND = {
     "simulation": {"plot"},
     "sources": {"simulation", "truth_table", "exchange", "plot"},
     "recording": {"sources", "simulation"},
-    "mapper": set(STAGES),
+    "recovery": {"slam", "relocalisation"},
+    "mapper": {*STAGES, "recovery"},
     "saved_map": {*STAGES, "mapper"},
     "merged_map": {*STAGES, "saved_map"},
 }

@@ -44,6 +44,7 @@ _PAPER: dict[str, object] = {
     "slam.update_distance": 1.0,
     "detection.sigma_range": 0.1,
     "detection.sigma_bearing": 1.0,
+    "relocalisation.method": "none",
     "gathering.method": "none",
     "tracking.dbh_arc_min": 0.0,
     "tracking.velocity_sigma": 0.1,

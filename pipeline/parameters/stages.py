@@ -297,6 +297,11 @@ class Slam(Stage):
 class Relocalisation(Stage):
     """Relocalisation: where a constellation of stems stands in a map that is known."""
 
+    method: Literal["none", "constellation"] = choice(
+        "constellation",
+        "When lost",
+        "Search the map for the stems around by the distances between them, or map on as if nothing were.",
+    )
     stems_min: int = count(
         6, "Stems in agreement", "", 4, 100, "No pose is taken that fewer stems agree with."
     )

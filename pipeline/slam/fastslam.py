@@ -14,10 +14,11 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.geometry import Float, Pose2, wrap_angle
+from pipeline.health import Health
 from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
-from pipeline.slam.health import TOLD, ScanTold, judged, remembered, scan_told
+from pipeline.slam.health import TOLD, Recent, ScanTold, is_astray, judged, remembered, scan_told
 from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
 from pipeline.slam.motion import Motion, compound, moved_poses, step_covariance, weighted_pose, wrapped
 from pipeline.slam.proposal import Room, room_for
@@ -89,6 +90,25 @@ class FastSlam:
         pose = T_map_base.as_array() + noise @ (axes * np.sqrt(np.maximum(values, 0.0))).T
         pose[:, 2] = wrap_angle(pose[:, 2])
         self.state = self.state.placed(pose)
+
+    @property
+    def is_astray(self) -> bool:
+        """Whether the known trees are not where they should be seen."""
+        return is_astray(self.state.recent)
+
+    def estimate(self, before: PoseEstimate) -> PoseEstimate:
+        """After `place`: the pose, with the health of an estimate before it."""
+        weights = normalised(self.state.log_weight)
+        return replace(_estimate(self.state, weights, self.parameters.hits_to_weigh), health=before.health)
+
+    def lost(self, estimate: PoseEstimate) -> Health:
+        """The health of an estimate that no tree has told anything of."""
+        ancestors = self.state.genealogy.distinct_ancestors
+        return judged(self.state.recent, ScanTold(), estimate.n_eff, ancestors, estimate.covariance)
+
+    def give_up(self) -> None:
+        """Judge the health anew: what the known trees said no longer counts."""
+        self.state = replace(self.state, recent=Recent(mapped=self.state.recent.mapped))
 
     def path(self) -> Float:
         """x, y [m], yaw [rad] at every scan as the best particle has it behind it, shape (N, 3)."""

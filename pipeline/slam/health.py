@@ -22,6 +22,8 @@ MOST_HITS = 20.0
 SIGMA_GOOD, SIGMA_WEAK = 0.5, 1.5  # m
 INNOVATION_WEAK = 3.0  # fading mean; the errors are 1.7 times as large as their covariances say
 FOUND_WEAK, FOUND_LOST = 0.35, 0.2  # fading share of the known trees in free view that were found
+# A tree of three hits is well known: before those of another place are, the robot must be told lost.
+STRANGE_LOST, STRANGE_MISSED = 3, 15.0  # scans; hits of the known trees that such a scan misses
 ODOMETRY_WEAK = 5.0  # sigma
 AMBIGUOUS_WEAK = 0.5  # fading share of the detections
 ALONE_WEAK = 5.0  # m without two known trees: then the heading is the odometry's alone
@@ -43,6 +45,7 @@ class Recent:
         alone: Distance driven since two known trees were recognised in a scan [m].
         mapped: Whether any landmark is well known.
         distrust: 1 when the trees overruled the odometry, fading.
+        strange: Scans in a row of which every detection is new while known trees in free view are missed.
     """
 
     innovation: float = 1.0
@@ -52,6 +55,7 @@ class Recent:
     alone: float = 0.0
     mapped: bool = False
     distrust: float = 0.0
+    strange: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +129,20 @@ def remembered(recent: Recent, scan: ScanTold, driven: float) -> Recent:
         alone=0.0 if scan.recognised >= FEWEST else recent.alone + driven,
         mapped=recent.mapped or scan.recognised > 0.5,
         distrust=(1.0 - FADING) * recent.distrust if recent.distrust > 0.01 else 0.0,
+        strange=_strange(recent.strange, scan),
     )
+
+
+def is_astray(recent: Recent) -> bool:
+    """Whether the known trees are not where they should be seen."""
+    return recent.mapped and (recent.found < FOUND_LOST or recent.strange >= STRANGE_LOST)
+
+
+def _strange(before: int, scan: ScanTold) -> int:
+    """Counted until a known tree is recognised; a scan that misses none or sees nothing says nothing."""
+    if scan.recognised >= 0.5 or scan.found > 0.0:
+        return 0
+    return before + 1 if scan.detections >= FEWEST and scan.missed >= STRANGE_MISSED else before
 
 
 def judged(
@@ -159,7 +176,7 @@ def judged(
 def _word(recent: Recent, sigma_xy: float, doubt: str) -> tuple[HealthState, str]:
     if not sigma_xy <= SIGMA_WEAK:
         return "lost", f"the position is uncertain by {sigma_xy:.1f} m, more than trees stand apart"
-    if recent.mapped and recent.found < FOUND_LOST:
+    if is_astray(recent):
         return "lost", "the known trees are not where they should be seen"
     if doubt:
         return "weak", doubt

@@ -1,0 +1,149 @@
+"""A kidnapped robot: it says that it is lost, finds itself again, and leaves no false tree behind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.geometry import Pose2
+from pipeline.mapper import Mapper
+from pipeline.parameters import preset
+from pipeline.sources import open_source
+from pipeline.steps import steps
+from tests.pipeline.test_mapper import as_bytes
+
+URI = "sim:stand?duration=22&seed=3"
+JUMP, BACK, AFTER = 160, 40, 50  # scan of the jump, the one where it lands, and how many are driven then
+
+
+@cache
+def drive():
+    """The steps of a drive through a stand, its true path, and what is known of its source."""
+    source = open_source(URI)
+    truth = source.truth()
+    assert truth is not None
+    return list(steps(source.records())), truth.path, source.description
+
+
+def kidnapped(landing=BACK):
+    """The drive up to JUMP, and from `landing` on once more without a word of the wheels about it."""
+    whole, _, _ = drive()
+    before, last = whole[:JUMP], whole[JUMP - 1]
+    T = last.T_odom_base @ whole[landing].T_odom_base.inverse()
+    after = [
+        replace(
+            step,
+            index=JUMP + k,
+            T_odom_base=T @ step.T_odom_base,
+            scan=replace(step.scan, stamp_ns=last.scan.stamp_ns + (k + 1) * 10**8),
+        )
+        for k, step in enumerate(whole[landing : landing + AFTER])
+    ]
+    return before, after
+
+
+def mapper(**changes: Any):
+    """A mapper for the drive."""
+    d = drive()[2]
+    return Mapper(preset("forest").replace(changes), sensor=d.sensor, T_base_lidar=d.T_base_lidar, seed=1)
+
+
+def confirmed(frame):
+    """Numbers of the trees on the map."""
+    return set(frame.trees.number[frame.trees.confirmed].tolist())
+
+
+@cache
+def mapped():
+    """The frames before and after the jump."""
+    m = mapper()
+    before, after = kidnapped()
+    return [m.process(step) for step in before], [m.process(step) for step in after]
+
+
+def test_a_drive_without_a_jump_is_never_lost():
+    assert {frame.health.state for frame in mapped()[0]} <= {"good", "weak"}
+
+
+def test_a_kidnapped_robot_says_so_and_is_good_again_within_fifty_scans():
+    states = [frame.health.state for frame in mapped()[1]]
+    assert "lost" in states[:5]
+    assert states[-1] == "good"
+    assert states.count("lost") < 20
+    told = [word for frame in mapped()[1] for word in frame.warnings]
+    assert any("is lost" in word for word in told)
+    assert any("found again" in word for word in told)
+
+
+def test_it_stands_where_it_was_put():
+    _, truth, _ = drive()
+    stamp = drive()[0][BACK + AFTER - 1].scan.stamp_ns
+    k = int(np.searchsorted(truth.stamp_ns, stamp))
+    pose = mapped()[1][-1].estimate.T_map_base
+    assert np.hypot(pose.x - truth.x[k], pose.y - truth.y[k]) < 0.15
+
+
+def test_a_jump_leaves_at_most_one_false_tree():
+    before, after = mapped()
+    known, now = confirmed(before[-1]), confirmed(after[-1])
+    place = after[-1].trees.position[after[-1].trees.confirmed]
+    old = before[-1].trees.position[before[-1].trees.confirmed]
+    far = np.hypot(*(place[:, None] - old[None]).transpose(2, 0, 1)).min(axis=1) > 1.0
+    known_truth = open_source(URI).truth()
+    assert known_truth is not None
+    assert known_truth.trees is not None
+    true = np.stack([known_truth.trees.x, known_truth.trees.y], axis=1)
+    false = np.hypot(*(place[far][:, None] - true[None]).transpose(2, 0, 1)).min(axis=1, initial=9.0) > 0.5
+    assert np.count_nonzero(false) <= 1
+    assert len(known - now) <= 2
+
+
+def test_without_relocalisation_it_maps_on():
+    m = mapper(**{"relocalisation.method": "none"})
+    before, after = kidnapped()
+    for step in before:
+        m.process(step)
+    words = [word for step in after[:10] for word in m.process(step).warnings]
+    assert not any("lost" in word for word in words)
+
+
+def test_a_snapshot_taken_while_lost_goes_on_to_the_same_bytes():
+    m = mapper()
+    before, after = kidnapped()
+    for step in before:
+        m.process(step)
+    lost = [m.process(step) for step in after[:5]]
+    assert lost[-1].health.state == "lost"
+    state = m.snapshot()
+    once = [as_bytes(m.process(step)) for step in after[5:15]]
+    m.restore(state)
+    assert [as_bytes(m.process(step)) for step in after[5:15]] == once
+
+
+@pytest.mark.parametrize("landing", [0, 90])
+def test_wherever_it_lands(landing):
+    m = mapper()
+    before, after = kidnapped(landing)
+    for step in before:
+        m.process(step)
+    states = [m.process(step).health.state for step in after]
+    assert states[-1] != "lost"
+
+
+def test_odometry_that_turns_by_half_a_circle_does_not_lose_the_robot():
+    """The robot itself drives on."""
+    m = mapper()
+    whole, truth, _ = drive()
+    for step in whole[:JUMP]:
+        m.process(step)
+    at = whole[JUMP].T_odom_base
+    wrong = at @ Pose2(0.0, 0.0, np.pi) @ at.inverse()
+    told = [m.process(replace(step, T_odom_base=wrong @ step.T_odom_base)) for step in whole[JUMP:][:AFTER]]
+    k = int(np.searchsorted(truth.stamp_ns, told[-1].stamp_ns))
+    pose = told[-1].estimate.T_map_base
+    assert told[-1].health.state != "lost"
+    assert np.hypot(pose.x - truth.x[k], pose.y - truth.y[k]) < 0.2
