@@ -80,6 +80,7 @@ _LASER2D: dict[str, object] = {
     "slam.miss_weight": 1.0,
     "tracking.hits_to_confirm": 5,
     "slam.update_distance": 0.5,
+    "relocalisation.method": "none",
     "relocalisation.slack": 0.3,
     "gathering.method": "none",
     "tracking.dbh_arc_min": 0.0,
