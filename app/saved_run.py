@@ -95,9 +95,11 @@ def read_saved_run(folder: Path) -> SavedRun:
         raise damaged(str(file), f"it has format {tree.get('format')!r} and not {FORMAT}")
     try:
         saved = decode(SavedRun, tree, blob)
+        if not saved.sources or not len(saved.map.stamp_ns):
+            raise ValueError("there is no scan in it")
         saved.map.state()
         saved.chosen_parameters()
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise damaged(str(file), str(error)) from None
     except StemmapError as error:
         raise damaged(str(file), error.what) from None

@@ -1,4 +1,8 @@
-"""A map as it is saved: all that the mapper knows, so that it goes on from there to the same bytes."""
+"""A map as it is saved: all that the mapper knows, so that it goes on from there to the same bytes.
+
+What is kept to take back wrong scans, and a search that goes on, are left out: a robot that is carried away
+shortly after a run goes on takes back no scan from before, and one that was lost is searched for anew.
+"""
 
 from __future__ import annotations
 
@@ -57,10 +61,11 @@ class SavedMap:
         """
         _check_slam(self.slam)
         n = len(self.slam.genealogy)
-        if not len(self.stamp_ns) == len(self.sigma_xy) == n or np.any(np.diff(self.stamp_ns) <= 0):
+        if not self.stamp_ns.shape == self.sigma_xy.shape == (n,) or np.any(np.diff(self.stamp_ns) <= 0):
             raise ValueError("the stamps are not those of the path")
         _check_rows(self.tracks, TrackTable.empty())
         _check_rows(self.columns, no_columns())
+        _check_finite(self.tracks.x, self.tracks.P, self.columns.axis)
         if (
             len(self.tracks)
             and not 0 < self.tracks.number.min() <= self.tracks.number.max() < self.next_number
@@ -87,8 +92,7 @@ def _check_slam(slam: SlamState) -> None:
             raise ValueError(f"{f.name} of the particles has another shape")
     if not is_sound(slam.maps, P) or not 0 <= slam.best < P:
         raise ValueError("the particles' maps do not fit")
-    if not np.all(np.isfinite(slam.pose)):
-        raise ValueError("a pose is not finite")
+    _check_finite(slam.pose, slam.motion, slam.motion_covariance, slam.maps.mean, slam.maps.covariance)
     past = slam.genealogy
     after = P
     for generation in reversed(past.recent):
@@ -101,6 +105,12 @@ def _check_slam(slam: SlamState) -> None:
         raise ValueError("the path has other columns")
     if past.founders is not None and any(len(f) != P or not _within(f, 1 << 20) for f in past.founders):
         raise ValueError("the particles have other founders")
+
+
+def _check_finite(*columns: Float) -> None:
+    """Compiled code turns places into rows of its tables, and what is no number into any row."""
+    if not all(np.isfinite(column).all() for column in columns):
+        raise ValueError("a place or a covariance is not finite")
 
 
 def _within(rows: Int, size: int) -> bool:

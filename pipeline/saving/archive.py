@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from typing import Any
 
 from pipeline.errors import StemmapError
@@ -45,7 +46,7 @@ def read_archive(data: bytes, where: str) -> tuple[Any, bytes]:
             blob = _entry(archive, ARRAYS, LARGEST_ARRAYS)
         return json.loads(text), blob
     except (zipfile.BadZipFile, zipfile.LargeZipFile, KeyError, ValueError, EOFError, OSError,
-            NotImplementedError, RuntimeError, RecursionError) as error:  # fmt: skip
+            NotImplementedError, RuntimeError, RecursionError, zlib.error) as error:  # fmt: skip
         raise damaged(where, str(error) or type(error).__name__) from None
 
 
@@ -55,7 +56,10 @@ def damaged(where: str, why: str) -> StemmapError:
 
 
 def _entry(archive: zipfile.ZipFile, name: str, largest: int) -> bytes:
-    declared = archive.getinfo(name).file_size
+    entry = archive.getinfo(name)
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is compressed in another way")
+    declared = entry.file_size
     if declared > largest:
         raise ValueError(f"{name} declares {declared} bytes")
     with archive.open(name) as file:

@@ -121,9 +121,9 @@ def _tuple(of: tuple[Any, ...], tree: Any, blob: bytes, name: str) -> tuple[Any,
 def _number(kind: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
     if kind is float and isinstance(tree, str) and tree in ("nan", "inf", "-inf"):
         return float(tree)
-    if kind is float and isinstance(tree, int | float) and not isinstance(tree, bool):
-        return float(tree)
-    if kind is int and isinstance(tree, int) and not isinstance(tree, bool) and abs(tree) < 1 << 63:
+    if isinstance(tree, int) and not isinstance(tree, bool) and abs(tree) < 1 << 63 and kind in (int, float):
+        return kind(tree)
+    if kind is float and isinstance(tree, float):
         return tree
     if kind in (bool, str) and isinstance(tree, kind):
         return tree
@@ -136,7 +136,7 @@ def _array(scalar: Any, tree: Any, blob: bytes, name: str) -> np.ndarray[Any, An
         raise ValueError(f"{name} is no array of {dtype}")
     shape: Any = tree.get("shape")
     at: Any = tree.get("at")
-    if not isinstance(shape, list) or not all(type(n) is int and n >= 0 for n in (*shape, at)):
+    if not isinstance(shape, list) or not shape or not all(type(n) is int and n >= 0 for n in (*shape, at)):
         raise ValueError(f"{name} has no shape")
     count = math.prod(shape)
     if len(shape) > 8 or at + count * dtype.itemsize > len(blob):

@@ -98,6 +98,30 @@ def test_a_cut_file_is_refused():
             read_archive(data[:length], "a file")
 
 
+def test_a_byte_that_went_wrong_anywhere_is_one_error_for_people():
+    whole = write_archive(*encode(saved()[0]))
+    rng = np.random.default_rng(3)
+    for at in rng.integers(0, len(whole), 60).tolist():
+        data = whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :]
+        with suppress(StemmapError, ValueError):
+            decode(SavedMap, *read_archive(data, "a file"))
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("sensor_z", 10**400),
+        ("tile", {"dtype": "<i8", "shape": [], "at": 0}),
+        ("tile", {"dtype": "<i8", "shape": [0, 1 << 70], "at": 0}),
+    ],
+)
+def test_numbers_and_shapes_that_no_array_has_are_refused(part, value):
+    tree, blob = encode(saved()[0])
+    tree["ground"][part] = value
+    with pytest.raises(ValueError, match=r"."):
+        decode(SavedMap, tree, blob).state()
+
+
 def _with(state, **changes: Any):
     return replace(state, slam=replace(state.slam, **changes))
 
@@ -117,6 +141,9 @@ def _with_maps(state, **changes: Any):
         lambda s: _with(s, best=100),
         lambda s: _with_maps(s, mean=s.slam.maps.mean[:, :, :1]),
         lambda s: _with(s, pose=s.slam.pose * np.nan),
+        lambda s: _with_maps(s, mean=s.slam.maps.mean + np.nan),
+        lambda s: replace(s, tracks=replace(s.tracks, x=s.tracks.x + np.nan)),
+        lambda s: replace(s, stamp_ns=s.stamp_ns[:, None]),
         lambda s: replace(s, columns=replace(s.columns, axis=s.columns.axis[:, :3])),
         lambda s: replace(s, memory=replace(s.memory, room=3)),
         lambda s: replace(s, memory=replace(s.memory, room=1 << 40)),
