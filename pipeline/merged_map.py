@@ -100,16 +100,23 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
     moved.x[:] = tracks.x @ C.T
     moved.x[:, :2] += [T.x, T.y]
     moved.P[:] = C @ tracks.P @ C.T
-    J = np.zeros((len(tracks), 2, 3))
-    J[:, 0, 0] = J[:, 1, 1] = 1.0
-    J[:, 0, 2], J[:, 1, 2] = T.y - moved.x[:, 1], moved.x[:, 0] - T.x
-    moved.P[:, :2, :2] += J @ covariance @ J.transpose(0, 2, 1)
+    moved.P[:, :2, :2] += _of_the_frame(moved.x[:, :2], T, covariance)
     moved.stamp_ns[:] += shift_ns
     moved.first_ns[:] += shift_ns
     turn = round(T.yaw / (2.0 * np.pi / SECTORS)) % SECTORS
     all_sides = (1 << SECTORS) - 1
     moved.sides[:] = ((tracks.sides << turn) | (tracks.sides >> (SECTORS - turn))) & all_sides
     return moved
+
+
+def _of_the_frame(place: Float, T: Pose2, covariance: Float) -> Float:
+    """What the error of a frame's pose, covariance of shape (3, 3), adds to places in it, shape (N, 2) and
+    already moved: J S J^T with J = d place / d (x, y, yaw), shape (N, 2, 2)."""
+    J = np.zeros((len(place), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = T.y - place[:, 1], place[:, 0] - T.x
+    spread: Float = J @ covariance @ J.transpose(0, 2, 1)
+    return spread
 
 
 def _moved_path(b: SavedMap, T: Pose2) -> Float:
@@ -123,8 +130,8 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
     known, other = a.map_of(a.best), b.map_of(b.best)
     C = T.rotation()
     full = other.covariance[:, [[0, 1], [1, 2]]]
-    R = _flat(C @ full @ C.T + covariance[:2, :2])
     mean = T.apply(other.mean)
+    R = _flat(C @ full @ C.T + _of_the_frame(mean, T, covariance))
     row_of, _ = associate(mean, R, known.mean, known.covariance, np.inf, reach)
     new = row_of < 0
     moved = MapColumns(mean, R, other.hits, other.score, other.birth + a.detections)
