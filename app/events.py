@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
-
 from pipeline.parameters.model import Value
 from pipeline.records import Frame
 
@@ -36,6 +34,7 @@ class Events:
 
     def __init__(self) -> None:
         self._events: dict[str, Event] = {}
+        self._confirmed: set[int] = set()
         self._warnings: frozenset[str] = frozenset()
         self._health = "good"
         self._base: tuple[str, dict[str, Value]] | None = None
@@ -43,14 +42,18 @@ class Events:
     def forget(self) -> None:
         """Another run begins."""
         self._events.clear()
+        self._confirmed.clear()
         self._warnings, self._health, self._base = frozenset(), "good", None
 
     def shown(self, frame: Frame, time_s: float) -> bool:
         """Take a scan's results; returns whether anything happened. A tree that is confirmed again after the
         run went back has its mark where it was confirmed first."""
         known = set(self._events)
-        for number in np.sort(frame.trees.number[frame.trees.confirmed]).tolist():
+        # Not those whose marks are there: of more trees than marks the forgotten ones would come again.
+        confirmed = set(frame.trees.number[frame.trees.confirmed].tolist())
+        for number in sorted(confirmed - self._confirmed):
             self._note(f"tree {number}", Event(time_s, "tree", f"Tree {number} confirmed"))
+        self._confirmed |= confirmed
         health = frame.health
         if health.state != self._health:
             self._health = health.state
@@ -74,11 +77,13 @@ class Events:
             before, after: All values by dotted name.
             time_s: Of the standing scan.
         """
-        self._events = {
-            key: event
+        undone = {
+            key
             for key, event in self._events.items()
-            if event.time_s <= time_s or event.kind in ("change", "warning")
+            if event.time_s > time_s and event.kind not in ("change", "warning")
         }
+        self._events = {key: event for key, event in self._events.items() if key not in undone}
+        self._confirmed = {number for number in self._confirmed if f"tree {number}" not in undone}
         key = f"change {time_s:.1f}"
         if self._base is None or self._base[0] != key:
             self._base = (key, before)

@@ -59,6 +59,15 @@ def test_a_slider_that_moves_is_one_change_and_one_that_came_back_is_none():
     assert [kind for _, kind, _ in marks(events)] == ["tree"]
 
 
+def test_of_more_trees_than_marks_none_is_confirmed_again():
+    events = Events()
+    assert events.shown(seen(0, 600), 0.0)
+    told = marks(events)
+    assert not events.shown(seen(1, 600), 0.1)
+    assert marks(events) == told
+    assert {t for t, _, _ in told} == {0.0}
+
+
 @given(st.lists(st.tuples(st.integers(0, 900), st.integers(0, 60)), max_size=40))
 def test_they_are_bounded_and_in_order(scans: list[tuple[int, int]]):
     events = Events()
