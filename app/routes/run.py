@@ -121,12 +121,16 @@ def what_may_be_opened(uri: str, settings: Settings) -> str | None:
     try:
         if uri.startswith("sim:") and not Path(uri).exists():
             return _simulated_that_may_be_opened(uri, settings)
-        if settings.recordings is None:
-            return None
-        path = Path(uri.removeprefix("file://")).expanduser().resolve()
-        return str(path) if path.is_relative_to(settings.recordings.resolve()) else None
+        return _path_that_may_be_opened(uri.removeprefix("file://"), settings)
     except (OSError, ValueError, RuntimeError):  # RuntimeError: a home of nobody
         return None
+
+
+def _path_that_may_be_opened(name: str, settings: Settings) -> str | None:
+    if settings.recordings is None:
+        return None
+    path = Path(name).expanduser().resolve()
+    return str(path) if path.is_relative_to(settings.recordings.resolve()) else None
 
 
 def _simulated_that_may_be_opened(uri: str, settings: Settings) -> str | None:
@@ -137,7 +141,7 @@ def _simulated_that_may_be_opened(uri: str, settings: Settings) -> str | None:
     values = dict(parse_qsl(query, keep_blank_values=True))
     for key in ("file", "truth"):
         if key in values:
-            path = what_may_be_opened(values[key].removeprefix("sim:"), settings)
+            path = _path_that_may_be_opened(values[key], settings)
             if path is None:
                 return None
             values[key] = path

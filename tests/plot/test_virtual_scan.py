@@ -126,4 +126,6 @@ def test_from_another_machine_a_cloud_is_read_only_from_the_folder_of_recordings
     inside = f"file={files / 'plot.laz'}"
     assert what_may_be_opened(f"sim:cloud?{inside}&truth=/etc/passwd", far) is None
     assert what_may_be_opened(f"sim:cloud?{inside}/../../other.laz", far) is None
+    for again in ("sim:", "sim:sim:", "sim:file://"):
+        assert what_may_be_opened(f"sim:cloud?file={again}{tmp_path / 'other.laz'}", far) is None
     assert what_may_be_opened("sim:cloud?file=/etc/passwd", replace(far, recordings=None)) is None
