@@ -36,7 +36,7 @@ from pipeline.recovery import Recovery, RecoveryState
 from pipeline.shape import describe
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.stems import take_stems
-from pipeline.terrain import Terrain, height_above
+from pipeline.terrain import Terrain, height_above, heights_of_places, shows_ground
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
 from pipeline.visibility import BINS, clear_range
@@ -46,6 +46,10 @@ ASTRAY = (
     "searched for the stems around"
 )
 NOT_FOUND = "the stems around were not found in the map; it goes on where the odometry leads"
+NO_GROUND = (
+    "a scan shows no ground (a wall or a ceiling only?): heights are guesses, and diameters are not told "
+    "for breast height"
+)
 NOTHING_FREE: Float = np.zeros(BINS)
 ALWAYS_GATHERED = 10  # first scans, so that a short recording is judged on all it has
 
@@ -150,6 +154,7 @@ class Mapper:
                     found,
                     free,
                     p.slam.view_range,
+                    seen.heights,
                 )
                 self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
 
@@ -188,7 +193,7 @@ class Mapper:
                 "out of range": len(step.scan.points) - len(seen.raw),
                 **seen.counts,
             },
-            warnings=(*step.warnings, *told),
+            warnings=(*step.warnings, *seen.warnings, *told),
             columns=columns,
             ground=None if p.ground.method == "none" else self._ground.state.record,
             base_z=(self._ground.state.sensor_z or 0.0) - float(seen.sensor_offset[2])
@@ -269,6 +274,7 @@ class Mapper:
             found = detections(judged, sensor_offset, p.detection)
             free = clear_range(raw, filtered, sensor_offset)
 
+        grounded = terrain is not None and shows_ground(terrain)
         return _Seen(
             raw=raw,
             filtered=filtered,
@@ -278,6 +284,10 @@ class Mapper:
             free=free,
             sensor_offset=sensor_offset,
             above=(boxed, height, terrain) if terrain and height is not None else None,
+            heights=heights_of_places(judged.centroid[found.cluster], terrain.height)
+            if terrain is not None and grounded
+            else None,
+            warnings=(NO_GROUND,) if terrain is not None and len(raw) and not grounded else (),
             counts={
                 "out of the box": len(raw) - len(boxed),
                 "ground or too high": len(boxed) - len(band),
@@ -308,6 +318,8 @@ class Mapper:
             free=free,
             sensor_offset=sensor_offset,
             above=None,
+            heights=None,
+            warnings=(),
             counts={"clustered": len(places)},
         )
 
@@ -374,6 +386,8 @@ class _Seen:
     Attributes:
         free: How far the view is free by direction (see visibility).
         above: Points of the box, their heights above the ground, and the ground; None without a ground.
+        heights: Mean height above the ground of what each detection is of, shape (D,) [m]; None where the
+            scan shows no ground.
     """
 
     raw: Float32
@@ -384,4 +398,6 @@ class _Seen:
     free: Float
     sensor_offset: Float
     above: tuple[Float32, Float32, Terrain] | None
+    heights: Float | None
+    warnings: tuple[str, ...]
     counts: dict[str, int]

@@ -14,6 +14,7 @@ from pipeline.records import Bool, Float32
 SECTORS = 72
 RINGS = 48  # would reach to infinity
 HALF_WAY = 20.0  # m; half of them lie nearer
+LEAST_SEEN = 60  # cells; the foot of walls around a sensor fills up to 50, ground that is seen over 400
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +32,22 @@ class Terrain:
 
     height: Float
     seen: Bool
+
+
+def shows_ground(terrain: Terrain) -> bool:
+    """Whether a scan saw ground at all, not only the foot of a wall, a ceiling or a heap of points."""
+    seen = int(np.count_nonzero(terrain.seen))
+    return seen >= LEAST_SEEN and ground_at(terrain.height, 0.0, 0.0) < 0.0
+
+
+@compiled
+def heights_of_places(places: Float, height: Float) -> Float:
+    """Height of places (N, 3) [m] of the level sensor frame above the ground, shape (N,) [m]; `height` is
+    a Terrain's."""
+    above = np.empty(places.shape[0])
+    for i in range(places.shape[0]):
+        above[i] = places[i, 2] - ground_at(height, places[i, 0], places[i, 1])
+    return above
 
 
 def height_above(points: Float32, terrain: Terrain) -> Float32:

@@ -378,6 +378,15 @@ class Tracking(Stage):
     dbh_arc_min: float = number(
         180.0, "Arc for a DBH", "deg", 0.0, 360.0, 10.0, "A diameter is told from this much of the trunk on."
     )
+    breast_height: float = number(
+        1.3,
+        "Breast height",
+        "m",
+        0.1,
+        5.0,
+        0.05,
+        "Height above the ground that a tree's diameter is told for.",
+    )
 
 
 class Evaluation(Stage):

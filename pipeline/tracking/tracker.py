@@ -39,6 +39,7 @@ class Tracker:
         detections: Detections,
         clear_range: Float,
         view_range: float,
+        heights: Float | None = None,
     ) -> None:
         """Take the detections of one scan.
 
@@ -48,6 +49,8 @@ class Tracker:
             detections: In the base frame.
             clear_range: How far the view was free by direction.
             view_range: A tree nearer than this can be missed [m].
+            heights: Mean height above the ground at which each detection was seen, shape (D,) [m], NaN
+                where it is not known; None where none is.
         """
         p, t = self.parameters, self.tracks
         row_of, touched, position, R = assign(
@@ -76,7 +79,9 @@ class Tracker:
             touched = np.concatenate([touched, np.ones(len(fresh), np.bool_)])
         else:
             self._update(row_of, stamp_ns, position, R)
-        _gather(self.tracks, row_of, position, T_map_base, detections)
+        unknown = np.full(len(position), np.nan)
+        above_breast = unknown if heights is None else heights - p.breast_height
+        _gather(self.tracks, row_of, position, T_map_base, detections, above_breast)
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius).with_score()
 
     def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
@@ -152,7 +157,9 @@ class Tracker:
         )
 
 
-def _gather(t: TrackTable, rows: Int, z: Float, T_map_base: Pose2, seen: Detections) -> None:
+def _gather(
+    t: TrackTable, rows: Int, z: Float, T_map_base: Pose2, seen: Detections, above_breast: Float
+) -> None:
     """Add what one scan's detections say about their trunks; no two are of the same trunk."""
     add_observations(
         rows,
@@ -162,6 +169,7 @@ def _gather(t: TrackTable, rows: Int, z: Float, T_map_base: Pose2, seen: Detecti
         seen.radius,
         seen.radius_sigma,
         seen.arc,
+        above_breast,
         t.hits,
         t.eccentricity,
         t.eccentricities,

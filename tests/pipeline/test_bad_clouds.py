@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.geometry import Pose2, Pose3
 from pipeline.ground import find_terrain, height_above
-from pipeline.mapper import Mapper
+from pipeline.mapper import NO_GROUND, Mapper
 from pipeline.parameters import preset
 from pipeline.records import Scan, Sensor, Step
 
@@ -59,6 +59,13 @@ def test_no_tree_is_invented_and_no_number_is_lost(name):
     above = height_above(points, find_terrain(points, FOREST.ground))
     assert above.shape == (len(points),)
     assert np.all(np.isfinite(above))
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_a_scan_without_ground_is_said_to_be_one(name):
+    (frame,) = map(mapper().process, _steps(CLOUDS[name], 1))
+    ground = name in ("empty", "the ground alone", "a slanted plane")
+    assert (NO_GROUND in frame.warnings) != ground
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.ground import find_terrain, height_above, in_band
 from pipeline.parameters import preset
+from pipeline.terrain import heights_of_places, shows_ground
 from tests.pipeline.strategies import FEW
 
 FOREST = preset("forest").ground
@@ -50,6 +51,16 @@ def test_a_point_over_a_plane_has_its_height(slope, height):
     error = height_above(raised, terrain)[near] - height
     assert abs(np.median(error)) < 0.12
     assert np.abs(error).max() < 0.25 + np.tan(np.radians(slope))
+
+
+@FEW
+@given(st.floats(0.0, 20.0), st.floats(-3.1, 3.1))
+def test_ground_is_known_for_ground_and_places_have_the_heights_of_points(slope, uphill):
+    points = _rings(slope, uphill)
+    terrain = find_terrain(points, FOREST)
+    assert shows_ground(terrain)
+    above = heights_of_places(points.astype(np.float64), terrain.height)
+    np.testing.assert_allclose(above, height_above(points, terrain), atol=1e-3)
 
 
 def test_level_ground_is_exact():

@@ -238,6 +238,16 @@ def test_an_unsure_heading_makes_far_trees_unsure_across():
     np.testing.assert_allclose(np.diag(t.tracks.P[0])[:2], [1e-4, 1e-4 + 0.1**2], rtol=1e-9)
 
 
+@pytest.mark.parametrize("breast_height", [1.3, 1.0])
+def test_a_diameter_is_told_for_breast_height(breast_height):
+    t = tracker(dbh_arc_min=0.0, breast_height=breast_height)
+    seen = detections([[5.0, 0.0]], radius=0.2)
+    for k, height in enumerate((0.7, 1.0, 1.6, np.nan)):
+        t.process(k * 100_000_000, Pose2(), SURE, seen, NOTHING_SEEN, 15.0, np.array([height]))
+    lost = 0.005 * np.mean([0.7 - breast_height, 1.0 - breast_height, 1.6 - breast_height, 0.0])
+    assert t.trees().dbh[0] == pytest.approx(2.0 * (0.2 + lost))
+
+
 def test_a_diameter_needs_three_radii_and_weighs_them():
     t = tracker(dbh_arc_min=0.0)
     for k in range(3):
