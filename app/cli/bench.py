@@ -42,8 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
     from tests.benchmarks.runner import run as run_benchmarks
 
     if arguments.list:
-        for name, line in descriptions().items():
-            print(f"{name:10}{line}")
+        known = descriptions()
+        for name, line in known.items():
+            print(f"{name:{max(map(len, known))}}  {line}")
         return 0
     out = arguments.out or _ROOT / "docs" / "benchmarks.md"
     day = arguments.date or date.today()

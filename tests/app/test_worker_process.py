@@ -77,7 +77,8 @@ async def test_it_opens_and_maps(both: tuple[WorkerProcess, Said]) -> None:
     await worker.send(Open("fake:30"))
     assert (await said.opened()).kind == "fake run"
     await worker.send(Advance(8))
-    assert (await said.scan(7)).path.x.size == 8
+    picture = await said.scan(7)
+    assert picture.path_start + picture.path.x.size == 8
     await worker.send(Play())
     assert (await said.state("finished")).scan_index == 29
 
