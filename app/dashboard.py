@@ -9,6 +9,7 @@ import asyncio
 from dataclasses import replace
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -314,6 +315,10 @@ class Dashboard:
         if shown.run != self._run:  # of a run that was left
             return
         self.path = joined(self.path, shown.path_start, shown.path)
+        if shown.frame.ground is None and self.shown is not None:
+            # An earlier picture brought it, which the scene may not have drawn, or before it was built anew.
+            frame = replace(shown.frame, ground=self.shown.frame.ground)
+            shown = msgspec.structs.replace(shown, frame=frame)
         self.shown = shown
         self.path_xy = np.column_stack([self.path.x, self.path.y])
         self.live.show(map_payload(shown), self.path_xy)

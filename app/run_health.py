@@ -68,7 +68,7 @@ class RunHealth:
         self._was = health.state
 
     def _extend(self, frame: Frame, health: Health) -> None:
-        if health.state == self._was:
+        if health.state == self._was and (self._spans or self._spans_left_out):
             if not self._spans_left_out:
                 self._spans[-1].last, self._spans[-1].end_ns = frame.index, frame.stamp_ns
         elif len(self._spans) < MOST_SPANS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from app.messages import Open, Play, Seek, SetParameters, Status
 from app.parameter_state import ParameterState
 from app.worker_messages import Answer, AskCluster, Begin, Report, Shown
 from pipeline.errors import ParameterError
+from pipeline.height_map import no_height_map
 from pipeline.parameters import preset
 from tests.app.fakes import FakeScene, FakeWorker, frame, opened, path, truth_trees
 from tests.story.stories import cluster_story
@@ -97,6 +99,20 @@ async def test_opening_empties_the_page_at_once_and_nothing_of_the_old_run_comes
     assert scene_calls(dashboard)[-3][0] == "clear"
     assert (dashboard.shown, dashboard.truth, dashboard.path) == (None, None, None)
     assert "trees" not in browser_knows(dashboard)["truth"]
+
+
+async def test_a_ground_stands_with_every_picture_after_the_one_that_brought_it(dashboard: Dashboard) -> None:
+    """Pictures that come fast are not all drawn, and a scene built anew draws the newest alone."""
+    await dashboard.receive(opened())
+    ground = no_height_map()
+    first, second = frame(0, 5_000_000_000), frame(1, 5_100_000_000)
+    await dashboard.receive(Shown(1, 0.0, replace(first, ground=ground), 0, path([0.0])))
+    await dashboard.receive(Shown(1, 0.1, replace(second, ground=None), 1, path([0.5])))
+    assert dashboard.shown is not None
+    assert dashboard.shown.frame.ground is ground
+    await dashboard.receive(opened(run=2))
+    await dashboard.receive(Shown(2, 0.0, replace(first, ground=None), 0, path([0.0])))
+    assert dashboard.shown.frame.ground is None
 
 
 async def test_what_a_person_chose_stays(dashboard: Dashboard) -> None:
