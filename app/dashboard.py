@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from app.annotating import Annotating
 from app.events import Events
 from app.live import Live
 from app.live_payload import map_payload, truth_payload
@@ -71,13 +72,16 @@ class Dashboard:
     Args:
         parameters: In force at the beginning.
         live: Where the browsers listen.
+        annotating: What people say of the trees; None keeps it in memory.
     """
 
     worker: WorkerLike
     scene: SceneLike
 
-    def __init__(self, parameters: ParameterState, live: Live) -> None:
+    def __init__(self, parameters: ParameterState, live: Live, annotating: Annotating | None = None) -> None:
         self.parameters = parameters
+        self.annotating = annotating or Annotating(None)
+        self.annotating.changed = self._use_truth
         self.live = live
         self.scores = Scores(lambda score: live.tell("evaluation", score))
         self.status = Status(state="starting", detail="Starting")
@@ -117,6 +121,7 @@ class Dashboard:
         self._leave_selecting()
         self._show_scene.cancel()
         await self.worker.close()
+        await self.annotating.close()
         self.scene.close()
 
     # --- what people do --------------------------------------------------------------------------
@@ -149,7 +154,8 @@ class Dashboard:
         """Leave the run and open another source."""
         self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self._run = None
-        await self._forget(None)
+        self.annotating.leave()
+        await self._forget()
         await self.command(source)
 
     async def change_parameters(self, changes: dict[str, Value]) -> None:
@@ -283,7 +289,10 @@ class Dashboard:
     async def _begin(self, opened: Opened) -> None:
         """A source is open and waits: parameters that suit it first, then it plays."""
         self._run = opened.run
-        await self._forget(opened.truth)
+        await self.annotating.begin(opened.digest or opened.uri, opened.uri, opened.truth)
+        if self._run != opened.run:  # it was left meanwhile
+            return
+        await self._forget()
         if self.parameters.suit(opened.preset):
             self._show_parameters()
         restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
@@ -295,11 +304,10 @@ class Dashboard:
         # Always with the parameters: those sent for a run that was left since did not reach the worker.
         await self.worker.send(Begin(opened.run, state.parameters.model_dump(), state.revision, play))
 
-    async def _forget(self, truth: TruthTrees | None) -> None:
+    async def _forget(self) -> None:
         """Show an empty map, with the truth of the run that comes."""
         self.shown = self.path = None
         self.path_xy = np.zeros((0, 2))
-        self.truth = truth
         self.live.forget_map()
         self.scores.forget()
         self.events.forget()
@@ -307,9 +315,18 @@ class Dashboard:
         self._tell_loop(None)
         self._show_scene.cancel()
         self.scene.clear()
-        self.scene.show_truth(truth)
-        self.live.tell("truth", truth_payload(truth))
+        self._use_truth()
         await self.select_tree(None)
+
+    def _use_truth(self) -> None:
+        """Show the truth, score against it, and tell what was annotated."""
+        self.truth = self.annotating.truth
+        self.scene.show_truth(self.truth)
+        self.live.tell("truth", truth_payload(self.truth))
+        self.live.tell("annotations", self.annotating.as_plain())
+        if self.truth is None:
+            self.scores.forget()
+        self._score()
 
     def _show(self, shown: Shown) -> None:
         if shown.run != self._run:  # of a run that was left

@@ -13,11 +13,13 @@ from starlette.middleware import Middleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.annotating import Annotating
 from app.dashboard import Dashboard, SceneLike, WorkerLike
 from app.live import Live
 from app.messages import Open
 from app.parameter_state import ParameterState
 from app.replies import BadRequestError, error_reply, failure_reply
+from app.routes import annotations as annotation_routes
 from app.routes import page, parameters, results, run, sockets, story
 from app.security import BodyTooLargeError, Guard
 from app.settings import Settings
@@ -25,7 +27,9 @@ from pipeline.errors import ParameterError, StemmapError
 
 _log = logging.getLogger(__name__)
 
-ROUTERS = tuple(module.router for module in (page, run, parameters, results, story, sockets))
+ROUTERS = tuple(
+    module.router for module in (page, run, parameters, results, annotation_routes, story, sockets)
+)
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
 MakeWorker = Callable[[Dashboard], WorkerLike]
@@ -59,7 +63,7 @@ def build(
         parameter_state: The parameters at the start.
         make_scene, make_worker: Stand in for viser and for the worker's process in tests.
     """
-    dashboard = Dashboard(parameter_state, Live())
+    dashboard = Dashboard(parameter_state, Live(), Annotating(settings.folder))
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

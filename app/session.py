@@ -335,4 +335,5 @@ def _opened(run: Run) -> Opened:
         scans=description.scans,
         end_s=end_s,
         truth=truth.trees if truth else None,
+        digest=description.digest,
     )

@@ -21,6 +21,7 @@ VARIABLES: dict[str, str] = {
     "STEMMAP_TOKEN": "token of the link, 16 characters or more; else a new one at each start",
     "STEMMAP_HOSTS": "further host names by which browsers may call the server, with commas between",
     "STEMMAP_RECORDINGS": "folder whose recordings the page offers",
+    "STEMMAP_FOLDER": "folder where annotations are kept (default: stemmap in your folder for data)",
 }
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
@@ -38,6 +39,7 @@ class Settings:
         hosts: Further names by which browsers may call the server.
         recordings: Folder whose recordings the page offers, or None.
         body_limit: Largest body of a request [bytes].
+        folder: Where annotations are kept; None keeps them in memory only.
         message_limit: Largest message of a browser's websocket [bytes].
     """
 
@@ -48,6 +50,7 @@ class Settings:
     recordings: Path | None = None
     body_limit: int = 1_000_000
     message_limit: int = 1_000_000
+    folder: Path | None = None
 
     @property
     def loopback(self) -> bool:
@@ -93,7 +96,17 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
             name.strip().lower() for name in given.get("STEMMAP_HOSTS", "").split(",") if name.strip()
         ),
         recordings=_folder(recordings) if recordings else None,
+        folder=_data_folder(given),
     )
+
+
+def _data_folder(given: Mapping[str, str]) -> Path | None:
+    """Where annotations are kept: the folder that was named, else the usual one of the system."""
+    if named := given.get("STEMMAP_FOLDER"):
+        return Path(named).expanduser()
+    home = given.get("HOME") or given.get("USERPROFILE")
+    base = given.get("XDG_DATA_HOME") or given.get("LOCALAPPDATA") or (home and f"{home}/.local/share")
+    return Path(base) / "stemmap" if base else None
 
 
 def _port(text: str) -> int:

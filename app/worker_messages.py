@@ -23,6 +23,7 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
         scans: Number of scans, None where it is not known.
         end_s: Time of the last scan since the first, None where it is not known.
         truth: What is known for certain to stand there, or None.
+        digest: Of what was recorded; empty where it is not known.
     """
 
     uri: str
@@ -32,6 +33,7 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
     end_s: float | None
     truth: TruthTrees | None
     run: int = 0
+    digest: str = ""
 
 
 class Shown(msgspec.Struct, frozen=True, tag="shown"):

@@ -41,18 +41,32 @@ def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
     Raises:
         SourceError: It is no such table; the message names line and column.
     """
-    lines, rows = _read_rows(path)
+    return parse_truth_trees(_text_of(path), where=str(path), dbh_unit=dbh_unit)
+
+
+def parse_truth_trees(text: str, *, where: str, dbh_unit: str | None = None) -> TruthTrees:
+    """The same from the text of a table.
+
+    Args:
+        text: Of the whole table.
+        where: What messages call it.
+        dbh_unit: As for `read_truth_trees`.
+
+    Raises:
+        SourceError: It is no such table; the message names line and column.
+    """
+    lines, rows = _rows_of(text, where)
     header = [name.strip().lower() for name in rows[0]] if rows else []
     column = {name: k for k, name in reversed(list(enumerate(header)))}
-    table = _Table(path, lines[1:], rows[1:], column)
+    table = _Table(where, lines[1:], rows[1:], column)
     x, y = _positions(table)
     dbh = _diameters(table, dbh_unit)
     return TruthTrees(x, y, dbh, _kinds(table))
 
 
 class _Table:
-    def __init__(self, path: Path, lines: list[int], rows: list[list[str]], column: dict[str, int]) -> None:
-        self.path, self.lines, self.rows, self.column = path, lines, rows, column
+    def __init__(self, where: str, lines: list[int], rows: list[list[str]], column: dict[str, int]) -> None:
+        self.where, self.lines, self.rows, self.column = where, lines, rows, column
 
     def find(self, names: Iterable[str]) -> str | None:
         return next((name for name in names if name in self.column), None)
@@ -74,29 +88,30 @@ class _Table:
         except ValueError:
             value = math.nan
         if not math.isfinite(value) and (required or text.lower() not in ("nan", "na")):
-            raise SourceError(
-                f"line {self.lines[row]}: {name} = {text!r} is not a number", where=str(self.path)
-            )
+            raise SourceError(f"line {self.lines[row]}: {name} = {text!r} is not a number", where=self.where)
         return value
 
 
-def _read_rows(path: Path) -> tuple[list[int], list[list[str]]]:
-    """The line number and the cells of every row that is not empty."""
+def _text_of(path: Path) -> str:
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise SourceError("the table of trees is larger than 64 MB", where=str(path))
-        text = path.read_text(encoding="utf-8-sig")
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise SourceError(f"cannot read the table of trees: {error.strerror}", where=str(path)) from None
     except UnicodeDecodeError:
         raise SourceError("the table of trees is not text", where=str(path)) from None
+
+
+def _rows_of(text: str, where: str) -> tuple[list[int], list[list[str]]]:
+    """The line number and the cells of every row that is not empty."""
     first = text.partition("\n")[0]
     delimiter = max(",;\t", key=first.count)
     try:
         reader = csv.reader(text.splitlines(), delimiter=delimiter)
         numbered = [(reader.line_num, row) for row in reader if any(row)]
     except csv.Error as error:
-        raise SourceError(f"the table of trees is not a CSV: {error}", where=str(path)) from None
+        raise SourceError(f"the table of trees is not a CSV: {error}", where=where) from None
     return [line for line, _ in numbered], [row for _, row in numbered]
 
 
@@ -108,7 +123,7 @@ def _positions(table: _Table) -> tuple[Float, ...]:
     if azimuth is None or distance is None:
         raise SourceError(
             "the table has no position",
-            where=str(table.path),
+            where=table.where,
             remedy=f"Name the columns x_m and y_m, or azimuth_deg and distance_m; it has "
             f"{', '.join(table.column) or 'no header'}",
         )
@@ -128,7 +143,7 @@ def _diameters(table: _Table, dbh_unit: str | None) -> Float:
     if dbh_unit is None:
         raise SourceError(
             f"column {name!r} does not say its unit",
-            where=str(table.path),
+            where=table.where,
             remedy="Give --dbh-unit m, cm or mm",
         )
     return _measured(table.numbers(name, required=False)) * _UNITS[dbh_unit]
@@ -148,6 +163,6 @@ def _kinds(table: _Table) -> tuple[str, ...]:
         if kind not in KINDS:
             raise SourceError(
                 f"line {table.lines[row]}: class {kind!r} is none of {', '.join(KINDS)}",
-                where=str(table.path),
+                where=table.where,
             )
     return kinds

@@ -6,7 +6,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
+from pipeline.errors import StemmapError
+
 KINDS = ("tree", "pole", "person", "bush", "other")
+MOST_ANNOTATIONS = 5000
+
+
+class StaleError(StemmapError):
+    """An edit of something that somebody else has changed since."""
+
+
+class UnknownError(StemmapError):
+    """There is no such annotation."""
 
 
 @dataclass(frozen=True, slots=True)

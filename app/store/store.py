@@ -16,20 +16,18 @@ from sqlalchemy import Connection, Insert, Row, func, insert, select, update
 
 from app.store import tables
 from app.store.opening import open_engine
-from app.store.records import Annotation, Author, Content, moment
+from app.store.records import (
+    MOST_ANNOTATIONS,
+    Annotation,
+    Author,
+    Content,
+    StaleError,
+    UnknownError,
+    moment,
+)
 from pipeline.errors import StemmapError
 
-MOST_ANNOTATIONS = 5000
-
 _annotations, _changes, _steps, _runs = tables.annotated, tables.changes, tables.steps, tables.runs
-
-
-class StaleError(StemmapError):
-    """An edit of something that somebody else has changed since."""
-
-
-class UnknownError(StemmapError):
-    """There is no such annotation."""
 
 
 class Store:

@@ -41,6 +41,15 @@ ROUTES = [
     ("GET", "/api/pairs"),
     ("GET", "/api/story/cluster/{number}"),
     ("GET", "/api/story/tree/{number}"),
+    ("GET", "/api/annotations"),
+    ("POST", "/api/annotations"),
+    ("PATCH", "/api/annotations/{number}"),
+    ("DELETE", "/api/annotations/{number}"),
+    ("POST", "/api/annotations/undo"),
+    ("POST", "/api/annotations/redo"),
+    ("POST", "/api/annotations/import"),
+    ("GET", "/api/annotations.csv"),
+    ("GET", "/api/annotations.geojson"),
     ("GET", "/no/such/route"),
 ]
 MISSES = {("GET", "/static/index.html"), ("GET", "/static/no-such-file.js")}

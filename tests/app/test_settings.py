@@ -22,11 +22,29 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         "STEMMAP_TOKEN": "0123456789abcdef",
         "STEMMAP_HOSTS": "Robot.local, tunnel ,",
         "STEMMAP_RECORDINGS": str(tmp_path),
+        "STEMMAP_FOLDER": str(tmp_path / "kept"),
     }
     assert set(given) == set(VARIABLES)
     assert from_environment(given) == Settings(
-        "localhost", 9000, "0123456789abcdef", ("robot.local", "tunnel"), tmp_path
+        "localhost",
+        9000,
+        "0123456789abcdef",
+        ("robot.local", "tunnel"),
+        tmp_path,
+        folder=tmp_path / "kept",
     )
+
+
+@pytest.mark.parametrize(
+    ("given", "folder"),
+    [
+        ({"HOME": "/home/ann"}, "/home/ann/.local/share/stemmap"),
+        ({"HOME": "/home/ann", "XDG_DATA_HOME": "/data"}, "/data/stemmap"),
+        ({"HOME": "/home/ann", "STEMMAP_FOLDER": "/kept"}, "/kept"),
+    ],
+)
+def test_annotations_are_kept_where_the_system_keeps_data(given: dict[str, str], folder: str) -> None:
+    assert from_environment(given).folder == Path(folder)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from app.store import MOST_ANNOTATIONS, Author, Content, StaleError, Store, UnknownError
 from app.store.opening import FILE_NAME
+from app.store.records import MOST_ANNOTATIONS, Author, Content, StaleError, UnknownError
+from app.store.store import Store
 from pipeline.errors import StemmapError
 
 ANN, BOB = Author("a" * 16, "Ann"), Author("b" * 16, "Bob")
@@ -182,7 +183,8 @@ def test_a_run_has_a_largest_number_of_annotations():
 CHILD = """
 import sys
 from pathlib import Path
-from app.store import Author, Content, Store
+from app.store.records import Author, Content
+from app.store.store import Store
 store = Store(Path(sys.argv[1]))
 run = store.open_run("d", "u", "n")
 for k in range(100_000):

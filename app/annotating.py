@@ -1,0 +1,203 @@
+"""The annotations of the run that is open: a store that never blocks the event loop, and the truth that
+comes of it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from app.store.records import Annotation, Content, StaleError
+from pipeline.errors import StemmapError
+from pipeline.records import TruthTrees
+
+if TYPE_CHECKING:
+    from app.store.store import Store
+
+T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
+
+# So near to an annotation, what the source says to stand there is the same thing [m].
+SAME_THING = 0.5
+
+
+class Annotating:
+    """What people say of the trees of the run that is open.
+
+    Args:
+        folder: Where it is kept; None keeps it in memory.
+
+    Attributes:
+        run: Number of the run in the store, None while none is open.
+        rows: The annotations of the run.
+        truth: What stands there: what the source knows, and over it what was annotated.
+        problem: Why nothing can be annotated, empty when all is well.
+        serial: Grows with each edit, so that a page knows when it has seen what it did.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.run: int | None = None
+        self.rows: list[Annotation] = []
+        self.truth: TruthTrees | None = None
+        self.problem = ""
+        self.serial = 0
+        self.changed: Callable[[], None] = lambda: None
+        self._own: TruthTrees | None = None
+        self._folder = folder
+        self._store: Store | None = None
+        # One thread: what is asked for first is done first, and the store is never used twice at once.
+        self._thread = ThreadPoolExecutor(1, "store")
+
+    async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
+        """A run was opened.
+
+        Args:
+            source: Digest of what was recorded, else the URI.
+            uri: As it was opened.
+            own: The truth that the source brings, if any.
+        """
+        self.leave()
+
+        def work() -> tuple[int, list[Annotation], TruthTrees | None]:
+            store = self._opened_store()
+            run = store.open_run(source, uri, Path(uri).name[:200] or uri[:200])
+            rows = store.annotations(run)
+            return run, rows, laid_over(own, rows)
+
+        self._own = self.truth = own
+        try:
+            self.run, self.rows, self.truth = await self._off_the_loop(work)
+            self.problem = ""
+        except StemmapError as error:
+            if str(error) != self.problem:
+                _log.warning("%s", error)
+            self.problem = str(error)
+
+    def leave(self) -> None:
+        """No run is open."""
+        self.run, self.rows, self.truth, self._own = None, [], None, None
+
+    async def edit(self, run: int, function: Callable[[Store], T]) -> T:
+        """Let something be done to the store, and tell what stands afterwards.
+
+        Args:
+            run: That the edit is meant for.
+            function: What is to be done, in the thread of the store.
+
+        Raises:
+            StaleError: Another run was opened since, or somebody else has changed the same.
+            StemmapError: Nothing can be annotated.
+        """
+        if self.problem:
+            raise StemmapError(self.problem)
+        if run != self.run:
+            raise StaleError(
+                "another run was opened", remedy="Your edit was not made; look at what stands now"
+            )
+        own = self._own
+
+        def work() -> tuple[T | StaleError, list[Annotation], TruthTrees | None]:
+            store = self._opened_store()
+            done: T | StaleError
+            try:
+                done = function(store)
+            except StaleError as error:  # then what stands is news
+                done = error
+            rows = store.annotations(run)
+            return done, rows, laid_over(own, rows)
+
+        done, rows, truth = await self._off_the_loop(work)
+        if run == self.run:
+            self.rows, self.truth = rows, truth
+            self.serial += 1
+            self.changed()
+        if isinstance(done, StaleError):
+            raise done
+        return done
+
+    async def read(self, function: Callable[[Store, int], T]) -> T | None:
+        """Ask the store about the run; None where there is none."""
+        run = self.run
+        if run is None or self.problem:
+            return None
+        return await self._off_the_loop(lambda: function(self._opened_store(), run))
+
+    async def close(self) -> None:
+        """Finish what is under way, and let go of the file."""
+        if self._store is not None:
+            await self._off_the_loop(self._store.close)
+        self._thread.shutdown()
+
+    def as_plain(self) -> dict[str, Any]:
+        """For the browsers."""
+        own = self._own is not None
+        return {
+            "run": self.run,
+            "serial": self.serial,
+            "problem": self.problem,
+            "used": {(False, False): "none", (True, False): "source", (False, True): "annotations"}.get(
+                (own, bool(self.rows)), "both"
+            ),
+            "same_thing_m": SAME_THING,
+            "trees": [row_payload(row) for row in self.rows],
+        }
+
+    def _opened_store(self) -> Store:
+        from app.store.store import Store
+
+        if self._store is None:
+            self._store = Store(self._folder)
+        return self._store
+
+    async def _off_the_loop(self, function: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._thread, function)
+
+
+def row_payload(row: Annotation) -> dict[str, Any]:
+    """One annotation, with the units in the names."""
+    content = row.content
+    return {
+        "id": row.id,
+        "x": round(content.x, 4),
+        "y": round(content.y, 4),
+        "kind": content.kind,
+        "dbh_cm": None if content.dbh is None else round(100.0 * content.dbh, 2),
+        "who": row.who,
+        "at_s": row.at_ns // 1_000_000_000,
+        "version": row.version,
+    }
+
+
+def contents_of(truth: TruthTrees) -> list[Content]:
+    """The rows of a table of trees."""
+    columns = zip(truth.x.tolist(), truth.y.tolist(), truth.kind, truth.dbh.tolist(), strict=True)
+    return [Content(x, y, kind, dbh if dbh == dbh else None) for x, y, kind, dbh in columns]
+
+
+def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees | None:
+    """What the source knows, and in its place what was annotated within SAME_THING of it."""
+    if not rows:
+        return own
+    contents = [row.content for row in rows]
+    x, y = np.array([c.x for c in contents]), np.array([c.y for c in contents])
+    dbh = np.array([np.nan if c.dbh is None else c.dbh for c in contents])
+    kind = tuple(c.kind for c in contents)
+    if own is None or not len(own.x):
+        return TruthTrees(x, y, dbh, kind)
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(np.column_stack([x, y])).query(np.column_stack([own.x, own.y]))
+    keep = np.flatnonzero(distance > SAME_THING)
+    return TruthTrees(
+        np.concatenate([own.x[keep], x]),
+        np.concatenate([own.y[keep], y]),
+        np.concatenate([own.dbh[keep], dbh]),
+        (*(own.kind[k] for k in keep), *kind),
+    )
