@@ -1,6 +1,6 @@
 // Requests to the server. A refusal becomes an Error whose message is for people.
 
-async function request(path, options = {}) {
+export async function request(path, options = {}) {
   let answer;
   try {
     answer = await fetch(path, { credentials: "same-origin", ...options });

@@ -1,5 +1,6 @@
 // Keyboard shortcuts, also while the scene has the focus.
 
+import { ANNOTATE_KEYS, annotateKey } from "./annotate_keys.js";
 import { byId, el } from "./dom.js";
 import { toggleLayer } from "./layers.js";
 import { select } from "./live.js";
@@ -13,6 +14,7 @@ const LIST = [
   ["space", "play or pause"], ["← →", "one scan back or forward"], ["shift ← →", "ten scans back or forward"],
   ["f", "follow the robot in the scene, or stop following"], ["t", "look at the robot from above"], ["b", "look at it from behind"],
   ["1 … 0", "show or hide a layer of the scene"], ["l", "begin, end and leave a loop"], ["m", "measure a distance on the map"], ["/", "find a tree"], ["esc", "select nothing"], ["?", "this list"],
+  ...ANNOTATE_KEYS,
 ];
 const TYPES = "input:not([type=range]), textarea, select, [contenteditable], [role=slider], [role=combobox], [role=option]";
 const PRESSED = "button, a, summary, [role=tab], [role=checkbox], input[type=checkbox], input[type=range]";
@@ -34,6 +36,11 @@ function openDrawer() {
 }
 
 function act(event, inScene) {
+  if (!document.querySelector("dialog[open]") && !event.target.matches?.(TYPES) && annotateKey(event, inScene)) {
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    return;
+  }
   if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
   const target = event.target;
   if (target.matches?.(TYPES) || (event.key === " " && target.matches?.(PRESSED))) return;

@@ -12,6 +12,7 @@ const takers = {
   parameters(message) { state.parameters = message; },
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
+  annotations(message) { state.annotations = message; },
   selection(message) { Object.assign(state, { selected: message.tree ?? null, selectedCluster: message.cluster ?? null }); },
   events(message) { state.events = message.events; },
   view(message) { state.view = message; },

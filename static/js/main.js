@@ -1,5 +1,7 @@
 // Starts every part of the page, then connects.
 
+import { startAnnotating } from "./annotate.js";
+import { startAnnotatePanel } from "./annotate_panel.js";
 import { startClusters } from "./clusters.js";
 import { startDrawer } from "./drawer.js";
 import { startKeys } from "./keys.js";
@@ -20,6 +22,6 @@ import { startTheme } from "./theme.js";
 import { startTimeline } from "./timeline.js";
 import { startWelcome } from "./welcome.js";
 
-for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory,
+for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel,
   startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startDrawer, startWelcome]) start();
 connect();

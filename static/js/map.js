@@ -1,5 +1,7 @@
 // The live 2D map: pan, zoom, hover and select.
 
+import { draft } from "./annotate.js";
+import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "./annotate_map.js";
 import { byId, setText } from "./dom.js";
 import { figure, NONE } from "./format.js";
 import { select, selectCluster } from "./live.js";
@@ -25,6 +27,7 @@ function redraw() {
     const pen = canvas.getContext("2d");
     pen.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
     drawMap(pen, view, state, colours);
+    drawAnnotations(pen, view, colours);
     const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
     canvas.setAttribute("aria-label", `Map: ${state.map?.trees.length ?? 0} trees and the robot's path. The table below lists the trees.${measured}`);
   });
@@ -105,7 +108,10 @@ const place = (event) => [event.offsetX, event.offsetY];
 function down(event) {
   canvas.setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, place(event));
-  if (pointers.size === 1) travelled = 0;
+  if (pointers.size === 1) {
+    travelled = 0;
+    if (!measuring()) grab(place(event), view);
+  }
   canvas.classList.add("dragging");
 }
 
@@ -114,8 +120,10 @@ function move(event) {
   const before = pointers.get(event.pointerId);
   hover(...now);
   if (measuring()) measureTowards(snapped(now));
+  else hoverAt(now, view);
   if (!before) return;
   travelled += Math.hypot(now[0] - before[0], now[1] - before[1]);
+  if (drag(now, view, travelled)) return void pointers.set(event.pointerId, now);
   const other = [...pointers].find(([id]) => id !== event.pointerId)?.[1];
   if (other) {
     const gap = (p) => Math.hypot(p[0] - other[0], p[1] - other[1]);
@@ -126,9 +134,10 @@ function move(event) {
 }
 
 function up(event) {
-  if (event.type === "pointerup" && pointers.size === 1 && travelled <= 4) {
+  const held = drop();
+  if (!held && event.type === "pointerup" && pointers.size === 1 && travelled <= 4) {
     if (measuring()) measureAt(snapped(place(event)));
-    else choose(nearest(...place(event)), clusterAt(...place(event)), place(event));
+    else if (!clickAt(place(event), view, nearest(...place(event)))) choose(nearest(...place(event)), clusterAt(...place(event)), place(event));
   }
   pointers.delete(event.pointerId);
   canvas.classList.toggle("dragging", pointers.size > 0);
@@ -158,6 +167,15 @@ function choose(tree, cluster, [px, py]) {
   } else select(null);
 }
 
+// The tree that is to be judged next is brought into sight.
+function lookAtNext() {
+  if (!draft.look) return;
+  const [px, py] = view.toScreen(draft.look.x, draft.look.y);
+  draft.look = null;
+  if (px > 30 && py > 40 && px < view.width - 40 && py < view.height - 30) return;
+  view.pan(view.width / 2 - px, view.height / 2 - py);
+}
+
 export function startMap() {
   const repaint = () => { colours = Object.fromEntries(NAMES.map((name) => [name, colour(name)])); redraw(); };
   repaint();
@@ -172,6 +190,7 @@ export function startMap() {
     redraw();
   }, { passive: false });
   byId("map-fit").addEventListener("click", () => { view.moved = false; view.fit(bounds(), true); redraw(); });
-  on("map truth selection measure", redraw);
+  on("annotating", lookAtNext);
+  on("map truth selection measure tab annotations annotating", redraw);
   on("theme", repaint);
 }

@@ -1,5 +1,6 @@
 // The map against the ground truth: rates never without their counts.
 
+import { truthInWords } from "./annotate.js";
 import { byId, el } from "./dom.js";
 import { figure, NONE, percent } from "./format.js";
 import { openSources } from "./sources.js";
@@ -29,7 +30,7 @@ const LINES = [
 function show() {
   if (!visible("scores")) return;
   const score = state.evaluation;
-  byId("panel-scores").replaceChildren(...(score ? [rates(score), lines(score)] : [nothing()]));
+  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: truthInWords() }), rates(score), lines(score)] : [nothing()]));
 }
 
 function rates(score) {
@@ -47,10 +48,10 @@ function lines(score) {
 function nothing() {
   if (!state.map) return el("p", { class: "empty", text: "Nothing mapped yet. Press play, or open a run." });
   return el("div", { class: "empty" },
-    el("p", { text: "This run brings no ground truth, so there is nothing to score the map against. The simulated runs do." }),
+    el("p", { text: "This run brings no ground truth, so there is nothing to score the map against. Annotate the trees, or open a simulated run." }),
     el("button", { text: "Open a simulated run", onclick: openSources }));
 }
 
 export function startScores() {
-  on("evaluation truth tab", show);
+  on("evaluation truth annotations tab", show);
 }

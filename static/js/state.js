@@ -7,6 +7,7 @@ export const state = {
   odometry: [],      // [x, y] by index of the scan, holes where the page was not looking
   truth: null,
   evaluation: null,
+  annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}]}
   parameters: null,
   selected: null,    // number of a tree
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when it was selected
