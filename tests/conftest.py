@@ -12,6 +12,12 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "2")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _annotations_apart(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Servers that tests start keep nothing in the folder of the person who runs the tests."""
+    os.environ["STEMMAP_FOLDER"] = str(tmp_path_factory.mktemp("annotations"))
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder with real recordings; the test is skipped where it is absent."""

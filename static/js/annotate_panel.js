@@ -2,19 +2,20 @@
 
 import { callMe, change, choose, draft, importTable, judge, KINDS, myName, NAME, next, redo, remove, rows, toggleAdding, truthInWords, undo, unjudged } from "./annotate.js";
 import { byId, el, setText } from "./dom.js";
-import { fixed } from "./format.js";
+import { count, figure, fixed } from "./format.js";
 import { on, state } from "./state.js";
 import { visible } from "./tabs.js";
 
 const EVERY = 300; // [ms] between two fillings
 let planned = 0, filledAt = 0;
+const OTHERS = { pole: "a pole", person: "a person", bush: "a bush", other: "something else" };
 const lines = new Map(); // rows of the table by the annotation's id
 
 const button = (id, text, title, onclick) => el("button", { id, class: "small", text, title, onclick });
 
 function build() {
   const kind = el("select", { id: "annotate-kind", "aria-label": "What a refused tree is", onchange: () => { draft.kind = kind.value; } },
-    ...KINDS.slice(1).map((each) => el("option", { value: each, text: each, selected: each === draft.kind })));
+    ...KINDS.slice(1).map((each) => el("option", { value: each, text: OTHERS[each], selected: each === draft.kind })));
   const name = el("input", { id: "annotate-name", type: "text", value: myName(), maxlength: "40", autocomplete: "off", onchange: () => {
     const fits = NAME.test(name.value.trim());
     name.setCustomValidity(fits ? "" : "Begin with a letter or digit; letters, digits, space and . @ - _ follow.");
@@ -36,7 +37,7 @@ function build() {
       button("annotate-add", "Add", "Add trees by clicks on the map (a)", () => toggleAdding()),
       button("annotate-next", "Next", "The next found tree that nobody judged, the one seen least often first (Tab on the map)", next),
       button("annotate-yes", "Is a tree", "The selected found tree is one (y)", () => judge("tree")),
-      button("annotate-no", "Is no tree", "The selected found tree is something else (n)", () => judge(draft.kind)), el("label", { class: "annotate-as" }, "but a ", kind)),
+      button("annotate-no", "Is no tree", "The selected found tree is something else (n)", () => judge(draft.kind)), el("label", { class: "annotate-as" }, "but ", kind)),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
     el("p", { id: "annotate-hint", class: "note dim" }),
     el("div", { class: "annotate-list" },
@@ -120,7 +121,9 @@ function fill() {
 function hint() {
   if (draft.adding) return "Click on the map where a tree stands; the ring shows where it will be. Esc ends.";
   if (draft.said) return draft.said;
-  if (!rows().length) return "Say which trees really stand here: press Next and judge what was found, or Add and click on the map what was missed.";
+  const tree = unjudged().find(({ number }) => number === state.selected);
+  if (tree) return `Tree ${tree.number}, seen in ${count(tree.observations, "scan")}, ${tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm`}: is it one? y or n; Tab leaves it and goes to the next.`;
+  if (!rows().length) return "Say which trees really stand here: press Next and judge what was found, or Add and click on the map what was missed (or shift-click in the 3D scene).";
   return truthInWords();
 }
 

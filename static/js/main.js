@@ -2,6 +2,7 @@
 
 import { startAnnotating } from "./annotate.js";
 import { startAnnotatePanel } from "./annotate_panel.js";
+import { startAnnotateScene } from "./annotate_scene.js";
 import { startClusters } from "./clusters.js";
 import { startDrawer } from "./drawer.js";
 import { startKeys } from "./keys.js";
@@ -22,6 +23,6 @@ import { startTheme } from "./theme.js";
 import { startTimeline } from "./timeline.js";
 import { startWelcome } from "./welcome.js";
 
-for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel,
+for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startAnnotateScene,
   startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startDrawer, startWelcome]) start();
 connect();

@@ -95,7 +95,7 @@ function describe(tree, truth, cluster) {
 function hover(px, py) {
   const tip = byId("map-tip");
   const [tree, truth, cluster] = [nearest(px, py), truthAt(px, py), clusterAt(px, py)];
-  tip.hidden = !(tree || truth || cluster !== null) || pointers.size > 0;
+  tip.hidden = !(tree || truth || cluster !== null) || pointers.size > 0 || draft.adding;
   canvas.classList.toggle("over", Boolean(tree) || cluster !== null);
   if (tip.hidden) return;
   setText(tip, describe(tree, truth, cluster));
@@ -167,12 +167,15 @@ function choose(tree, cluster, [px, py]) {
   } else select(null);
 }
 
+// Where a place of the map [m] is seen, in pixels of the canvas.
+export const screenOf = (x, y) => view.toScreen(x, y);
+
 // The tree that is to be judged next is brought into sight.
 function lookAtNext() {
   if (!draft.look) return;
   const [px, py] = view.toScreen(draft.look.x, draft.look.y);
   draft.look = null;
-  if (px > 30 && py > 40 && px < view.width - 40 && py < view.height - 30) return;
+  if (px > 12 && py > 12 && px < view.width - 12 && py < view.height - 12) return;
   view.pan(view.width / 2 - px, view.height / 2 - py);
 }
 

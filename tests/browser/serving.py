@@ -21,14 +21,15 @@ class Server:
         source: What it opens.
         port: 0 for any free one.
         token: Of the link; empty for a new one.
+        settings: Further variables of its environment.
     """
 
-    def __init__(self, source: str = "sim:stand", port: int = 0, token: str = "") -> None:
+    def __init__(self, source: str = "sim:stand", port: int = 0, token: str = "", **settings: str) -> None:
         self._log: deque[str] = deque(maxlen=50)
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START, "serve", source, "--no-browser", "--port", str(port)],
             cwd=ROOT,
-            env={**os.environ, **({"STEMMAP_TOKEN": token} if token else {})},
+            env={**os.environ, **({"STEMMAP_TOKEN": token} if token else {}), **settings},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
