@@ -8,14 +8,13 @@ import { visible } from "./tabs.js";
 
 const EVERY = 300; // [ms] between two fillings
 let planned = 0, filledAt = 0;
-const OTHERS = { pole: "a pole", person: "a person", bush: "a bush", other: "something else" };
 const lines = new Map(); // rows of the table by the annotation's id
 
 const button = (id, text, title, onclick) => el("button", { id, class: "small", text, title, onclick });
 
 function build() {
   const kind = el("select", { id: "annotate-kind", "aria-label": "What a refused tree is", onchange: () => { draft.kind = kind.value; } },
-    ...KINDS.slice(1).map((each) => el("option", { value: each, text: OTHERS[each], selected: each === draft.kind })));
+    ...KINDS.slice(1).map((each) => el("option", { value: each, text: each, selected: each === draft.kind })));
   const name = el("input", { id: "annotate-name", type: "text", value: myName(), maxlength: "40", autocomplete: "off", onchange: () => {
     const fits = NAME.test(name.value.trim());
     name.setCustomValidity(fits ? "" : "Begin with a letter or digit; letters, digits, space and . @ - _ follow.");
@@ -37,7 +36,7 @@ function build() {
       button("annotate-add", "Add", "Add trees by clicks on the map (a)", () => toggleAdding()),
       button("annotate-next", "Next", "The next found tree that nobody judged, the one seen least often first (Tab on the map)", next),
       button("annotate-yes", "Is a tree", "The selected found tree is one (y)", () => judge("tree")),
-      button("annotate-no", "Is no tree", "The selected found tree is something else (n)", () => judge(draft.kind)), el("label", { class: "annotate-as" }, "but ", kind)),
+      button("annotate-no", "Is no tree", "The selected found tree is something else (n)", () => judge(draft.kind)), el("label", { class: "annotate-as" }, "it is ", kind)),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
     el("p", { id: "annotate-hint", class: "note dim" }),
     el("div", { class: "annotate-list" },

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,17 @@ import httpx
 import pytest
 import pytest_asyncio
 from websockets.asyncio.client import connect
+from websockets.typing import Origin
 
 from app.annotating import Annotating, contents_of, laid_over
 from app.dashboard import Dashboard
+from app.security import session_value
 from app.settings import Settings
 from app.store.records import Annotation, Content
 from app.worker_messages import Shown
 from pipeline.truth_table import parse_truth_trees
 from tests.app.fakes import frame, opened, path, truth_trees
-from tests.app.server_for_tests import BEARER, COOKIE, running, served
+from tests.app.server_for_tests import BEARER, TOKEN, running, served
 
 Running = tuple[httpx.AsyncClient, Dashboard]
 ANN = {"browser": "a" * 16, "who": "Ann"}
@@ -246,12 +249,17 @@ def test_without_annotations_the_truth_is_that_of_the_source() -> None:
 async def test_every_browser_is_told() -> None:
     async with served() as (host, dashboard):
         await show(dashboard)
-        port = host.rpartition(":")[2]
-        name, _, value = _cookie(int(port)).partition("=")
-        headers = {"Cookie": f"{name}={value}"}
+        port = int(host.rpartition(":")[2])
+        cookie = {"Cookie": f"stemmap_{port}={session_value(TOKEN, port)}"}
+        listen = partial(
+            connect,
+            f"ws://{host}/api/live",
+            additional_headers=cookie,
+            origin=Origin(f"http://{host}"),
+        )
         async with (
-            connect(f"ws://{host}/api/live", additional_headers=headers, origin=f"http://{host}") as one,
-            connect(f"ws://{host}/api/live", additional_headers=headers, origin=f"http://{host}") as other,
+            listen() as one,
+            listen() as other,
             httpx.AsyncClient(base_url=f"http://{host}", headers=BEARER) as client,
         ):
             number = (await edit(client, "POST", x=1.0, y=2.0)).json()["id"]
@@ -262,14 +270,6 @@ async def test_every_browser_is_told() -> None:
                         if message["type"] == "annotations" and message["trees"]:
                             break
                 assert [(t["id"], t["who"]) for t in message["trees"]] == [(number, "Ann")]
-
-
-def _cookie(port: int) -> str:
-    from app.security import session_value
-    from tests.app.server_for_tests import TOKEN
-
-    assert COOKIE
-    return f"stemmap_{port}={session_value(TOKEN, port)}"
 
 
 async def test_what_was_annotated_is_there_after_a_restart(tmp_path: Path) -> None:

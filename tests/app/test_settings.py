@@ -38,9 +38,9 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "folder"),
     [
-        ({"HOME": "/home/ann"}, "/home/ann/.local/share/stemmap"),
-        ({"HOME": "/home/ann", "XDG_DATA_HOME": "/data"}, "/data/stemmap"),
-        ({"HOME": "/home/ann", "STEMMAP_FOLDER": "/kept"}, "/kept"),
+        ({"HOME": "/people/ann"}, "/people/ann/.local/share/stemmap"),
+        ({"HOME": "/people/ann", "XDG_DATA_HOME": "/data"}, "/data/stemmap"),
+        ({"HOME": "/people/ann", "STEMMAP_FOLDER": "/kept"}, "/kept"),
     ],
 )
 def test_annotations_are_kept_where_the_system_keeps_data(given: dict[str, str], folder: str) -> None:

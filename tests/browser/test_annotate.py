@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Position, expect
 
 from tests.browser.conftest import opened
 from tests.browser.dashboard import Dashboard
@@ -41,7 +41,7 @@ def rows(dashboard: Dashboard) -> list[dict[str, Any]]:
     return found
 
 
-def place_of(dashboard: Dashboard, x: float, y: float) -> dict[str, float]:
+def place_of(dashboard: Dashboard, x: float, y: float) -> Position:
     """Where a place of the map [m] is seen on the canvas [pixels]."""
     scale = "([x, y]) => import('/static/js/map.js').then(map => map.screenOf(x, y))"
     px, py = dashboard.page.evaluate(scale, [x, y])
