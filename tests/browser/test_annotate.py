@@ -198,6 +198,7 @@ def test_a_shift_click_on_a_stem_in_the_scene_adds_it(person: Dashboard):
 # At once, however slow the machine is: a pause between them would make two edits of it.
 FIVE_TIMES_RIGHT = """canvas => {
   for (let k = 0; k < 5; k += 1) {
-    canvas.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight', bubbles: true, cancelable: true }));
+    const press = { key: 'ArrowRight', bubbles: true, cancelable: true };
+    canvas.dispatchEvent(new KeyboardEvent('keydown', press));
   }
 }"""
