@@ -36,7 +36,7 @@ from pipeline.recovery import Recovery, RecoveryState
 from pipeline.shape import describe
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.stems import take_stems
-from pipeline.terrain import Terrain, height_above, heights_of_places, shows_ground
+from pipeline.terrain import NO_GROUND, Terrain, height_above, heights_of_places, shows_ground
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
 from pipeline.visibility import BINS, clear_range
@@ -46,10 +46,6 @@ ASTRAY = (
     "searched for the stems around"
 )
 NOT_FOUND = "the stems around were not found in the map; it goes on where the odometry leads"
-NO_GROUND = (
-    "a scan shows no ground (a wall or a ceiling only?): heights are guesses, and diameters are not told "
-    "for breast height"
-)
 NOTHING_FREE: Float = np.zeros(BINS)
 ALWAYS_GATHERED = 10  # first scans, so that a short recording is judged on all it has
 

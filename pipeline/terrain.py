@@ -15,6 +15,10 @@ SECTORS = 72
 RINGS = 48  # would reach to infinity
 HALF_WAY = 20.0  # m; half of them lie nearer
 LEAST_SEEN = 60  # cells; the foot of walls around a sensor fills up to 50, ground that is seen over 400
+NO_GROUND = (
+    "a scan shows no ground (a wall or a ceiling only?): heights are guesses, and diameters are not told "
+    "for breast height"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,9 +7,10 @@ import pytest
 
 from pipeline.geometry import Pose2, Pose3
 from pipeline.ground import find_terrain, height_above
-from pipeline.mapper import NO_GROUND, Mapper
+from pipeline.mapper import Mapper
 from pipeline.parameters import preset
 from pipeline.records import Scan, Sensor, Step
+from pipeline.terrain import NO_GROUND
 
 RNG = np.random.default_rng(7)
 FOREST = preset("forest")
