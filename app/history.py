@@ -11,6 +11,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from pipeline.parameters import Parameters
+from pipeline.slam import Smoother
 
 S = TypeVar("S")
 
@@ -21,7 +22,7 @@ _MOST_BYTES = 256 << 20
 
 def nbytes(state: object) -> int:
     """Bytes of the arrays in a state: of dataclasses, lists and tuples, however deep."""
-    if isinstance(state, np.ndarray):
+    if isinstance(state, np.ndarray | Smoother):
         return state.nbytes
     if isinstance(state, list | tuple):
         return sum(map(nbytes, state))

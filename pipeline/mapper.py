@@ -34,7 +34,7 @@ from pipeline.records import (
 )
 from pipeline.recovery import Recovery, RecoveryState
 from pipeline.shape import describe
-from pipeline.slam import FastSlam, Motion, SlamState
+from pipeline.slam import BackEnd, BackEndState, Motion
 from pipeline.stems import take_stems
 from pipeline.terrain import NO_GROUND, Terrain, height_above, heights_of_places, shows_ground
 from pipeline.tracking import Tracker
@@ -61,7 +61,7 @@ def no_watch(_stage: str) -> AbstractContextManager[None]:
 class MapperState:
     """An independent copy of all that the mapper knows between two scans."""
 
-    slam: SlamState
+    slam: BackEndState
     gathering: GatheringState
     ground: HeightMapState
     tracks: TrackTable
@@ -97,7 +97,7 @@ class Mapper:
         self._sensor = sensor
         self._T_base_lidar = T_base_lidar
         self._watch = watch
-        self._slam = FastSlam(parameters.slam, seed)
+        self._slam = BackEnd(parameters.slam, seed)
         self._gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=forest)
         self._ground = HeightMapper()
         self._tracker = Tracker(parameters.tracking)

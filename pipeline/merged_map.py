@@ -14,7 +14,7 @@ from pipeline.parameters import Parameters
 from pipeline.records import Bool, Columns, Int, Verdict
 from pipeline.saved_map import SavedMap
 from pipeline.slam import SlamState
-from pipeline.slam.genealogy import BLOCK, Genealogy, Generation
+from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.maps import MapColumns, shared_map
 from pipeline.tracking.merge import join
 from pipeline.tracking.observation import SECTORS
@@ -142,18 +142,8 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
         a.placed(np.tile(path[-1], (P, 1))),
         maps=shared_map(P, landmarks),
         detections=a.detections + b.detections,
-        genealogy=_past(path, P),
+        genealogy=Genealogy.of_path(path, P),
     )
-
-
-def _past(path: Float, particles: int) -> Genealogy:
-    """All particles with one path behind them."""
-    blocks = len(path) // BLOCK
-    settled = tuple(path[BLOCK * k : BLOCK * (k + 1)].copy() for k in range(blocks))
-    recent = tuple(
-        Generation(np.tile(row.astype(np.float32), (particles, 1)), None) for row in path[BLOCK * blocks :]
-    )
-    return Genealogy(settled, recent)
 
 
 def _memory(a: PackedMemory, b: PackedMemory, T: Pose2, scan: int, most: int) -> PackedMemory:

@@ -16,7 +16,7 @@ from pipeline.height_map import PackedHeightMap
 from pipeline.mapper import Mapper, MapperState
 from pipeline.parameters import Parameters
 from pipeline.records import Columns, Int, Trees
-from pipeline.slam import SlamState
+from pipeline.slam import GraphState, SlamState
 from pipeline.slam.genealogy import BLOCK
 from pipeline.slam.maps import is_sound
 from pipeline.tracking import Tracker
@@ -39,10 +39,12 @@ class SavedMap:
 
     @classmethod
     def of(cls, mapper: Mapper) -> SavedMap:
-        """What a mapper knows now."""
-        state, path = mapper.snapshot(), mapper.path
+        """What a mapper knows now; a pose graph is saved as the particles that would go on from it."""
+        state, path, slam = mapper.snapshot(), mapper.path, mapper.snapshot().slam
+        if isinstance(slam, GraphState):
+            slam = slam.as_particles(mapper.parameters.slam.particles, seed=0)
         return cls(
-            state.slam,
+            slam,
             PackedMemory.of(state.gathering.folded()),
             state.gathering.columns,
             PackedHeightMap.of(state.ground),

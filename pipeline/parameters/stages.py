@@ -7,6 +7,7 @@ from typing import Literal, Self
 from pydantic import model_validator
 
 from pipeline.parameters.declare import Stage, choice, count, number
+from pipeline.parameters.extras import SlamMethod
 
 
 class Acquisition(Stage):
@@ -183,12 +184,10 @@ class Detection(Stage):
 
 
 class Slam(Stage):
-    """SLAM: FastSLAM with a map per particle (Eq. 5-7)."""
+    """SLAM: FastSLAM with a map per particle (Eq. 5-7), or a pose graph."""
 
-    method: Literal["fastslam1", "fastslam2"] = choice(
-        "fastslam2",
-        "Method",
-        "FastSLAM 1.0 draws the pose from the odometry alone, 2.0 from odometry and scan together.",
+    method: SlamMethod = choice(
+        "fastslam2", "Method", "FastSLAM by odometry (1.0), by the scan too (2.0), or a pose graph (extra)."
     )
     particles: int = count(100, "Particles", "", 1, 5000, "How many hypotheses of the path are kept.")
     noise_distance: float = number(

@@ -1,7 +1,9 @@
 """SLAM: the path of the robot and the landmarks that it was found by (Eq. 5-7)."""
 
+from pipeline.slam.back_end import BackEnd, BackEndState
 from pipeline.slam.fastslam import FastSlam
 from pipeline.slam.motion import Motion
+from pipeline.slam.pose_graph import GraphState, Smoother
 from pipeline.slam.state import SlamState
 
-__all__ = ["FastSlam", "Motion", "SlamState"]
+__all__ = ["BackEnd", "BackEndState", "FastSlam", "GraphState", "Motion", "SlamState", "Smoother"]

@@ -20,15 +20,13 @@ from pipeline.records import Detections, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
 from pipeline.slam.health import TOLD, Recent, ScanTold, is_astray, judged, remembered, scan_told
 from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
-from pipeline.slam.motion import Motion, compound, moved_poses, step_covariance, weighted_pose, wrapped
+from pipeline.slam.motion import Motion, accumulated, moved_poses, weighted_pose
 from pipeline.slam.proposal import Room, room_for
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.state import SlamState
 from pipeline.slam.update import Near, Rules, near_for, observe, predict
 
 PLACED = 1  # tells the draws of a placing from those of a scan
-DISTRUST = (0.1, 0.03)  # m, rad; added to a step of wheels that just slipped, for they slip again
-TURN_AS_DISTANCE = 1.0  # m/rad; a robot that turns on the spot sees the trees anew as well
 
 
 class FastSlam:
@@ -121,41 +119,33 @@ class FastSlam:
         return landmarks.mean, landmarks.covariance
 
     def _moved(self, state: SlamState, motion: Motion) -> SlamState:
-        step, distrust = motion.step, state.recent.distrust
-        slack = motion.slack[0] + distrust * DISTRUST[0], motion.slack[1] + distrust * DISTRUST[1]
-        if step.x == step.y == step.yaw == 0.0 and slack == (0.0, 0.0) and motion.measured is None:
+        moved = accumulated(
+            state.motion, state.motion_covariance, motion, state.recent.distrust, self.parameters
+        )
+        if moved is None:
             return state
-        noise = step_covariance(step, self.parameters)
-        noise += np.diag([slack[0] ** 2, slack[0] ** 2, slack[1] ** 2])
-        moved, covariance = compound(state.motion, state.motion_covariance, step, noise)
-        driven = math.hypot(step.x, step.y) + TURN_AS_DISTANCE * abs(wrapped(step.yaw))
-        if motion.measured is not None or slack != (0.0, 0.0):
-            driven = max(driven, self.parameters.update_distance)  # news that must not wait
         return replace(
-            state, motion=moved, motion_covariance=covariance, since_update=state.since_update + driven
+            state,
+            motion=moved[0],
+            motion_covariance=moved[1],
+            since_update=state.since_update + moved[2],
         )
 
     def _against_slip(self, state: SlamState, detections: Detections) -> tuple[SlamState, bool]:
         """Put the motion right where the scan contradicts the map that the best particle knows well."""
         if len(detections.cluster) < slip.FEWEST or not state.recent.mapped:
             return state, False
-        p = self.parameters
-        before = state.pose[state.best]
-        pose = moved_poses(before[None], state.motion)[0]
-        known = state.map_of(state.best)
-        away = np.hypot(known.mean[:, 0] - pose[0], known.mean[:, 1] - pose[1])
-        landmarks = known.mean[(known.hits >= p.hits_to_weigh) & (away < p.view_range + slip.SEARCH)]
-        sigma = np.sqrt(0.5 * np.trace(detections.covariance, axis1=1, axis2=2))
-        spread = np.sqrt(np.maximum(np.diag(state.motion_covariance), 0.0))
-        if not slip.contradicts(pose, detections.centre, sigma, landmarks, spread, p.gate):
+        p, known = self.parameters, state.map_of(state.best)
+        landmarks = known.mean[known.hits >= p.hits_to_weigh]
+        motion = slip.motion_by_trees(
+            state.pose[state.best], state.motion, state.motion_covariance, detections, landmarks,
+            p.view_range, p.gate,
+        )  # fmt: skip
+        if motion is None:
             return state, False
-        sure, place = slip.offset(pose, detections.centre, sigma, landmarks)
-        if not sure:
-            return state, False
-        found = Pose2(*before).inverse() @ Pose2(*place)
         covariance = state.motion_covariance + np.diag(slip.SIGMA**2)
         recent = replace(state.recent, distrust=1.0)
-        return replace(state, motion=found.as_array(), motion_covariance=covariance, recent=recent), True
+        return replace(state, motion=motion, motion_covariance=covariance, recent=recent), True
 
     def _observed(
         self,
@@ -212,7 +202,7 @@ def _arrays(measured: PoseMeasurement | None) -> tuple[Float, Float]:
 
 def _rules(p: Slam) -> Rules:
     return Rules(
-        use_proposal=p.method == "fastslam2",
+        use_proposal=p.method != "fastslam1",
         gate=p.gate,
         distance_max=p.distance_max,
         hits_to_weigh=p.hits_to_weigh,

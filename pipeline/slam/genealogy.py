@@ -44,6 +44,17 @@ class Genealogy:
     recent: tuple[Generation, ...] = ()
     founders: tuple[Int, Int] | None = None
 
+    @classmethod
+    def of_path(cls, path: Float, particles: int) -> Genealogy:
+        """All particles with one path behind them, x, y [m], yaw [rad], shape (N, 3)."""
+        blocks = len(path) // BLOCK
+        settled = tuple(path[BLOCK * k : BLOCK * (k + 1)].copy() for k in range(blocks))
+        recent = tuple(
+            Generation(np.tile(row.astype(np.float32), (particles, 1)), None)
+            for row in path[BLOCK * blocks :]
+        )
+        return cls(settled, recent)
+
     def __len__(self) -> int:
         return BLOCK * len(self.settled) + len(self.recent)
 

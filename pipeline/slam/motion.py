@@ -62,6 +62,32 @@ class Motion(NamedTuple):
     measured: PoseMeasurement | None = None
 
 
+DISTRUST = (0.1, 0.03)  # m, rad; added to a step of wheels that just slipped, for they slip again
+TURN_AS_DISTANCE = 1.0  # m/rad; a robot that turns on the spot sees the trees anew as well
+
+
+def accumulated(
+    before: Float, covariance: Float, motion: Motion, distrust: float, p: Slam
+) -> tuple[Float, Float, float] | None:
+    """A motion so far and one step more, with its covariance, and what the step counts as driven [m]; None
+    where nothing moved and nothing is new.
+
+    Args:
+        before: x, y [m], yaw [rad] since the last scan that was used; covariance: shape (3, 3).
+        distrust: 0 to 1, how much the odometry was wrong lately.
+    """
+    step = motion.step
+    slack = motion.slack[0] + distrust * DISTRUST[0], motion.slack[1] + distrust * DISTRUST[1]
+    is_news = motion.measured is not None or slack != (0.0, 0.0)
+    if step.x == step.y == step.yaw == 0.0 and not is_news:
+        return None
+    noise = step_covariance(step, p)
+    noise += np.diag([slack[0] ** 2, slack[0] ** 2, slack[1] ** 2])
+    moved, spread = compound(before, covariance, step, noise)
+    driven = math.hypot(step.x, step.y) + TURN_AS_DISTANCE * abs(wrapped(step.yaw))
+    return moved, spread, max(driven, p.update_distance) if is_news else driven  # news must not wait
+
+
 @compiled
 def correct_by_pose(mu: Float, P: Float, z: Float, R: Float) -> float:
     """Kalman update of a pose by a measured one, in place; returns the log likelihood of the measurement.

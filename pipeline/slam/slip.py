@@ -9,7 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiled import compiled
-from pipeline.geometry import Float
+from pipeline.geometry import Float, Pose2
+from pipeline.records import Detections
+from pipeline.slam.motion import moved_poses
 
 SEARCH = 8.0  # m around where the odometry has the robot
 TURNS = np.radians(np.arange(-12.0, 12.5, 2.0))
@@ -19,6 +21,35 @@ EXPLAINED = 0.4  # of the detections on known landmarks contradict nothing
 CONVINCING = 0.7  # of the detections must lie on landmarks after the offset
 MARGIN = 2  # detections more than at any other place
 SIGMA = np.array([0.15, 0.15, np.radians(1.5)])  # of the offset that is found: m, m, rad
+
+
+def motion_by_trees(
+    before: Float,
+    motion: Float,
+    covariance: Float,
+    detections: Detections,
+    known: Float,
+    reach: float,
+    gate: float,
+) -> Float | None:
+    """How the robot really moved, shape (3,); None where the scan contradicts nothing or tells nothing.
+
+    Args:
+        before: x, y [m], yaw [rad] in the frame of the map.
+        motion: By the odometry since then, shape (3,); covariance: shape (3, 3).
+        known: Well known landmarks, shape (L, 2) [m]; those within `reach` [m] are asked.
+        gate: [sigma].
+    """
+    if len(detections.cluster) < FEWEST:
+        return None
+    pose = moved_poses(before[None], motion)[0]
+    near = known[np.hypot(known[:, 0] - pose[0], known[:, 1] - pose[1]) < reach + SEARCH]
+    sigma = np.sqrt(0.5 * np.trace(detections.covariance, axis1=1, axis2=2))
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    if not contradicts(pose, detections.centre, sigma, near, spread, gate):
+        return None
+    sure, place = offset(pose, detections.centre, sigma, near)
+    return (Pose2(*before).inverse() @ Pose2(*place)).as_array() if sure else None
 
 
 @compiled

@@ -13,6 +13,7 @@ from pipeline.geometry import Pose3
 from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
 from pipeline.records import Sensor
+from pipeline.slam import SlamState
 
 SETS = [Parameters().replace({"clustering.eps": eps}) for eps in (0.1, 0.2, 0.3)]
 
@@ -59,6 +60,7 @@ def test_the_bytes_of_a_state_are_those_of_all_its_arrays() -> None:
     assert nbytes(7) == 0
     state = Mapper(Parameters(), sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0).snapshot()
     slam = state.slam
+    assert isinstance(slam, SlamState)
     assert nbytes(state) >= slam.pose.nbytes + slam.maps.block.nbytes + slam.maps.mean.nbytes
 
 

@@ -17,7 +17,7 @@ from pipeline.geometry import Pose2
 from pipeline.parameters import Parameters, preset
 from pipeline.records import Detections, Float, Path, Trees, Truth
 from pipeline.shape import describe
-from pipeline.slam import FastSlam
+from pipeline.slam import BackEnd
 from pipeline.sources import open_source
 from pipeline.steps import steps
 from pipeline.tracking import Tracker
@@ -81,7 +81,7 @@ def seen_in(uri: str, parameters: Parameters | None = None) -> tuple[list[Seen],
 
 def mapped(rows: Sequence[Seen], truth: Truth, parameters: Parameters, seed: int) -> Mapped:
     """SLAM and tracking over a run."""
-    slam, tracker = FastSlam(parameters.slam, seed), Tracker(parameters.tracking)
+    slam, tracker = BackEnd(parameters.slam, seed), Tracker(parameters.tracking)
     reach = parameters.slam.view_range
     before: Pose2 | None = None
     sigma = np.zeros(len(rows))

@@ -1,0 +1,90 @@
+"""The method of SLAM that the parameters name, behind one face."""
+
+from __future__ import annotations
+
+from pipeline.geometry import Float, Pose2
+from pipeline.health import Health
+from pipeline.parameters.stages import Slam
+from pipeline.records import Detections, PoseEstimate
+from pipeline.slam.fastslam import FastSlam
+from pipeline.slam.motion import Motion
+from pipeline.slam.pose_graph import GraphSlam, GraphState
+from pipeline.slam.state import SlamState
+
+BackEndState = SlamState | GraphState
+
+
+class BackEnd:
+    """FastSLAM or the pose graph; one takes over from the other where the parameter changes in a run, with
+    its map, its pose and its path as they are (see GraphState)."""
+
+    def __init__(self, parameters: Slam, seed: int) -> None:
+        self._seed = seed
+        self._slam = _made(parameters, seed)
+
+    @property
+    def parameters(self) -> Slam:
+        """In force; new ones act from the next scan on."""
+        return self._slam.parameters
+
+    @parameters.setter
+    def parameters(self, parameters: Slam) -> None:
+        state = self._slam.state
+        if (parameters.method == "graph") != isinstance(self._slam, GraphSlam):
+            self._slam = _made(parameters, self._seed)
+        self._slam.parameters = parameters
+        self.state = state
+
+    @property
+    def state(self) -> BackEndState:
+        """All that is known between two scans; `copy()` makes it independent."""
+        return self._slam.state
+
+    @state.setter
+    def state(self, state: BackEndState) -> None:
+        p = self.parameters
+        if isinstance(self._slam, GraphSlam):
+            self._slam.state = state if isinstance(state, GraphState) else GraphState.of(state)
+        elif isinstance(state, GraphState):
+            self._slam.state = state.as_particles(p.particles, self._seed)
+        else:
+            self._slam.state = state
+
+    @property
+    def is_astray(self) -> bool:
+        """Whether the known trees are not where they should be seen."""
+        return self._slam.is_astray
+
+    def process(
+        self, index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
+    ) -> PoseEstimate:
+        """See FastSlam.process."""
+        return self._slam.process(index, motion, detections, clear_range)
+
+    def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
+        """See FastSlam.place."""
+        self._slam.place(index, T_map_base, covariance)
+
+    def estimate(self, before: PoseEstimate) -> PoseEstimate:
+        """After `place`: the pose, with the health of an estimate before it."""
+        return self._slam.estimate(before)
+
+    def lost(self, estimate: PoseEstimate) -> Health:
+        """The health of an estimate that no tree has told anything of."""
+        return self._slam.lost(estimate)
+
+    def give_up(self) -> None:
+        """Judge the health anew: what the known trees said no longer counts."""
+        self._slam.give_up()
+
+    def path(self) -> Float:
+        """x, y [m], yaw [rad] at every scan, shape (N, 3)."""
+        return self._slam.path()
+
+    def landmarks(self) -> tuple[Float, Float]:
+        """Positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""
+        return self._slam.landmarks()
+
+
+def _made(parameters: Slam, seed: int) -> FastSlam | GraphSlam:
+    return GraphSlam(parameters) if parameters.method == "graph" else FastSlam(parameters, seed)

@@ -1,0 +1,130 @@
+"""SLAM by a pose graph: keyframes and landmarks in one least-squares problem that is solved as it grows.
+
+x*, m* = argmin sum |f(x_k-1, u_k) - x_k|^2_Q + sum rho(|h(x_k, m_j) - z_kj|_R)
+
+Where FastSLAM keeps hypotheses of the path and chooses among them, the graph keeps one and bends it: a loop
+moves all keyframes behind it. What it took for the same tree it never unlearns.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.geometry import Float, Pose2
+from pipeline.health import Health
+from pipeline.parameters.stages import Slam
+from pipeline.records import Detections, PoseEstimate
+from pipeline.slam import slip
+from pipeline.slam.health import Recent, ScanTold, is_astray, judged
+from pipeline.slam.motion import Motion, accumulated, compound
+from pipeline.slam.pose_graph.keyframe import observe
+from pipeline.slam.pose_graph.smoother import Additions
+from pipeline.slam.pose_graph.state import NOTHING, GraphState
+from pipeline.slam.state import SlamState
+
+KEYFRAME = 0.25  # m; views from nearer places share their errors and cost as much
+
+
+class GraphSlam:
+    """The same face as FastSlam; its particles are the one pose that the graph has."""
+
+    def __init__(self, parameters: Slam) -> None:
+        self.parameters = parameters
+        self.state = GraphState.of(SlamState.at_origin(1))
+
+    def process(
+        self, _index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
+    ) -> PoseEstimate:
+        """See FastSlam.process."""
+        motion = Motion(motion) if isinstance(motion, Pose2) else motion
+        state, p, scan, doubt = self.state, self.parameters, ScanTold(), motion.doubt
+        self._move(motion)
+        due = state.since_update >= max(KEYFRAME, p.update_distance)
+        due = due or motion.measured is not None or motion.slack != (0.0, 0.0)  # news that must not wait
+        if due and (len(detections.cluster) or motion.measured is not None):
+            slipped = self._against_slip(detections)
+            doubt = doubt or ("the trees contradict the odometry: corrected by them" if slipped else "")
+            scan = observe(state, p, motion, detections, clear_range)
+        state.keyframe_of.append(state.keyframes - 1)
+        state.since.append(state.motion)
+        estimate = self._estimate()
+        health = judged(state.recent, scan, 1.0, 1, estimate.covariance, doubt)
+        return replace(estimate, health=health)
+
+    def place(self, _index: int, T_map_base: Pose2, covariance: Float) -> None:
+        """See FastSlam.place: a keyframe that no odometry leads to."""
+        state = self.state
+        additions = Additions()
+        pose = T_map_base.as_array()
+        additions.pose(state.keyframes, pose)
+        additions.pose_prior(state.keyframes, pose, covariance)
+        state.smoother.update(additions)
+        state.keyframe_motion.append(NOTHING)
+        state.pose, state.covariance = pose, covariance.copy()
+        state.motion, state.motion_covariance = np.zeros(3), np.zeros((3, 3))
+        state.since_update = np.inf
+        state.recent = Recent(mapped=state.recent.mapped)
+
+    @property
+    def is_astray(self) -> bool:
+        """Whether the known trees are not where they should be seen."""
+        return is_astray(self.state.recent)
+
+    def estimate(self, before: PoseEstimate) -> PoseEstimate:
+        """After `place`: the pose, with the health of an estimate before it."""
+        return replace(self._estimate(), health=before.health)
+
+    def lost(self, estimate: PoseEstimate) -> Health:
+        """The health of an estimate that no tree has told anything of."""
+        return judged(self.state.recent, ScanTold(), 1.0, 1, estimate.covariance)
+
+    def give_up(self) -> None:
+        """Judge the health anew: what the known trees said no longer counts."""
+        self.state.recent = Recent(mapped=self.state.recent.mapped)
+
+    def path(self) -> Float:
+        """x, y [m], yaw [rad] at every scan as the graph has it now, shape (N, 3)."""
+        return self.state.path()
+
+    def landmarks(self) -> tuple[Float, Float]:
+        """All landmarks: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""
+        known = self.state.landmarks
+        return known.mean, known.covariance.reshape(-1, 4)[:, [0, 1, 3]]
+
+    def _move(self, motion: Motion) -> None:
+        s = self.state
+        moved = accumulated(s.motion, s.motion_covariance, motion, s.recent.distrust, self.parameters)
+        if moved is not None:
+            s.motion, s.motion_covariance = moved[0], moved[1]
+            s.since_update += moved[2]
+            s.driven += moved[2]
+
+    def _against_slip(self, detections: Detections) -> bool:
+        s, p = self.state, self.parameters
+        if not s.recent.mapped:
+            return False
+        known = s.landmarks.mean[s.landmarks.hits >= p.hits_to_weigh]
+        motion = slip.motion_by_trees(
+            s.pose, s.motion, s.motion_covariance, detections, known, p.view_range, p.gate
+        )
+        if motion is None:
+            return False
+        s.motion, s.motion_covariance = motion, s.motion_covariance + np.diag(slip.SIGMA**2)
+        s.recent = replace(s.recent, distrust=1.0)
+        return True
+
+    def _estimate(self) -> PoseEstimate:
+        s = self.state
+        pose, covariance = compound(s.pose, s.covariance, Pose2(*s.motion), s.motion_covariance)
+        known = s.landmarks
+        return PoseEstimate(
+            T_map_base=Pose2(*(float(value) for value in pose)),
+            covariance=covariance,
+            particles=pose[None],
+            weights=np.ones(1),
+            n_eff=1.0,
+            landmarks=known.mean[known.hits >= self.parameters.hits_to_weigh],
+            resampled=False,
+        )
