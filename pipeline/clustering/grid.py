@@ -10,13 +10,15 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Bool, Int, Int32
 
 _AXIS_BITS = 21
+_FARTHEST = float(1 << _AXIS_BITS)
+_DIGIT_BITS = 10  # of a counting sort: its table stays in the nearest cache
+_DIGIT = 1 << _DIGIT_BITS
 _ROUNDING = 1.0 - 1e-9  # keeps the diagonal of a cell below eps in floating point
 
 
@@ -40,34 +42,18 @@ def dbscan_grid(
     if n == 0:
         return np.zeros(0, np.int32), np.zeros(0, np.bool_)
     side = eps / np.sqrt(dimensions) * _ROUNDING
-    low = points.min(axis=0)
-    # Two cells of margin on every side, so that a neighbour's key never wraps into another row.
-    cells = np.floor((points - low) / side).astype(np.int64) + 2
+    cells = _cells(points, side)
     if int(cells.max()) + 2 >= 1 << _AXIS_BITS:
         raise ValueError("the cloud is too wide for cells of this eps")
-    key = np.zeros(n, np.int64)
-    for axis in range(dimensions):
-        key = (key << _AXIS_BITS) | cells[:, axis]
-    order = np.argsort(key, kind="stable")
-    sorted_key = key[order]
-    starts = np.flatnonzero(np.concatenate(([True], sorted_key[1:] != sorted_key[:-1])))
-    bounds = np.append(starts, n)
-    label, core = _label(
-        points[order],
-        bounds,
-        sorted_key[starts],
-        _neighbour_offsets(dimensions),
-        eps * eps,
-        min_points,
-        order,
-        np.ones(n, np.int32) if weight is None else weight[order],
-    )
-    return label, core
+    offsets, opposite = _neighbour_offsets(dimensions)
+    weight = np.ones(n, np.int32) if weight is None else weight
+    return _cluster(points, cells, offsets, opposite, eps * eps, min_points, weight)
 
 
 @cache
-def _neighbour_offsets(dimensions: int) -> Int:
-    """Key differences of the cells that can hold a neighbour, nearest first, the cell itself left out."""
+def _neighbour_offsets(dimensions: int) -> tuple[Int, Int]:
+    """Key differences of the cells that can hold a neighbour, nearest first, the cell itself left out; and
+    where the opposite of each stands in that list."""
     reach = np.arange(-2, 3)
     grid = np.stack(np.meshgrid(*([reach] * dimensions), indexing="ij"), axis=-1).reshape(-1, dimensions)
     gap = np.maximum(np.abs(grid) - 1, 0)
@@ -75,7 +61,79 @@ def _neighbour_offsets(dimensions: int) -> Int:
     grid = grid[near][np.argsort((grid[near] ** 2).sum(axis=1), kind="stable")]
     weights = np.array([1 << (_AXIS_BITS * (dimensions - 1 - axis)) for axis in range(dimensions)], np.int64)
     offsets: Int = grid @ weights
-    return offsets
+    opposite = np.argmax(offsets[:, None] == -offsets[None, :], axis=0)
+    return offsets, opposite
+
+
+@compiled
+def _cells(points: Float, side: float) -> Int32:
+    """The cell of each point along each axis, shape (N, dimensions).
+
+    Two cells of margin on every side, so that a neighbour's key never wraps into another row. One farther
+    than any that is allowed stands for all that are.
+    """
+    cells = np.empty(points.shape, np.int32)
+    for a in range(points.shape[1]):
+        low = points[0, a]
+        for i in range(points.shape[0]):
+            low = min(low, points[i, a])
+        for i in range(points.shape[0]):
+            cells[i, a] = np.int32(min((points[i, a] - low) / side, _FARTHEST)) + 2
+    return cells
+
+
+@compiled
+def _by_key(cells: Int32) -> Int:
+    """Rows in the order of their cells, the first axis first, rows of one cell in their own order.
+
+    A counting sort from the least digit to the greatest; an axis of few cells has one digit.
+    """
+    n = cells.shape[0]
+    order, other = np.arange(n), np.empty(n, np.int64)
+    place = np.empty(_DIGIT + 1, np.int64)
+    for a in range(cells.shape[1] - 1, -1, -1):
+        most = 0
+        for i in range(n):
+            most = max(most, cells[i, a])
+        shift = 0
+        while most >> shift > 0:
+            place[:] = 0
+            for i in range(n):
+                place[((cells[i, a] >> shift) & (_DIGIT - 1)) + 1] += 1
+            for d in range(_DIGIT):
+                place[d + 1] += place[d]
+            for k in range(n):
+                d = (cells[order[k], a] >> shift) & (_DIGIT - 1)
+                other[place[d]] = order[k]
+                place[d] += 1
+            order, other = other, order
+            shift += _DIGIT_BITS
+    return order
+
+
+@compiled
+def _cluster(
+    points: Float, cells: Int32, offsets: Int, opposite: Int, eps2: float, min_points: int, weight: Int32
+) -> tuple[Int32, Bool]:
+    """Lay the points cell by cell, and label them there."""
+    n = points.shape[0]
+    order = _by_key(cells)
+    keys, bounds = np.empty(n, np.int64), np.empty(n + 1, np.int64)
+    laid, weight_laid = np.empty_like(points), np.empty_like(weight)
+    last, filled = np.int64(-1), 0
+    for k in range(n):
+        i = order[k]
+        key = np.int64(0)
+        for a in range(points.shape[1]):
+            key = (key << _AXIS_BITS) | np.int64(cells[i, a])
+            laid[k, a] = points[i, a]
+        weight_laid[k] = weight[i]
+        if key != last:
+            keys[filled], bounds[filled], last = key, k, key
+            filled += 1
+    bounds[filled] = n
+    near = _neighbours(keys[:filled], offsets, opposite)
+    return _label(laid, bounds[: filled + 1], near, eps2, min_points, order, weight_laid)
 
 
 @compiled
@@ -96,22 +154,26 @@ def _root(parent: Int, c: int) -> int:
 
 
 @compiled
-def _neighbours(keys: Int, offsets: Int) -> NDArray[np.int64]:
+def _neighbours(keys: Int, offsets: Int, opposite: Int) -> Int32:
     """Row of the neighbouring cell at each offset, -1 where it is empty; shape (cells, offsets)."""
-    found = np.full((keys.shape[0], offsets.shape[0]), -1, np.int64)
+    found = np.full((keys.shape[0], offsets.shape[0]), -1, np.int32)
     for o in range(offsets.shape[0]):
+        if offsets[o] < 0:
+            continue  # found from the other cell
         j = 0
         for c in range(keys.shape[0]):  # keys ascend, so the wanted keys do too: one sweep
             wanted = keys[c] + offsets[o]
             while j < keys.shape[0] and keys[j] < wanted:
                 j += 1
-            if j < keys.shape[0] and keys[j] == wanted:
-                found[c, o] = j
+            if j == keys.shape[0]:
+                break
+            if keys[j] == wanted:
+                found[c, o], found[j, opposite[o]] = j, c
     return found
 
 
 @compiled
-def _find_cores(points: Float, bounds: Int, near: Int, eps2: float, min_points: int, weight: Int32) -> Bool:
+def _find_cores(points: Float, bounds: Int, near: Int32, eps2: float, min_points: int, weight: Int32) -> Bool:
     core = np.zeros(points.shape[0], np.bool_)
     for c in range(near.shape[0]):
         count_here = 0
@@ -143,21 +205,13 @@ def _touch(points: Float, bounds: Int, core: Bool, c: int, d: int, eps2: float) 
 
 @compiled
 def _label(
-    points: Float,
-    bounds: Int,
-    keys: Int,
-    offsets: Int,
-    eps2: float,
-    min_points: int,
-    order: Int,
-    weight: Int32,
+    points: Float, bounds: Int, near: Int32, eps2: float, min_points: int, order: Int, weight: Int32
 ) -> tuple[Int32, Bool]:
-    near = _neighbours(keys, offsets)
     core = _find_cores(points, bounds, near, eps2, min_points, weight)
-    cells = keys.shape[0]
+    cells = near.shape[0]
     parent = np.arange(cells)
     for c in range(cells):
-        for o in range(offsets.shape[0]):
+        for o in range(near.shape[1]):
             d = near[c, o]
             if d > c:
                 a, b = _root(parent, c), _root(parent, d)
@@ -194,7 +248,7 @@ def _label(
 
 @compiled
 def _cell_of_nearest_core(
-    points: Float, bounds: Int, core: Bool, near: Int, c: int, i: int, eps2: float
+    points: Float, bounds: Int, core: Bool, near: Int32, c: int, i: int, eps2: float
 ) -> int:
     best, best2 = -1, eps2
     for o in range(-1, near.shape[1]):
