@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.compiled import compiled
 from pipeline.ground.cells import evidence, forget_what_overhangs, lowest_returns
 from pipeline.ground.surface import smooth_surface, trend
 from pipeline.parameters.stages import Ground
@@ -35,5 +36,16 @@ def find_terrain(points: Float32, parameters: Ground) -> Terrain:
 
 def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
     """The points whose height above the ground lies in the band. Shape (N, 3) -> (M, 3)."""
-    inside: Float32 = points[(height >= parameters.height_min) & (height <= parameters.height_max)]
-    return inside
+    return _between(points, height, np.array([parameters.height_min, parameters.height_max], np.float32))
+
+
+@compiled
+def _between(points: Float32, height: Float32, band: Float32) -> Float32:
+    low, high = band[0], band[1]
+    inside = np.empty_like(points)
+    n = 0
+    for i in range(points.shape[0]):
+        inside[n, 0], inside[n, 1], inside[n, 2] = points[i, 0], points[i, 1], points[i, 2]
+        # Counted without a branch, which the processor could not foresee.
+        n += low <= height[i] <= high
+    return inside[:n].copy()

@@ -28,28 +28,23 @@ def lowest_returns(points: Float32) -> tuple[Int32, Float]:
         cell: int32, shape (N,), of each point, sector times RINGS plus ring; -1 where it has none.
         lowest: shape (SECTORS, rings, 3): x, y, z [m] of the lowest return; z is inf where none is.
     """
-    cell = np.empty(points.shape[0], np.int32)
-    sector, ring = on_the_grid(points)
+    cell, rings = _cell_of(points)
     row = np.full((SECTORS * RINGS, 2), -1, np.int32)  # of the lowest return and the next one
     bottom = np.full((SECTORS * RINGS, 2), np.float32(np.inf))
-    rings = 1
     for i in range(points.shape[0]):
-        z = points[i, 2]
-        # Written so that a coordinate that is not a number fails it.
-        if not (ring[i] < np.float32(RINGS) and abs(z) < FARTHEST):
-            cell[i] = -1
+        c = cell[i]
+        if c < 0:
             continue
-        k = int(ring[i])
-        c = int(min(int(sector[i]), SECTORS - 1)) * RINGS + k
-        cell[i] = c
-        rings = int(max(rings, k + 1))
-        if z > bottom[c, 1]:
-            continue
-        if z < bottom[c, 0] or (z == bottom[c, 0] and _comes_first(points, i, row[c, 0])):
-            row[c, 1], bottom[c, 1] = row[c, 0], bottom[c, 0]
-            row[c, 0], bottom[c, 0] = i, z
-        elif z < bottom[c, 1] or (z == bottom[c, 1] and _comes_first(points, i, row[c, 1])):
-            row[c, 1], bottom[c, 1] = i, z
+        z, low, next_low, r, next_r = points[i, Z], bottom[c, 0], bottom[c, 1], row[c, 0], row[c, 1]
+        # Chosen without a branch, which the processor could not foresee.
+        lower, between = z < low, z < next_low
+        as_low, as_next = z == low, z == next_low
+        if as_low or as_next:
+            lower = lower or (as_low and _comes_first(points, i, r))
+            between = between or (as_next and _comes_first(points, i, next_r))
+        bottom[c, 0], row[c, 0] = (z, np.int32(i)) if lower else (low, r)
+        bottom[c, 1] = low if lower else (z if between else next_low)
+        row[c, 1] = r if lower else (np.int32(i) if between else next_r)
     lowest = np.full((SECTORS, rings, 3), np.inf)
     for s in range(SECTORS):
         for k in range(rings):
@@ -58,6 +53,23 @@ def lowest_returns(points: Float32) -> tuple[Int32, Float]:
                 ghost = bottom[c, 0] + GHOST < bottom[c, 1] < np.inf
                 lowest[s, k] = points[row[c, 1] if ghost else row[c, 0]]
     return cell, lowest
+
+
+@compiled
+def _cell_of(points: Float32) -> tuple[Int32, int]:
+    """The cell of each point, see `lowest_returns`, and how many rings there are."""
+    n = points.shape[0]
+    sector, ring = on_the_grid(points)
+    cell = np.empty(n, np.int32)
+    last, outermost = np.int32(SECTORS - 1), np.int32(0)
+    for i in range(n):
+        k = np.int32(ring[i])
+        c = min(np.int32(sector[i]), last) * np.int32(RINGS) + k
+        # Written so that a coordinate that is not a number fails it.
+        known = ring[i] < np.float32(RINGS) and abs(points[i, Z]) < FARTHEST
+        cell[i] = c if known else np.int32(-1)
+        outermost = max(outermost, k if known else np.int32(0))
+    return cell, int(outermost) + 1
 
 
 @compiled
@@ -121,21 +133,19 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
             if z < np.inf:
                 c = s * RINGS + k
                 sums[c, LOW], sums[c, AT_X], sums[c, AT_Y] = z - plane[0] - plane[1] * x - plane[2] * y, x, y
-    residual, one = _above_plane(points, plane), np.float32(1.0)
+    residual, zero, one = _above_plane(points, plane), np.float32(0.0), np.float32(1.0)
     for i in range(points.shape[0]):
         c = cell[i]
         if c < 0:
             continue
         up = residual[i] - sums[c, LOW]
-        if up > STANDS_UP_TO:
-            continue
-        if up > STANDS:
-            sums[c, STANDING] += one
-        elif -LAYER < up < LAYER:
-            x, y = points[i, X] - sums[c, AT_X], points[i, Y] - sums[c, AT_Y]
-            sums[c, TOTAL] += up
-            sums[c, COUNT] += one
-            sums[c, SPREAD] += x * x + y * y
+        x, y = points[i, X] - sums[c, AT_X], points[i, Y] - sums[c, AT_Y]
+        # Zeros are added where nothing is to be: a branch here could not be foreseen.
+        layer, standing = -LAYER < up < LAYER, STANDS < up <= STANDS_UP_TO
+        sums[c, TOTAL] += up if layer else zero
+        sums[c, COUNT] += one if layer else zero
+        sums[c, STANDING] += one if standing else zero
+        sums[c, SPREAD] += x * x + y * y if layer else zero
     height, weight = np.full((sectors, rings), np.nan), np.zeros((sectors, rings))
     for s in range(sectors):
         for k in range(rings):
