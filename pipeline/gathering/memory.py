@@ -161,11 +161,16 @@ class Memory:
 
 
 @compiled
+def _first_place(key: int | np.int64, mask: int) -> int:
+    # The upper bits of the product are well mixed, 26 of them enough for any table that is allowed.
+    return int(np.int64((np.uint64(key) * _SPREAD) >> np.uint64(38)) & mask)
+
+
+@compiled
 def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
     """The place in the hash table of a key, or where it would go."""
     mask = slot.shape[0] - 1
-    # The upper bits of the product are well mixed, 26 of them enough for any table that is allowed.
-    at = np.int64((np.uint64(key) * _SPREAD) >> np.uint64(38)) & mask
+    at = _first_place(key, mask)
     while slot[at] > 0 and keys[slot[at] - 1] != key:
         at = (at + 1) & mask
     return int(at)
@@ -286,26 +291,25 @@ def _add(
     tiles: int,
 ) -> tuple[int, int, int]:
     """Returns the first point that found no room (their number when all did), voxels and tiles in use."""
+    wanted, guess = _guess(points, begin, keys, slot)
     row, last = np.int64(-1), np.int64(-1)
     for i in range(begin, points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        h = np.int64(np.floor(points[i, 2] / SLICE))
-        # Written so that a coordinate that is not a number fails it.
-        if not (0 <= h < SLICES and abs(x) < _FARTHEST and abs(y) < _FARTHEST):
+        key = wanted[i]
+        if key < 0:
             continue
-        ix, iy = np.int64(np.floor(x / SIDE)) + _OFFSET, np.int64(np.floor(y / SIDE)) + _OFFSET
-        key = (ix << 36) | (iy << 5) | h
         if key != last:
-            at = _find(key, keys, slot)
-            row = np.int64(slot[at]) - 1
+            row = guess[i]
             if row < 0:
-                if used == keys.shape[0] or tiles == tile_key.shape[0]:
-                    return i, used, tiles
-                row = np.int64(used)
-                used += 1
-                slot[at] = used
-                keys[row], latest[row] = key, -1
-                tiles = _hang_in(row, key, following, home, tile_key, tile_slot, tile_first, tiles)
+                at = _find(key, keys, slot)
+                row = np.int64(slot[at]) - 1
+                if row < 0:
+                    if used == keys.shape[0] or tiles == tile_key.shape[0]:
+                        return i, used, tiles
+                    row = np.int64(used)
+                    used += 1
+                    slot[at] = used
+                    keys[row], latest[row] = key, -1
+                    tiles = _hang_in(row, key, following, home, tile_key, tile_slot, tile_first, tiles)
             last = key
         returns[row] += 1
         for a in range(3):
@@ -315,6 +319,33 @@ def _add(
             scans[row] += 1
         tile_returns[home[row]] += 1
     return points.shape[0], used, tiles
+
+
+@compiled
+def _guess(points: Float32, begin: int, keys: Int, slot: Int32) -> tuple[Int, Int]:
+    """Of each point its key, -1 where it has none, and the row of its voxel where that is the first that
+    the hash table tells, else -1.
+
+    The table lies far from the processor, and a look into it takes as long as all else. Here no look waits
+    for another one, so that many are under way at a time.
+    """
+    n = points.shape[0]
+    wanted, guess = np.empty(n, np.int64), np.empty(n, np.int64)
+    for i in range(begin, n):
+        x, y = points[i, 0], points[i, 1]
+        h = np.int64(np.floor(points[i, 2] / SLICE))
+        # Written so that a coordinate that is not a number fails it.
+        if not (0 <= h < SLICES and abs(x) < _FARTHEST and abs(y) < _FARTHEST):
+            wanted[i] = -1
+            continue
+        ix, iy = np.int64(np.floor(x / SIDE)) + _OFFSET, np.int64(np.floor(y / SIDE)) + _OFFSET
+        wanted[i] = (ix << 36) | (iy << 5) | h
+    mask = slot.shape[0] - 1
+    for i in range(begin, n):
+        guess[i] = slot[_first_place(wanted[i], mask)] - 1
+    for i in range(begin, n):
+        guess[i] = guess[i] if keys[max(guess[i], 0)] == wanted[i] else -1
+    return wanted, guess
 
 
 @compiled
