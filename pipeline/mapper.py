@@ -163,8 +163,11 @@ class Mapper:
                 self._gathering.add(boxed, height, step.index, view)
                 columns = self._gathering.columns
                 self._tracker.judge(step.scan.stamp_ns, columns)
+        elif self._gathering.is_unsettled:
+            with watch("gathering"):
+                self._gathering.settle()
 
-        if known and seen.above is not None and self._is_gathered(step.index):
+        if known and seen.above is not None and self._is_fused(step.index):
             with watch("height map"):
                 self._ground.add(seen.above[2], estimate.T_map_base, seen.sensor_offset)
 
@@ -326,6 +329,12 @@ class Mapper:
 
     def _is_gathered(self, index: int) -> bool:
         return index < ALWAYS_GATHERED or index % self._parameters.gathering.every == 0
+
+    def _is_fused(self, index: int) -> bool:
+        """Whether its ground goes into the height map: midway between two scans that are gathered, so that
+        no scan takes long."""
+        every = self._parameters.gathering.every
+        return index < ALWAYS_GATHERED or index % every == every // 2
 
     def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
         """The odometry's step since the last scan that had one, and its pose; without any the robot

@@ -92,9 +92,19 @@ class Gathering:
         self.memory = state.folded()
         self.columns = state.columns
 
+    @property
+    def is_unsettled(self) -> bool:
+        """Whether so many scans were taken that `settle` is due."""
+        return len(self._since) >= FOLD
+
+    def settle(self) -> None:
+        """Fold the scans since into what a snapshot shares. It changes nothing that is known, so it may be
+        done at any time, best between two scans that are taken; else the next one does it."""
+        self._base, self._since = PackedMemory.of(self.memory), []
+
     def _remember(self, points: Float32, scan: int, most: int) -> Int:
-        if len(self._since) >= FOLD:
-            self._base, self._since = PackedMemory.of(self.memory), []
+        if self.is_unsettled:
+            self.settle()
         self._since.append((points, scan, most))
         self.memory.add(points, scan, most)
         return self.memory.judge_anew(GROWN)
