@@ -39,6 +39,7 @@ from pipeline.stems import take_stems
 from pipeline.terrain import NO_GROUND, Terrain, height_above, heights_of_places, shows_ground
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
+from pipeline.turns import is_fused, is_gathered
 from pipeline.visibility import BINS, clear_range
 
 ASTRAY = (
@@ -47,7 +48,6 @@ ASTRAY = (
 )
 NOT_FOUND = "the stems around were not found in the map; it goes on where the odometry leads"
 NOTHING_FREE: Float = np.zeros(BINS)
-ALWAYS_GATHERED = 10  # first scans, so that a short recording is judged on all it has
 
 Watch = Callable[[str], AbstractContextManager[None]]
 
@@ -155,7 +155,8 @@ class Mapper:
                 self._tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, p.slam.view_range)
 
         columns = self._gathering.columns if p.gathering.method == "columns" else None
-        if known and columns is not None and self._is_gathered(step.index) and seen.above is not None:
+        every = p.gathering.every
+        if known and columns is not None and is_gathered(step.index, every) and seen.above is not None:
             boxed, height, terrain = seen.above
             with watch("gathering"):
                 steepest = steepest_by_direction(seen.raw, seen.sensor_offset, self._sensor.rings > 0)
@@ -167,7 +168,7 @@ class Mapper:
             with watch("gathering"):
                 self._gathering.settle()
 
-        if known and seen.above is not None and self._is_fused(step.index):
+        if known and seen.above is not None and is_fused(step.index, every):
             with watch("height map"):
                 self._ground.add(seen.above[2], estimate.T_map_base, seen.sensor_offset)
 
@@ -326,15 +327,6 @@ class Mapper:
         if self._parameters.ground.method == "none":
             return None
         return ground.find_terrain(raw, self._parameters.ground)
-
-    def _is_gathered(self, index: int) -> bool:
-        return index < ALWAYS_GATHERED or index % self._parameters.gathering.every == 0
-
-    def _is_fused(self, index: int) -> bool:
-        """Whether its ground goes into the height map: midway between two scans that are gathered, so that
-        no scan takes long."""
-        every = self._parameters.gathering.every
-        return index < ALWAYS_GATHERED or index % every == every // 2
 
     def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
         """The odometry's step since the last scan that had one, and its pose; without any the robot

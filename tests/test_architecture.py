@@ -30,6 +30,7 @@ FOUNDATION = (
     "visibility",
     "terrain",
     "growing_path",
+    "turns",
 )
 # One stage each: they never know one another.
 STAGES = (
