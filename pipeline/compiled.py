@@ -3,22 +3,34 @@
 Kernels are compiled at their first call and kept on disk beside the source, so that only the first
 start on a machine waits for them. `fastmath` stays off: the same input must give the same bytes. Only
 where a kernel does nothing but add up over an array, its terms may be added in another order.
+
+A kernel takes in what it calls, and constants too, from other files. Numba looks at the kernel's own
+file alone when it asks whether what is kept is still good; here all files of ours that it imports count.
 """
 
 from __future__ import annotations
 
+import hashlib
+import re
+import sys
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from functools import cache
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
+_IMPORT = re.compile(r"^from ([\w.]+) import (\([^)]*\)|.*)$", re.MULTILINE)
+_NAME = re.compile(r"\w+")
+
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a loop over arrays to machine code; it holds no interpreter lock while it runs."""
     kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    _keep_by_all_sources(kernel, function.__module__)
     return kernel
 
 
@@ -29,4 +41,41 @@ def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
     kernel: Callable[P, R] = numba.njit(
         cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz"}
     )(function)
+    _keep_by_all_sources(kernel, function.__module__)
     return kernel
+
+
+def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
+    """Let what is kept of a kernel be good only while no source that it may have taken in has changed."""
+    file = kernel._cache._cache_file  # numba has no public place for this
+    file._source_stamp = (file._source_stamp, sources_digest(module))
+
+
+def sources_digest(module: str) -> str:
+    """SHA-256 (hex) of a module's source and of those of its package that it imports, however far."""
+    package = module.partition(".")[0] + "."
+    seen = {module}
+    waiting = [module]
+    while waiting:
+        found = {name for name in _imported(waiting.pop()) if name.startswith(package)} - seen
+        seen |= found
+        waiting += found
+    digest = hashlib.sha256()
+    for name in sorted(seen):
+        digest.update(name.encode() + b"\0" + _source(name))
+    return digest.hexdigest()
+
+
+@cache
+def _imported(module: str) -> frozenset[str]:
+    """The modules that are loaded and named in the imports of this one."""
+    names: set[str] = set()
+    for origin, what in _IMPORT.findall(_source(module).decode()):
+        names |= {origin, *(f"{origin}.{name}" for name in _NAME.findall(what))}
+    return frozenset(name for name in names if name in sys.modules)
+
+
+@cache
+def _source(module: str) -> bytes:
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return Path(file).read_bytes() if file else b""

@@ -1,0 +1,54 @@
+"""What is kept of a compiled kernel: good while no source that it took in has changed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+CALLER = """
+from pipeline.compiled import compiled
+from wood.leaf import FACTOR, grown
+
+@compiled
+def twice(x):
+    return FACTOR * grown(x)
+"""
+LEAF = """
+from pipeline.compiled import compiled
+
+FACTOR = {factor}
+
+@compiled
+def grown(x):
+    return x + {more}
+"""
+CALL = "from wood.tree import twice; print(twice(1.0), sum(twice.stats.cache_hits.values()))"
+
+
+def call(folder: Path, factor: float, more: float) -> list[str]:
+    """What a new process gets from the kernel, and how often it took what was kept."""
+    (folder / "wood" / "leaf.py").write_text(LEAF.format(factor=factor, more=more))
+    told = subprocess.run(
+        [sys.executable, "-c", CALL],
+        cwd=folder,
+        env={"PYTHONPATH": f"{folder}:{ROOT}", "NUMBA_CACHE_DIR": str(folder / "kept")},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    return told.stdout.split()
+
+
+def test_a_kernel_is_compiled_anew_when_what_it_calls_in_another_file_changes(tmp_path):
+    (tmp_path / "wood").mkdir()
+    (tmp_path / "wood" / "__init__.py").touch()
+    (tmp_path / "wood" / "tree.py").write_text(CALLER)
+    assert call(tmp_path, 2.0, 1.0) == ["4.0", "0"]
+    assert call(tmp_path, 2.0, 1.0) == ["4.0", "1"]
+    assert call(tmp_path, 2.0, 3.0) == ["8.0", "0"]
+    assert call(tmp_path, 5.0, 3.0) == ["20.0", "0"]
+    assert call(tmp_path, 5.0, 3.0) == ["20.0", "1"]
