@@ -190,7 +190,7 @@ def search(
                     # One with fewer than half could not even be the second best that matters.
                     floor = max(floor, found // 2 + 1)
                     if kept == KEPT:
-                        floor = max(floor, agree.min() + 1)
+                        floor = max(floor, int(agree.min()) + 1)
     return pose[:kept], agree[:kept], looked
 
 
