@@ -27,13 +27,14 @@ from pipeline.evaluation.matching import match
 from pipeline.gathering.forest import ALL_AROUND, ONE_WAY, Forest, forest_of
 from pipeline.mapper import Mapper
 from pipeline.parameters import preset
+from pipeline.plot.circle import FIGURES, best_circle, fit_circle
 from pipeline.records import Float, Frame, Int
-from pipeline.shape.stem import fit_stems
 from pipeline.sources import open_source
 from pipeline.steps import steps
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 REACH, MATCH = 25.0, 0.5
+TOLERANCE, REACH_OF_A_SLICE, RADIUS_MIN, RADIUS_MAX = 0.02, 0.1, 0.03, 0.6  # m; of circles in merged slices
 RINGS = ((0.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
 EXACT_POSES = {
     "slam.particles": 1,
@@ -188,9 +189,16 @@ def _dbh() -> None:
     for name, tape in _tape(folder / "dbh_reference.csv"):
         with closing(open_source(str(folder / name))) as source:
             points = next(r.points for r in source.records() if hasattr(r, "points")).astype(np.float64)
-        stem = fit_stems(points, np.array([0, len(points)]), 0.02, 0.0035)[0]
-        error.append(200.0 * stem[5] - tape)
-        print(f"{name}: {200 * stem[5]:.1f} cm, tape {tape:.1f} cm, arc {np.degrees(stem[8]):.0f} deg")
+        # Merged from several views, as a whole cloud is: no ray tells which side of the trunk was seen.
+        circle = np.zeros(FIGURES)
+        best_circle(points[:, :2], TOLERANCE, RADIUS_MIN, RADIUS_MAX, circle)
+        if not fit_circle(points[:, :2], REACH_OF_A_SLICE, RADIUS_MIN, RADIUS_MAX, circle):
+            print(f"{name}: no circle, tape {tape:.1f} cm")
+            continue
+        error.append(200.0 * circle[2] - tape)
+        said = f"{200 * circle[2]:.1f} +- {200 * np.sqrt(circle[6]):.1f} cm"
+        print(f"{name}: {said}, tape {tape:.1f} cm, {np.degrees(circle[8]):.0f} degrees seen")
+    print(f"{len(error)} circles")
     print(f"trunk_dbh: RMSE {np.sqrt(np.mean(np.square(error))):.2f} cm, bias {np.mean(error):+.2f} cm")
 
 
