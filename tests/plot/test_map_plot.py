@@ -42,8 +42,9 @@ def test_lean_and_taper_are_told():
 
 def test_a_short_arc_carries_a_place_but_no_diameter():
     rng = np.random.default_rng(3)
-    points = np.concatenate([ground(6.0, 0.05, rng), stem(3.0, 3.0, 0.15, rng, arc=2.2, sigma=0.003)])
-    m = map_plot(Made(points), FOREST)
+    crown = np.array([3.0, 3.0, 5.5]) + rng.normal(0.0, 1.0, (3000, 3)) * [0.8, 0.8, 0.5]  # else it is a pole
+    parts = [ground(6.0, 0.05, rng), stem(3.0, 3.0, 0.15, rng, arc=2.2, sigma=0.003), crown]
+    m = map_plot(Made(np.concatenate(parts)), FOREST)
     assert len(m.trees.number) == 1
     assert np.hypot(*(m.trees.position[0] - 3.0)) < 0.03
     assert np.isnan(m.trees.dbh[0])
