@@ -16,7 +16,7 @@ from pipeline.slam.motion import moved_poses
 SEARCH = 8.0  # m around where the odometry has the robot
 TURNS = np.radians(np.arange(-12.0, 12.5, 2.0))
 NEAR = 0.3  # m, added to the error of a detection that lies off by half a step of TURNS
-FEWEST = 3  # detections; two fit somewhere in any stand
+FEWEST = 6  # detections; in a park three fit somewhere by chance, and throw a good pose away
 EXPLAINED = 0.4  # of the detections on known landmarks contradict nothing
 CONVINCING = 0.7  # of the detections must lie on landmarks after the offset
 MARGIN = 2  # detections more than at any other place
