@@ -1,4 +1,4 @@
-"""Turns: which scans do the works that not every scan needs, so that no two of them fall on one scan."""
+"""Turns: which scans do the works that not every scan needs, so that they do not fall on one scan."""
 
 from __future__ import annotations
 

@@ -87,11 +87,17 @@ def _topic_lines(d: SourceDescription) -> list[str]:
     if not d.topics:
         return []
     lines = ["", "topics (* is read; --topic ROLE=NAME chooses another)"]
-    width = max(len(topic.name) for topic in d.topics)
+    width = max(len(_plain(topic.name)) for topic in d.topics)
     for topic in d.topics:
         mark, use = ("*", topic.read_as) if topic.read_as else (" ", topic.fits and f"could be {topic.fits}")
-        lines.append(f" {mark} {topic.name:{width}}  {topic.messages:>8,}  {topic.type}  {use}".rstrip())
+        name, kind = _plain(topic.name), _plain(topic.type)
+        lines.append(f" {mark} {name:{width}}  {topic.messages:>8,}  {kind}  {use}".rstrip())
     return lines
+
+
+def _plain(text: str) -> str:
+    """Text from a file without what would steer a terminal."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _commands(d: SourceDescription) -> list[str]:

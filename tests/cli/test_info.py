@@ -56,3 +56,10 @@ def test_what_cannot_be_read_is_said_in_one_line(capsys, tmp_path):
     (tmp_path / "empty.mcap").touch()
     stemmap(capsys, "info", tmp_path / "empty.mcap").refused(1, "the file is empty")
     stemmap(capsys, "info", tmp_path / "none").refused(1, "no such file")
+
+
+def test_a_name_from_a_file_cannot_steer_the_terminal():
+    from app.cli.info import _plain
+
+    assert _plain("/points\x1b[2J\n\u202e") == "/points?[2J??"
+    assert _plain("/wäldchen/points") == "/wäldchen/points"
