@@ -115,6 +115,7 @@ READABLE = ", ".join(
         "a rosbag2 folder",
         "a folder of TreeManagerState_<i>.csv with trajectory.txt",
         "sim:stand and the other sim: scenarios",
+        "a whole cloud as .laz or .las (with `stemmap map` alone)",
     ]
 )
 
