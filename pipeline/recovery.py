@@ -12,10 +12,11 @@ import numpy as np
 
 from pipeline.geometry import Float, Pose2
 from pipeline.parameters import Parameters
-from pipeline.records import Detections, PoseEstimate, Trees
+from pipeline.records import Detections, PoseEstimate, Trees, nothing_found
 from pipeline.relocalisation import Stems, find_constellation
 from pipeline.relocalisation.stems import worst_sigma
-from pipeline.slam import FastSlam, Motion, SlamState
+from pipeline.slam import BackEnd, FastSlam, Motion, SlamState
+from pipeline.visibility import BINS
 
 S = TypeVar("S")
 
@@ -25,6 +26,12 @@ EVERY = 3  # scans between two searches
 HYPOTHESES = 100_000
 FARTHEST = 100.0  # m; after so long a search the map goes on where the odometry leads
 SEEDS = 1  # added to the run's seed, for the small map
+NOTHING_FREE: Float = np.zeros(BINS)
+ASTRAY = (
+    "the robot is lost: what was mapped since the known trees were last seen is taken back, and the map is "
+    "searched for the stems around"
+)
+NOT_FOUND = "the stems around were not found in the map; it goes on where the odometry leads"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +64,25 @@ class Found:
     stems: int
 
 
+@dataclass(frozen=True, slots=True)
+class Mapped(Generic[S]):
+    """What is asked of a mapper whose states are of type S.
+
+    Attributes:
+        slam: Where it is.
+        state: Gives all its state without that of its recovery.
+        take_back: Leaves its map as it was in a state.
+        trees: Gives the trees of its map.
+    """
+
+    slam: BackEnd
+    state: Callable[[], S]
+    take_back: Callable[[S], None]
+    trees: Callable[[], Trees]
+
+
 class Recovery(Generic[S]):
-    """Watches over a mapper whose states are of type S."""
+    """Finds the pose of each scan for a mapper, and the robot when it is lost."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed + SEEDS
@@ -69,32 +93,92 @@ class Recovery(Generic[S]):
         """Whether the robot does not know where it is."""
         return self.state.local is not None
 
-    def remember(self, index: int, motion: Motion, snapshot: Callable[[], S]) -> None:
+    def locate(
+        self,
+        index: int,
+        motion: Motion,
+        found: Detections,
+        free: Float,
+        parameters: Parameters,
+        mapped: Mapped[S],
+    ) -> tuple[PoseEstimate, tuple[str, ...]]:
+        """The pose after a scan, and what a person should know of how it was found.
+
+        Args:
+            index, motion, found, free: As `FastSlam.process` takes them.
+            parameters: Of all stages.
+            mapped: The mapper; its map goes back where the robot went astray.
+        """
+        slam = mapped.slam
+        if parameters.relocalisation.method == "none":
+            self._end()
+            return slam.process(index, motion, found, free), ()
+        if self.searching:
+            return self._follow(index, motion, found, free, parameters, mapped)
+        self._remember(index, motion, mapped)
+        estimate = slam.process(index, motion, found, free)
+        if not slam.is_astray:
+            return estimate, ()
+        estimate = self._begin(estimate, found, parameters, mapped)
+        self._search(index, Motion(Pose2()), found, free, parameters, mapped.trees)
+        return estimate, (ASTRAY,)
+
+    def _remember(self, index: int, motion: Motion, mapped: Mapped[S]) -> None:
         """Take a scan that is about to be mapped."""
         s = self.state
         if not s.kept or index % SPACING == 0:
-            kept = (*s.kept[-1:], snapshot())
+            kept = (*s.kept[-1:], mapped.state())
             motions = s.motions[-SPACING:] if len(kept) > 1 else ()
             s = replace(s, kept=kept, motions=motions)
         self.state = replace(s, motions=(*s.motions, (index, motion)))
 
-    def begin(self, parameters: Parameters) -> tuple[S, tuple[tuple[int, Motion], ...]]:
-        """Begin a search; returns the state before the robot went astray and the motions since."""
-        s = self.state
+    def _begin(
+        self, estimate: PoseEstimate, found: Detections, parameters: Parameters, mapped: Mapped[S]
+    ) -> PoseEstimate:
+        """Go back to the map before the robot went astray, and follow the odometry from there."""
+        s, slam = self.state, mapped.slam
+        recent = slam.state.recent
+        mapped.take_back(s.kept[0])
+        for index, motion in s.motions:
+            estimate = slam.process(index, motion, nothing_found(found), NOTHING_FREE)
+        slam.state = replace(slam.state, recent=recent)
         local = SlamState.at_origin(min(PARTICLES, parameters.slam.particles))
-        self.state = replace(s, kept=(), motions=(), local=local, driven=0.0)
-        return s.kept[0], s.motions
+        self.state = RecoveryState(local=local)
+        return replace(estimate, health=slam.lost(estimate))
 
-    def search(
-        self, index: int, motion: Motion, found: Detections, free: Float, trees: Trees, parameters: Parameters
+    def _follow(
+        self,
+        index: int,
+        motion: Motion,
+        found: Detections,
+        free: Float,
+        parameters: Parameters,
+        mapped: Mapped[S],
+    ) -> tuple[PoseEstimate, tuple[str, ...]]:
+        """A scan of a robot that is lost: the odometry leads, until the stems around are found."""
+        slam = mapped.slam
+        estimate = slam.process(index, motion, nothing_found(found), np.zeros_like(free))
+        at = self._search(index, motion, found, free, parameters, mapped.trees)
+        if at is not None:
+            slam.place(index, at.T_map_base, at.covariance)
+            self._end()
+            return slam.estimate(estimate), (f"found again in the map by {at.stems} stems that agree",)
+        if self.state.driven > FARTHEST:
+            slam.give_up()
+            self._end()
+            return estimate, (NOT_FOUND,)
+        return estimate, ()
+
+    def _search(
+        self,
+        index: int,
+        motion: Motion,
+        found: Detections,
+        free: Float,
+        parameters: Parameters,
+        trees: Callable[[], Trees],
     ) -> Found | None:
-        """Take a scan into the small map and look for it among the trees of the map.
-
-        Args:
-            index, motion, found, free: As `FastSlam.process` takes them.
-            trees: Of the map.
-            parameters: Of all stages.
-        """
+        """Take a scan into the small map and look for it among the trees of the map."""
         s = self.state
         if s.local is None:
             return None
@@ -106,18 +190,16 @@ class Recovery(Generic[S]):
         if index % EVERY:
             return None
         match = find_constellation(
-            _stems(slam, parameters), Stems.of_trees(trees), parameters.relocalisation, hypotheses=HYPOTHESES
+            _stems(slam, parameters),
+            Stems.of_trees(trees()),
+            parameters.relocalisation,
+            hypotheses=HYPOTHESES,
         )
         if match.pose is None:
             return None
         return Found(*_through(match.pose, match.covariance, estimate), len(match.local))
 
-    @property
-    def is_over(self) -> bool:
-        """Whether the search has taken so long that the map goes on without it."""
-        return self.state.driven > FARTHEST
-
-    def end(self) -> None:
+    def _end(self) -> None:
         """The robot is mapped again."""
         self.state = RecoveryState()
 

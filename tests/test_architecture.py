@@ -31,6 +31,7 @@ FOUNDATION = (
     "terrain",
     "growing_path",
     "turns",
+    "watch",
 )
 # One stage each: they never know one another.
 STAGES = (
@@ -59,7 +60,8 @@ AROUND = {
     "sources": {"simulation", "truth_table", "exchange", "plot"},
     "recording": {"sources", "simulation"},
     "recovery": {"slam", "relocalisation"},
-    "mapper": {*STAGES, "recovery"},
+    "perception": {"acquisition", "filters", "ground", "clustering", "shape", "detection", "stems"},
+    "mapper": {*STAGES, "perception", "recovery"},
     "saved_map": {*STAGES, "mapper"},
     "merged_map": {*STAGES, "saved_map"},
 }

@@ -95,16 +95,16 @@ def _steps(uri: str, until: int, every: int) -> tuple[Sensor, list[Step]]:
 def _measured(sensor: Sensor, run: Sequence[Step]) -> tuple[StageClock, tuple[int, int]]:
     """Times of the scans, gone through again and again, and their median returns and clusters."""
     from pipeline.geometry import Pose3
-    from pipeline.mapper import Mapper
     from pipeline.parameters import preset
+    from pipeline.perception import perceive
 
+    parameters = preset("forest")
     clock, returns, clusters = StageClock(), [], []
     for turn in range(WARM + ROUNDS):
         clock = StageClock() if turn == WARM else clock
-        mapper = Mapper(preset("forest"), sensor=sensor, T_base_lidar=Pose3.identity(), seed=0, watch=clock)
         gc.collect()
         for step in run:
-            seen = mapper._perceive(step)
+            seen = perceive(step, sensor, Pose3.identity(), parameters, clock)
             returns.append(len(step.scan.points))
             clusters.append(len(seen.clusters.size))
     return clock, (round(middle(returns)), round(middle(clusters)))
