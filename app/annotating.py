@@ -129,6 +129,14 @@ class Annotating:
             return None
         return await self._off_the_loop(lambda: function(self._opened_store(), run))
 
+    async def in_store(self, function: Callable[[Store], T]) -> T:
+        """Let something be done to what belongs to no run.
+
+        Raises:
+            StemmapError: The store cannot be used, or refuses.
+        """
+        return await self._off_the_loop(lambda: function(self._opened_store()))
+
     async def close(self) -> None:
         """Finish what is under way, and let go of the file."""
         if self._store is not None:

@@ -6,6 +6,7 @@ Joins the worker, the parameters, the 3D scene and the browsers. Everything runs
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -18,9 +19,11 @@ from app.events import Events
 from app.live import Live
 from app.live_payload import map_payload, truth_payload
 from app.messages import Open, Play, Seek, SetParameters, Status
+from app.parameter_sets import ParameterSets
 from app.parameter_state import ParameterState
 from app.scores import Scores
 from app.selection import Selection
+from app.standing_scan import BeforeAfter, counts_of
 from app.story.questions import NoStoryError, Questions
 from app.story.records import ClusterStory, TreeStory
 from app.throttle import Throttle
@@ -89,6 +92,8 @@ class Dashboard:
         self.path: Path | None = None
         self.path_xy = np.zeros((0, 2))
         self.truth: TruthTrees | None = None
+        self.sets = ParameterSets(self.annotating, self._show_parameters)
+        self._before_after = BeforeAfter()
         self.selection = Selection()
         self.questions = Questions(lambda question: self.worker.send(question))
         self._selecting: asyncio.Task[None] | None = None
@@ -109,7 +114,7 @@ class Dashboard:
 
     async def start(self, source: Open) -> None:
         """Start the worker with a source; it plays as soon as it is open."""
-        self._show_parameters()
+        await self.sets.load()
         self.live.tell("view", self.scene.view)
         await self.worker.start()
         await self._send_parameters()
@@ -164,9 +169,7 @@ class Dashboard:
         Raises:
             ParameterError: A value does not fit; nothing is changed.
         """
-        before = self.parameters.parameters
-        self.parameters.change(changes)
-        await self._tell_parameters(before)
+        await self.tune(lambda state: state.change(changes))
 
     async def use_preset(self, name: str) -> None:
         """Take all values of a preset.
@@ -174,9 +177,7 @@ class Dashboard:
         Raises:
             ParameterError: There is none of this name.
         """
-        before = self.parameters.parameters
-        self.parameters.use_preset(name)
-        await self._tell_parameters(before)
+        await self.tune(lambda state: state.use_preset(name))
 
     async def reset_parameters(self, names: list[str]) -> None:
         """Give parameters (none named: all) the preset's values again.
@@ -184,9 +185,24 @@ class Dashboard:
         Raises:
             ParameterError: A name is unknown.
         """
-        before = self.parameters.parameters
-        self.parameters.reset(names)
-        await self._tell_parameters(before)
+        await self.tune(lambda state: state.reset(names))
+
+    async def tune(self, change: Callable[[ParameterState], None]) -> None:
+        """Let parameters be changed, and tell everybody.
+
+        Raises:
+            StemmapError: The change is refused; nothing is changed.
+        """
+        before, step = self.parameters.parameters, self.parameters.step
+        change(self.parameters)
+        if self.parameters.step != step:
+            self._before_after.step()
+        self._show_parameters()
+        if self.shown is not None:
+            self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
+            self._tell_events()
+        await self._send_parameters()
+        self._score()
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree everywhere; None selects nothing."""
@@ -252,17 +268,12 @@ class Dashboard:
         self.live.tell("selection", selection.as_plain())
         self.live.tell("missing", None)
 
-    async def _tell_parameters(self, before: Parameters) -> None:
-        self._show_parameters()
-        if self.shown is not None:
-            self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
-            self._tell_events()
-        await self._send_parameters()
-        self._score()
-
     def _show_parameters(self) -> None:
-        self.live.tell("parameters", self.parameters.as_plain())
-        self.scene.show_parameters(self.parameters.parameters, self.parameters.preset)
+        state = self.parameters
+        name = self.sets.name_of(state.preset, state.parameters)
+        self.live.tell("sets", self.sets.as_plain())
+        self.live.tell("parameters", {**state.as_plain(), "set": name})
+        self.scene.show_parameters(state.parameters, state.preset)
 
     def _tell_events(self) -> None:
         self.live.tell("events", self.events.as_plain())
@@ -310,6 +321,7 @@ class Dashboard:
         self.path_xy = np.zeros((0, 2))
         self.live.forget_map()
         self.scores.forget()
+        self._before_after.forget()
         self.events.forget()
         self._tell_events()
         self._tell_loop(None)
@@ -338,7 +350,9 @@ class Dashboard:
             shown = msgspec.structs.replace(shown, frame=frame)
         self.shown = shown
         self.path_xy = np.column_stack([self.path.x, self.path.y])
-        self.live.show(map_payload(shown), self.path_xy)
+        distance = self.parameters.parameters.evaluation.match_distance
+        counts = self._before_after.shown(counts_of(shown.frame, self.truth, distance))
+        self.live.show({**map_payload(shown), **counts}, self.path_xy)
         if self.events.shown(shown.frame, shown.time_s):
             self._tell_events()
         self._score()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-from pipeline.errors import ParameterError
+from pipeline.errors import ParameterError, StemmapError
 from pipeline.parameters import PRESETS, Parameters, field_specs, preset
 from pipeline.parameters.model import Value
 
@@ -13,11 +14,21 @@ Begin = Callable[[str], tuple[str, Parameters]]
 
 DEFAULT_PRESET = "forest"
 _SPECS = field_specs()
+# A slider that moves sends many values; those that follow one another so fast are one step.
+_ONE_GESTURE_S = 1.5
+_MOST_STEPS = 200
 
 
 def preset_alone(name: str) -> tuple[str, Parameters]:
     """A preset as it is."""
     return name, preset(name)
+
+
+class _Standing(NamedTuple):
+    """What holds at one time: it is undone to, and done again."""
+
+    preset: str
+    parameters: Parameters
 
 
 class ParameterState:
@@ -26,13 +37,20 @@ class ParameterState:
     Args:
         begin: Preset name and parameters to begin with, from the preset that suits a source. It is asked
             again for each source until a person changes something.
+        clock: Seconds from any start; changes of the same values in quick succession are one step.
+
+    Attributes:
+        step: Grows with each change that is a step of its own.
     """
 
-    def __init__(self, begin: Begin = preset_alone) -> None:
-        self._begin = begin
+    def __init__(self, begin: Begin = preset_alone, clock: Callable[[], float] = time.monotonic) -> None:
+        self._begin, self._clock = begin, clock
         self.preset, self.parameters = begin(DEFAULT_PRESET)
-        self.revision = 0
+        self.revision = self.step = 0
         self._chosen = False
+        self._undo: list[_Standing] = []
+        self._redo: list[_Standing] = []
+        self._gesture: tuple[frozenset[str], float] = (frozenset(), 0.0)
 
     def change(self, changes: dict[str, Value]) -> None:
         """Change values by their dotted names.
@@ -41,7 +59,11 @@ class ParameterState:
             ParameterError: A name is unknown, a value is out of bounds, or two values contradict;
                 then nothing is changed.
         """
-        self._become(self.parameters.replace(changes))
+        parameters = self.parameters.replace(changes)
+        names, now = frozenset(changes), self._clock()
+        goes_on = names == self._gesture[0] and now - self._gesture[1] < _ONE_GESTURE_S
+        self._become(self.preset, parameters, goes_on)
+        self._gesture = (names, now)
 
     def use_preset(self, name: str) -> None:
         """Take all values of a preset.
@@ -49,9 +71,36 @@ class ParameterState:
         Raises:
             ParameterError: There is none of this name.
         """
-        parameters = preset(name)
-        self.preset = name
-        self._become(parameters)
+        self._become(name, preset(name))
+
+    def use(self, preset_name: str, parameters: Parameters) -> None:
+        """Take all values of a set.
+
+        Args:
+            preset_name: That the set differs from.
+            parameters: Its values.
+
+        Raises:
+            ParameterError: There is no such preset.
+        """
+        preset(preset_name)
+        self._become(preset_name, parameters)
+
+    def undo(self) -> None:
+        """Take back the last step, of whoever made it.
+
+        Raises:
+            StemmapError: There is none.
+        """
+        self._go_back(self._undo, self._redo, "there is no change of a parameter to undo")
+
+    def redo(self) -> None:
+        """Do again what was undone last.
+
+        Raises:
+            StemmapError: Nothing was, or something else was changed since.
+        """
+        self._go_back(self._redo, self._undo, "there is no change of a parameter to do again")
 
     def reset(self, names: list[str]) -> None:
         """Give parameters (none named: all) the preset's values again.
@@ -63,7 +112,7 @@ class ParameterState:
         unknown = [name for name in names if name not in wanted]
         if unknown:
             raise ParameterError(f"there is no parameter {unknown[0]!r}")
-        self._become(self.parameters.replace({name: wanted[name] for name in names or wanted}))
+        self._become(self.preset, self.parameters.replace({name: wanted[name] for name in names or wanted}))
 
     def suit(self, name: str) -> bool:
         """Take the preset that suits a source, unless a person has chosen. Returns whether anything
@@ -81,10 +130,13 @@ class ParameterState:
         return True
 
     def as_plain(self) -> dict[str, Any]:
-        """What changes: preset, revision, values, and the names that differ from the preset."""
+        """What changes: preset, revision, values, the names that differ from the preset, and how many steps
+        can be undone and done again."""
         return {
             "preset": self.preset,
             "revision": self.revision,
+            "undo": len(self._undo),
+            "redo": len(self._redo),
             "values": self.parameters.flat(),
             "changed": list(self.parameters.changes_from(preset(self.preset))),
         }
@@ -94,7 +146,25 @@ class ParameterState:
         presets = [{"name": name, "doc": doc} for name, (doc, _) in PRESETS.items()]
         return {**self.as_plain(), "specs": _SPECS, "presets": presets}
 
-    def _become(self, parameters: Parameters) -> None:
-        self.parameters = parameters
-        self.revision += 1
+    def _become(self, preset_name: str, parameters: Parameters, goes_on: bool = False) -> None:
+        """Let this hold from now on; `goes_on`: as part of the step before."""
+        before = _Standing(self.preset, self.parameters)
+        self._gesture = (frozenset(), 0.0)
         self._chosen = True
+        self.revision += 1
+        if before == (preset_name, parameters):
+            return
+        if not (goes_on and self._undo):
+            self._undo = [*self._undo, before][-_MOST_STEPS:]
+            self.step += 1
+        self._redo.clear()
+        self.preset, self.parameters = preset_name, parameters
+
+    def _go_back(self, steps: list[_Standing], others: list[_Standing], none: str) -> None:
+        if not steps:
+            raise StemmapError(none)
+        others.append(_Standing(self.preset, self.parameters))
+        self.preset, self.parameters = steps.pop()
+        self._gesture = (frozenset(), 0.0)
+        self.revision += 1
+        self.step += 1

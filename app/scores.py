@@ -1,7 +1,8 @@
 """The score against the ground truth, kept up with the map.
 
 It is computed in the web process, in a thread: it needs nothing but the tree table, which is here
-already, takes about a millisecond, and the worker's time belongs to the mapping. At most once a second.
+already, takes about a millisecond, and the worker's time belongs to the mapping. Three times a
+second at most.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ Float = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 
-_PAUSE_S = 1.0
+_PAUSE_S = 0.3
 MOST_PAIRED = 300
 
 

@@ -20,15 +20,17 @@ from app.messages import Open
 from app.parameter_state import ParameterState
 from app.replies import BadRequestError, error_reply, failure_reply
 from app.routes import annotations as annotation_routes
-from app.routes import page, parameters, results, run, sockets, story
+from app.routes import page, parameter_sets, parameters, results, run, sockets, story
 from app.security import BodyTooLargeError, Guard
 from app.settings import Settings
+from app.store.records import UnknownError
 from pipeline.errors import ParameterError, StemmapError
 
 _log = logging.getLogger(__name__)
 
 ROUTERS = tuple(
-    module.router for module in (page, run, parameters, results, annotation_routes, story, sockets)
+    module.router
+    for module in (page, run, parameters, parameter_sets, results, annotation_routes, story, sockets)
 )
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
@@ -119,7 +121,13 @@ class SafeHeaders:
 
 
 def _answer_errors(app: FastAPI) -> None:
-    statuses = {BadRequestError: 422, ParameterError: 422, BodyTooLargeError: 413, StemmapError: 409}
+    statuses = {
+        BadRequestError: 422,
+        ParameterError: 422,
+        BodyTooLargeError: 413,
+        UnknownError: 404,
+        StemmapError: 409,
+    }
 
     @app.exception_handler(StemmapError)
     async def for_people(_: Request, error: Exception) -> Response:

@@ -9,9 +9,9 @@ from fastapi import APIRouter, Request
 from msgspec import Meta
 from starlette.responses import Response
 
+from app.parameter_sets import file_of
 from app.replies import body_of, json_reply, table_reply
 from app.routes.access import Dash
-from pipeline.parameters import to_toml
 
 router = APIRouter(prefix="/api")
 
@@ -53,6 +53,20 @@ async def use_preset(request: Request, dashboard: Dash) -> Response:
     return await read(dashboard)
 
 
+@router.post("/parameters/undo")
+async def undo(dashboard: Dash) -> Response:
+    """Take back the last step."""
+    await dashboard.tune(lambda state: state.undo())
+    return await read(dashboard)
+
+
+@router.post("/parameters/redo")
+async def redo(dashboard: Dash) -> Response:
+    """Do again what was undone last."""
+    await dashboard.tune(lambda state: state.redo())
+    return await read(dashboard)
+
+
 @router.post("/parameters/reset")
 async def reset(request: Request, dashboard: Dash) -> Response:
     """Give the named parameters (none: all) the preset's values again."""
@@ -77,4 +91,5 @@ async def choose_view(request: Request, dashboard: Dash) -> Response:
 @router.get("/parameters.toml")
 async def download(dashboard: Dash) -> Response:
     """All values as a file that `--config` takes."""
-    return table_reply(to_toml(dashboard.parameters.parameters), "parameters.toml", "application/toml")
+    text = file_of(dashboard.parameters.preset, dashboard.parameters.parameters)
+    return table_reply(text, "parameters.toml", "application/toml")

@@ -12,12 +12,15 @@ KINDS = ("tree", "pole", "person", "bush", "other")
 MOST_ANNOTATIONS = 5000
 
 
+MOST_SETS = 200
+
+
 class StaleError(StemmapError):
     """An edit of something that somebody else has changed since."""
 
 
 class UnknownError(StemmapError):
-    """There is no such annotation."""
+    """There is no such annotation or set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +68,22 @@ class Annotation:
     who: str
     at_ns: int
     version: int
+
+
+@dataclass(frozen=True, slots=True)
+class SavedSet:
+    """Parameters that were saved under a name.
+
+    Attributes:
+        name: By which people know it; there is one of each.
+        toml: The file that `--config` takes.
+        who, at_ns: Who saved it last, and when.
+    """
+
+    name: str
+    toml: str
+    who: str
+    at_ns: int
 
 
 def moment(at_ns: int) -> str:

@@ -25,6 +25,7 @@ from app.store.records import (
     UnknownError,
     moment,
 )
+from app.store.sets import Sets
 from pipeline.errors import StemmapError
 
 _annotations, _changes, _steps, _runs = tables.annotated, tables.changes, tables.steps, tables.runs
@@ -44,6 +45,11 @@ class Store:
     def __init__(self, folder: Path | None, clock: Callable[[], int] = time.time_ns) -> None:
         self._engine = open_engine(folder)
         self._clock = clock
+
+    @property
+    def sets(self) -> Sets:
+        """The parameters that were saved, of all runs."""
+        return Sets(self._engine, self._clock)
 
     def close(self) -> None:
         """Let go of the file."""

@@ -17,6 +17,7 @@ from sqlalchemy import (
     MetaData,
     String,
     Table,
+    Text,
     UniqueConstraint,
     insert,
     inspect,
@@ -83,8 +84,24 @@ changes = Table(
     sqlite_autoincrement=True,
 )
 
+parameter_sets = Table(
+    "parameter_sets",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("name", String(60), nullable=False),
+    Column("toml", Text, nullable=False, comment="the file that --config takes"),
+    Column("who", String(60), nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+    UniqueConstraint("name"),
+)
+
+
+def _add_parameter_sets(connection: Connection) -> None:
+    parameter_sets.create(connection)
+
+
 # The function at place k makes a database of version k + 1 into one of version k + 2.
-MIGRATIONS: tuple[Callable[[Connection], None], ...] = ()
+MIGRATIONS: tuple[Callable[[Connection], None], ...] = (_add_parameter_sets,)
 VERSION = 1 + len(MIGRATIONS)
 
 

@@ -7,6 +7,7 @@ import { select } from "./live.js";
 import { setLoop } from "./marks.js";
 import { onSceneLoad, pressInScene } from "./scene.js";
 import { openTab } from "./tabs.js";
+import { tuneKey } from "./tune.js";
 import { stopMeasuring, toggleMeasure } from "./measure.js";
 import { advance, togglePlay } from "./timeline.js";
 
@@ -36,7 +37,7 @@ function openDrawer() {
 }
 
 function act(event, inScene) {
-  if (!document.querySelector("dialog[open]") && !event.target.matches?.(TYPES) && annotateKey(event, inScene)) {
+  if (!document.querySelector("dialog[open]") && !event.target.matches?.(TYPES) && (annotateKey(event, inScene) || tuneKey(event))) {
     event.preventDefault();
     event.stopImmediatePropagation();
     return;

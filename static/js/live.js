@@ -10,6 +10,7 @@ const takers = {
   status(message) { state.status = message; },
   map(message) { takeMap(message); },
   parameters(message) { state.parameters = message; },
+  sets(message) { state.sets = message; },
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   annotations(message) { state.annotations = message; },

@@ -21,8 +21,10 @@ import { startTable } from "./table.js";
 import { startTabs } from "./tabs.js";
 import { startTheme } from "./theme.js";
 import { startTimeline } from "./timeline.js";
+import { startTunePanel } from "./tune_panel.js";
+import { startTuning } from "./tune.js";
 import { startWelcome } from "./welcome.js";
 
-for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startAnnotateScene,
+for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startAnnotateScene, startTunePanel, startTuning,
   startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startDrawer, startWelcome]) start();
 connect();

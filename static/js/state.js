@@ -8,7 +8,8 @@ export const state = {
   truth: null,
   evaluation: null,
   annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}]}
-  parameters: null,
+  parameters: null,  // {preset, set, revision, undo, redo, values, changed}
+  sets: null,        // {sets: [{name, who, at_s}]}: parameters that were saved
   selected: null,    // number of a tree
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when it was selected
   view: null,        // layers and choices of the 3D scene

@@ -19,13 +19,19 @@ const FIGURES = {
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
   sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
-  f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE]],
+  f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE, "", ofScan()]],
 };
 const cells = {};
 
 // Time from scan to scan [ms]: mapping that takes longer falls behind.
 function budget({ scans, end_s: end }) {
   return scans > 1 && end > 0 ? (1000 * end) / (scans - 1) : 100;
+}
+
+// What the standing scan took for trees, against the truth: it moves with a slider, before the map follows.
+function ofScan() {
+  const { right, wrong } = state.map ?? {};
+  return right === null || right === undefined ? "F1 to truth" : `F1; this scan ${right} right, ${wrong} wrong`;
 }
 
 function reason({ health }) {

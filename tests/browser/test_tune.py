@@ -1,0 +1,132 @@
+"""A person tunes in the tab Tune: types, slides, resets, takes back, saves sets and shares them."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser.dashboard import Dashboard
+
+
+@pytest.fixture(autouse=True)
+def _standing(dashboard: Dashboard):
+    dashboard.pause()
+    dashboard.command({"type": "seek", "time_s": 22.55})
+    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 22.47 && it.time_s < 22.56")
+    dashboard.tab("Tune")
+    dashboard.page.locator("#tune-set").select_option("forest")
+    dashboard.until_server("/api/parameters", "it.preset === 'forest' && it.changed.length === 0")
+
+
+def value(page: Page, name: str):
+    return page.locator(f"[id='tune-{name}']")
+
+
+def test_a_value_is_typed_marked_taken_back_and_reset(dashboard: Dashboard):
+    page = dashboard.page
+    row = page.locator("[data-parameter='clustering.eps']")
+    trees = page.locator("[data-chip=tree] b")
+    eps = value(page, "clustering.eps")
+    expect(eps).to_have_value("0.15")
+    expect(row).not_to_have_class("tune-row changed")
+    clusters = int(page.locator("[data-chip=tree] b").inner_text().split()[-1])
+    eps.fill("5")
+    eps.press("Enter")
+    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
+    expect(row).to_have_class("tune-row changed")
+    expect(page.locator("#tune-summary")).to_contain_text("1 of ")
+    expect(trees).to_contain_text(f"{clusters} → ")  # before and after the change, of the same scan
+    expect(page.locator("[data-stage=Clustering] summary")).to_contain_text("1 changed")
+    expect(page.locator("[data-figure=f1] dt")).to_contain_text("this scan")
+    # viser's slider is in step.
+    expect(dashboard.row("Radius eps").locator("input[type=text]")).to_have_value("5")
+
+    page.locator("#tune-undo").focus()
+    page.keyboard.press("Control+z")
+    dashboard.until_server("/api/parameters", "it.changed.length === 0")
+    expect(eps).to_have_value("0.15")
+    page.locator("#panel-tune summary").first.press("Control+Shift+z")
+    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
+    row.get_by_role("button", name="Reset Radius eps").click()
+    dashboard.until_server("/api/parameters", "it.changed.length === 0")
+    expect(row.get_by_role("button")).to_be_hidden()
+
+
+def test_a_slider_moves_by_its_step_and_shows_the_same_in_the_scene(dashboard: Dashboard):
+    page = dashboard.page
+    slider = page.get_by_role("slider", name="Radius eps, slider")
+    slider.press("ArrowRight")
+    dashboard.until_server("/api/parameters", "Math.abs(it.values['clustering.eps'] - 0.16) < 1e-9")
+    slider.evaluate("node => { node.value = 1000; node.dispatchEvent(new Event('input', {bubbles: true})); }")
+    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
+    expect(value(page, "clustering.eps")).to_have_value("5")
+    assert dashboard.state == "paused"
+    box = dashboard.row("Radius eps").locator("input[type=text]")
+    box.fill("0.3")
+    box.press("Tab")
+    expect(value(page, "clustering.eps")).to_have_value("0.3")
+
+
+def test_what_is_refused_is_told_and_goes_back(dashboard: Dashboard):
+    page = dashboard.page
+    lowest = value(page, "detection.e_min")
+    for typed, words in (("900", "must be less than"), ("many", "is no number"), ("-3", "greater than")):
+        lowest.fill(typed)
+        lowest.press("Enter")
+        expect(page.locator("#tune-error")).to_contain_text(words)
+        expect(lowest).to_have_value("1")
+    dashboard.errors.clear()  # the browser logs an answer that refuses
+    lowest.fill("1.5")
+    lowest.press("Enter")
+    expect(page.locator("#tune-error")).to_be_hidden()
+
+
+def test_parameters_are_found_by_their_words(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("#tune-find").fill("Heading metre")
+    rows = page.locator(".tune-row:visible")
+    expect(rows.first).to_be_visible()
+    names = rows.evaluate_all("all => all.map(row => row.dataset.words)")
+    assert all("heading" in words and "metre" in words for words in names)
+    page.locator("#tune-find").fill("no such thing at all")
+    expect(page.locator("#tune-none")).to_contain_text("No parameter has these words")
+    page.locator("#tune-find").fill("")
+    page.get_by_label("changed only").check()
+    expect(page.locator("#tune-none")).to_contain_text("Nothing differs")
+    page.get_by_label("changed only").uncheck()
+
+
+def test_a_set_is_saved_and_shared_as_a_file(dashboard: Dashboard, tmp_path: Path):
+    page = dashboard.page
+    sets = page.locator("#tune-set")
+    eps = value(page, "clustering.eps")
+    eps.fill("0.25")
+    eps.press("Enter")
+    expect(sets).to_have_value("")
+    page.locator("#tune-save").click()
+    page.locator("#tune-name").fill("wet larches")
+    page.locator("#tune-name").press("Enter")
+    expect(sets).to_have_value("wet larches")
+    with page.expect_download() as download:
+        page.locator("#tune-download").click()
+    file = tmp_path / "shared.toml"
+    download.value.save_as(file)
+    assert tomllib.loads(file.read_text())["clustering"]["eps"] == 0.25
+
+    sets.select_option("paper")
+    dashboard.until_server("/api/parameters", "it.preset === 'paper'")
+    sets.select_option("wet larches")
+    dashboard.until_server(
+        "/api/parameters", "it.values['clustering.eps'] === 0.25 && it.preset === 'forest'"
+    )
+    page.locator("#tune-delete").click()
+    expect(sets.locator("option", has_text="wet larches")).to_have_count(0)
+    sets.select_option("forest")
+    page.locator("#tune-file").set_input_files(file)
+    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 0.25")
+    page.locator("#tune-reset").click()
+    dashboard.until_server("/api/parameters", "it.changed.length === 0")
+    assert dashboard.errors == []
