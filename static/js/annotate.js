@@ -123,7 +123,7 @@ function nearestRow({ x, y }) {
 export const unjudged = () => (state.map?.trees ?? []).filter((tree) => !nearestRow(tree))
   .sort((a, b) => a.observations - b.observations || a.number - b.number);
 
-// The selected tree is one, or is something else; then to the next.
+// The selected tree is one, or is something else; then to the next, unless another was selected meanwhile.
 export async function judge(kind) {
   const tree = state.map?.trees.find(({ number }) => number === state.selected);
   if (!tree) {
@@ -133,7 +133,7 @@ export async function judge(kind) {
   const row = nearestRow(tree);
   if (row) await change(row, { kind });
   else await add({ x: tree.x, y: tree.y, kind });
-  if (!draft.error) next();
+  if (!draft.error && state.selected === tree.number) next();
 }
 
 // The one seen least often first; after it the next.

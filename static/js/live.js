@@ -3,8 +3,10 @@
 import { state, changed } from "./state.js";
 
 const FIRST_WAIT = 500, LONGEST_WAIT = 5000;
+const ANSWER_WAIT = 3000; // [ms] that a choice made here stands against what the server still says
 let socket = null;
 let wait = FIRST_WAIT;
+let chosen = null; // {tree, until}: selected here, and not yet heard of from the server
 
 const takers = {
   status(message) { state.status = message; },
@@ -14,7 +16,7 @@ const takers = {
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   annotations(message) { state.annotations = message; },
-  selection(message) { Object.assign(state, { selected: message.tree ?? null, selectedCluster: message.cluster ?? null }); },
+  selection(message) { takeSelection(message.tree ?? null, message.cluster ?? null); },
   events(message) { state.events = message.events; },
   view(message) { state.view = message; },
   loop(message) { state.loop = message.to_s === undefined ? null : message; },
@@ -27,6 +29,13 @@ function takeMap({ path, ...map }) {
   if (path.start === 0) state.odometry.length = 0; // another run
   state.map = map.index < 0 ? null : map; // -1: another run is opened, and nothing of it is mapped yet
   if (map.odom) state.odometry[map.index] = map.odom;
+}
+
+// An answer to an earlier click must not undo a later one.
+function takeSelection(tree, cluster) {
+  if (chosen && chosen.tree !== tree && performance.now() < chosen.until) return;
+  chosen = null;
+  Object.assign(state, { selected: tree, selectedCluster: cluster });
 }
 
 function receive(event) {
@@ -65,5 +74,16 @@ function send(message) {
   if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(message));
 }
 
-export const select = (tree) => send({ type: "select", tree });
-export const selectCluster = (scan, cluster) => send({ type: "select_cluster", scan, cluster });
+// Selected at once: a key pressed right after the click acts on what was clicked, however far the server is.
+export function select(tree) {
+  if (socket?.readyState !== WebSocket.OPEN) return;
+  send({ type: "select", tree });
+  chosen = { tree, until: performance.now() + ANSWER_WAIT };
+  Object.assign(state, { selected: tree, selectedCluster: null });
+  changed("selection");
+}
+
+export function selectCluster(scan, cluster) {
+  chosen = null; // which tree it is, the server says
+  send({ type: "select_cluster", scan, cluster });
+}

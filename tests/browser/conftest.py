@@ -1,5 +1,5 @@
 """A real Chromium, a real server, and the dashboard open in it. Software rendering is slow: the window is
-small, the scene is drawn coarsely, and everything is waited for, up to a minute.
+small, the scene is drawn coarsely, and everything is waited for, patiently.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ from typing import Any, cast
 
 from playwright.sync_api import ConsoleMessage, Frame, Locator, Page, Response
 
-PATIENCE_S = 60
+# Of a machine that is busy and compiles the kernels first.
+PATIENCE_S = 150
 
 # What software rendering says of itself is not an error of ours.
 HARMLESS = ("GPU stall", "GL Driver Message", "Automatic fallback to software WebGL")
