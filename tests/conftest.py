@@ -1,4 +1,4 @@
-"""What tests share: where the real data lies, and a limit on threads."""
+"""What tests share: where the real data lies, a limit on threads, and both cores for the whole suite."""
 
 from __future__ import annotations
 
@@ -7,9 +7,21 @@ from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).resolve().parents[1]
+_WORKERS = 2
+
 # The machine is shared: a test that takes every core slows the others down and proves nothing.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(_name, "2")
+    os.environ.setdefault(_name, "1")
+
+# Two processes that compile the same function for other types at once may spoil numba's index of its cache.
+if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".numba_cache" / os.environ["PYTEST_XDIST_WORKER"]))
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """The whole suite runs on two cores, a part that somebody names in one process, which starts at once."""
+    return _WORKERS if config.args_source is pytest.Config.ArgsSource.TESTPATHS else 0
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -21,8 +33,7 @@ def _annotations_apart(tmp_path_factory: pytest.TempPathFactory) -> None:
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder with real recordings; the test is skipped where it is absent."""
-    root = Path(__file__).resolve().parents[1]
-    folder = Path(os.environ.get("STEMMAP_DATA", root / ".." / "shared" / "data")).resolve()
+    folder = Path(os.environ.get("STEMMAP_DATA", ROOT / ".." / "shared" / "data")).resolve()
     if not folder.is_dir():
         pytest.skip(f"no real data at {folder}; set STEMMAP_DATA")
     return folder
