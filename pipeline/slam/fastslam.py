@@ -21,7 +21,7 @@ from pipeline.slam import slip
 from pipeline.slam.health import TOLD, Recent, ScanTold, is_astray, judged, remembered, scan_told
 from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
 from pipeline.slam.motion import Motion, accumulated, moved_poses, weighted_pose
-from pipeline.slam.proposal import Room, room_for
+from pipeline.slam.pairs import Room, room_for
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.state import SlamState
 from pipeline.slam.update import Near, Rules, near_for, observe, predict

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
+from pipeline.slam.cells import Cells, holds_unseen
 
 VARIANCE_MIN = 1e-4  # m^2; views of one trunk share an error of about a centimetre
 
@@ -41,19 +44,25 @@ def merge_duplicates(
     known: int,
     seen: Bool,
     gate: float,
+    cells: Cells,
+    scale: float,
 ) -> None:
     """Join each landmark that was seen with those nearby that were not, where both may be one tree.
 
     Two that this scan sees are two. Of two that are one the older keeps its birth; the other one is
-    left without score, to be removed. Only the first `known` rows are asked.
+    left without score, to be removed. Only the first `known` rows are asked; the cells hold them, `scale`
+    a metre, at least those that were not seen where they are now.
     """
     gate2 = gate * gate
     largest = 0.0
     for j in range(known):
         largest = max(largest, covariance[j, 0] + covariance[j, 2])
     reach2 = 2.0 * gate2 * largest
+    narrow = 2.0 * scale * np.sqrt(reach2) < 1.0
     for j in range(known):
         if not seen[j]:
+            continue
+        if narrow and not holds_unseen(cells, mean, seen, mean[j, 0], mean[j, 1], reach2, scale):
             continue
         for k in range(known):
             y0, y1 = mean[k, 0] - mean[j, 0], mean[k, 1] - mean[j, 1]

@@ -10,11 +10,14 @@ from pipeline.compiled import compiled
 from pipeline.direction import direction_bin
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
+from pipeline.slam.cells import Cells, cells_for, clear, fill, per_metre
+from pipeline.slam.gaussian import draw, rotated
 from pipeline.slam.health import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.maps import ROOM, Maps, own_block
 from pipeline.slam.motion import correct_by_pose
-from pipeline.slam.proposal import Room, draw, recognise, rotated
+from pipeline.slam.pairs import Room
+from pipeline.slam.proposal import recognise
 from pipeline.visibility import BEHIND
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
@@ -56,6 +59,7 @@ class Near(NamedTuple):
         mean, covariance, hits, score, birth: As in Maps, shape (L, ...).
         seen, changed: shape (L,).
         free: int32, shape (L, 2): block and place of places without a landmark.
+        cells: Those known before the scan, by where they stood then.
     """
 
     block: Int32
@@ -68,6 +72,7 @@ class Near(NamedTuple):
     seen: Bool
     changed: Bool
     free: Int32
+    cells: Cells
 
 
 def near_for(landmarks: int) -> Near:
@@ -84,6 +89,7 @@ def near_for(landmarks: int) -> Near:
         seen=np.empty(n, np.bool_),
         changed=np.empty(n, np.bool_),
         free=np.empty((n, 2), np.int32),
+        cells=cells_for(n),
     )
 
 
@@ -145,6 +151,9 @@ def observe(
     """
     mu = np.empty(3)
     P = np.zeros((3, 3))
+    scale = per_metre(rules.distance_max)
+    for i in range(centre.shape[0]):
+        room.turn[i] = i
     for p in range(pose.shape[0]):
         before_c, before_s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
         x, y, yaw = pose[p, 0], pose[p, 1], pose[p, 2]
@@ -154,8 +163,9 @@ def observe(
         if measured.shape[0] > 0:
             log_weight[p] += correct_by_pose(mu, P, measured, measured_covariance)
         known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, near)
+        fill(near.cells, near.mean, known, scale)
         likelihood = recognise(
-            mu, P, centre, R, known, near.mean, near.covariance, near.hits,
+            mu, P, centre, R, known, near.mean, near.covariance, near.hits, near.cells, scale,
             rules.gate, rules.distance_max, rules.hits_to_weigh, room, told, p,
         )  # fmt: skip
         _shift(x, y, yaw, before_c, before_s, motion, mu, told, p)
@@ -167,8 +177,10 @@ def observe(
         missed = _miss(pose, p, near, known, clear_range, rules, told)
         log_weight[p] += rules.weight_power * (likelihood - rules.miss_weight * missed)
         merge_duplicates(
-            near.mean, near.covariance, near.hits, near.score, near.birth, known, near.seen, rules.merge_gate
-        )
+            near.mean, near.covariance, near.hits, near.score, near.birth, known, near.seen,
+            rules.merge_gate, near.cells, scale,
+        )  # fmt: skip
+        clear(near.cells, known)
         _write_back(maps, p, near, all_near)
 
 
