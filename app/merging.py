@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from app.continuing import PAUSE_NS
+from app.driven import breaks_of, driven
 from app.finished import read_run_record
 from app.run_health import RunHealth
 from app.saved_run import SavedRun, read_saved_run
@@ -129,13 +130,14 @@ def _path(merged: MergedMap) -> Path:
 def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, match: Match) -> None:
     """Make the record of run a that of both."""
     first, *others = saved.sources
+    seconds, metres = driven(path, breaks_of(saved.sources))
     record["source"].update(uri=first.uri, sha256=first.digest)
     record.update(
         stemmap=version(),
         parameters=json.loads(saved.parameters),
         scans=len(path.stamp_ns),
-        duration_s=round((int(path.stamp_ns[-1]) - int(path.stamp_ns[0])) * 1e-9, 6),
-        distance_m=round(float(np.hypot(np.diff(path.x), np.diff(path.y)).sum()), 3),
+        duration_s=round(seconds, 6),
+        distance_m=round(metres, 3),
         trees=trees,
         points=dict(saved.tally.points),
         health=saved.tally.health.record(saved.start_ns),

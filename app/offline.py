@@ -11,11 +11,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from app.continuing import Beginning, Continued, at_origin, go_on
+from app.driven import breaks_of, driven
 from app.odometry import odometry_warnings
 from app.saved_run import FORMAT, SavedRun
 from app.stopwatch import Stopwatch
 from app.tally import Tally
 from app.version import version
+from pipeline.compiled import on_compiling
 from pipeline.errors import SourceError
 from pipeline.evaluation import Evaluation, PathError, Rate, evaluate, path_error
 from pipeline.export import RunFiles, terrain_text
@@ -61,7 +63,8 @@ class Outcome:
         summary: Lines to print.
         warnings: Each once, with how often it came.
         losses: What was left out, by reason.
-        scan_ms, stage_ms: Median time of a scan and of each stage [ms].
+        scan_ms, stage_ms: Median time of a scan and of each stage [ms]; what waited for a kernel to be
+            compiled does not count.
     """
 
     summary: list[str] = field(default_factory=list)
@@ -87,8 +90,10 @@ def map_run(
         OSError: The folder could not be written; nothing new stands in it then.
     """
     files = RunFiles(folder, earlier)
+    stopwatch = Stopwatch(scans=MEASURED_SCANS)
     try:
-        return _map(plan, files, progress)
+        with on_compiling(stopwatch.disturb):
+            return _map(plan, files, progress, stopwatch)
     except BaseException:
         files.abandon()
         raise
@@ -96,9 +101,8 @@ def map_run(
         progress.close()
 
 
-def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
+def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopwatch) -> Outcome:
     description = plan.source.description
-    stopwatch = Stopwatch(scans=MEASURED_SCANS)
     mapper = Mapper(
         plan.parameters,
         sensor=description.sensor,
@@ -131,13 +135,14 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress) -> Outcome:
     tally.tell_of_far_truth(evaluation)
     if plan.parameters.gathering.method == "none":  # else a track is judged by more than its hits
         tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
-    record = _run_record(plan, tally, frame, path, evaluation, error, losses)
+    seconds, metres = driven(path, breaks_of(begun.sources))
+    record = _run_record(plan, tally, frame, (seconds, metres), start_ns, evaluation, error, losses)
     if len(begun.sources) > 1:
         first, *others = begun.sources
         record["source"].update(uri=first.uri, sha256=first.digest)
         record["continued"] = [asdict(other) for other in others]
     outcome = Outcome(
-        summary=_summary(description.uri, frame, path, evaluation, error)
+        summary=_summary(description.uri, frame, (seconds, metres), evaluation, error)
         + _start_words(begun)
         + tally.health.summary(),
         warnings=tally.warnings(),
@@ -199,7 +204,8 @@ def _run_record(
     plan: OfflineRun,
     tally: Tally,
     frame: Frame,
-    path: Path,
+    driven_s_m: tuple[float, float],
+    start_ns: int,
     evaluation: Evaluation | None,
     error: PathError | None,
     losses: dict[str, int],
@@ -220,11 +226,11 @@ def _run_record(
         "parameters": plan.parameters.model_dump(),
         "revisions": [{"revision": 0, "from_scan": 0, "changes": {}}],
         "scans": frame.index + 1,
-        "duration_s": round((int(path.stamp_ns[-1]) - int(path.stamp_ns[0])) * 1e-9, 6),
-        "distance_m": round(_length(path), 3),
+        "duration_s": round(driven_s_m[0], 6),
+        "distance_m": round(driven_s_m[1], 3),
         "trees": int(np.count_nonzero(frame.trees.confirmed)),
         "points": dict(tally.points),
-        "health": tally.health.record(int(path.stamp_ns[0])),
+        "health": tally.health.record(start_ns),
         "verdicts": dict(sorted(tally.verdicts.items())),
         "evaluation": None if evaluation is None else asdict(evaluation),
         "path_error": None if error is None else asdict(error),
@@ -234,11 +240,15 @@ def _run_record(
 
 
 def _summary(
-    uri: str, frame: Frame, path: Path, evaluation: Evaluation | None, error: PathError | None
+    uri: str,
+    frame: Frame,
+    driven_s_m: tuple[float, float],
+    evaluation: Evaluation | None,
+    error: PathError | None,
 ) -> list[str]:
-    seconds = (int(path.stamp_ns[-1]) - int(path.stamp_ns[0])) * 1e-9
+    seconds, metres = driven_s_m
     trees = int(np.count_nonzero(frame.trees.confirmed))
-    lines = [f"{uri}: {frame.index + 1} scans, {seconds:.1f} s, {_length(path):.1f} m driven, {trees} trees"]
+    lines = [f"{uri}: {frame.index + 1} scans, {seconds:.1f} s, {metres:.1f} m driven, {trees} trees"]
     if evaluation is not None:
         lines += evaluation_lines(evaluation)
     if error is not None:
@@ -276,7 +286,3 @@ def _metres(value: float | None) -> str:
 
 def _pair(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f} %"
-
-
-def _length(path: Path) -> float:
-    return float(np.hypot(np.diff(path.x), np.diff(path.y)).sum())

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from app.driven import driven
 from app.messages import State, Status
 from app.run import Run
-from pipeline.records import Path
 
 _NS = 1_000_000_000
 
@@ -40,7 +40,7 @@ def describe(
         mapping_ms=round(run.stopwatch.scan_ms, 3),
         stage_ms={stage: round(ms, 3) for stage, ms in run.stopwatch.stage_ms.items()},
         trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
-        distance_m=round(distance_driven(run.path), 3),
+        distance_m=round(driven(run.path)[1], 3),
         health="good" if frame is None else frame.health.state,
         warnings=list(warnings + losses),
         revision=revision,
@@ -52,8 +52,3 @@ def clock(seconds: float) -> str:
     """A time as the page writes it: minutes and seconds."""
     whole = int(seconds)
     return f"{whole // 60}:{whole % 60:02d}"
-
-
-def distance_driven(path: Path) -> float:
-    """Length of a path [m]."""
-    return float(np.hypot(np.diff(path.x), np.diff(path.y)).sum())

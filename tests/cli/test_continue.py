@@ -70,6 +70,9 @@ def test_a_second_run_finds_its_start_and_keeps_the_numbers(stand, tmp_path, cap
     assert len(after) <= 1.1 * len(before)
     assert record["evaluation"]["spurious"] <= 1
     assert len(rows(tmp_path, "path.csv")) == 2 * len(rows(stand, "path.csv"))
+    once = json.loads((stand / "run.json").read_text())
+    assert record["duration_s"] == pytest.approx(2 * once["duration_s"], abs=0.01)  # the pause is none
+    assert record["distance_m"] == pytest.approx(2 * once["distance_m"], rel=0.05)  # nor is the jump a drive
 
 
 def test_another_stand_is_not_found_in_the_map(stand, tmp_path, capsys):
