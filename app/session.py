@@ -128,6 +128,11 @@ class Session:
             self._run.prepare()
             make_ready(self._run.source.description.sensor)
 
+    def disturb(self) -> None:
+        """What is being mapped waits for something that is no part of the mapping: its times do not count."""
+        if self._run is not None:
+            self._run.stopwatch.disturb()
+
     def work(self) -> Frame | None:
         """Map one scan if one is wanted. None when there was none: the run is at its end, or the
         sought scan was already reached."""

@@ -12,6 +12,8 @@ from statistics import median
 class Stopwatch:
     """The mapper's `Watch`: remembers how long each stage took over the last scans.
 
+    What was disturbed (see `disturb`) is not remembered.
+
     Args:
         scans: Over how many scans medians are taken.
         clock: Seconds from any start.
@@ -22,25 +24,32 @@ class Stopwatch:
         self._scans = scans
         self._stages: dict[str, deque[float]] = {}
         self._totals: deque[float] = deque(maxlen=scans)
+        self._disturbances = 0
+
+    def disturb(self) -> None:
+        """What is being measured waits for something else, as for a kernel to be compiled."""
+        self._disturbances += 1
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
         """Measure one stage."""
-        start = self._clock()
+        start, disturbances = self._clock(), self._disturbances
         try:
             yield
         finally:
             times = self._stages.setdefault(stage, deque(maxlen=self._scans))
-            times.append(self._clock() - start)
+            if disturbances == self._disturbances:
+                times.append(self._clock() - start)
 
     @contextmanager
     def whole_scan(self) -> Iterator[None]:
         """Measure the mapping of one scan, all stages and what lies between them."""
-        start = self._clock()
+        start, disturbances = self._clock(), self._disturbances
         try:
             yield
         finally:
-            self._totals.append(self._clock() - start)
+            if disturbances == self._disturbances:
+                self._totals.append(self._clock() - start)
 
     def clear(self) -> None:
         """Forget what was measured."""
@@ -55,4 +64,4 @@ class Stopwatch:
     @property
     def stage_ms(self) -> dict[str, float]:
         """Median time of each stage [ms], in the order in which they first ran."""
-        return {stage: 1e3 * median(times) for stage, times in self._stages.items()}
+        return {stage: 1e3 * median(times) for stage, times in self._stages.items() if times}

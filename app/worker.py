@@ -21,6 +21,7 @@ from app.wire import WireError, to_worker
 from app.worker_driver import Driver
 from app.worker_mailbox import Mailbox
 from app.worker_messages import ToWorker
+from pipeline.compiled import on_compiling
 from pipeline.parameters import Parameters
 from pipeline.sources.base import Source
 
@@ -58,7 +59,9 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     reader.start()
     recent = Recent()
     mailbox = Mailbox(outgoing, recent)
-    Driver(session, commands, mailbox.put, recent=recent).run()
+    driver = Driver(session, commands, mailbox.put, recent=recent)
+    with on_compiling(driver.compiling):
+        driver.run()
     mailbox.close()
     finished.set()
 

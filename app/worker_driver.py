@@ -5,6 +5,7 @@ process what came of it.
 from __future__ import annotations
 
 import contextlib
+import math
 import queue
 import sys
 import time
@@ -42,6 +43,7 @@ T = TypeVar("T")
 # that is sought: rarely enough that a short way shows no flicker.
 _REPORT_S = 0.25
 _GLIMPSE_S = 0.5
+COMPILING = "Compiling for this machine; it takes about a minute, and only the first time"
 
 
 class Driver:
@@ -113,7 +115,7 @@ class Driver:
         pace = self._session.pace
         if pace == "idle":
             return None
-        if pace == "hurry":
+        if pace == "hurry" or not self._prepared:
             return 0.0
         stamp_ns = self._guarded(self._session.next_ns)
         return 0.0 if stamp_ns is None else self._pacer.delay(stamp_ns, self._clock())
@@ -215,12 +217,26 @@ class Driver:
 
     def _prepare(self) -> None:
         """Before the first scan, and not when opening: only now are the parameters those of the run."""
+        self._tell(self._preparing(), self._clock())
         self._prepared = True
-        detail = "Preparing the mapper; the first time on a machine this takes up to a minute"
-        self._put(Report(replace(self._session.status(), state="starting", detail=detail)))
         self._session.prepare()
         self._pacer.release()
         self._report()
+
+    def _preparing(self) -> Status:
+        return replace(self._session.status(), state="starting", detail="Preparing the mapper")
+
+    def compiling(self) -> None:
+        """Say that work waits for a kernel that is being compiled; called while it works."""
+        self._session.disturb()
+        if self._reported is None or self._reported[0].detail == COMPILING:
+            return
+        # What was told last, because the session is in the middle of its work.
+        status = replace(self._reported[0], detail=COMPILING)
+        if status.state == "playing":
+            status = replace(status, state="waiting")
+        self._reported = (status, -math.inf)  # so that what comes of it is told at once
+        self._put(Report(status))
 
     def _show(self, frame: Frame | None) -> None:
         path = self._session.path
@@ -229,6 +245,10 @@ class Driver:
 
     def _report(self) -> None:
         now = self._clock()
+        if self._session.pace != "idle" and not self._prepared:
+            # Nothing plays yet: the first scan is read, and on a new machine all is compiled, before.
+            self._tell(self._preparing(), now)
+            return
         playing = self._session.pace == "replay"
         status = self._session.status()
         if status.going_to and now >= self._long_way_at:  # a short way would only flicker
@@ -239,6 +259,9 @@ class Driver:
             scan_rate_hz=round(self._pacer.rate_hz, 2) if playing else 0.0,
             scans_behind=self._pacer.behind(now) if playing else 0,
         )
+        self._tell(status, now)
+
+    def _tell(self, status: Status, now: float) -> None:
         self._reported = (status, now)
         self._put(Report(status))
 

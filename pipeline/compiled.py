@@ -13,12 +13,14 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
+from numba.core import event
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -43,6 +45,29 @@ def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
     )(function)
     _keep_by_all_sources(kernel, function.__module__)
     return kernel
+
+
+class _Compiling(event.Listener):  # type: ignore[misc]
+    """Hears of every kernel that is compiled; one that is loaded from what is kept is none."""
+
+    def __init__(self, begun: Callable[[], None]) -> None:
+        self._begun = begun
+
+    def on_start(self, event: event.Event) -> None:
+        """A kernel begins to be compiled."""
+        del event
+        self._begun()
+
+    def on_end(self, event: event.Event) -> None:
+        """It is compiled."""
+
+
+@contextmanager
+def on_compiling(tell: Callable[[], None]) -> Iterator[None]:
+    """Inside, `tell` is called before each kernel that this machine has to compile, in the thread that
+    waits for it. Kernels that are kept on disk need no compiling and are not told."""
+    with event.install_listener("numba:compile", _Compiling(tell)):
+        yield
 
 
 def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401

@@ -18,6 +18,7 @@ from app.cli.choices import (
     source,
     source_options,
 )
+from app.cli.waiting import compiling_is_said
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
+@compiling_is_said()
 def run(arguments: argparse.Namespace) -> int:
     """Map the run."""
     if arguments.start is not None and arguments.continued is None:
@@ -183,8 +185,7 @@ def _scans(text: str) -> int:
 
 
 class _Bar:
-    """A progress bar on a terminal, nothing elsewhere. Until the first scan is done it says what a
-    first run on a machine waits for."""
+    """A progress bar on a terminal, nothing elsewhere."""
 
     def __init__(self, scans: int | None) -> None:
         from tqdm import tqdm
@@ -192,7 +193,7 @@ class _Bar:
         self._bar = tqdm(
             total=scans,
             unit="scan",
-            desc="preparing (the first run on a machine compiles for half a minute)",
+            desc="preparing",
             file=sys.stderr,
             disable=not sys.stderr.isatty(),
             leave=False,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from app.cli.waiting import compiling_is_said
 from pipeline.errors import StemmapError
 
 HELP = "merge two mapped runs of one stand into one map"
@@ -29,6 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
+@compiling_is_said()
 def run(arguments: argparse.Namespace) -> int:
     """Merge the runs."""
     import numpy as np

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli.choices import seed
+from app.cli.waiting import compiling_is_said
 
 if TYPE_CHECKING:
     from pipeline.records import Record
     from pipeline.sources.simulated import SimulatedSource
 
-HELP = "Write a simulated run as an MCAP of ROS 2 messages, with its ground truth"
+HELP = "write a simulated run as an MCAP of ROS 2 messages, with its ground truth"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "The ground truth is attached to the recording, and written beside it as RUN.trees.csv."
 
 
+@compiling_is_said()
 def run(arguments: argparse.Namespace) -> int:
     """Write the recording and the table of trees beside it."""
     from pipeline.recording import write_recording

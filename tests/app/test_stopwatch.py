@@ -26,3 +26,15 @@ def test_a_failing_stage_is_measured_and_fails() -> None:
         raise KeyError
     assert stopwatch.stage_ms == {"slam": 1000.0}
     assert stopwatch.scan_ms == 3000.0
+
+
+def test_what_waits_for_a_kernel_to_be_compiled_is_not_measured() -> None:
+    ticks = itertools.count()
+    stopwatch = Stopwatch(clock=lambda: next(ticks))
+    with stopwatch.whole_scan():
+        with stopwatch("ground"):
+            stopwatch.disturb()
+        with stopwatch("slam"):
+            pass
+    assert stopwatch.stage_ms == {"slam": 1000.0}
+    assert stopwatch.scan_ms == 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import queue
 import threading
@@ -16,7 +17,7 @@ from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpe
 from app.picture import MOST_POINTS, picture_of
 from app.story.recent import Recent
 from app.wire import from_worker
-from app.worker_driver import Driver
+from app.worker_driver import COMPILING, Driver
 from app.worker_mailbox import Mailbox, joined, rows_in_common
 from app.worker_messages import (
     Answer,
@@ -78,6 +79,39 @@ def test_playing_shows_every_scan_and_ends_finished() -> None:
 
 def begin(run: int, eps: float = 0.15, *, play: bool = True) -> Begin:
     return Begin(run, Parameters().replace({"clustering.eps": eps}).model_dump(), 4, play)
+
+
+def test_nothing_is_said_to_play_before_the_first_scan_is_ready() -> None:
+    said = driven(FakeSource(5), Open("fake:"), begin(1))
+    states = [m.status.state for m in said if isinstance(m, Report) and m.status.source == "fake:"]
+    assert states.index("playing") > states.index("starting")
+    first_picture = next(k for k, m in enumerate(said) if isinstance(m, Shown))
+    before = [m.status for m in said[:first_picture] if isinstance(m, Report) and m.status.revision == 4]
+    assert before[0].state == "starting"
+    assert before[0].detail == "Preparing the mapper"
+
+
+def test_a_kernel_that_is_compiled_is_said_once_and_no_silence_follows() -> None:
+    session, said = make_session(FakeSource(9)), list[FromWorker]()
+    commands: queue.Queue[ToWorker | None] = queue.Queue()
+
+    def put(message: FromWorker) -> None:
+        said.append(message)
+        if isinstance(message, Shown) and message.frame.index == 2:
+            driver.compiling()
+            driver.compiling()
+        if isinstance(message, Report) and message.status.state == "finished":
+            commands.put(None)
+
+    driver = Driver(session, commands, put, itertools.count().__next__)
+    for command in (Open("fake:"), SetSpeed(0.0), Play()):
+        commands.put(command)
+    driver.run()
+    reports = [m.status for m in said if isinstance(m, Report)]
+    (waits,) = (k for k, status in enumerate(reports) if status.state == "waiting")
+    assert reports[waits].detail == COMPILING
+    assert reports[waits].source == "fake:"
+    assert (reports[waits + 1].state, reports[waits + 1].detail) == ("playing", "")
 
 
 def test_the_answer_to_an_opening_begins_that_run_only() -> None:

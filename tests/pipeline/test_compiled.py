@@ -28,11 +28,21 @@ def grown(x):
 CALL = "from wood.tree import twice; print(twice(1.0), sum(twice.stats.cache_hits.values()))"
 
 
-def call(folder: Path, factor: float, more: float) -> list[str]:
+CALL_AND_LISTEN = """
+from pipeline.compiled import on_compiling
+from wood.tree import twice
+
+told = []
+with on_compiling(lambda: told.append(1)):
+    print(twice(1.0), bool(told))
+"""
+
+
+def call(folder: Path, factor: float, more: float, program: str = CALL) -> list[str]:
     """What a new process gets from the kernel, and how often it took what was kept."""
     (folder / "wood" / "leaf.py").write_text(LEAF.format(factor=factor, more=more))
     told = subprocess.run(
-        [sys.executable, "-c", CALL],
+        [sys.executable, "-c", program],
         cwd=folder,
         env={"PYTHONPATH": f"{folder}:{ROOT}", "NUMBA_CACHE_DIR": str(folder / "kept")},
         capture_output=True,
@@ -52,3 +62,11 @@ def test_a_kernel_is_compiled_anew_when_what_it_calls_in_another_file_changes(tm
     assert call(tmp_path, 2.0, 3.0) == ["8.0", "0"]
     assert call(tmp_path, 5.0, 3.0) == ["20.0", "0"]
     assert call(tmp_path, 5.0, 3.0) == ["20.0", "1"]
+
+
+def test_compiling_is_told_and_taking_what_was_kept_is_not(tmp_path):
+    (tmp_path / "wood").mkdir()
+    (tmp_path / "wood" / "__init__.py").touch()
+    (tmp_path / "wood" / "tree.py").write_text(CALLER)
+    assert call(tmp_path, 2.0, 1.0, CALL_AND_LISTEN) == ["4.0", "True"]
+    assert call(tmp_path, 2.0, 1.0, CALL_AND_LISTEN) == ["4.0", "False"]
