@@ -25,5 +25,9 @@ class SourceError(StemmapError):
     """A recording, folder, scenario or live address that cannot be read."""
 
 
+class UsageError(SourceError):
+    """A source that is no file and was mistyped: a scenario, option or scheme that does not exist."""
+
+
 class ParameterError(StemmapError):
     """A parameter that does not exist, has the wrong type or lies out of its bounds."""

@@ -12,11 +12,16 @@ import os
 import sys
 
 from app.version import version
-from pipeline.errors import ParameterError, StemmapError
+from pipeline.errors import ParameterError, StemmapError, UsageError
 
 COMMANDS = ("serve", "map", "merge", "info", "simulate", "evaluate", "export", "params", "train", "bench")
 
 DONE, FAILED, WRONG_USAGE, DONE_WITH_LOSSES = 0, 1, 2, 3
+
+CODES = (
+    "Exit codes: 0 done, 1 failed (one line says why), 2 wrong usage (as a mistyped flag, parameter or\n"
+    "scenario), 3 done, but something was left out (said on stderr)."
+)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -45,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
         return int(command.run(parsed))
     except SystemExit as stop:  # argparse has printed its line
         return int(stop.code or 0)
-    except ParameterError as error:
+    except (ParameterError, UsageError) as error:
         return _complain(error, WRONG_USAGE)
     except StemmapError as error:
         return _complain(error, FAILED)
@@ -60,7 +65,9 @@ def _build_parser(wanted: str) -> argparse.ArgumentParser:
     parser = _Parser(
         prog="stemmap",
         description="Maps trees from a robot's LiDAR as it drives, and shows in the browser why.",
-        epilog="`stemmap [SOURCE]` opens the dashboard; without a SOURCE a simulated stand plays.",
+        epilog="`stemmap [SOURCE]` opens the dashboard; without a SOURCE a simulated stand plays.\n"
+        f"{CODES} Each command has its own --help.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"stemmap {version()}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)

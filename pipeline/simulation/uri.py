@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from urllib.parse import parse_qsl
 
-from pipeline.errors import SourceError
+from pipeline.errors import UsageError
 from pipeline.simulation.scenarios import SCENARIOS, Scenario
 from pipeline.simulation.wheel_qualities import QUALITIES
 
@@ -65,14 +65,14 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
         seed: Taken where the URI names none.
 
     Raises:
-        SourceError: No such scenario or key, a key twice, a value that is no number or out of bounds.
+        UsageError: No such scenario or key, a key twice, a value that is no number or out of bounds.
     """
     name, _, query = uri.removeprefix(SCHEME).partition("?")
     if name == CLOUD:
         return _parse_cloud(uri, query, seed)
     if name not in SCENARIOS:
         known = ", ".join(SCHEME + scenario for scenario in SCENARIOS)
-        raise SourceError(f"there is no scenario {name!r}", where=uri, remedy=f"Scenarios: {known}")
+        raise UsageError(f"there is no scenario {name!r}", where=uri, remedy=f"Scenarios: {known}")
     values = _pairs(uri, query, _KEYS)
     scenario = SCENARIOS[name]
     odometry = values.get("odometry", "normal")
@@ -93,7 +93,7 @@ def _parse_cloud(uri: str, query: str, seed: int) -> RunRequest:
     """A run through a real cloud; a duration of 0 stands for one loop."""
     values = _pairs(uri, query, _CLOUD_KEYS)
     if not values.get("file"):
-        raise SourceError(
+        raise UsageError(
             "the cloud to be driven through is not named", where=uri, remedy="sim:cloud?file=plot.laz"
         )
     odometry = values.get("odometry", "normal")
@@ -115,15 +115,15 @@ def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
     except ValueError:
-        raise SourceError(
+        raise UsageError(
             "the part after ? must be key=value, joined by &", where=uri, remedy=_allowed(keys)
         ) from None
     values: dict[str, str] = {}
     for key, value in pairs:
         if key not in keys:
-            raise SourceError(f"a simulated run has no option {key!r}", where=uri, remedy=_allowed(keys))
+            raise UsageError(f"a simulated run has no option {key!r}", where=uri, remedy=_allowed(keys))
         if key in values:
-            raise SourceError(f"option {key!r} is given twice", where=uri, remedy="Give it once")
+            raise UsageError(f"option {key!r} is given twice", where=uri, remedy="Give it once")
         values[key] = value
     return values
 
@@ -132,15 +132,15 @@ def _allowed(keys: dict[str, str]) -> str:
     return "Options: " + "; ".join(f"{key} ({meaning})" for key, meaning in keys.items())
 
 
-def _refusal(uri: str, key: str, text: str) -> SourceError:
-    return SourceError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_KEYS[key]}")
+def _refusal(uri: str, key: str, text: str) -> UsageError:
+    return UsageError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_KEYS[key]}")
 
 
 def _whole(uri: str, key: str, text: str, most: int) -> int:
     if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
         refusal = _refusal(uri, key, text)
         if key == "trees" and most < 2000:
-            refusal = SourceError(refusal.what, where=uri, remedy=f"This scenario has at most {most} trees")
+            refusal = UsageError(refusal.what, where=uri, remedy=f"This scenario has at most {most} trees")
         raise refusal
     return int(text)
 

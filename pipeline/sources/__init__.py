@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, UsageError
 from pipeline.sources.base import Source, SourceDescription, SourceOptions
 from pipeline.sources.formats import READABLE, Opener, expected_format, file_format, folder_opener
 
@@ -53,7 +53,7 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
         raise SourceError(
             "this version does not read live input", where=uri, remedy="Record it first and open the file."
         )
-    raise SourceError(f"unknown kind of source {scheme!r}", where=uri, remedy=f"Readable are: {READABLE}.")
+    raise UsageError(f"unknown kind of source {scheme!r}", where=uri, remedy=f"Readable are: {READABLE}.")
 
 
 def _opener(path: Path, uri: str) -> Opener:
