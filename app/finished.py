@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import ParameterError, SourceError
-from pipeline.export import PATH_COLUMNS, TREE_COLUMNS
+from pipeline.export import PATH_COLUMNS, TREE_COLUMNS, path_rows, tree_rows
 from pipeline.geometry import Float
 from pipeline.parameters import Parameters
 from pipeline.parameters.model import validated
@@ -69,6 +69,16 @@ def read_run_record(folder: FilePath) -> dict[str, Any]:
     raise SourceError("run.json is damaged", where=str(folder), remedy="Map the run again")
 
 
+def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
+    """The confirmed trees and the path as `read_run` gives them once they are in their files, so that figures
+    which are told when a run is mapped are those which are told of it later."""
+    columns = (
+        _table(path_rows(path, start_ns), PATH_COLUMNS),
+        _table(tree_rows(trees, start_ns), TREE_COLUMNS),
+    )
+    return _trees(columns[1]), _path(columns[0])
+
+
 def _text(file: FilePath) -> str:
     try:
         if file.stat().st_size > LARGEST_FILE:
@@ -89,16 +99,23 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
     if not rows or tuple(rows[0]) != names:
         raise SourceError(f"its columns are not {', '.join(names)}", where=str(file))
     try:
-        table = np.array(
-            [[float(cell) if cell else math.nan for cell in row] for row in rows[1:]], np.float64
-        ).reshape(len(rows) - 1, len(names))
+        columns = _table(rows[1:], names)
     except ValueError:
         raise SourceError("a row is damaged", where=str(file), remedy="Map the run again") from None
-    columns = dict(zip(names, table.T, strict=True))
     for name in _NEVER_EMPTY.intersection(names):
         if not np.all(np.isfinite(columns[name])):
             raise SourceError(f"a cell of {name} is empty", where=str(file), remedy="Map the run again")
     return columns
+
+
+def _table(rows: list[list[str]], names: tuple[str, ...]) -> dict[str, Float]:
+    """Columns by name; an empty cell is NaN.
+
+    Raises:
+        ValueError: A row has no such cells.
+    """
+    table = np.array([[float(cell) if cell else math.nan for cell in row] for row in rows], np.float64)
+    return dict(zip(names, table.reshape(len(rows), len(names)).T, strict=True))
 
 
 def _path(c: dict[str, Float]) -> Path:

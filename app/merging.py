@@ -15,6 +15,7 @@ import numpy as np
 from app.continuing import PAUSE_NS
 from app.driven import breaks_of, driven
 from app.finished import read_run_record
+from app.preset_words import changed_values
 from app.run_health import RunHealth
 from app.saved_run import SavedRun, read_saved_run
 from app.tally import Tally
@@ -135,6 +136,7 @@ def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, mat
     record.update(
         stemmap=version(),
         parameters=json.loads(saved.parameters),
+        changed=changed_values(saved.preset, saved.chosen_parameters()),
         scans=len(path.stamp_ns),
         duration_s=round(seconds, 6),
         distance_m=round(metres, 3),

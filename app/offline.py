@@ -12,18 +12,21 @@ import numpy as np
 
 from app.continuing import Beginning, Continued, at_origin, go_on
 from app.driven import breaks_of, driven
+from app.finished import as_written
 from app.odometry import odometry_warnings
+from app.preset_words import changed_values, preset_words
 from app.saved_run import FORMAT, SavedRun
 from app.stopwatch import Stopwatch
+from app.summary import start_lines, summary_lines
 from app.tally import Tally
 from app.version import version
 from pipeline.compiled import on_compiling
 from pipeline.errors import SourceError
-from pipeline.evaluation import Evaluation, PathError, Rate, evaluate, path_error
+from pipeline.evaluation import Evaluation, PathError, evaluate, path_error
 from pipeline.export import RunFiles, terrain_text
 from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
-from pipeline.records import Frame, Path, Truth, TruthTrees
+from pipeline.records import Frame, Path, Trees, Truth, TruthTrees
 from pipeline.saved_map import SavedMap
 from pipeline.sources.base import Source
 from pipeline.steps import OdometryChoice
@@ -127,7 +130,7 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopw
         )
         raise SourceError(what, where=description.uri)
     path, truth = mapper.path, _truth(plan, begun)
-    evaluation = _evaluate(frame, path, truth, plan.parameters)
+    evaluation = _evaluate(*as_written(frame.trees, path, start_ns), truth, plan.parameters)
     error = path_error(path, truth.path) if truth.path else None
     counted = begun.losses + left_out + Counter(plan.source.losses)
     losses = {reason: n for reason, n in counted.items() if n}
@@ -142,9 +145,12 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopw
         record["source"].update(uri=first.uri, sha256=first.digest)
         record["continued"] = [asdict(other) for other in others]
     outcome = Outcome(
-        summary=_summary(description.uri, frame, (seconds, metres), evaluation, error)
-        + _start_words(begun)
-        + tally.health.summary(),
+        summary=[
+            *summary_lines(description.uri, frame, (seconds, metres), evaluation, error),
+            preset_words(plan.preset, plan.parameters),
+            *start_lines(begun.sources[-1]),
+            *tally.health.summary(),
+        ],
         warnings=tally.warnings(),
         losses=losses,
         scan_ms=stopwatch.scan_ms,
@@ -179,25 +185,15 @@ def _saved(
     )
 
 
-def _start_words(begun: Beginning) -> list[str]:
-    last = begun.sources[-1]
-    if last.start != "constellation":
-        return []
-    x, y, yaw = last.pose
-    return [
-        f"started at {x:.2f}, {y:.2f} m, {np.degrees(yaw):.1f} degrees of the map: {last.stems} stems agree"
-    ]
-
-
 def _truth(plan: OfflineRun, begun: Beginning) -> Truth:
     known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
 
 
-def _evaluate(frame: Frame, path: Path, truth: Truth, parameters: Parameters) -> Evaluation | None:
+def _evaluate(trees: Trees, path: Path, truth: Truth, parameters: Parameters) -> Evaluation | None:
     if truth.trees is None:
         return None
-    return evaluate(frame.trees, truth.trees, parameters.evaluation, np.stack([path.x, path.y], axis=1))
+    return evaluate(trees, truth.trees, parameters.evaluation, np.stack([path.x, path.y], axis=1))
 
 
 def _run_record(
@@ -223,6 +219,7 @@ def _run_record(
         "seed": plan.seed,
         "odometry": plan.odometry,
         "preset": plan.preset,
+        "changed": changed_values(plan.preset, plan.parameters),
         "parameters": plan.parameters.model_dump(),
         "revisions": [{"revision": 0, "from_scan": 0, "changes": {}}],
         "scans": frame.index + 1,
@@ -237,52 +234,3 @@ def _run_record(
         "warnings": tally.warnings(),
         "losses": losses,
     }
-
-
-def _summary(
-    uri: str,
-    frame: Frame,
-    driven_s_m: tuple[float, float],
-    evaluation: Evaluation | None,
-    error: PathError | None,
-) -> list[str]:
-    seconds, metres = driven_s_m
-    trees = int(np.count_nonzero(frame.trees.confirmed))
-    lines = [f"{uri}: {frame.index + 1} scans, {seconds:.1f} s, {metres:.1f} m driven, {trees} trees"]
-    if evaluation is not None:
-        lines += evaluation_lines(evaluation)
-    if error is not None:
-        how = "after alignment" if error.aligned else "in the frame of the map"
-        lines.append(
-            f"path: RMS {error.rms:.3f} m, median {error.median:.3f} m, largest {error.largest:.3f} m "
-            f"({error.compared} true positions, {how})"
-        )
-    return lines
-
-
-def evaluation_lines(e: Evaluation) -> list[str]:
-    """The scores as lines for people, counts beside the rates."""
-    return [
-        f"TA {_rate(e.TA)}   FR {_rate(e.FR)}   of the trees within {e.reach:g} m of the path",
-        f"TR {_rate(e.TR)}   FA {_rate(e.FA)}   of the other things; {e.spurious} trees where nothing stands",
-        f"completeness {_percent(e.completeness)}   correctness {_percent(e.correctness)}   "
-        f"F1 {_percent(e.f1)}",
-        f"position RMSE {_metres(e.position_rmse)}   DBH RMSE {_metres(e.dbh_rmse)} ({e.dbh_count} trees)   "
-        f"mean pair error {_pair(e.mean_pair_error_percent)}",
-    ]
-
-
-def _rate(rate: Rate) -> str:
-    return f"{rate.count}/{rate.of} ({_percent(rate.rate)})"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.1f} %"
-
-
-def _metres(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.1f} cm"
-
-
-def _pair(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f} %"

@@ -15,8 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from app.offline import evaluation_lines
+from app.finished import as_written
+from app.preset_words import changed_values, preset_words
+from app.summary import evaluation_lines
 from app.version import version
+from app.words import count
 from pipeline.evaluation import Evaluation, evaluate
 from pipeline.export import ROBOTS_FRAME, RunFiles, csv_text, geojson
 from pipeline.geometry import Float
@@ -70,7 +73,9 @@ def _map(
     about = cloud.description
     plot = map_plot(cloud, parameters)
     trees = replace(plot.trees, position=plot.trees.position + about.offset[:2])
-    evaluation = None if truth is None else evaluate(trees, truth, parameters.evaluation)
+    evaluation = None
+    if truth is not None:
+        evaluation = evaluate(as_written(trees, _NO_PATH, 0)[0], truth, parameters.evaluation)
     losses = {reason: n for reason, n in cloud.losses.items() if n}
     if plot.counts["apart from the plot"]:
         losses["points far from the plot"] = plot.counts["apart from the plot"]
@@ -90,7 +95,8 @@ def _map(
             "slices.csv": csv_text(SLICE_COLUMNS, _slice_rows(plot, about.offset)),
         },
     )
-    return PlotOutcome(_summary(about.uri, plot, trees, evaluation), warnings, losses)
+    summary = [*_summary(about.uri, plot, trees, evaluation), preset_words(preset, parameters)]
+    return PlotOutcome(summary, warnings, losses)
 
 
 _OWN_FRAME = {**ROBOTS_FRAME, "origin": "that of the cloud"}
@@ -179,6 +185,7 @@ def _run_record(
         },
         "seed": 0,
         "preset": preset,
+        "changed": changed_values(preset, parameters),
         "parameters": parameters.model_dump(),
         "scans": 0,
         "trees": len(plot.trees.number),
@@ -202,7 +209,7 @@ def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: Evaluation | Non
     verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict if v != Verdict.TREE)
     refused = ", ".join(f"{n} {label}" for label, n in sorted(verdicts.items()))
     lines = [
-        f"{uri}: {plot.counts['read']} points, {len(trees.number)} trees{wide}",
+        f"{uri}: {count(plot.counts['read'], 'point')}, {count(len(trees.number), 'tree')}{wide}",
         f"refused: {refused or 'nothing'}",
     ]
     return lines + (evaluation_lines(evaluation) if evaluation is not None else [])

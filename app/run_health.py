@@ -7,6 +7,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from app.words import count
 from pipeline.health import Health, HealthState
 from pipeline.records import Frame
 
@@ -114,4 +115,4 @@ class RunHealth:
         if not weak and not lost:
             return []
         why = Counter(span.reason.partition(" by ")[0].partition(" for ")[0] for span in self._spans)
-        return [f"health: {weak} scans weak, {lost} lost; most often: {why.most_common(1)[0][0]}"]
+        return [f"health: {count(weak, 'scan')} weak, {lost} lost; most often: {why.most_common(1)[0][0]}"]

@@ -26,7 +26,7 @@ def describe(
     if run is None:
         return Status(state=state, detail=detail, source=uri, warnings=list(warnings), revision=revision)
     description = run.source.description
-    losses = tuple(f"{count} {reason}" for reason, count in run.source.losses.items() if count)
+    losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
     frame = run.frame
     return Status(
         state=state,

@@ -41,7 +41,7 @@ class Tally:
             ] += 1
 
     def warnings(self) -> list[str]:
-        return [text if n == 1 else f"{text} ({n} times)" for text, n in self.warned.items()]
+        return [text if n == 1 else f"{text} ({n:,} times)" for text, n in self.warned.items()]
 
 
 def far_truth(reach: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,11 @@ SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of .bin or .pcd scans "
     "or of TreeManagerState_<i>.csv stems, or a simulated run such as sim:stand"
 )
+
+
+def program() -> str:
+    """What to type before the words of a command, so that a line that is printed can be pasted."""
+    return "uv run stemmap" if os.environ.get("UV_RUN_RECURSION_DEPTH") else "stemmap"
 
 
 def add_parameter_flags(parser: argparse.ArgumentParser) -> None:

@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from app.finished import read_run
-    from app.offline import evaluation_lines
+    from app.summary import evaluation_lines
     from app.tally import far_truth
     from pipeline.evaluation import evaluate
     from pipeline.parameters import assign

@@ -32,13 +32,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write it."""
     from app.finished import read_run
+    from app.words import count
     from pipeline.exchange import write_tree_manager
 
     finished = read_run(arguments.run)
     left_out = write_tree_manager(arguments.out, finished.path, finished.trees, arguments.reach)
-    print(f"{len(finished.path.x)} frames with {len(finished.trees.number)} trees in {arguments.out}")
+    frames, trees = count(len(finished.path.x), "frame"), count(len(finished.trees.number), "tree")
+    print(f"{frames} with {trees} in {arguments.out}")
     if left_out:
-        print(f"left out: {left_out} trees farther than {arguments.reach:g} m from the path", file=sys.stderr)
+        told = f"trees farther than {arguments.reach:g} m from the path ({left_out:,})"
+        print(f"left out: {told}", file=sys.stderr)
     return 3 if left_out else 0
 
 

@@ -7,7 +7,7 @@ import json
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
-from app.cli.choices import SOURCE_HELP, add_source_flags, seed, source, source_options
+from app.cli.choices import SOURCE_HELP, add_source_flags, program, seed, source, source_options
 
 if TYPE_CHECKING:
     from pipeline.records import Sensor, Truth
@@ -61,10 +61,16 @@ def _record(opened: Source) -> dict[str, Any]:
 
 
 def _lines(opened: Source) -> list[str]:
+    from app.words import count
+
     d, truth = opened.description, opened.truth()
     x, y, z = d.T_base_lidar.t
     trees, others = _truth_counts(truth)
-    known = [f"{trees} trees, {others} that are none"] if trees + others else []
+    known = (
+        [f"{count(trees, 'tree')}, {others} that {'is' if others == 1 else 'are'} none"]
+        if trees + others
+        else []
+    )
     known += ["the path"] if truth is not None and truth.path is not None else []
     rows = [
         ("kind", d.kind),
@@ -79,7 +85,7 @@ def _lines(opened: Source) -> list[str]:
     ]
     lines = [f"{name:10}{text}" for name, text in rows]
     lines += [f"warning: {text}" for text in d.warnings]
-    lines += [f"left out: {count} {reason}" for reason, count in opened.losses.items()]
+    lines += [f"left out: {reason} ({n:,})" for reason, n in opened.losses.items() if n]
     return lines + _topic_lines(d) + _commands(d)
 
 
@@ -103,8 +109,8 @@ def _plain(text: str) -> str:
 def _commands(d: SourceDescription) -> list[str]:
     import shlex
 
-    uri = shlex.quote(d.uri)
-    return ["", f"watch it:  stemmap {uri}", f"map it:    stemmap map {uri} --out out"]
+    uri, command = shlex.quote(d.uri), program()
+    return ["", f"watch it:  {command} {uri}", f"map it:    {command} map {uri} --out out"]
 
 
 def _scans(d: SourceDescription) -> str:

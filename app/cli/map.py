@@ -154,7 +154,7 @@ def _tell(summary: list[str], out: Path, warnings: list[str], losses: dict[str, 
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
     for reason, number in losses.items():
-        print(f"left out: {number} {reason}", file=sys.stderr)
+        print(f"left out: {reason} ({number:,})", file=sys.stderr)
     return 3 if losses else 0
 
 

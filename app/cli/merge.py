@@ -37,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from app.merging import merge_runs
     from app.saved_run import read_saved_run
+    from app.words import count
     from pipeline.parameters import assign
 
     parameters = None
@@ -54,6 +55,6 @@ def run(arguments: argparse.Namespace) -> int:
         f"{arguments.b} lies at {pose.x:.2f}, {pose.y:.2f} m, {np.degrees(pose.yaw):.1f} degrees of "
         f"{arguments.a}: {len(done.match.local)} stems agree, {done.match.second} in the next best pose"
     )
-    print(f"{done.a} trees of the first, {done.b} of the second, {done.both} in both")
+    print(f"{count(done.a, 'tree')} of the first, {done.b} of the second, {done.both} in both")
     print(f"files in {arguments.out}")
     return 0

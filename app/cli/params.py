@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from app.cli.choices import add_parameter_flags, chosen_parameters
+
+if TYPE_CHECKING:
+    from pipeline.parameters import Parameters
 
 HELP = "list every parameter, or print a preset as a TOML file"
 
@@ -31,14 +34,17 @@ def run(arguments: argparse.Namespace) -> int:
     elif arguments.format == "markdown":
         print(markdown_table({p: preset(p) for p in PRESETS}), end="")
     else:
-        _print_table(name, parameters.flat())
+        _print_table(name, parameters)
     return 0
 
 
-def _print_table(name: str, values: Mapping[str, object]) -> None:
+def _print_table(name: str, parameters: Parameters) -> None:
+    from app.preset_words import preset_words
     from pipeline.parameters import field_specs
 
-    print(f"Preset {name}. Change a value with --set stage.name=value.\n")
+    words = preset_words(name, parameters)
+    print(f"{words[0].upper()}{words[1:]}. Change a value with --set stage.name=value.\n")
+    values = parameters.flat()
     for spec in field_specs():
         if spec.minimum is None:
             bounds = " | ".join(spec.choices) or "true | false"

@@ -37,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @compiling_is_said()
 def run(arguments: argparse.Namespace) -> int:
     """Write the recording and the table of trees beside it."""
+    from app.words import count
     from pipeline.recording import write_recording
     from pipeline.sources.simulated import open_simulated
 
@@ -54,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
         truth=truth,
     )
     _write_trees(table, source)
-    print(f"{out}: {description.scans} scans; its ground truth is attached, and in {table}")
+    print(f"{out}: {count(description.scans or 0, 'scan')}; its ground truth is attached, and in {table}")
     return 0
 
 

@@ -8,7 +8,10 @@ import { on, state } from "./state.js";
 import { visible } from "./tabs.js";
 
 const RATES = {
-  TA: "TA  trees found", FR: "FR  trees missed", TR: "TR  others left out", FA: "FA  others taken for trees",
+  TA: ["TA  trees found", "True acceptance: trees of the ground truth that the map has too"],
+  FR: ["FR  trees missed", "False rejection: trees of the ground truth that the map has not"],
+  TR: ["TR  others left out", "True rejection: poles, persons, bushes and other things of the ground truth that the map has not"],
+  FA: ["FA  others taken for trees", "False acceptance: other things of the ground truth that the map has as trees"],
 };
 const centimetres = (value) => (value === null ? NONE : `${figure(value)} cm`);
 const inCentimetres = (metres) => (metres === null ? NONE : centimetres(100 * metres));
@@ -34,9 +37,9 @@ function show() {
 }
 
 function rates(score) {
-  return el("dl", { class: "rates" }, ...Object.entries(RATES).map(([name, title]) => {
+  return el("dl", { class: "rates" }, ...Object.entries(RATES).map(([name, [words, meaning]]) => {
     const { count, of, rate } = score[name];
-    return el("div", { "data-rate": name }, el("dt", { text: title }),
+    return el("div", { "data-rate": name, title: meaning }, el("dt", { text: words }),
       el("dd", {}, el("b", { text: of ? percent(rate ?? count / of) : NONE }), el("small", { text: `${count} of ${of}` })));
   }));
 }

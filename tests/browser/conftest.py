@@ -53,7 +53,10 @@ def playwright() -> Iterator[Playwright]:
 def chromium(playwright: Playwright) -> Iterator[Browser]:
     path = os.environ.get("CHROMIUM", "/usr/bin/chromium")
     if not Path(path).exists():
-        pytest.skip(f"no Chromium at {path}; install it or set CHROMIUM")
+        pytest.skip(
+            f"no Chromium at {path}: install it (on Debian: sudo apt-get install chromium), "
+            "or name another one with CHROMIUM=/path/to/chrome"
+        )
     browser = playwright.chromium.launch(executable_path=path, headless=True, args=FLAGS)
     yield browser
     browser.close()

@@ -46,10 +46,18 @@ def test_a_topic_that_the_user_chose_is_the_one_that_is_read(capsys, recording):
     stemmap(capsys, "info", recording, "--topic", "scan=/none").refused(1, "/none", name)
 
 
-def test_a_simulated_run_has_no_topics(capsys):
+def test_a_simulated_run_has_no_topics(capsys, monkeypatch):
+    monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
     told = stemmap(capsys, "info", "sim:paper?duration=2")
     assert "topics" not in told.out
     assert "watch it:  stemmap 'sim:paper?duration=2'" in told.out
+
+
+def test_the_commands_that_it_names_can_be_pasted(capsys, monkeypatch):
+    monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", "1")
+    assert "map it:    uv run stemmap map sim:stand " in stemmap(capsys, "info", "sim:stand").out
+    monkeypatch.delenv("UV_RUN_RECURSION_DEPTH")
+    assert "map it:    stemmap map sim:stand " in stemmap(capsys, "info", "sim:stand").out
 
 
 def test_what_cannot_be_read_is_said_in_one_line(capsys, tmp_path):
