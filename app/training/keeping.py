@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import zipfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
 
 from app.training.growing import Examples
+from pipeline.errors import StemmapError
 
 
 def kept_or_made(folder: Path | None, scene: str, make: Callable[[], Iterable[Examples]]) -> list[Examples]:
@@ -41,10 +44,35 @@ def read_examples(folder: Path) -> list[Examples]:
 
 
 def _read(file: Path) -> list[Examples]:
-    with np.load(file, allow_pickle=False) as kept:
-        scene, simulated = str(kept["scene"]), bool(kept["simulated"])
-        around = bool(kept["all_around"])
-        return [
-            Examples(scene, simulated, around, kept[f"axis{k}"], kept[f"figures{k}"], kept[f"label{k}"])
-            for k in range(int(kept["sets"]))
-        ]
+    try:
+        _check_sizes(file)
+        with np.load(file, allow_pickle=False) as kept:
+            scene, simulated = str(kept["scene"]), bool(kept["simulated"])
+            around = bool(kept["all_around"])
+            return [
+                Examples(scene, simulated, around, kept[f"axis{k}"], kept[f"figures{k}"], kept[f"label{k}"])
+                for k in range(int(kept["sets"]))
+            ]
+    except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        raise StemmapError(
+            f"the kept examples are damaged: {error}",
+            where=str(file),
+            remedy="Remove the file: it is made anew",
+        ) from None
+
+
+def _check_sizes(file: Path) -> None:
+    """Every array lies whole in the file, as numpy writes it: else a few bytes could ask for gigabytes.
+
+    Raises:
+        ValueError: One does not.
+    """
+    with zipfile.ZipFile(file) as archive:
+        for entry in archive.infolist():
+            with archive.open(entry) as text:
+                if np.lib.format.read_magic(text) != (1, 0):
+                    raise ValueError(f"{entry.filename} is of another version")
+                shape, _, dtype = np.lib.format.read_array_header_1_0(text)
+            packed = entry.compress_type != zipfile.ZIP_STORED
+            if packed or math.prod(shape) * dtype.itemsize > entry.file_size:
+                raise ValueError(f"{entry.filename} does not lie in the file")

@@ -15,6 +15,7 @@ from pipeline.errors import StemmapError
 
 TREE, ARRAYS = "tree.json", "arrays.bin"
 LARGEST_TREE, LARGEST_ARRAYS = 64 << 20, 4 << 30  # bytes
+MOST_RATIO, FREE = 100, 64 << 20  # a real state is packed to half; a small file unpacks to no gigabytes
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -46,7 +47,7 @@ def read_archive(data: bytes, where: str) -> tuple[Any, bytes]:
             blob = _entry(archive, ARRAYS, LARGEST_ARRAYS)
         return json.loads(text), blob
     except (zipfile.BadZipFile, zipfile.LargeZipFile, KeyError, ValueError, EOFError, OSError,
-            NotImplementedError, RuntimeError, RecursionError, zlib.error) as error:  # fmt: skip
+            NotImplementedError, RuntimeError, RecursionError, MemoryError, zlib.error) as error:  # fmt: skip
         raise damaged(where, str(error) or type(error).__name__) from None
 
 
@@ -60,7 +61,7 @@ def _entry(archive: zipfile.ZipFile, name: str, largest: int) -> bytes:
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name} is compressed in another way")
     declared = entry.file_size
-    if declared > largest:
+    if declared > min(largest, FREE + MOST_RATIO * entry.compress_size):
         raise ValueError(f"{name} declares {declared} bytes")
     with archive.open(name) as file:
         data = file.read(declared + 1)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -50,6 +52,17 @@ def test_the_file_has_the_same_bytes_each_time():
     state, _, _ = saved()
     one = write_archive(*encode(state))
     assert write_archive(*encode(through_a_file(state))) == one
+
+
+def test_a_small_file_that_unpacks_to_gigabytes_is_refused_before_it_does():
+    large = io.BytesIO()
+    with zipfile.ZipFile(large, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("tree.json", "{}")
+        with archive.open("arrays.bin", "w", force_zip64=True) as file:
+            for _ in range(80):
+                file.write(bytes(1 << 20))
+    with pytest.raises(StemmapError, match=r"arrays\.bin declares 83886080 bytes"):
+        read_archive(large.getvalue(), "a file")
 
 
 def test_a_placed_robot_stands_where_it_was_put():

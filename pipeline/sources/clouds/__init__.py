@@ -31,8 +31,10 @@ def open_cloud(uri: str) -> Cloud:
 
     try:
         return LasCloud(uri, Path(uri).expanduser())
-    except (OSError, ValueError, MemoryError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or "there is no such file"
+    except MemoryError:
+        raise SourceError("it is too large for the memory of this machine", where=uri) from None
+    except (OSError, ValueError, RuntimeError) as error:  # a path with a zero byte, a home of nobody
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise SourceError(
-            f"cannot open: {reason}", where=uri, remedy="Look at the path and its rights."
+            f"cannot open: {reason}", where=uri, remedy="Look at the path and its rights"
         ) from None
