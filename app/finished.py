@@ -24,13 +24,17 @@ _NEVER_EMPTY = frozenset({"t_s", "x_m", "y_m", "tree", "observations", "sigma_x_
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedRun:
-    """What `stemmap map` wrote: the source's URI, the seed, the parameters, path and trees."""
+    """What `stemmap map` wrote: the source's URI, the seed, the parameters, path and trees.
+
+    Of a whole cloud (`of_cloud`) there is no path.
+    """
 
     uri: str
     seed: int
     parameters: Parameters
     path: Path
     trees: Trees
+    of_cloud: bool
 
 
 def read_run(folder: FilePath) -> FinishedRun:
@@ -51,7 +55,13 @@ def read_run(folder: FilePath) -> FinishedRun:
         parameters,
         _path(_columns(folder / "path.csv", PATH_COLUMNS)),
         _trees(_columns(folder / "trees.csv", TREE_COLUMNS)),
+        is_of_cloud(record),
     )
+
+
+def is_of_cloud(record: dict[str, Any]) -> bool:
+    """Whether run.json tells of a whole cloud, which nobody drove through."""
+    return isinstance(record.get("source"), dict) and "offset_m" in record["source"]
 
 
 def read_run_record(folder: FilePath) -> dict[str, Any]:

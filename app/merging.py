@@ -15,6 +15,7 @@ import numpy as np
 from app.continuing import PAUSE_NS
 from app.driven import breaks_of, driven
 from app.finished import read_run_record
+from app.overwriting import check_folder
 from app.preset_words import changed_values
 from app.run_health import RunHealth
 from app.saved_run import SavedRun, read_saved_run
@@ -43,7 +44,12 @@ class Merging:
 
 
 def merge_runs(
-    folder_a: FilePath, folder_b: FilePath, out: FilePath, parameters: Parameters | None
+    folder_a: FilePath,
+    folder_b: FilePath,
+    out: FilePath,
+    parameters: Parameters | None,
+    *,
+    force: bool = False,
 ) -> Merging:
     """Merge run b into run a and write the files of a run, with correspondence.csv beside them.
 
@@ -51,6 +57,7 @@ def merge_runs(
         folder_a, folder_b: Of finished runs.
         out: For the files.
         parameters: None takes those of run a.
+        force: Write over the map of another source.
 
     Raises:
         StemmapError: A run cannot be read, or the two maps do not fit with confidence.
@@ -59,6 +66,7 @@ def merge_runs(
     a, b = read_saved_run(folder_a), read_saved_run(folder_b)
     chosen = a.chosen_parameters() if parameters is None else parameters
     record = read_run_record(folder_a)
+    check_folder(out, a.sources[0].digest, force=force)
     trees_a, trees_b = a.map.trees(chosen), b.map.trees(b.chosen_parameters())
     match = find_constellation(
         Stems.of_trees(trees_b), Stems.of_trees(trees_a), chosen.relocalisation, hypotheses=HYPOTHESES

@@ -1,7 +1,8 @@
 """A whole cloud of a plot mapped into a folder, with the same files as a run.
 
-Positions are in the cloud's own coordinates. `path.csv` has a header and no row, because nobody drove;
-`slices.csv` stands beside the files of a run and tells every circle of every tree.
+Positions are in the cloud's own coordinates. `path.csv` has a header and no row, because nobody drove, and
+there is no `state.zip`, with which a drive goes on; `slices.csv` stands beside the files of a run and tells
+every circle of every tree, and `terrain.csv` the ground where the cloud shows it.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ from app.summary import evaluation_lines
 from app.version import version
 from app.words import count
 from pipeline.evaluation import Evaluation, evaluate
-from pipeline.export import ROBOTS_FRAME, RunFiles, csv_text, geojson
+from pipeline.export import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson
 from pipeline.geometry import Float
 from pipeline.parameters import Parameters
 from pipeline.plot import PlotMap, map_plot
 from pipeline.plot.cloud import Cloud
+from pipeline.plot.height_map import HeightMap
 from pipeline.records import Path, Trees, TruthTrees, Verdict
 
 SLICE_COLUMNS = (
@@ -93,6 +95,7 @@ def _map(
         further={
             "trees.geojson": geojson(trees, 0, frame=frame, lon_lat=lon_lat),
             "slices.csv": csv_text(SLICE_COLUMNS, _slice_rows(plot, about.offset)),
+            "terrain.csv": csv_text(TERRAIN_COLUMNS, _terrain_rows(plot.ground, about.offset)),
         },
     )
     summary = [*_summary(about.uri, plot, trees, evaluation), preset_words(preset, parameters)]
@@ -159,6 +162,16 @@ def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
                 ]
 
 
+def _terrain_rows(ground: HeightMap, offset: Float) -> Iterator[list[str]]:
+    """The middles of the cells in which returns of the ground lay, from west to east; what was filled in
+    between is not told. A cloud has no views to be counted, and how far the heights err is not known."""
+    columns, rows = np.nonzero(ground.seen)
+    place = ground.low + (np.stack([columns, rows], axis=1) + 0.5) * ground.cell + offset[:2]
+    height = ground.height[columns, rows] + offset[2]
+    for (x, y), z in zip(place, height, strict=True):
+        yield [_text(x, 3), _text(y, 3), _text(z, 3), "", ""]
+
+
 def _text(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else ""
 
@@ -212,4 +225,4 @@ def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: Evaluation | Non
         f"{uri}: {count(plot.counts['read'], 'point')}, {count(len(trees.number), 'tree')}{wide}",
         f"refused: {refused or 'nothing'}",
     ]
-    return lines + (evaluation_lines(evaluation) if evaluation is not None else [])
+    return lines + (evaluation_lines(evaluation, whole=True) if evaluation is not None else [])

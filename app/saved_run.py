@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from app.finished import is_of_cloud, read_run_record
 from app.tally import Tally
 from pipeline.errors import StemmapError
 from pipeline.parameters import Parameters
@@ -85,6 +86,13 @@ def read_saved_run(folder: Path) -> SavedRun:
             raise damaged(str(file), "it is larger than 4 GB")
         data = file.read_bytes()
     except OSError as error:
+        if _is_map_of_cloud(folder):
+            raise StemmapError(
+                "this is the map of a whole cloud, with which no drive goes on",
+                where=str(folder),
+                remedy="Map a drive by itself and go on with that one, or drive through the cloud with "
+                "sim:cloud?file=",
+            ) from None
         raise StemmapError(
             f"there is no saved state: {error.strerror}",
             where=str(file),
@@ -104,3 +112,10 @@ def read_saved_run(folder: Path) -> SavedRun:
     except StemmapError as error:
         raise damaged(str(file), error.what) from None
     return saved
+
+
+def _is_map_of_cloud(folder: Path) -> bool:
+    try:
+        return is_of_cloud(read_run_record(folder))
+    except StemmapError:
+        return False

@@ -39,10 +39,12 @@ def summary_lines(
     return lines
 
 
-def evaluation_lines(e: Evaluation) -> list[str]:
-    """The scores as lines for people, counts beside the rates."""
+def evaluation_lines(e: Evaluation, *, whole: bool = False) -> list[str]:
+    """The scores as lines for people, counts beside the rates; `whole` where nobody drove, so that all of the
+    truth was asked for."""
+    where = "in the whole cloud" if whole else f"within {e.reach:g} m of the path"
     return [
-        f"trees found (TA) {_rate(e.TA)}, missed (FR) {_rate(e.FR)} within {e.reach:g} m of the path",
+        f"trees found (TA) {_rate(e.TA)}, missed (FR) {_rate(e.FR)} {where}",
         f"other things left out (TR) {_rate(e.TR)}, taken for trees (FA) {_rate(e.FA)}; "
         f"{count(e.spurious, 'tree')} where nothing stands",
         f"completeness {_percent(e.completeness)}   correctness {_percent(e.correctness)}   "

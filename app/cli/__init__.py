@@ -54,6 +54,8 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain(error, WRONG_USAGE)
     except StemmapError as error:
         return _complain(error, FAILED)
+    except MemoryError:
+        return _complain("this needs more memory than this machine has", FAILED)
     except KeyboardInterrupt:
         return _complain("stopped", FAILED)
     except BrokenPipeError:  # `stemmap params | head`

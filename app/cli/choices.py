@@ -15,13 +15,18 @@ if TYPE_CHECKING:
 
 SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of .bin or .pcd scans "
-    "or of TreeManagerState_<i>.csv stems, or a simulated run such as sim:stand"
+    "or of TreeManagerState_<i>.csv stems, a whole cloud (.laz, .las), or a simulated run such as sim:stand"
 )
 
 
 def program() -> str:
     """What to type before the words of a command, so that a line that is printed can be pasted."""
     return "uv run stemmap" if os.environ.get("UV_RUN_RECURSION_DEPTH") else "stemmap"
+
+
+def plain(text: str) -> str:
+    """Text from a file without what would steer a terminal."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def add_parameter_flags(parser: argparse.ArgumentParser) -> None:
@@ -37,6 +42,13 @@ def add_parameter_flags(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="one value laid over both; may be given again; `stemmap params` lists them",
+    )
+
+
+def add_force_flag(parser: argparse.ArgumentParser) -> None:
+    """--force."""
+    parser.add_argument(
+        "--force", action="store_true", help="write over the map of another source that stands in the folder"
     )
 
 

@@ -57,14 +57,14 @@ def run(arguments: argparse.Namespace) -> int:
     parameters = assign(finished.parameters, changes)
     truth = _truth(arguments, finished)
     # A whole cloud was mapped without a path: all of the truth is asked for.
-    path = np.stack([finished.path.x, finished.path.y], axis=1) if len(finished.path.x) else None
+    path = None if finished.of_cloud else np.stack([finished.path.x, finished.path.y], axis=1)
     evaluation = evaluate(finished.trees, truth, parameters.evaluation, path)
     if path is not None and evaluation.TA.of + evaluation.TR.of == 0:
         print(f"warning: {far_truth(evaluation.reach)}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(asdict(evaluation), indent=1))
     else:
-        for line in evaluation_lines(evaluation):
+        for line in evaluation_lines(evaluation, whole=path is None):
             print(line)
     return 0
 
@@ -78,6 +78,12 @@ def _truth(arguments: argparse.Namespace, finished: FinishedRun) -> TruthTrees:
     if arguments.truth is not None:
         return read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit)
     uri = finished.uri
+    if finished.of_cloud:
+        raise StemmapError(
+            "a whole cloud brings no true trees",
+            where=uri,
+            remedy="Give them with --truth trees.csv, in the coordinates of the cloud",
+        )
     with closing(open_source(uri, SourceOptions(seed=finished.seed))) as source:
         truth = source.truth()
     if truth is None or truth.trees is None:

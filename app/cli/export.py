@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from pipeline.errors import StemmapError
+
 HELP = "write a finished run in the files of other tools"
 REACH = 30.0
 
@@ -36,6 +38,12 @@ def run(arguments: argparse.Namespace) -> int:
     from pipeline.exchange import write_tree_manager
 
     finished = read_run(arguments.run)
+    if finished.of_cloud:
+        raise StemmapError(
+            "this is the map of a whole cloud: nobody drove, so there are no frames to write",
+            where=str(arguments.run),
+            remedy="Use its trees.csv, trees.geojson and slices.csv as they are",
+        )
     left_out = write_tree_manager(arguments.out, finished.path, finished.trees, arguments.reach)
     frames, trees = count(len(finished.path.x), "frame"), count(len(finished.trees.number), "tree")
     print(f"{frames} with {trees} in {arguments.out}")

@@ -7,7 +7,7 @@ import json
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
-from app.cli.choices import SOURCE_HELP, add_source_flags, program, seed, source, source_options
+from app.cli.choices import SOURCE_HELP, add_source_flags, plain, program, seed, source, source_options
 
 if TYPE_CHECKING:
     from pipeline.records import Sensor, Truth
@@ -27,7 +27,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Open it, look, print."""
     from pipeline.sources import open_source
+    from pipeline.sources.clouds import is_cloud, open_cloud
 
+    if is_cloud(arguments.source):
+        from app.cli.info_cloud import say
+
+        say(open_cloud(arguments.source).description, as_json=arguments.json)
+        return 0
     with closing(open_source(arguments.source, source_options(arguments))) as opened:
         if arguments.json:
             print(json.dumps(_record(opened), indent=1, allow_nan=False))
@@ -93,17 +99,12 @@ def _topic_lines(d: SourceDescription) -> list[str]:
     if not d.topics:
         return []
     lines = ["", "topics (* is read; --topic ROLE=NAME chooses another)"]
-    width = max(len(_plain(topic.name)) for topic in d.topics)
+    width = max(len(plain(topic.name)) for topic in d.topics)
     for topic in d.topics:
         mark, use = ("*", topic.read_as) if topic.read_as else (" ", topic.fits and f"could be {topic.fits}")
-        name, kind = _plain(topic.name), _plain(topic.type)
+        name, kind = plain(topic.name), plain(topic.type)
         lines.append(f" {mark} {name:{width}}  {topic.messages:>8,}  {kind}  {use}".rstrip())
     return lines
-
-
-def _plain(text: str) -> str:
-    """Text from a file without what would steer a terminal."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _commands(d: SourceDescription) -> list[str]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from app.cli.choices import (
     SOURCE_HELP,
+    add_force_flag,
     add_parameter_flags,
     add_run_flags,
     add_source_flags,
@@ -31,6 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("source", metavar="SOURCE", type=source, help=SOURCE_HELP)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the files")
+    add_force_flag(parser)
     add_parameter_flags(parser)
     add_run_flags(parser)
     add_source_flags(parser)
@@ -66,9 +68,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.set_defaults(seed=None)
     parser.epilog = (
-        "DIR gets trees.csv, path.csv, trees.geojson, detections.csv, run.json and state.zip, from which\n"
-        "--continue goes on (all the same bytes for the same\n"
-        "source, parameters and seed). Exit code 3 says that something was left out."
+        "DIR gets trees.csv, path.csv, trees.geojson, detections.csv, terrain.csv, run.json and state.zip,\n"
+        "from which --continue goes on (all the same bytes for the same source, parameters and seed). A map\n"
+        "of the same source that stands there is replaced. Exit code 3 says that something was left out."
     )
 
 
@@ -92,22 +94,26 @@ def _run_plot(arguments: argparse.Namespace) -> int:
         raise ParameterError(
             "a whole cloud has no scans to go on with", remedy="Leave --continue and --stop-after away"
         )
+    from app.overwriting import check_folder
     from app.plot_run import map_plot_run
     from pipeline.sources.clouds import open_cloud
     from pipeline.truth_table import read_truth_trees
 
     truth = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     name, parameters = chosen_parameters(arguments, "forest")
+    cloud = open_cloud(arguments.source)
+    replaces = check_folder(arguments.out, cloud.description.digest, force=arguments.force)
     try:
-        outcome = map_plot_run(open_cloud(arguments.source), name, parameters, truth, arguments.out)
+        outcome = map_plot_run(cloud, name, parameters, truth, arguments.out)
     except OSError as error:
         raise _cannot_write(error, arguments.out) from None
-    return _tell(outcome.summary, arguments.out, outcome.warnings, outcome.losses)
+    return _tell(outcome.summary, arguments.out, outcome.warnings, outcome.losses, replaces=replaces)
 
 
 def _run_scans(arguments: argparse.Namespace) -> int:
     from app.continuing import Continued
     from app.offline import OfflineRun, map_run
+    from app.overwriting import check_folder
     from app.saved_run import read_saved_run
     from pipeline.sources import open_source
     from pipeline.truth_table import read_truth_trees
@@ -132,6 +138,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             continued=Continued(saved, _in_the_map(arguments.start)) if saved else None,
             stop_after=arguments.stop_after,
         )
+        first = saved.sources[0].digest if saved else opened.description.digest
+        replaces = check_folder(arguments.out, first, force=arguments.force)
         try:
             bar = _Bar(opened.description.scans)
             outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
@@ -139,18 +147,22 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             raise _cannot_write(error, arguments.out) from None
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
     times = f"median {outcome.scan_ms:.2f} ms a scan ({stages})"
-    return _tell([*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses)
+    return _tell(
+        [*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses, replaces=replaces
+    )
 
 
 def _cannot_write(error: OSError, out: Path) -> StemmapError:
     return StemmapError(f"cannot write: {error.strerror}", where=str(error.filename or out))
 
 
-def _tell(summary: list[str], out: Path, warnings: list[str], losses: dict[str, int]) -> int:
+def _tell(
+    summary: list[str], out: Path, warnings: list[str], losses: dict[str, int], *, replaces: bool
+) -> int:
     """Print what came of it; the exit code."""
     for line in summary:
         print(line)
-    print(f"files in {out}")
+    print(f"files in {out}" + (", in place of those that stood there" if replaces else ""))
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
     for reason, number in losses.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from app.cli.choices import add_force_flag
 from app.cli.waiting import compiling_is_said
 from pipeline.errors import StemmapError
 
@@ -16,6 +17,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("a", metavar="DIR_A", type=Path, help="a mapped run; its frame and numbers stay")
     parser.add_argument("b", metavar="DIR_B", type=Path, help="the run that is brought into it")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the files")
+    add_force_flag(parser)
     parser.add_argument(
         "--set",
         metavar="STAGE.NAME=VALUE",
@@ -44,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.assignments:
         parameters = assign(read_saved_run(arguments.a).chosen_parameters(), arguments.assignments)
     try:
-        done = merge_runs(arguments.a, arguments.b, arguments.out, parameters)
+        done = merge_runs(arguments.a, arguments.b, arguments.out, parameters, force=arguments.force)
     except OSError as error:
         raise StemmapError(
             f"cannot write: {error.strerror}", where=str(error.filename or arguments.out)

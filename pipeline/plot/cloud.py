@@ -22,6 +22,8 @@ class CloudDescription:
         crs: Its coordinate reference system, as WKT or "EPSG:32632"; empty when it is not said.
         digest: SHA-256 (hex) of the file.
         warnings: What a person should know.
+        low, high: Corners that the file promises, in its own coordinates, shape (3,) [m]; not checked.
+        attributes: What the file says of each point besides its place, by the names of the format.
     """
 
     uri: str
@@ -31,6 +33,9 @@ class CloudDescription:
     crs: str
     digest: str
     warnings: tuple[str, ...] = ()
+    low: Float | None = None
+    high: Float | None = None
+    attributes: tuple[str, ...] = ()
 
 
 class Cloud(Protocol):

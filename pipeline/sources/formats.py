@@ -70,6 +70,12 @@ def _pcd(uri: str, path: Path, options: SourceOptions) -> Source:
     return open_pcd(uri, path, options)
 
 
+def _cloud(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.simulated import drive_through
+
+    return drive_through(uri, path, options)
+
+
 @dataclass(frozen=True, slots=True)
 class Format:
     """A kind of file.
@@ -105,6 +111,7 @@ FILES = (
     ),
     Format("Victoria Park .zip (LASER.txt, DRS.txt)", (b"PK\x03\x04",), (".zip",), _victoria),
     Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _pcd),
+    Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud),
     Format("KITTI .bin", (), (".bin",), _kitti),
 )
 
@@ -115,7 +122,6 @@ READABLE = ", ".join(
         "a rosbag2 folder",
         "a folder of TreeManagerState_<i>.csv with trajectory.txt",
         "sim:stand and the other sim: scenarios",
-        "a whole cloud as .laz or .las (with `stemmap map` alone)",
     ]
 )
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlencode
 
+from pipeline.errors import SourceError
 from pipeline.records import Record, Truth
 from pipeline.simulation.inertial import IMU_HZ
 from pipeline.simulation.run import START_NS, SimulatedRun, open_run
 from pipeline.simulation.scenarios import scenarios
-from pipeline.simulation.uri import CLOUD, RunRequest, parse_uri
+from pipeline.simulation.uri import CLOUD, SCHEME, RunRequest, parse_uri
 from pipeline.simulation.wheels import ODOMETRY_HZ
 from pipeline.sources.base import SourceDescription, SourceOptions
 
@@ -20,13 +23,15 @@ _TICK_NS = 1_000_000_000 // IMU_HZ
 class SimulatedSource:
     """A simulated run, read like any recording (see `pipeline.sources.base.Source`)."""
 
-    def __init__(self, uri: str, run: SimulatedRun, *, knows_trees: bool = True) -> None:
+    def __init__(
+        self, uri: str, run: SimulatedRun, *, knows_trees: bool = True, kind: str = "simulated run"
+    ) -> None:
         self.run = run
         self._knows_trees = knows_trees
         last = START_NS + (run.scans - 1) * run.lidar.period_ns
         self.description = SourceDescription(
             uri=uri,
-            kind="simulated run",
+            kind=kind,
             sensor=run.lidar.sensor,
             T_base_lidar=run.T_base_lidar,
             has_odometry=True,
@@ -83,8 +88,6 @@ def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedS
 
 def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> SimulatedSource:
     """A run through the real cloud of a plot."""
-    from pathlib import Path
-
     from pipeline.simulation.cloud_run import open_cloud_run
     from pipeline.sources.clouds import open_cloud
     from pipeline.truth_table import read_truth_trees
@@ -92,3 +95,24 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
     trees = read_truth_trees(Path(request.truth).expanduser()) if request.truth else None
     run = open_cloud_run(request, open_cloud(request.file), trees, options.T_base_lidar)
     return SimulatedSource(uri, run, knows_trees=trees is not None)
+
+
+def drive_through(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
+    """A whole cloud as a run: a simulated robot drives through it (`sim:cloud?file=`).
+
+    Raises:
+        SourceError: It cannot be read, or leaves no way for a robot.
+    """
+    from pipeline.simulation.cloud_run import open_cloud_run
+    from pipeline.sources.clouds import open_cloud
+
+    request = parse_uri(f"{SCHEME}{CLOUD}?{urlencode({'file': str(file)})}", options.seed)
+    cloud = open_cloud(str(file))
+    try:
+        run = open_cloud_run(request, cloud, None, options.T_base_lidar)
+    except SourceError as error:
+        raise SourceError(
+            error.what, where=uri, remedy="`stemmap map` maps the cloud as a whole, without a robot"
+        ) from None
+    kind = f"simulated drive through a whole cloud ({cloud.description.kind})"
+    return SimulatedSource(uri, run, knows_trees=False, kind=kind)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -365,11 +366,30 @@ def test_a_failed_mapping_leaves_the_old_files(mapped, tmp_path, capsys, monkeyp
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("pipeline.export.detection_rows", breaks)
-    told = stemmap(capsys, "map", RUN, "--out", tmp_path)
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path, "--force")
     told.refused(1, "No space left")
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == {
         file.name: file.read_bytes() for file in mapped.iterdir()
     }
+
+
+def test_the_map_of_another_source_is_overwritten_when_asked_alone(mapped, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(mapped, folder)
+    stemmap(capsys, "map", RUN, "--out", folder).refused(1, "sim:paper?duration=4", "--force")
+    assert (folder / "trees.csv").read_bytes() == (mapped / "trees.csv").read_bytes()
+    told = stemmap(capsys, "map", "sim:paper?duration=4", "--out", folder, "--stop-after", "3")
+    assert f"files in {folder}, in place of" in told.out
+    assert stemmap(capsys, "map", RUN, "--out", folder, "--force").code == 0
+    assert json.loads((folder / "run.json").read_text())["source"]["uri"] == RUN
+    (folder / "run.json").write_text("{")
+    stemmap(capsys, "map", RUN, "--out", folder).refused(1, "run.json", "--force")
+
+
+def test_files_of_that_name_that_are_of_no_run_are_kept(tmp_path, capsys):
+    (tmp_path / "trees.csv").write_text("mine")
+    stemmap(capsys, "map", RUN, "--out", tmp_path).refused(1, "trees.csv", "--force")
+    assert (tmp_path / "trees.csv").read_text() == "mine"
 
 
 def test_losses_are_said_and_told_by_the_exit_code(tmp_path, capsys, monkeypatch):

@@ -46,10 +46,18 @@ def test_a_cloud_is_mapped_into_the_files_of_a_run(tmp_path, points, crs, capsys
     )
     out = tmp_path / "out"
     assert main(["map", str(file), "--out", str(out), "--truth", str(tmp_path / "truth.csv")]) == 0
-    assert "TA 9/9" in capsys.readouterr().out
+    assert "(TA) 9/9" in capsys.readouterr().out
     assert main(["evaluate", str(out), "--truth", str(tmp_path / "truth.csv")]) == 0
-    assert "TA 9/9" in capsys.readouterr().out
-    names = {"trees.csv", "trees.geojson", "detections.csv", "slices.csv", "path.csv", "run.json"}
+    assert "(TA) 9/9" in capsys.readouterr().out
+    names = {
+        "trees.csv",
+        "trees.geojson",
+        "detections.csv",
+        "slices.csv",
+        "path.csv",
+        "terrain.csv",
+        "run.json",
+    }
     assert {path.name for path in out.iterdir()} == names
     assert (out / "path.csv").read_text().count("\n") == 1
     trees = json.loads((out / "trees.geojson").read_text())

@@ -48,6 +48,8 @@ class LasCloud:
                 header = reader.header
                 self._scales, self._offsets = header.scales.copy(), header.offsets.copy()
                 crs = _crs_of(header)
+                low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
+                attributes = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
                 middle = self._xyz(reader.read_points(min(1000, self._there))).mean(axis=0)
         except SourceError:
             raise
@@ -64,6 +66,9 @@ class LasCloud:
             offset=offset,
             crs=crs,
             digest=digest_of([path]),
+            low=low,
+            high=high,
+            attributes=attributes,
         )
 
     def parts(self) -> Iterator[Float32]:
