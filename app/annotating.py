@@ -4,15 +4,14 @@ comes of it.
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from app.keeper import Keeper
 from app.store.records import Annotation, Content, StaleError
 from pipeline.errors import StemmapError
 from pipeline.records import TruthTrees
@@ -32,7 +31,7 @@ class Annotating:
     """What people say of the trees of the run that is open.
 
     Args:
-        folder: Where it is kept; None keeps it in memory.
+        keeper: Of the store.
 
     Attributes:
         run: Number of the run in the store, None while none is open.
@@ -42,7 +41,7 @@ class Annotating:
         serial: Grows with each edit, so that a page knows when it has seen what it did.
     """
 
-    def __init__(self, folder: Path | None) -> None:
+    def __init__(self, keeper: Keeper) -> None:
         self.run: int | None = None
         self.rows: list[Annotation] = []
         self.truth: TruthTrees | None = None
@@ -50,10 +49,7 @@ class Annotating:
         self.serial = 0
         self.changed: Callable[[], None] = lambda: None
         self._own: TruthTrees | None = None
-        self._folder = folder
-        self._store: Store | None = None
-        # One thread: what is asked for first is done first, and the store is never used twice at once.
-        self._thread = ThreadPoolExecutor(1, "store")
+        self._keeper = keeper
 
     async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
         """A run was opened.
@@ -65,15 +61,14 @@ class Annotating:
         """
         self.leave()
 
-        def work() -> tuple[int, list[Annotation], TruthTrees | None]:
-            store = self._opened_store()
+        def work(store: Store) -> tuple[int, list[Annotation], TruthTrees | None]:
             run = store.open_run(source, uri, Path(uri).name[:200] or uri[:200])
             rows = store.annotations(run)
             return run, rows, laid_over(own, rows)
 
         self._own = self.truth = own
         try:
-            self.run, self.rows, self.truth = await self._off_the_loop(work)
+            self.run, self.rows, self.truth = await self._keeper.ask(work)
             self.problem = ""
         except StemmapError as error:
             if str(error) != self.problem:
@@ -103,8 +98,7 @@ class Annotating:
             )
         own = self._own
 
-        def work() -> tuple[T | StaleError, list[Annotation], TruthTrees | None]:
-            store = self._opened_store()
+        def work(store: Store) -> tuple[T | StaleError, list[Annotation], TruthTrees | None]:
             done: T | StaleError
             try:
                 done = function(store)
@@ -113,7 +107,7 @@ class Annotating:
             rows = store.annotations(run)
             return done, rows, laid_over(own, rows)
 
-        done, rows, truth = await self._off_the_loop(work)
+        done, rows, truth = await self._keeper.ask(work)
         if run == self.run:
             self.rows, self.truth = rows, truth
             self.serial += 1
@@ -127,21 +121,7 @@ class Annotating:
         run = self.run
         if run is None or self.problem:
             return None
-        return await self._off_the_loop(lambda: function(self._opened_store(), run))
-
-    async def in_store(self, function: Callable[[Store], T]) -> T:
-        """Let something be done to what belongs to no run.
-
-        Raises:
-            StemmapError: The store cannot be used, or refuses.
-        """
-        return await self._off_the_loop(lambda: function(self._opened_store()))
-
-    async def close(self) -> None:
-        """Finish what is under way, and let go of the file."""
-        if self._store is not None:
-            await self._off_the_loop(self._store.close)
-        self._thread.shutdown()
+        return await self._keeper.ask(lambda store: function(store, run))
 
     def as_plain(self) -> dict[str, Any]:
         """For the browsers."""
@@ -156,16 +136,6 @@ class Annotating:
             "same_thing_m": SAME_THING,
             "trees": [row_payload(row) for row in self.rows],
         }
-
-    def _opened_store(self) -> Store:
-        from app.store.store import Store
-
-        if self._store is None:
-            self._store = Store(self._folder)
-        return self._store
-
-    async def _off_the_loop(self, function: Callable[[], T]) -> T:
-        return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
 
 def row_payload(row: Annotation) -> dict[str, Any]:

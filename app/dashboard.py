@@ -8,17 +8,20 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from app.annotating import Annotating
 from app.events import Events
+from app.hands import SOMEBODY, hand
+from app.keeper import Keeper
 from app.live import Live
 from app.live_payload import map_payload, truth_payload
+from app.logbook import Glance, Logbook
 from app.messages import Open, Play, Seek, SetParameters, Status
+from app.neighbours import SceneLike, WorkerLike
 from app.parameter_sets import ParameterSets
 from app.parameter_state import ParameterState
 from app.scores import Scores
@@ -29,44 +32,11 @@ from app.story.records import ClusterStory, TreeStory
 from app.throttle import Throttle
 from app.worker_mailbox import joined
 from app.worker_messages import Answer, Begin, FromWorker, Opened, Report, Shown, ToWorker
-from pipeline.parameters import Parameters
 from pipeline.parameters.model import Value
-from pipeline.records import Frame, Path, TruthTrees
+from pipeline.records import Path, TruthTrees
 
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 _SCENE_PAUSE_S = 0.09
-
-
-class SceneLike(Protocol):
-    """What the dashboard needs of `app.scene.Scene`."""
-
-    @property
-    def port(self) -> int: ...
-
-    secret: str
-
-    def show(self, frame: Frame, path: NDArray[np.float64], /) -> None: ...
-    def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None: ...
-    def show_truth(self, trees: TruthTrees | None, /) -> None: ...
-    def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None: ...
-    def choose(self, name: str, value: str | bool, /) -> None: ...
-    @property
-    def view(self) -> dict[str, Any]: ...
-    def clear(self) -> None: ...
-    def close(self) -> None: ...
-
-
-class WorkerLike(Protocol):
-    """What the dashboard needs of `app.worker_process.WorkerProcess`."""
-
-    restarts: int
-
-    @property
-    def pid(self) -> int | None: ...
-
-    async def start(self) -> None: ...
-    async def send(self, command: ToWorker, /) -> None: ...
-    async def close(self) -> None: ...
 
 
 class Dashboard:
@@ -75,29 +45,33 @@ class Dashboard:
     Args:
         parameters: In force at the beginning.
         live: Where the browsers listen.
-        annotating: What people say of the trees; None keeps it in memory.
+        keeper: Of the store; None keeps all in memory.
     """
 
     worker: WorkerLike
     scene: SceneLike
 
-    def __init__(self, parameters: ParameterState, live: Live, annotating: Annotating | None = None) -> None:
+    def __init__(self, parameters: ParameterState, live: Live, keeper: Keeper | None = None) -> None:
         self.parameters = parameters
-        self.annotating = annotating or Annotating(None)
+        self.keeper = keeper or Keeper(None)
+        self.logbook = Logbook(self.keeper)
+        self.annotating = Annotating(self.keeper)
         self.annotating.changed = self._use_truth
         self.live = live
-        self.scores = Scores(lambda score: live.tell("evaluation", score))
+        self.scores = Scores(self._tell_score)
         self.status = Status(state="starting", detail="Starting")
         self.shown: Shown | None = None
         self.path: Path | None = None
         self.path_xy = np.zeros((0, 2))
         self.truth: TruthTrees | None = None
-        self.sets = ParameterSets(self.annotating, self._show_parameters)
+        self.sets = ParameterSets(self.keeper, self._show_parameters)
         self._before_after = BeforeAfter()
         self.selection = Selection()
         self.questions = Questions(lambda question: self.worker.send(question))
         self._selecting: asyncio.Task[None] | None = None
         self.scene_viewers = 0
+        self.scene_hand = SOMEBODY  # who moved something in the scene last
+        self.source = Open("")
         self.events = Events()
         self.loop: tuple[float, float] | None = None
         self._turning = False
@@ -125,8 +99,9 @@ class Dashboard:
         self.scores.close()
         self._leave_selecting()
         self._show_scene.cancel()
+        await self.logbook.close()
         await self.worker.close()
-        await self.annotating.close()
+        await self.keeper.close()
         self.scene.close()
 
     # --- what people do --------------------------------------------------------------------------
@@ -158,10 +133,21 @@ class Dashboard:
     async def open(self, source: Open) -> None:
         """Leave the run and open another source."""
         self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
-        self._run = None
+        self._run, self.source = None, source
+        self.logbook.leave()
         self.annotating.leave()
         await self._forget()
         await self.command(source)
+
+    async def replay(self, source: Open, preset_name: str, values: dict[str, Value]) -> None:
+        """Open a source once more with the parameters of an earlier run of it.
+
+        Raises:
+            ParameterError: They are not those of this version; nothing is changed.
+        """
+        self.parameters.take(preset_name, values)
+        self._show_parameters()  # the worker gets them when the source is open
+        await self.open(source)
 
     async def change_parameters(self, changes: dict[str, Value]) -> None:
         """Change values by their dotted names.
@@ -201,6 +187,9 @@ class Dashboard:
         if self.shown is not None:
             self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
             self._tell_events()
+        state = self.parameters
+        who = hand.get() or self.scene_hand
+        self.logbook.changed(before.flat(), state.parameters.flat(), state.preset, state.revision, who)
         await self._send_parameters()
         self._score()
 
@@ -307,6 +296,7 @@ class Dashboard:
         if self.parameters.suit(opened.preset):
             self._show_parameters()
         restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
+        self.logbook.begin(self.annotating.run, self.source, opened, again=restarted)
         play = self._go or not restarted
         if not play:
             self._notice = "The mapping process ended and was started again. Press play to begin anew"
@@ -355,8 +345,19 @@ class Dashboard:
         self.live.show({**map_payload(shown), **counts}, self.path_xy)
         if self.events.shown(shown.frame, shown.time_s):
             self._tell_events()
+        self.logbook.shown(self._glance(shown))
         self._score()
         self._show_scene(shown.frame, self.path_xy)
+
+    def _glance(self, shown: Shown) -> Glance:
+        state = self.parameters
+        return Glance(
+            shown, self.path_xy, state.preset, state.parameters.flat(), self.truth, self.scores.latest
+        )
+
+    def _tell_score(self, score: dict[str, Any] | None) -> None:
+        self.live.tell("evaluation", score)
+        self.logbook.scored(score)
 
     async def _go_round(self, shown: Shown) -> None:
         """At the end of the loop go to its beginning, while the run plays."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from app.story.history import half_axes
 from app.worker_messages import Shown
 from pipeline.health import Health
-from pipeline.records import Frame, TruthTrees, Verdict
+from pipeline.records import Frame, Trees, TruthTrees, Verdict
 
 Float = NDArray[np.float64]
 
@@ -90,7 +90,11 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 
 def trees_payload(frame: Frame, start_ns: int) -> list[dict[str, Any]]:
     """The confirmed trees, one dict each; what is not known is None."""
-    trees = frame.trees
+    return tree_rows(frame.trees, start_ns)
+
+
+def tree_rows(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
+    """The confirmed trees of a table, one dict each; what is not known is None."""
     keep = np.flatnonzero(trees.confirmed)
     columns: dict[str, Sequence[Any]] = {
         "number": trees.number[keep].tolist(),

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from app.annotating import Annotating
+from app.keeper import Keeper
 from app.parameter_state import DEFAULT_PRESET
 from app.store.records import SavedSet, UnknownError
 from pipeline.errors import ParameterError, StemmapError
@@ -41,19 +41,19 @@ class ParameterSets:
     """The saved sets, as they stand in the store.
 
     Args:
-        annotating: Has the store.
+        keeper: Of the store.
         changed: Called when others stand there.
     """
 
-    def __init__(self, annotating: Annotating, changed: Callable[[], None]) -> None:
-        self._annotating, self._changed = annotating, changed
+    def __init__(self, keeper: Keeper, changed: Callable[[], None]) -> None:
+        self._keeper, self._changed = keeper, changed
         self._sets: dict[str, SavedSet] = {}
         self._values: dict[str, tuple[str, Parameters]] = {}
 
     async def load(self) -> None:
         """Read what was saved; a store that cannot be used has none, and says so when asked to save."""
         try:
-            rows = await self._annotating.in_store(lambda store: store.sets.all())
+            rows = await self._keeper.ask(lambda store: store.sets.all())
         except StemmapError:
             rows = []
         self._sets = {row.name: row for row in rows}
@@ -73,7 +73,7 @@ class ParameterSets:
         if name in PRESETS:
             raise ParameterError("a preset has this name", where=name, remedy="Choose another")
         text = file_of(preset_name, parameters)
-        await self._annotating.in_store(lambda store: store.sets.save(name, text, who))
+        await self._keeper.ask(lambda store: store.sets.save(name, text, who))
         await self.load()
 
     async def delete(self, name: str) -> None:
@@ -82,7 +82,7 @@ class ParameterSets:
         Raises:
             UnknownError: There is none of this name.
         """
-        await self._annotating.in_store(lambda store: store.sets.delete(name))
+        await self._keeper.ask(lambda store: store.sets.delete(name))
         await self.load()
 
     def text(self, name: str) -> str:

@@ -114,6 +114,15 @@ class ParameterState:
             raise ParameterError(f"there is no parameter {unknown[0]!r}")
         self._become(self.preset, self.parameters.replace({name: wanted[name] for name in names or wanted}))
 
+    def take(self, preset_name: str, values: dict[str, Value]) -> None:
+        """Take all values, as another run had them.
+
+        Raises:
+            ParameterError: The preset or a name is unknown, or a value does not fit.
+        """
+        name = preset_name if preset_name in PRESETS else self.preset
+        self._become(name, preset(name).replace(values))
+
     def suit(self, name: str) -> bool:
         """Take the preset that suits a source, unless a person has chosen. Returns whether anything
         changed."""

@@ -21,6 +21,7 @@ from starlette.datastructures import Headers
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from app.hands import hand, name_in
 from app.replies import error_reply
 from pipeline.errors import StemmapError
 
@@ -99,7 +100,9 @@ class Guard:
         refusal = self._refusal(scope, headers) or self._login(scope, headers)
         if refusal is not None:
             await refusal(scope, receive, send)
-        elif scope["type"] == "http":
+            return
+        hand.set(name_in(headers.getlist("cookie")))
+        if scope["type"] == "http":
             await self._app(scope, _limited(receive, self._body_limit), send)
         else:
             await self._app(scope, receive, send)

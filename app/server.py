@@ -13,14 +13,15 @@ from starlette.middleware import Middleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.annotating import Annotating
-from app.dashboard import Dashboard, SceneLike, WorkerLike
+from app.dashboard import Dashboard
+from app.keeper import Keeper
 from app.live import Live
 from app.messages import Open
+from app.neighbours import SceneLike, WorkerLike
 from app.parameter_state import ParameterState
 from app.replies import BadRequestError, error_reply, failure_reply
 from app.routes import annotations as annotation_routes
-from app.routes import page, parameter_sets, parameters, results, run, sockets, story
+from app.routes import page, parameter_sets, parameters, results, run, runs, sockets, story
 from app.security import BodyTooLargeError, Guard
 from app.settings import Settings
 from app.store.records import UnknownError
@@ -30,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 ROUTERS = tuple(
     module.router
-    for module in (page, run, parameters, parameter_sets, results, annotation_routes, story, sockets)
+    for module in (page, run, runs, parameters, parameter_sets, results, annotation_routes, story, sockets)
 )
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
@@ -65,7 +66,7 @@ def build(
         parameter_state: The parameters at the start.
         make_scene, make_worker: Stand in for viser and for the worker's process in tests.
     """
-    dashboard = Dashboard(parameter_state, Live(), Annotating(settings.folder))
+    dashboard = Dashboard(parameter_state, Live(), Keeper(settings.folder, settings.database))
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

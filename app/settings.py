@@ -21,7 +21,8 @@ VARIABLES: dict[str, str] = {
     "STEMMAP_TOKEN": "token of the link, 16 characters or more; else a new one at each start",
     "STEMMAP_HOSTS": "further host names by which browsers may call the server, with commas between",
     "STEMMAP_RECORDINGS": "folder whose recordings the page offers",
-    "STEMMAP_FOLDER": "folder where annotations are kept (default: stemmap in your folder for data)",
+    "STEMMAP_FOLDER": "folder for runs, annotations and uploads (default: stemmap in your folder for data)",
+    "STEMMAP_DATABASE": "PostgreSQL database for runs and annotations, postgresql://name@host/database",
 }
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
@@ -39,7 +40,8 @@ class Settings:
         hosts: Further names by which browsers may call the server.
         recordings: Folder whose recordings the page offers, or None.
         body_limit: Largest body of a request [bytes].
-        folder: Where annotations are kept; None keeps them in memory only.
+        folder: Where runs, annotations and uploads are kept; None keeps them in memory only.
+        database: Address of a PostgreSQL database for runs and annotations; empty for a file in the folder.
         message_limit: Largest message of a browser's websocket [bytes].
     """
 
@@ -51,6 +53,18 @@ class Settings:
     body_limit: int = 1_000_000
     message_limit: int = 1_000_000
     folder: Path | None = None
+    database: str = ""
+
+    @property
+    def uploads(self) -> Path | None:
+        """Folder where uploaded recordings go, None where nothing is kept."""
+        return self.recordings or (self.folder and self.folder / "recordings")
+
+    @property
+    def data_folders(self) -> tuple[Path, ...]:
+        """Folders whose recordings and finished runs the page offers, those that are there."""
+        named = (self.recordings, self.folder and self.folder / "recordings")
+        return tuple(dict.fromkeys(folder for folder in named if folder is not None and folder.is_dir()))
 
     @property
     def loopback(self) -> bool:
@@ -97,6 +111,7 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
         ),
         recordings=_folder(recordings) if recordings else None,
         folder=_data_folder(given),
+        database=given.get("STEMMAP_DATABASE", ""),
     )
 
 

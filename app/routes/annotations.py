@@ -13,6 +13,7 @@ from starlette.responses import Response
 
 from app.annotating import contents_of, row_payload
 from app.dashboard import Dashboard
+from app.hands import NAME
 from app.replies import BadRequestError, body_of, failure_reply, json_reply, table_reply
 from app.routes.access import Dash
 from app.store.records import MOST_ANNOTATIONS, Author, Content, UnknownError, moment
@@ -23,8 +24,7 @@ router = APIRouter(prefix="/api")
 # Eastings and northings of the earth are smaller.
 _FARTHEST_M = 1e7
 _BROWSER = r"^[0-9a-f]{16,40}\Z"
-# It stands in tables that others open: no sign that a program there takes for a formula.
-_WHO = r"^[\w][\w .@-]{0,39}\Z"
+_WHO = NAME
 
 _Id = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 _Number = Annotated[int, Path(ge=0, le=2**31 - 1)]

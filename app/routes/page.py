@@ -39,6 +39,12 @@ def page(request: Request) -> Response:
     return _file(request, page_folder() / "index.html", _PAGE_POLICY)
 
 
+@router.get("/runs")
+def runs_page(request: Request) -> Response:
+    """The page of all runs."""
+    return _file(request, page_folder() / "runs.html", _PAGE_POLICY)
+
+
 @router.get("/static/plotly.min.js")
 def plotly(request: Request) -> Response:
     """The plots' library, of the installed package."""

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Request
 from msgspec import Meta
 from starlette.responses import Response
 
+from app.hands import NAME
 from app.parameter_sets import read_file
 from app.replies import body_of, json_reply, table_reply
 from app.routes.access import Dash
@@ -17,7 +18,7 @@ router = APIRouter(prefix="/api/sets")
 
 # Letters of any script, so that it can be read everywhere and never steers a terminal or a path.
 _NAME = r"^\w[\w .+-]{0,39}\Z"
-_WHO = r"^[\w][\w .@-]{0,39}\Z"
+_WHO = NAME
 _LONGEST_FILE = 100_000
 
 _Name = Annotated[str, Meta(pattern=_NAME)]

@@ -22,6 +22,7 @@ _MOST_RECORDINGS = 500
 # A path or address; far longer ones are no mistake of typing.
 _LONGEST_URI = 4096
 SHORTEST_LOOP_S = 0.5
+NOT_FROM_AFAR = "from another machine only scenarios and the recordings of the folder can be opened"
 
 _Command = Play | Pause | Advance | Seek | SetSpeed
 
@@ -77,7 +78,7 @@ async def open_source(request: Request, dashboard: Dash) -> Response:
     if uri is None:
         return error_reply(
             403,
-            "from another machine only scenarios and the recordings of the folder can be opened",
+            NOT_FROM_AFAR,
             where=wanted.uri,
             remedy="Put it into the folder of recordings, or open it on the machine itself",
         )
@@ -127,10 +128,9 @@ def what_may_be_opened(uri: str, settings: Settings) -> str | None:
 
 
 def _path_that_may_be_opened(name: str, settings: Settings) -> str | None:
-    if settings.recordings is None:
-        return None
     path = Path(name).expanduser().resolve()
-    return str(path) if path.is_relative_to(settings.recordings.resolve()) else None
+    inside = any(path.is_relative_to(folder.resolve()) for folder in settings.data_folders)
+    return str(path) if inside else None
 
 
 def _simulated_that_may_be_opened(uri: str, settings: Settings) -> str | None:

@@ -6,25 +6,34 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, StaticPool, create_engine, event
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy import URL, Connection, Engine, StaticPool, create_engine, event, make_url
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
-from app.store.tables import bring_up_to_date
+from app.store.migrating import bring_up_to_date
 from pipeline.errors import StemmapError
 
 FILE_NAME = "annotations.sqlite"
 _PATIENCE_MS = 5000
+_PATIENCE_S = 5
+# Any number, the same for every stemmap: who writes holds the lock of this number.
+_LOCK = 7_330_117
 
 
-def open_engine(folder: Path | None) -> Engine:
-    """The engine on the database of a folder, which is made if it is not there; None keeps all in memory.
+def open_engine(folder: Path | None, database: str = "") -> Engine:
+    """The engine on a database, whose tables are made or brought up to date.
+
+    Args:
+        folder: Of the SQLite file, made if it is not there; None keeps all in memory.
+        database: Address of a PostgreSQL database to be used instead.
 
     Raises:
-        StemmapError: The folder cannot be used, or the file is damaged or of a newer version. The file is
-            left as it is.
+        StemmapError: The folder or the server cannot be used, or the database is damaged or of a newer
+            version; it is left as it is.
     """
+    if database:
+        return _open_server(database)
     if folder is None:
-        return _checked(_engine(":memory:"), "memory")
+        return _checked(_sqlite(":memory:"), "memory")
     path = folder / FILE_NAME
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -34,10 +43,28 @@ def open_engine(folder: Path | None) -> Engine:
             where=str(folder),
             remedy="Name another folder with STEMMAP_FOLDER",
         ) from None
-    return _checked(_engine(str(path)), str(path))
+    return _checked(_sqlite(str(path)), str(path))
 
 
-def _engine(database: str) -> Engine:
+def _open_server(database: str) -> Engine:
+    remedy = "Give STEMMAP_DATABASE as postgresql://name@host/database"
+    try:
+        url = make_url(database)
+    except (ArgumentError, ValueError):
+        raise StemmapError("this is no address of a database", remedy=remedy) from None
+    if url.drivername not in ("postgresql", "postgresql+psycopg"):
+        raise StemmapError(f"{url.drivername} is not supported", where="STEMMAP_DATABASE", remedy=remedy)
+    where = url.render_as_string(hide_password=True)
+    try:
+        engine = _postgresql(url)
+    except ImportError:
+        raise StemmapError(
+            "the driver of PostgreSQL is missing", where=where, remedy="Install stemmap[postgres]"
+        ) from None
+    return _checked(engine, where)
+
+
+def _sqlite(database: str) -> Engine:
     # One connection, used by one thread at a time; a memory database lives as long as it.
     engine = create_engine(
         "sqlite+pysqlite://",
@@ -60,13 +87,32 @@ def _engine(database: str) -> Engine:
     return engine
 
 
+def _postgresql(url: URL) -> Engine:
+    engine = create_engine(
+        url.set(drivername="postgresql+psycopg"),
+        pool_size=1,
+        max_overflow=0,
+        pool_pre_ping=True,  # the server may have been started anew since
+        connect_args={"connect_timeout": _PATIENCE_S, "application_name": "stemmap"},
+    )
+
+    @event.listens_for(engine, "begin")
+    def _(connection: Connection) -> None:
+        # As BEGIN IMMEDIATE above. A lock that is not given in time is an error, not a server that hangs.
+        connection.exec_driver_sql(f"SET LOCAL lock_timeout = {_PATIENCE_MS}")
+        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LOCK})")
+
+    return engine
+
+
 def _checked(engine: Engine, where: str) -> Engine:
     keep = "It is left as it is: move it away to begin anew, or bring back a copy"
     try:
         with engine.begin() as connection:
-            said = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
-            if said != "ok":
-                raise StemmapError("the annotations are damaged", where=where, remedy=keep)
+            if engine.dialect.name == "sqlite":
+                said = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
+                if said != "ok":
+                    raise StemmapError("the annotations are damaged", where=where, remedy=keep)
             bring_up_to_date(connection)
     except StemmapError as error:
         engine.dispose()
@@ -76,6 +122,13 @@ def _checked(engine: Engine, where: str) -> Engine:
         raise StemmapError(what, where=where, remedy=error.remedy or keep) from None
     except (SQLAlchemyError, sqlite3.Error) as error:
         engine.dispose()
-        reason = str(getattr(error, "orig", error)).lower()
-        raise StemmapError(f"the annotations cannot be read: {reason}", where=where, remedy=keep) from None
+        remedy = keep if engine.dialect.name == "sqlite" else "Look whether the server runs and lets you in"
+        raise StemmapError(
+            f"the annotations cannot be read: {reason_of(error)}", where=where, remedy=remedy
+        ) from None
     return engine
+
+
+def reason_of(error: Exception) -> str:
+    """Why the database refused, in one line."""
+    return " ".join(str(getattr(error, "orig", None) or error).lower().split())[:300]

@@ -9,12 +9,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
 from sqlalchemy import Connection, Insert, Row, func, insert, select, update
 
 from app.store import tables
+from app.store.book import RunBook
 from app.store.opening import open_engine
 from app.store.records import (
     MOST_ANNOTATIONS,
@@ -28,23 +30,29 @@ from app.store.records import (
 from app.store.sets import Sets
 from pipeline.errors import StemmapError
 
+# Longer ones were never the digests that all recordings have.
+_LONGEST_KEY = 600
 _annotations, _changes, _steps, _runs = tables.annotated, tables.changes, tables.steps, tables.runs
 
 
 class Store:
-    """The annotations of all runs.
+    """The annotations of all runs, and in `book` what became of the runs.
 
     Args:
         folder: Where the database is kept; None keeps it in memory.
         clock: Nanoseconds since 1970.
+        database: Address of a PostgreSQL database in place of the folder.
 
     Raises:
         StemmapError: The database cannot be used; the file is left as it is.
     """
 
-    def __init__(self, folder: Path | None, clock: Callable[[], int] = time.time_ns) -> None:
-        self._engine = open_engine(folder)
+    def __init__(
+        self, folder: Path | None, clock: Callable[[], int] = time.time_ns, database: str = ""
+    ) -> None:
+        self._engine = open_engine(folder, database)
         self._clock = clock
+        self.book = RunBook(self._engine, clock)
 
     @property
     def sets(self) -> Sets:
@@ -63,6 +71,7 @@ class Store:
             uri, name: As it was opened now.
         """
         now = {"uri": uri, "name": name, "opened_ns": self._clock()}
+        source = _key(source)
         with self._engine.begin() as connection:
             known = connection.execute(select(_runs.c.id).where(_runs.c.source == source)).scalar()
             if known is None:
@@ -220,6 +229,11 @@ def _row(connection: Connection, id_: int) -> Row[Any]:
 
 def _content(row: Row[Any]) -> Content:
     return Content(row.x, row.y, row.kind, row.dbh)
+
+
+def _key(source: str) -> str:
+    """A source as it is looked for: an index of PostgreSQL takes no entry of 2,700 bytes."""
+    return source if len(source) <= _LONGEST_KEY else f"sha256 {sha256(source.encode()).hexdigest()}"
 
 
 def _made(connection: Connection, statement: Insert) -> int:

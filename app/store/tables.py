@@ -1,15 +1,12 @@
-"""The tables, and how a database of an older version becomes one of this version."""
+"""The tables as this version has them; `app.store.migrations` leads there from older ones."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 from sqlalchemy import (
     JSON,
     BigInteger,
     Boolean,
     Column,
-    Connection,
     Float,
     ForeignKey,
     Index,
@@ -19,18 +16,11 @@ from sqlalchemy import (
     Table,
     Text,
     UniqueConstraint,
-    insert,
-    inspect,
-    select,
-    update,
 )
-
-from pipeline.errors import StemmapError
 
 metadata = MetaData()
 
-schema = Table("schema_version", metadata, Column("version", Integer, nullable=False))
-
+# What was recorded: the annotations of a recording are those of all its runs.
 runs = Table(
     "runs",
     metadata,
@@ -95,35 +85,59 @@ parameter_sets = Table(
     UniqueConstraint("name"),
 )
 
+# What became of a source under parameters: one row each time that it was opened and mapped.
+records = Table(
+    "run_records",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("run", ForeignKey("runs.id"), nullable=False, index=True),
+    Column("name", String(200), nullable=False),
+    Column("uri", String(4096), nullable=False),
+    Column("kind", String(200), nullable=False),
+    Column("odometry", String(20), nullable=False),
+    Column("seed", BigInteger, nullable=False),
+    Column("begun_ns", BigInteger, nullable=False),
+    Column("changed_ns", BigInteger, nullable=False),
+    Column("deleted_ns", BigInteger),
+    Column("scans", Integer, nullable=False, comment="mapped; figures, parameters and map are of the last"),
+    Column("all_scans", Integer),
+    Column("time_s", Float, nullable=False),
+    Column("distance_m", Float, nullable=False),
+    Column("trees", Integer, nullable=False),
+    Column("preset", String(100), nullable=False),
+    Column("parameters", JSON(none_as_null=True), nullable=False),
+    Column("scores", JSON(none_as_null=True)),
+    sqlite_autoincrement=True,
+)
 
-def _add_parameter_sets(connection: Connection) -> None:
-    parameter_sets.create(connection)
+# Apart from the records, so that a list of them stays small.
+maps = Table(
+    "run_maps",
+    metadata,
+    Column("record", ForeignKey("run_records.id"), primary_key=True),
+    Column("map", JSON(none_as_null=True), nullable=False),
+)
 
+revisions = Table(
+    "parameter_revisions",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("record", ForeignKey("run_records.id"), nullable=False, index=True),
+    Column("revision", Integer, nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+    Column("time_s", Float, nullable=False, comment="of the scan that stood in the run"),
+    Column("who", String(60), nullable=False),
+    Column("preset", String(100), nullable=False),
+    Column("changes", JSON(none_as_null=True), nullable=False, comment="name: [before, after]"),
+    sqlite_autoincrement=True,
+)
 
-# The function at place k makes a database of version k + 1 into one of version k + 2.
-MIGRATIONS: tuple[Callable[[Connection], None], ...] = (_add_parameter_sets,)
-VERSION = 1 + len(MIGRATIONS)
-
-
-def bring_up_to_date(connection: Connection) -> None:
-    """Make the tables, or bring those of an older version to this one.
-
-    Raises:
-        StemmapError: They are of a newer version, or not ours.
-    """
-    names = inspect(connection).get_table_names()
-    if not names:
-        metadata.create_all(connection)
-        connection.execute(insert(schema).values(version=VERSION))
-        return
-    if schema.name not in names:
-        raise StemmapError("it is a database of another program")
-    version = connection.execute(select(schema.c.version)).scalar_one()
-    if version > VERSION:
-        raise StemmapError(
-            f"it was written by a newer stemmap (version {version} of the tables, this one knows {VERSION})",
-            remedy="Start the newer stemmap",
-        )
-    for migrate in MIGRATIONS[version - 1 :]:
-        migrate(connection)
-    connection.execute(update(schema).values(version=VERSION))
+uploads = Table(
+    "uploads",
+    metadata,
+    Column("file", String(100), primary_key=True, comment="name in the folder of uploads"),
+    Column("name", String(200), nullable=False, comment="that it had where it came from"),
+    Column("kind", String(200), nullable=False),
+    Column("bytes", BigInteger, nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+)

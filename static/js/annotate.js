@@ -39,8 +39,14 @@ function browser() {
 const me = browser();
 export const myName = () => recall("who") ?? `browser ${me.slice(0, 4)}`;
 
+// The server writes beside each change of a parameter who made it.
+function signAs(name) {
+  document.cookie = `stemmap_name=${encodeURIComponent(name)}; SameSite=Strict; Path=/`;
+}
+
 export function callMe(name) {
   if (NAME.test(name)) remember("who", name);
+  signAs(myName());
 }
 
 const call = (method, where, fields = {}) => request(`/api/annotations${where}`, { method, headers: { "Content-Type": "application/json" },
@@ -196,6 +202,7 @@ async function count() {
 }
 
 export function startAnnotating() {
+  signAs(myName());
   let run = null;
   on("annotations", () => {
     if (rowOf(draft.chosen) === null) draft.chosen = null;

@@ -24,6 +24,14 @@ export function drawMap(pen, view, state, colours) {
   drawScaleBar(pen, view, colours);
 }
 
+// Grid and scale bar around what another picture paints.
+export function drawFrame(pen, view, colours, paint) {
+  pen.clearRect(0, 0, view.width, view.height);
+  drawGrid(pen, view, colours);
+  paint();
+  drawScaleBar(pen, view, colours);
+}
+
 function drawGrid(pen, view, colours) {
   const step = view.step();
   const [x0, y0] = view.toMap(0, view.height);
@@ -48,7 +56,7 @@ function drawGrid(pen, view, colours) {
   pen.stroke();
 }
 
-function drawLine(pen, view, points, colour, width) {
+export function drawLine(pen, view, points, colour, width) {
   Object.assign(pen, { strokeStyle: colour, lineWidth: width, lineJoin: "round" });
   pen.beginPath();
   let last = null;
@@ -79,7 +87,7 @@ function alignedOdometry({ odometry, path, map }) {
     p && [path[first][0] + c * (p[0] - ox) - s * (p[1] - oy), path[first][1] + s * (p[0] - ox) + c * (p[1] - oy)]);
 }
 
-function drawTruth(pen, view, truth, colours) {
+export function drawTruth(pen, view, truth, colours) {
   const [px, py] = view.toScreen(truth.x, truth.y);
   const radius = symbolRadius(truth, view.scale) + 3;
   Object.assign(pen, { strokeStyle: colours.truth, lineWidth: 1.6 });
@@ -108,7 +116,7 @@ function drawRing(pen, view, { x, y }, colours) {
   pen.strokeRect(px - 8, py - 8, 16, 16);
 }
 
-function drawTree(pen, view, tree, selected, colours) {
+export function drawTree(pen, view, tree, selected, colours) {
   const [px, py] = view.toScreen(tree.x, tree.y);
   pen.beginPath();
   pen.arc(px, py, symbolRadius(tree, view.scale), 0, TURN);
@@ -135,7 +143,7 @@ function drawTree(pen, view, tree, selected, colours) {
 }
 
 // Numbers that would cover one another are left out; zooming brings them back.
-function drawNumbers(pen, view, trees, selected, colours) {
+export function drawNumbers(pen, view, trees, selected, colours) {
   const taken = new Set();
   Object.assign(pen, { fillStyle: colours.text, strokeStyle: colours.surface, lineWidth: 3, textAlign: "left" });
   for (const tree of [...trees].sort((a, b) => (b.number === selected) - (a.number === selected))) {

@@ -17,6 +17,7 @@ from websockets.typing import Origin
 
 from app.annotating import Annotating, contents_of, laid_over
 from app.dashboard import Dashboard
+from app.keeper import Keeper
 from app.security import session_value
 from app.settings import Settings
 from app.store.records import Annotation, Content
@@ -300,10 +301,11 @@ async def test_a_store_that_cannot_be_used_is_said_and_the_map_goes_on(tmp_path:
 async def test_the_store_works_beside_the_event_loop() -> None:
     import threading
 
-    annotating = Annotating(None)
+    keeper = Keeper(None)
+    annotating = Annotating(keeper)
     await annotating.begin("d", "u", None)
     assert annotating.run is not None
     name = await annotating.edit(annotating.run, lambda _: threading.current_thread().name)
     assert name.startswith("store")
     assert threading.current_thread().name != name
-    await annotating.close()
+    await keeper.close()

@@ -19,6 +19,7 @@ from tests.app.server_for_tests import BEARER, COOKIE, HOST, PORT, TOKEN, build_
 
 ROUTES = [
     ("GET", "/"),
+    ("GET", "/runs"),
     ("GET", "/static/plotly.min.js"),
     ("GET", "/static/index.html"),
     ("GET", "/static/no-such-file.js"),
@@ -34,6 +35,13 @@ ROUTES = [
     ("POST", "/api/loop"),
     ("PATCH", "/api/view"),
     ("GET", "/api/sources"),
+    ("GET", "/api/runs"),
+    ("GET", "/api/runs/compare"),
+    ("GET", "/api/runs/{key}"),
+    ("PATCH", "/api/runs/{number}"),
+    ("DELETE", "/api/runs/{number}"),
+    ("POST", "/api/runs/{number}/restore"),
+    ("POST", "/api/runs/{key}/replay"),
     ("GET", "/api/trees"),
     ("GET", "/api/trees.csv"),
     ("GET", "/api/path.csv"),

@@ -23,6 +23,7 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         "STEMMAP_HOSTS": "Robot.local, tunnel ,",
         "STEMMAP_RECORDINGS": str(tmp_path),
         "STEMMAP_FOLDER": str(tmp_path / "kept"),
+        "STEMMAP_DATABASE": "postgresql://ann@server/stand",
     }
     assert set(given) == set(VARIABLES)
     assert from_environment(given) == Settings(
@@ -32,6 +33,7 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         ("robot.local", "tunnel"),
         tmp_path,
         folder=tmp_path / "kept",
+        database="postgresql://ann@server/stand",
     )
 
 

@@ -233,8 +233,8 @@ def spoil(path: Path, statement: str) -> None:
     [
         (lambda path: path.write_bytes(b"no database" * 400), "not a database"),
         (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "malformed|damaged"),
-        (lambda path: spoil(path, "UPDATE schema_version SET version = version + 1"), "newer stemmap"),
-        (lambda path: spoil(path, "DROP TABLE schema_version"), "another program"),
+        (lambda path: spoil(path, "UPDATE alembic_version SET version_num = '9999'"), "newer stemmap"),
+        (lambda path: spoil(path, "DROP TABLE alembic_version"), "another program"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_line_and_kept(tmp_path: Path, damage, words):

@@ -1,0 +1,253 @@
+"""What became of the runs: their figures, maps and parameters, and the recordings that were uploaded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from sqlalchemy import Connection, Engine, Row, Select, delete, insert, select, update
+
+from app.store import tables
+from app.store.records import UnknownError
+
+_records, _maps, _revisions, _uploads = tables.records, tables.maps, tables.revisions, tables.uploads
+
+MOST_LISTED = 500
+# What was deleted can come back for a month.
+_KEPT_NS = 30 * 86_400 * 1_000_000_000
+# Changes of the same parameters by one person within this time are one: a slider that moves.
+_ONE_MOVE_NS = 3_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """How a run begins: number of its source in the store, and as in `Open` and `Opened`."""
+
+    run: int
+    name: str
+    uri: str
+    kind: str
+    odometry: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What became of a run so far.
+
+    Attributes:
+        scans: Mapped; all_scans: of the source, None where it is not known.
+        time_s: Of the last of them; distance_m: driven.
+        trees: Confirmed ones.
+        preset, parameters: Name, and all values by dotted name.
+        scores: As the page shows them, or None.
+        map: Trees, path and truth, as plain lists.
+    """
+
+    scans: int
+    all_scans: int | None
+    time_s: float
+    distance_m: float
+    trees: int
+    preset: str
+    parameters: Mapping[str, Any]
+    scores: Mapping[str, Any] | None
+    map: Mapping[str, Any] = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Parameters that somebody changed: `changes` is name to [before, after]."""
+
+    revision: int
+    time_s: float
+    who: str
+    preset: str
+    changes: dict[str, list[Any]]
+
+
+class RunBook:
+    """The records of all runs. Calls block.
+
+    Args:
+        engine: Of the store.
+        clock: Nanoseconds since 1970.
+    """
+
+    def __init__(self, engine: Engine, clock: Callable[[], int]) -> None:
+        self._engine = engine
+        self._clock = clock
+
+    def begin(self, beginning: Beginning, standing: Standing) -> int:
+        """Make the record of a run that has begun; returns its number."""
+        now = self._clock()
+        with self._engine.begin() as connection:
+            _forget_deleted(connection, now - _KEPT_NS)
+            values = {
+                "run": beginning.run,
+                "name": beginning.name[:200],
+                "uri": beginning.uri,
+                "kind": beginning.kind[:200],
+                "odometry": beginning.odometry,
+                "seed": beginning.seed,
+                "begun_ns": now,
+                "changed_ns": now,
+                **_figures(standing),
+            }
+            key = connection.execute(insert(_records).values(**values)).inserted_primary_key
+            assert key is not None  # noqa: S101 - one row was inserted
+            record = int(key[0])
+            connection.execute(insert(_maps).values(record=record, map=dict(standing.map)))
+            return record
+
+    def update(self, record: int, standing: Standing) -> None:
+        """Write what became of a run since."""
+        with self._engine.begin() as connection:
+            values = {"changed_ns": self._clock(), **_figures(standing)}
+            connection.execute(update(_records).where(_records.c.id == record).values(**values))
+            connection.execute(update(_maps).where(_maps.c.record == record).values(map=dict(standing.map)))
+
+    def revise(self, record: int, change: Change) -> None:
+        """Write down a change of parameters; those of one move of a slider become one."""
+        now = self._clock()
+        query = select(_revisions).where(_revisions.c.record == record).order_by(_revisions.c.id.desc())
+        with self._engine.begin() as connection:
+            last = connection.execute(query.limit(1)).one_or_none()
+            values = {"revision": change.revision, "at_ns": now, "time_s": change.time_s}
+            if last is not None and _is_one_move(last, change, now):
+                changes = {
+                    name: [last.changes[name][0], after] for name, (_, after) in change.changes.items()
+                }
+                connection.execute(
+                    update(_revisions)
+                    .where(_revisions.c.id == last.id)
+                    .values(**values, preset=change.preset, changes=changes)
+                )
+                return
+            connection.execute(
+                insert(_revisions).values(
+                    record=record, **values, who=change.who, preset=change.preset, changes=change.changes
+                )
+            )
+
+    def listed(self) -> list[dict[str, Any]]:
+        """The runs, the newest first, without their maps."""
+        query = (
+            _with_source()
+            .where(_records.c.deleted_ns.is_(None))
+            .order_by(_records.c.changed_ns.desc(), _records.c.id.desc())
+            .limit(MOST_LISTED)
+        )
+        with self._engine.begin() as connection:
+            return [_plain(row) for row in connection.execute(query).all()]
+
+    def whole(self, record: int) -> dict[str, Any]:
+        """A run with its map and the revisions of its parameters, oldest first.
+
+        Raises:
+            UnknownError: There is none, or it was deleted.
+        """
+        with self._engine.begin() as connection:
+            row = _found(connection, record)
+            stored = connection.execute(select(_maps.c.map).where(_maps.c.record == record)).scalar_one()
+            query = select(_revisions).where(_revisions.c.record == record).order_by(_revisions.c.id)
+            changes = [_plain(each) for each in connection.execute(query).all()]
+        return {**_plain(row), "map": stored, "revisions": changes}
+
+    def rename(self, record: int, name: str) -> None:
+        """Give a run another name.
+
+        Raises:
+            UnknownError: There is none, or it was deleted.
+        """
+        with self._engine.begin() as connection:
+            _found(connection, record)
+            connection.execute(update(_records).where(_records.c.id == record).values(name=name))
+
+    def delete(self, record: int) -> None:
+        """Take a run away; for a month it can come back.
+
+        Raises:
+            UnknownError: There is none.
+        """
+        with self._engine.begin() as connection:
+            _found(connection, record)
+            connection.execute(
+                update(_records).where(_records.c.id == record).values(deleted_ns=self._clock())
+            )
+
+    def bring_back(self, record: int) -> None:
+        """Undo the deletion of a run.
+
+        Raises:
+            UnknownError: There is none any more.
+        """
+        with self._engine.begin() as connection:
+            found = connection.execute(
+                update(_records).where(_records.c.id == record).values(deleted_ns=None)
+            )
+            if not found.rowcount:
+                raise _unknown(record)
+
+    # --- uploads ---------------------------------------------------------------------------------
+
+    def add_upload(self, file: str, name: str, kind: str, size: int) -> None:
+        """Remember how an uploaded file was called."""
+        values = {"name": name[:200], "kind": kind[:200], "bytes": size, "at_ns": self._clock()}
+        with self._engine.begin() as connection:
+            connection.execute(insert(_uploads).values(file=file, **values))
+
+    def uploads(self) -> dict[str, dict[str, Any]]:
+        """What is known of uploaded files, by their names in the folder."""
+        with self._engine.begin() as connection:
+            return {row.file: _plain(row) for row in connection.execute(select(_uploads)).all()}
+
+
+def _with_source() -> Select[Any]:
+    """The records with `source`, which two runs of one recording share."""
+    return select(_records, tables.runs.c.source).join(tables.runs, tables.runs.c.id == _records.c.run)
+
+
+def _figures(standing: Standing) -> dict[str, Any]:
+    return {
+        "scans": standing.scans,
+        "all_scans": standing.all_scans,
+        "time_s": standing.time_s,
+        "distance_m": standing.distance_m,
+        "trees": standing.trees,
+        "preset": standing.preset,
+        "parameters": dict(standing.parameters),
+        "scores": None if standing.scores is None else dict(standing.scores),
+    }
+
+
+def _is_one_move(last: Row[Any], change: Change, now: int) -> bool:
+    return bool(
+        last.who == change.who
+        and last.changes.keys() == change.changes.keys()
+        and now - last.at_ns <= _ONE_MOVE_NS
+    )
+
+
+def _found(connection: Connection, record: int) -> Row[Any]:
+    query = _with_source().where(_records.c.id == record, _records.c.deleted_ns.is_(None))
+    row = connection.execute(query).one_or_none()
+    if row is None:
+        raise _unknown(record)
+    return row
+
+
+def _forget_deleted(connection: Connection, before_ns: int) -> None:
+    gone = select(_records.c.id).where(_records.c.deleted_ns < before_ns)
+    connection.execute(delete(_maps).where(_maps.c.record.in_(gone)))
+    connection.execute(delete(_revisions).where(_revisions.c.record.in_(gone)))
+    connection.execute(delete(_records).where(_records.c.deleted_ns < before_ns))
+
+
+def _plain(row: Row[Any]) -> dict[str, Any]:
+    return dict(row._mapping)
+
+
+def _unknown(record: int) -> UnknownError:
+    return UnknownError("there is no such run", where=f"run {record}", remedy="Load the list anew")

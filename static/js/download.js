@@ -1,0 +1,25 @@
+// What is on the screen, saved as a file by the browser.
+
+import { el } from "./dom.js";
+
+function save(name, blob) {
+  const address = URL.createObjectURL(blob);
+  const link = el("a", { href: address, download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(address), 10_000);
+}
+
+const cell = (value) => {
+  const text = value === null || value === undefined ? "" : String(value);
+  return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+};
+
+export const csvText = (rows) => rows.map((row) => `${row.map(cell).join(",")}\n`).join("");
+
+export const saveCsv = (name, rows) => save(name, new Blob([csvText(rows)], { type: "text/csv" }));
+
+export const saveCanvas = (name, canvas) => canvas.toBlob((blob) => blob && save(name, blob), "image/png");
+
+export async function saveUrl(name, address) {
+  save(name, await (await fetch(address)).blob());
+}

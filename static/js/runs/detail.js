@@ -1,0 +1,109 @@
+// One run: its figures, its finished map, its parameters and who changed them.
+
+import { request } from "../api.js";
+import { byId, el, setText } from "../dom.js";
+import { saveCanvas, saveCsv } from "../download.js";
+import { clock, count, fixed, NONE } from "../format.js";
+import { nearest, paintRun, treeWords } from "./draw.js";
+import { boundsOf, picture } from "./picture.js";
+import { FIGURES, SCORES, shortSource, when } from "./words.js";
+
+let shown = null; // the picture on the screen
+export const repaint = () => shown?.redraw();
+
+export function say(text) {
+  shown = null;
+  byId("run-detail").replaceChildren(el("p", { class: "empty", text }));
+}
+
+export function put(newest, ...nodes) {
+  shown = newest;
+  byId("run-detail").replaceChildren(...nodes);
+}
+
+// A table of a finished page: heads, and rows of texts; `figures` are the columns with numbers.
+export function table(heads, rows, figures = []) {
+  const cls = (k) => (figures.includes(k) ? "figure" : "");
+  return el("div", { class: "scroll" }, el("table", {},
+    el("thead", {}, el("tr", {}, ...heads.map((text, k) => el("th", { scope: "col", class: cls(k), text })))),
+    el("tbody", {}, ...rows.map((row) => el("tr", {}, ...row.map((text, k) => el("td", { class: cls(k), text })))))));
+}
+
+export async function showRun(key, actions) {
+  say("Reading the run …");
+  let run;
+  try {
+    run = await request(`/api/runs/${encodeURIComponent(key)}`);
+  } catch (error) {
+    say(error.message);
+    return;
+  }
+  const { trees, path, truth } = run.map;
+  const map = picture({
+    label: `Map of ${run.name}: ${trees.length} trees`,
+    legend: [["tree", "tree, size by DBH"], ["path", "path"], ...(truth ? [["truth", "ground truth"]] : [])],
+    paint: (pen, view, colours) => paintRun(pen, view, run.map, colours),
+    bounds: () => boundsOf(trees, path),
+    describe: (px, py, view) => { const tree = nearest(trees, px, py, view); return tree ? treeWords(tree) : ""; },
+  });
+  put(map, head(run, actions), figures(run), map.box, more(run, map));
+}
+
+function head(run, { replay, rename, remove }) {
+  const error = el("p", { class: "error-text dim", role: "alert", hidden: true });
+  const guarded = (work) => async () => {
+    try {
+      await work();
+    } catch (problem) {
+      setText(error, problem.message);
+      error.hidden = false;
+    }
+  };
+  const title = el("h2", { text: run.name });
+  const own = run.id !== undefined; // a folder is renamed and deleted where it lies
+  return el("div", { class: "run-head" }, title,
+    el("button", { class: "primary", id: "run-replay", "data-edit": true, text: "Replay", title: "Open the recording again, with the parameters of this run", onclick: guarded(() => replay(run)) }),
+    ...(own ? [
+      el("button", { id: "run-rename", "data-edit": true, text: "Rename", onclick: () => edit(title, run, guarded, rename) }),
+      el("button", { id: "run-delete", "data-edit": true, text: "Delete", title: "It can be undone", onclick: guarded(() => remove(run)) })] : []),
+    el("p", { class: "dim", text: `${run.uri} · ${run.kind}${run.begun_s ? ` · ${when(run.begun_s)}` : ""}` }), error);
+}
+
+function edit(title, run, guarded, rename) {
+  const box = el("input", { type: "text", value: run.name, maxlength: "200", "aria-label": "Name of the run" });
+  const form = el("form", { onsubmit: (event) => { event.preventDefault(); guarded(() => rename(run, box.value))(); } },
+    box, el("button", { class: "primary", text: "Save" }), el("button", { type: "button", text: "Cancel", onclick: () => form.replaceWith(title) }));
+  title.replaceWith(form);
+  box.select();
+}
+
+function figures(run) {
+  const all = [...FIGURES, ["preset", (each) => each.preset || NONE]];
+  return el("dl", { class: "run-figures" }, ...all.map(([name, text]) =>
+    el("div", { "data-figure": name }, el("dt", { text: name }), el("dd", { text: text(run) }))));
+}
+
+function more(run, map) {
+  const file = shortSource(run.name).replace(/[^\w.-]+/g, "_") || "run";
+  return el("div", { class: "run-more" },
+    el("div", { class: "row" },
+      el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas(`${file}.png`, map.canvas) }),
+      el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv(`${file}_trees.csv`, treeRows(run.map.trees)) })),
+    ...(run.scores ? [el("div", {}, el("h3", { text: "Against the ground truth" }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
+    el("div", {}, el("h3", { text: "Changes of parameters" }), ...changes(run)),
+    el("details", {}, el("summary", { text: `All ${Object.keys(run.parameters).length} parameters` }),
+      table(["parameter", "value"], Object.entries(run.parameters).map(([name, value]) => [name, String(value)]))));
+}
+
+function changes({ revisions }) {
+  if (!revisions.length) return [el("p", { class: "note", text: "None: the run kept the parameters that it began with." })];
+  const rows = revisions.map((each) => [each.who, when(each.at_s), clock(each.time_s),
+    Object.entries(each.changes).slice(0, 4).map(([name, [before, after]]) => `${name}: ${before} → ${after}`).join(", ") + (Object.keys(each.changes).length > 4 ? `, ${count(Object.keys(each.changes).length - 4, "more", "more")}` : "")]);
+  return [table(["who", "when", "in the run", "what"], rows)];
+}
+
+const COLUMNS = ["tree", "x_m", "y_m", "sigma_m", "dbh_cm", "sigma_dbh_cm", "eccentricity", "observations"];
+
+function treeRows(trees) {
+  return [COLUMNS, ...trees.map((t) => [t.number, fixed(t.x, 4), fixed(t.y, 4), fixed(t.ellipse[0], 4), t.dbh_cm, t.sigma_dbh_cm, t.eccentricity, t.observations])];
+}

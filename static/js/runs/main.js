@@ -1,0 +1,134 @@
+// The page of all runs: the list, and beside it the chosen run or two of them compared.
+
+import { get, patch, post, request } from "../api.js";
+import { byId, el, setText } from "../dom.js";
+import { count, figure } from "../format.js";
+import { on } from "../state.js";
+import { startTheme } from "../theme.js";
+import { showTwo } from "./compare.js";
+import { repaint, say, showRun } from "./detail.js";
+import { scans, shortSource, when } from "./words.js";
+
+const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor"], ["trees", ""], ["F1", ""], ["preset", "minor"]];
+let known = { runs: [], folders: [], open: null };
+const ticked = new Set();
+let deleted = null; // the run that Undo brings back
+
+async function load() {
+  try {
+    known = await get("/api/runs");
+    byId("runs-error").hidden = true;
+  } catch (error) {
+    setText(byId("runs-error"), error.message);
+    byId("runs-error").hidden = false;
+  }
+  for (const key of ticked) if (![...known.runs, ...known.folders].some((run) => run.key === key)) ticked.delete(key);
+  fill();
+}
+
+function fill() {
+  const wanted = byId("runs-find").value.trim().toLowerCase();
+  const fits = ({ name, uri = "" }) => `${name} ${uri}`.toLowerCase().includes(wanted);
+  const [runs, folders] = [known.runs.filter(fits), known.folders.filter(fits)];
+  byId("runs").tBodies[0].replaceChildren(...runs.map(row), ...(folders.length ? [group("Finished maps in the data folder (stemmap map --out)"), ...folders.map(row)] : []));
+  const all = known.runs.length + known.folders.length;
+  setText(byId("runs-count"), count(all, "run"));
+  byId("runs").hidden = !(runs.length + folders.length);
+  const empty = byId("runs-empty");
+  empty.hidden = runs.length + folders.length > 0;
+  setText(empty, all ? `No run is called “${wanted}”.` : "No run yet. A run is kept here as soon as the dashboard has mapped something of it: go to the dashboard and press play, or open a recording.");
+  markTicked();
+}
+
+const group = (text) => el("tr", { class: "group" }, el("td", { colspan: HEADS.length, text }));
+
+function row(run) {
+  const name = el("td", {}, el("button", { text: run.name, onclick: (event) => { event.stopPropagation(); go(`run=${run.key}`); } }),
+    el("small", {}, ...(run.id === known.open && run.id !== undefined ? [el("span", { class: "badge", text: "open now" })] : []),
+      run.uri && shortSource(run.uri) !== run.name ? shortSource(run.uri) : run.kind ?? ""));
+  const texts = run.id === undefined ? [when(run.changed_s), "", "", "", "", ""]
+    : [when(run.begun_s), scans(run), figure(run.distance_m), String(run.trees), figure(run.scores?.f1), run.preset];
+  return el("tr", { "data-run": run.key, onclick: () => go(`run=${run.key}`) },
+    el("td", { onclick: (event) => event.stopPropagation() }, el("input", { type: "checkbox", "aria-label": `Compare ${run.name}`, checked: ticked.has(run.key), onchange: (event) => tick(run.key, event.target.checked) })),
+    name, ...texts.map((text, k) => el("td", { class: HEADS[k + 2][1], text })));
+}
+
+// Of three ticks the oldest goes: two can be compared.
+function tick(key, yes) {
+  if (yes) ticked.add(key);
+  else ticked.delete(key);
+  if (ticked.size > 2) ticked.delete(ticked.values().next().value);
+  fill();
+}
+
+function markTicked() {
+  byId("runs-compare").disabled = ticked.size !== 2;
+  const { run } = chosen();
+  for (const each of byId("runs").querySelectorAll("tr[data-run]")) each.setAttribute("aria-selected", String(each.dataset.run === run));
+}
+
+// What is chosen stands in the address, so that a link brings it back.
+function chosen() {
+  const given = new URLSearchParams(location.hash.slice(1));
+  return { run: given.get("run"), compare: given.getAll("compare") };
+}
+
+function go(hash) {
+  if (location.hash === `#${hash}`) follow();
+  else location.hash = hash;
+}
+
+function follow() {
+  const { run, compare } = chosen();
+  markTicked();
+  if (compare.length === 2) showTwo(...compare);
+  else if (run) showRun(run, { replay, rename, remove });
+  else say("Choose a run to see its finished map, or tick two to compare them.");
+}
+
+async function replay(run) {
+  await post(`/api/runs/${encodeURIComponent(run.key)}/replay`, {});
+  location.href = "/";
+}
+
+async function rename(run, name) {
+  await patch(`/api/runs/${run.id}`, { name });
+  await load();
+  follow();
+}
+
+async function remove(run) {
+  await request(`/api/runs/${run.id}`, { method: "DELETE" });
+  deleted = run;
+  setText(byId("toast").querySelector("span"), `“${run.name}” was deleted.`);
+  byId("toast").hidden = false;
+  history.replaceState(null, "", location.pathname);
+  ticked.delete(run.key);
+  await load();
+  follow();
+}
+
+async function undo() {
+  const run = deleted;
+  byId("toast").hidden = true;
+  try {
+    await post(`/api/runs/${run.id}/restore`, {});
+  } catch (error) {
+    setText(byId("runs-error"), error.message);
+    byId("runs-error").hidden = false;
+    return;
+  }
+  await load();
+  go(`run=${run.key}`);
+}
+
+byId("runs").tHead.replaceChildren(el("tr", {}, ...HEADS.map(([text, cls]) => el("th", { scope: "col", class: cls, text: text || " " }))));
+byId("runs-find").addEventListener("input", fill);
+byId("runs-compare").addEventListener("click", () => go([...ticked].map((key) => `compare=${encodeURIComponent(key)}`).join("&")));
+byId("toast-undo").addEventListener("click", undo);
+addEventListener("hashchange", follow);
+addEventListener("focus", load);
+on("theme", repaint);
+startTheme();
+load();
+follow();

@@ -1,0 +1,77 @@
+"""A person at the page of all runs: looks, compares, renames, deletes, takes it back, plays again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import opened
+from tests.browser.dashboard import Dashboard
+from tests.browser.serving import Server
+
+
+@pytest.fixture
+def own(chromium: Browser, tmp_path: Path) -> Iterator[Dashboard]:
+    """A server with a folder of its own, in which one short run was mapped to its end."""
+    server = Server("sim:stand?duration=4", STEMMAP_FOLDER=str(tmp_path))
+    yield from opened(chromium, server.link)
+    server.stop()
+
+
+def map_again(dashboard: Dashboard, changes: dict[str, object]) -> None:
+    """Change parameters, and map the same run once more to its end."""
+    dashboard.page.evaluate(
+        "body => fetch('/api/parameters', { method: 'PATCH', body: JSON.stringify(body),"
+        " headers: { 'Content-Type': 'application/json' } })",
+        {"changes": changes},
+    )
+    dashboard.page.evaluate(
+        "() => fetch('/api/open', { method: 'POST', body: JSON.stringify({ uri: 'sim:stand?duration=4' }),"
+        " headers: { 'Content-Type': 'application/json' } })"
+    )
+
+
+def test_runs_are_kept_compared_renamed_deleted_and_played_again(own: Dashboard):
+    page = own.page
+    own.until_server("/api/status", "it.state === 'finished'")
+    own.until_server("/api/runs", "it.runs.length === 1 && it.runs[0].scans === 40")
+    map_again(own, {"tracking.hits_to_confirm": 25})
+    own.until_server("/api/status", "it.state === 'finished' && it.revision > 0")
+    own.until_server("/api/runs", "it.runs.length === 2 && it.runs.every(run => run.scans === 40)")
+    page.get_by_role("link", name="Runs").click()
+
+    rows = page.locator("#runs tbody tr")
+    expect(rows).to_have_count(2)
+    older = own.ask("/api/runs")["runs"][1]
+    rows.nth(1).get_by_role("button").click()
+    expect(page.locator("[data-figure=trees] dd")).to_have_text(str(older["trees"]))
+    expect(page.locator(".run-map canvas")).to_be_visible()
+
+    for row in rows.all():
+        row.get_by_role("checkbox").click()
+    page.get_by_role("button", name="Compare two").click()
+    keys = [run["key"] for run in own.ask("/api/runs")["runs"]]
+    told = own.ask(f"/api/runs/compare?a={keys[0]}&b={keys[1]}")
+    assert told["parameters"] == [{"name": "tracking.hits_to_confirm", "a": 25, "b": 3}]
+    expect(page.locator("#compare-figures dd").first).to_have_text(str(len(told["pairs"])))
+    expect(page.get_by_text("tracking.hits_to_confirm")).to_be_visible()
+
+    rows.nth(1).get_by_role("button").click()
+    page.get_by_role("button", name="Rename").click()
+    page.get_by_label("Name of the run").fill("<b>north</b> stand")
+    page.get_by_role("button", name="Save").click()
+    expect(page.get_by_role("heading", name="<b>north</b> stand")).to_be_visible()
+    page.get_by_role("button", name="Delete").click()
+    expect(rows).to_have_count(1)
+    page.get_by_role("button", name="Undo").click()
+    expect(rows).to_have_count(2)
+    expect(page.get_by_role("heading", name="<b>north</b> stand")).to_be_visible()
+
+    assert own.errors == []
+    page.get_by_role("button", name="Replay").click()
+    expect(page.locator("#source-name")).to_have_text("sim:stand?duration=4")
+    own.until_server("/api/parameters", "it.values['tracking.hits_to_confirm'] === 3")
+    own.until_server("/api/runs", "it.runs.length === 3")
