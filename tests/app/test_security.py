@@ -30,6 +30,14 @@ ROUTES = [
     ("POST", "/api/parameters/preset"),
     ("POST", "/api/parameters/reset"),
     ("GET", "/api/parameters.toml"),
+    ("GET", "/api/sets"),
+    ("POST", "/api/sets"),
+    ("POST", "/api/sets/use"),
+    ("POST", "/api/sets/delete"),
+    ("POST", "/api/sets/upload"),
+    ("GET", "/api/sets/{name}.toml"),
+    ("POST", "/api/parameters/undo"),
+    ("POST", "/api/parameters/redo"),
     ("POST", "/api/command"),
     ("POST", "/api/open"),
     ("POST", "/api/loop"),
@@ -245,7 +253,7 @@ async def test_a_websocket_of_our_page_is_accepted() -> None:
         for headers in (BEARER, by_cookie):
             async with connect(f"ws://{host}/api/live", additional_headers=headers, proxy=None) as live:
                 first = json.loads(await live.recv())
-                assert first["type"] in ("status", "parameters", "truth", "evaluation", "selection")
+                assert first["type"] in ("status", "parameters", "sets", "truth", "evaluation", "selection")
 
 
 async def test_what_the_page_does_not_say_ends_the_connection() -> None:
