@@ -100,7 +100,9 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
     moved.x[:] = tracks.x @ C.T
     moved.x[:, :2] += [T.x, T.y]
     moved.P[:] = C @ tracks.P @ C.T
-    moved.P[:, :2, :2] += _of_the_frame(moved.x[:, :2], T, covariance)
+    of_the_frame = _of_the_frame(moved.x[:, :2], T, covariance)
+    moved.P[:, :2, :2] += of_the_frame
+    moved.shared[:] = C[:2, :2] @ tracks.shared @ C[:2, :2].T + of_the_frame
     moved.stamp_ns[:] += shift_ns
     moved.first_ns[:] += shift_ns
     turn = round(T.yaw / (2.0 * np.pi / SECTORS)) % SECTORS

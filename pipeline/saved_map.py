@@ -67,7 +67,7 @@ class SavedMap:
             raise ValueError("the stamps are not those of the path")
         _check_rows(self.tracks, TrackTable.empty())
         _check_rows(self.columns, no_columns())
-        _check_finite(self.tracks.x, self.tracks.P, self.columns.axis)
+        _check_finite(self.tracks.x, self.tracks.P, self.tracks.shared, self.columns.axis)
         if (
             len(self.tracks)
             and not 0 < self.tracks.number.min() <= self.tracks.number.max() < self.next_number

@@ -18,7 +18,9 @@ from pipeline.health import Health
 from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
+from pipeline.slam.frame import FrameMemory, kinship, of_kin
 from pipeline.slam.health import TOLD, Recent, ScanTold, is_astray, judged, remembered, scan_told
+from pipeline.slam.landmarks import laid
 from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
 from pipeline.slam.motion import Motion, accumulated, moved_poses, weighted_pose
 from pipeline.slam.pairs import Room, room_for
@@ -63,13 +65,16 @@ class FastSlam:
             doubt = doubt or ("the trees contradict the odometry: corrected by them" if slipped else "")
             state, scan = self._observed(state, detections, clear_range, noise, motion.measured)
         weights = normalised(state.log_weight)
-        estimate = _estimate(state, weights, p.hits_to_weigh)
+        estimate, frame = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
+        if used and len(detections.cluster):
+            serial = state.detections - len(detections.cluster)
+            frame = frame.marked(serial, estimate.T_map_base.as_array(), estimate.covariance)
         if used and estimate.n_eff < p.resample_below * p.particles:
             ancestors = low_variance_ancestors(weights, offset)
             take_ancestors(ancestors, state.pose, state.maps)
             state.log_weight[:] = 0.0
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
-        self.state = replace(state, genealogy=genealogy)
+        self.state = replace(state, genealogy=genealogy, frame=frame)
         health = judged(
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.covariance, doubt
         )
@@ -97,7 +102,8 @@ class FastSlam:
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
         """After `place`: the pose, with the health of an estimate before it."""
         weights = normalised(self.state.log_weight)
-        return replace(_estimate(self.state, weights, self.parameters.hits_to_weigh), health=before.health)
+        estimate, _ = _estimate(self.state, weights, self.parameters, 0.0)
+        return replace(estimate, health=before.health)
 
     def lost(self, estimate: PoseEstimate) -> Health:
         """The health of an estimate that no tree has told anything of."""
@@ -113,10 +119,14 @@ class FastSlam:
         return self.state.genealogy.path(self.state.best)
 
     def landmarks(self) -> tuple[Float, Float]:
-        """All landmarks of the best particle: positions, shape (L, 2) [m], and covariances xx, xy, yy,
-        shape (L, 3) [m^2]."""
-        landmarks = self.state.map_of(self.state.best)
-        return landmarks.mean, landmarks.covariance
+        """All landmarks of the best particle, laid to the pose that is told: positions, shape (L, 2) [m],
+        and covariances xx, xy, yy, shape (L, 3) [m^2]."""
+        s = self.state
+        landmarks = s.map_of(s.best)
+        if (s.maps.block == s.maps.block[s.best]).all():  # put into one map: no particle has learnt anything
+            return landmarks.mean, landmarks.covariance
+        told, _ = weighted_pose(s.pose, normalised(s.log_weight), np.zeros(3), np.zeros((3, 3)))
+        return laid(landmarks.mean, landmarks.covariance, s.pose[s.best], told)
 
     def _moved(self, state: SlamState, motion: Motion) -> SlamState:
         moved = accumulated(
@@ -157,9 +167,7 @@ class FastSlam:
     ) -> tuple[SlamState, ScanTold]:
         p, found = self.parameters, len(detections.cluster)
         centre = detections.centre
-        reach = p.view_range
-        if found:
-            reach = max(reach, math.sqrt(float((centre * centre).sum(axis=1).max())) + p.distance_max)
+        reach = max(p.view_range, _farthest(detections) + p.distance_max) if found else p.view_range
         rules = _rules(p)
         moved = predict(state.pose, state.motion, state.motion_covariance, noise, rules.use_proposal)
         blocks, lengths, rows = blocks_in_reach(state.maps, moved, reach, found)
@@ -194,6 +202,12 @@ class FastSlam:
         return self._near, self._room
 
 
+def _farthest(detections: Detections) -> float:
+    """Distance of the farthest one [m], 0 where there is none."""
+    centre = detections.centre
+    return math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
+
+
 def _arrays(measured: PoseMeasurement | None) -> tuple[Float, Float]:
     if measured is None:
         return np.zeros(0), np.eye(3)
@@ -215,16 +229,21 @@ def _rules(p: Slam) -> Rules:
     )
 
 
-def _estimate(state: SlamState, weights: Float, hits_to_show: int) -> PoseEstimate:
+def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[PoseEstimate, FrameMemory]:
     pose = moved_poses(state.pose, state.motion)
-    mean, covariance = weighted_pose(pose, weights, state.motion, state.motion_covariance)
+    mean, spread = weighted_pose(pose, weights, state.motion, state.motion_covariance)
+    if state.genealogy.founders is not None:
+        spread = of_kin(spread, kinship(weights, state.genealogy.founders[1]))
     landmarks = state.map_of(state.best)
+    covariance, frame = state.frame.told(
+        mean, spread, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
+    )
     return PoseEstimate(
         T_map_base=Pose2(float(mean[0]), float(mean[1]), float(mean[2])),
         covariance=covariance,
         particles=pose,
         weights=weights,
         n_eff=1.0 / float(weights @ weights),
-        landmarks=landmarks.mean[landmarks.hits >= hits_to_show],
+        landmarks=landmarks.mean[landmarks.hits >= p.hits_to_weigh],
         resampled=False,
-    )
+    ), frame

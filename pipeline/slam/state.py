@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.geometry import Float
+from pipeline.slam.frame import FrameMemory
 from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.health import Recent
 from pipeline.slam.maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
@@ -28,6 +29,7 @@ class SlamState:
         best: The particle that explained the last scans best; its map and past are shown.
         genealogy: Where the particles came from.
         recent: What the health is judged by.
+        frame: How well the frame was known where landmarks were begun.
     """
 
     pose: Float
@@ -40,6 +42,7 @@ class SlamState:
     best: int = 0
     genealogy: Genealogy = field(default_factory=Genealogy)
     recent: Recent = field(default_factory=Recent)
+    frame: FrameMemory = field(default_factory=FrameMemory)
 
     @classmethod
     def at_origin(cls, particles: int) -> SlamState:
@@ -83,6 +86,7 @@ class SlamState:
             best=0,
             genealogy=self.genealogy.redrawn(rows),
             recent=Recent(mapped=self.recent.mapped),
+            frame=self.frame.forgotten(),
         )
 
     def with_particles(self, particles: int) -> SlamState:

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.association import associate
 from pipeline.compiled import compiled
 from pipeline.geometry import Float, Pose2
+from pipeline.tracking.assignment import by_pose
 from pipeline.tracking.table import TrackTable
 
 AGREE = 3.0  # sigma; nearer than this, tree and landmark tell the same
@@ -21,6 +22,7 @@ def anchor(
     landmarks: Float,
     covariance: Float,
     T_map_base: Pose2,
+    pose_covariance: Float,
     reach: float,
     distance_max: float,
     miss: float,
@@ -30,22 +32,28 @@ def anchor(
     Args:
         tracks: Changed in place; nothing is removed.
         landmarks: shape (L, 2) [m]; covariance: xx, xy, yy, shape (L, 3) [m^2].
-        T_map_base: Where the robot is; reach: trees farther from it are left alone [m].
+        T_map_base: Where the robot is; pose_covariance: of it, shape (3, 3).
+        reach: trees farther from it are left alone [m].
         distance_max: A landmark farther from a tree than this is another tree's [m].
         miss: What a tree without a landmark loses of its score.
     """
     here = T_map_base.as_array()
-    _anchor(tracks.x, tracks.P, tracks.score, landmarks, covariance, here, reach, distance_max, miss)
+    _anchor(
+        tracks.x, tracks.P, tracks.shared, tracks.score, landmarks, covariance, here, pose_covariance, reach,
+        distance_max, miss,
+    )  # fmt: skip
 
 
 @compiled
 def _anchor(
     x: Float,
     P: Float,
+    shared: Float,
     score: Float,
     landmarks: Float,
     covariance: Float,
     here: Float,
+    pose_covariance: Float,
     reach: float,
     distance_max: float,
     miss: float,
@@ -67,4 +75,8 @@ def _anchor(
         elif distance2[k] > AGREE * AGREE:
             C = covariance[landmark]
             x[t, 0], x[t, 1] = landmarks[landmark, 0], landmarks[landmark, 1]
-            P[t, 0, 0], P[t, 0, 1], P[t, 1, 0], P[t, 1, 1] = C[0], C[1], C[1], C[2]
+            # The landmark is known from here, so what is shared now is the error of the pose of now.
+            B = by_pose(x[t, 0] - here[0], x[t, 1] - here[1], pose_covariance)
+            shared[t, 0, 0], shared[t, 0, 1], shared[t, 1, 0], shared[t, 1, 1] = B[0], B[1], B[1], B[2]
+            P[t, 0, 0], P[t, 1, 1] = C[0] + B[0], C[2] + B[2]
+            P[t, 0, 1] = P[t, 1, 0] = C[1] + B[1]

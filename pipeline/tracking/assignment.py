@@ -20,6 +20,7 @@ def assign(
     pose_covariance: Float,
     x: Float,
     P: Float,
+    shared: Float,
     stamp_ns: Int,
     score: Float,
     clear_range: Float,
@@ -29,22 +30,23 @@ def assign(
     gate: float,
     distance_max: float,
     miss: float,
-) -> tuple[Int, Bool, Float, Float]:
+) -> tuple[Int, Bool, Float, Float, Float]:
     """The tree of each detection; trees in free view without one lose `miss` of their score, in place.
 
     Args:
         centre: Base frame, shape (D, 2) [m]; covariance: shape (D, 2, 2).
         pose: x, y [m], yaw [rad], shape (3,); pose_covariance: shape (3, 3).
-        x, P, stamp_ns, score: Columns of a `TrackTable`.
+        x, P, shared, stamp_ns, score: Columns of a `TrackTable`.
         clear_range: How far the view was free by direction; view_range: a tree nearer can be missed [m].
         gate: Largest Mahalanobis distance [sigma]; distance_max: largest distance [m].
 
     Returns:
         Row of the tree, -1 for none, shape (D,); which trees have a detection, shape (T,); the
-        detections in the frame of the map, shape (D, 2), and their covariances, shape (D, 2, 2).
+        detections in the frame of the map, shape (D, 2), and their covariances, shape (D, 2, 2): their own,
+        and what the pose adds.
     """
-    position, R, packed = in_map(centre, covariance, pose, pose_covariance)
-    expected, spread = expected_positions(x, P, stamp_ns, now_ns, acceleration_sigma)
+    position, R, B, packed = in_map(centre, covariance, pose, pose_covariance)
+    expected, spread = expected_positions(x, P, shared, stamp_ns, now_ns, acceleration_sigma)
     row_of, _ = associate(position, packed, expected, spread, gate, distance_max)
     touched = np.zeros(x.shape[0], np.bool_)
     for d in range(row_of.shape[0]):
@@ -54,25 +56,24 @@ def assign(
     for t in range(x.shape[0]):
         if not touched[t] and is_in_free_view(x[t], pose, c, s, clear_range, view_range):
             score[t] -= miss
-    return row_of, touched, position, R
+    return row_of, touched, position, R, B
 
 
 @compiled
 def in_map(
     centre: Float, covariance: Float, pose: Float, pose_covariance: Float
-) -> tuple[Float, Float, Float]:
-    """Detections in the frame of the map: centres, shape (D, 2) [m], their covariances, shape (D, 2, 2),
-    and the same as xx, xy, yy, shape (D, 3).
-
-    The covariance is the detection's own, turned, and the pose's, J Sigma J^T with J = d(position) /
-    d(x, y, yaw).
+) -> tuple[Float, Float, Float, Float]:
+    """Detections in the frame of the map: centres, shape (D, 2) [m]; their own covariances, turned, shape
+    (D, 2, 2); those by the pose, J Sigma J^T with J = d(position) / d(x, y, yaw); and the sums of both as
+    xx, xy, yy, shape (D, 3).
 
     Args:
         centre: Base frame, shape (D, 2) [m]; covariance: shape (D, 2, 2).
         pose: x, y [m], yaw [rad], shape (3,); pose_covariance: shape (3, 3).
     """
     D, Sigma = centre.shape[0], pose_covariance
-    place, R, packed = np.empty((D, 2)), np.empty((D, 2, 2)), np.empty((D, 3))
+    place, packed = np.empty((D, 2)), np.empty((D, 3))
+    R, B = np.empty((D, 2, 2)), np.empty((D, 2, 2))
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for d in range(D):
         x, y = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
@@ -80,10 +81,19 @@ def in_map(
         xx = c * c * a - 2.0 * c * s * b + s * s * e
         xy = c * s * (a - e) + (c * c - s * s) * b
         yy = s * s * a + 2.0 * c * s * b + c * c * e
-        xx += Sigma[0, 0] - 2.0 * y * Sigma[0, 2] + y * y * Sigma[2, 2]
-        xy += Sigma[0, 1] + x * Sigma[0, 2] - y * Sigma[1, 2] - x * y * Sigma[2, 2]
-        yy += Sigma[1, 1] + 2.0 * x * Sigma[1, 2] + x * x * Sigma[2, 2]
-        place[d, 0], place[d, 1] = pose[0] + x, pose[1] + y
-        packed[d, 0], packed[d, 1], packed[d, 2] = xx, xy, yy
         R[d, 0, 0], R[d, 0, 1], R[d, 1, 0], R[d, 1, 1] = xx, xy, xy, yy
-    return place, R, packed
+        bxx, bxy, byy = by_pose(x, y, Sigma)
+        place[d, 0], place[d, 1] = pose[0] + x, pose[1] + y
+        packed[d, 0], packed[d, 1], packed[d, 2] = xx + bxx, xy + bxy, yy + byy
+        B[d, 0, 0], B[d, 0, 1], B[d, 1, 0], B[d, 1, 1] = bxx, bxy, bxy, byy
+    return place, R, B, packed
+
+
+@compiled
+def by_pose(x: float, y: float, Sigma: Float) -> tuple[float, float, float]:
+    """J Sigma J^T, xx, xy, yy, of what lies x, y [m] from the robot along the axes of the map."""
+    return (
+        Sigma[0, 0] - 2.0 * y * Sigma[0, 2] + y * y * Sigma[2, 2],
+        Sigma[0, 1] + x * Sigma[0, 2] - y * Sigma[1, 2] - x * y * Sigma[2, 2],
+        Sigma[1, 1] + 2.0 * x * Sigma[1, 2] + x * x * Sigma[2, 2],
+    )

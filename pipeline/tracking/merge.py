@@ -7,6 +7,7 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Bool, Verdict
+from pipeline.tracking.shared import split
 from pipeline.tracking.table import TrackTable
 
 
@@ -47,7 +48,10 @@ def join(tracks: TrackTable, old: int, young: int) -> None:
     """Add to a tree, by its row, what is known of another row of the same tree, which is left as it is."""
     if tracks.stamp_ns[old] == tracks.stamp_ns[young]:  # two halves of one trunk in one scan
         tracks.hits[old] -= 1
-    tracks.x[old], tracks.P[old] = fuse(tracks.x[old], tracks.P[old], tracks.x[young], tracks.P[young])
+    other, row = tracks.P[young].copy(), np.array([old])
+    own = other[None, :2, :2] - tracks.shared[young]
+    other[:2, :2] = split(tracks.P, tracks.shared, row, own, tracks.shared[[young]], np.zeros(1), 0.0)[0]
+    tracks.x[old], tracks.P[old] = fuse(tracks.x[old], tracks.P[old], tracks.x[young], other)
     tracks.stamp_ns[old] = max(tracks.stamp_ns[old], tracks.stamp_ns[young])
     tracks.first_ns[old] = min(tracks.first_ns[old], tracks.first_ns[young])
     tracks.score[old] = max(tracks.score[old], tracks.score[young])

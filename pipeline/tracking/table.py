@@ -17,6 +17,7 @@ class TrackTable:
     Attributes:
         number: int64, in the order of first sight, never used twice.
         x: shape (T, 4): x, y [m], vx, vy [m/s]; P: its covariance, shape (T, 4, 4).
+        shared: What of P the poses have done that the tree was seen from, shape (T, 2, 2) [m^2].
         stamp_ns: int64, of `x` and of the last observation; first_ns: of the first.
         hits: int64, observations; score: hits less misses.
         eccentricity: Sum over the observations with a finite one; eccentricities: their number.
@@ -29,6 +30,7 @@ class TrackTable:
     number: Int
     x: Float
     P: Float
+    shared: Float
     stamp_ns: Int
     first_ns: Int
     hits: Int
@@ -49,6 +51,7 @@ class TrackTable:
             number=ints.copy(),
             x=np.zeros((rows, 4)),
             P=np.zeros((rows, 4, 4)),
+            shared=np.zeros((rows, 2, 2)),
             stamp_ns=ints.copy(),
             first_ns=ints.copy(),
             hits=ints.copy(),

@@ -8,11 +8,12 @@ from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Tracking
 from pipeline.records import Columns, Detections, Int, Trees, Verdict
 from pipeline.tracking.anchor import anchor
-from pipeline.tracking.assignment import assign
+from pipeline.tracking.assignment import assign, in_map
 from pipeline.tracking.judging import assign_verdicts, tree_columns
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.merge import merge_near
 from pipeline.tracking.observation import add_observations, table_figures
+from pipeline.tracking.shared import split
 from pipeline.tracking.table import TrackTable
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
@@ -30,6 +31,7 @@ class Tracker:
         self.parameters = parameters
         self.tracks = TrackTable.empty()
         self.next_number = 1
+        self._at, self._pose_covariance = Pose2(), np.zeros((3, 3))  # of the scan that is processed
 
     def process(
         self,
@@ -53,13 +55,15 @@ class Tracker:
                 where it is not known; None where none is.
         """
         p, t = self.parameters, self.tracks
-        row_of, touched, position, R = assign(
+        self._at, self._pose_covariance = T_map_base, pose_covariance
+        row_of, touched, position, R, B = assign(
             detections.centre,
             detections.covariance,
             T_map_base.as_array(),
             pose_covariance,
             t.x,
             t.P,
+            t.shared,
             t.stamp_ns,
             t.score,
             clear_range,
@@ -73,12 +77,12 @@ class Tracker:
         fresh = np.flatnonzero(row_of < 0)
         if len(fresh):
             old = np.flatnonzero(row_of >= 0)
-            self._update(row_of[old], stamp_ns, position[old], R[old])
+            self._update(row_of[old], stamp_ns, position[old], R[old], B[old])
             row_of[fresh] = len(t) + np.arange(len(fresh))
-            self._begin(stamp_ns, position[fresh], R[fresh])
+            self._begin(stamp_ns, position[fresh], R[fresh], B[fresh])
             touched = np.concatenate([touched, np.ones(len(fresh), np.bool_)])
         else:
-            self._update(row_of, stamp_ns, position, R)
+            self._update(row_of, stamp_ns, position, R, B)
         unknown = np.full(len(position), np.nan)
         above_breast = unknown if heights is None else heights - p.breast_height
         _gather(self.tracks, row_of, position, T_map_base, detections, above_breast)
@@ -87,7 +91,10 @@ class Tracker:
     def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
         """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.anchor`)."""
         p = self.parameters
-        anchor(self.tracks, landmarks, covariance, T_map_base, reach, p.distance_max, 1.0 / p.misses_per_hit)
+        anchor(
+            self.tracks, landmarks, covariance, T_map_base, self._pose_covariance, reach, p.distance_max,
+            1.0 / p.misses_per_hit,
+        )  # fmt: skip
         touched = np.ones(len(self.tracks), np.bool_)
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius).with_score()
 
@@ -97,29 +104,32 @@ class Tracker:
         trees = tree_columns(columns)
         place = columns.axis[trees, :2]
         fresh = assign_verdicts(self.tracks, columns, trees)
-        self._begin(
-            stamp_ns, place[fresh], np.broadcast_to(GATHERED_SIGMA**2 * np.eye(2), (len(fresh), 2, 2))
-        )
+        own = np.tile(GATHERED_SIGMA**2 * np.eye(2), (len(fresh), 1, 1))
+        from_here = self._at.inverse().apply(place[fresh])
+        _, _, B, _ = in_map(from_here, own, self._at.as_array(), self._pose_covariance)
+        self._begin(stamp_ns, place[fresh], own, B)
         t = self.tracks
         t.verdict[len(t) - len(fresh) :] = Verdict.TREE
         standing = t.verdict == Verdict.TREE
         t.score[standing] = np.maximum(t.score[standing], SCORE_STANDING)
 
-    def _update(self, rows: Int, stamp_ns: int, z: Float, R: Float) -> None:
+    def _update(self, rows: Int, stamp_ns: int, z: Float, R: Float, B: Float) -> None:
         p, t = self.parameters, self.tracks
         dt = (stamp_ns - t.stamp_ns[rows]).astype(np.float64) * NANOSECONDS
+        R = split(t.P, t.shared, rows, R, B, dt, p.acceleration_sigma)
         ENGINES[p.engine](t.x, t.P, rows, dt, p.acceleration_sigma, z, R)
         t.stamp_ns[rows] = stamp_ns
         t.score[rows] = np.minimum(t.score[rows] + 1.0, SCORE_MAX)
 
-    def _begin(self, stamp_ns: int, z: Float, R: Float) -> None:
+    def _begin(self, stamp_ns: int, z: Float, R: Float, B: Float) -> None:
         if len(z) == 0:
             return
         new = TrackTable.empty(len(z))
         new.number[:] = self.next_number + np.arange(len(z))
         self.next_number += len(z)
         new.x[:, :2] = z
-        new.P[:, :2, :2] = R
+        new.P[:, :2, :2] = R + B
+        new.shared[:] = B
         new.P[:, [2, 3], [2, 3]] = self.parameters.velocity_sigma**2
         new.stamp_ns[:] = new.first_ns[:] = stamp_ns
         new.score[:] = 1.0

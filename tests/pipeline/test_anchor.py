@@ -9,6 +9,7 @@ from pipeline.tracking.anchor import anchor
 from pipeline.tracking.table import TrackTable
 
 COVARIANCE = np.array([[0.01, 0.0, 0.01]])
+SURE = np.zeros((3, 3))
 
 
 def tracks(rows):
@@ -21,7 +22,7 @@ def tracks(rows):
 
 def held(table, landmarks, reach=20.0):
     landmarks = np.asarray(landmarks, np.float64).reshape(-1, 2)
-    anchor(table, landmarks, np.repeat(COVARIANCE, len(landmarks), 0), Pose2(), reach, 2.0, 1.0)
+    anchor(table, landmarks, np.repeat(COVARIANCE, len(landmarks), 0), Pose2(), SURE, reach, 2.0, 1.0)
     return table
 
 

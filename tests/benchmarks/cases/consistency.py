@@ -51,7 +51,8 @@ def run() -> list[Table]:
                 "A ring of 16 m is driven twice among 40 trees; odometry and detections err as the filter is "
                 "told. The mean of 50 runs lies in the band in 95 % of the scans if the sigmas are honest; "
                 "above it they are too small, below it too large.",
-                "Trees: those of the tracker at the end, all runs in one mean. Innovations: mean of a run, a "
+                "Trees: those of the tracker at the end, all in one mean; the band is for 50 runs of one "
+                "tree each, those of a run sharing the error of its path. Innovations: mean of a run, a "
                 "degree of freedom; the band is for 50 runs of one scan each, views of other scans "
                 "not being independent.",
             ),
@@ -70,7 +71,7 @@ def summary(particles: int, errors: Errors) -> list[tuple[Cell, ...]]:
         low, high = chi2.ppf([0.025, 0.975], freedom * RUNS) / RUNS
         inside = 100.0 * float(np.mean((mean >= low) & (mean <= high)))
         rows.append((particles, f"NEES of the {name}", freedom, float(mean.mean()), low, high, inside))
-    low, high = chi2.ppf([0.025, 0.975], 2 * len(errors.trees)) / len(errors.trees)
+    low, high = chi2.ppf([0.025, 0.975], 2 * RUNS) / RUNS
     mean = float(np.mean(errors.trees))
     rows.append((particles, "NEES of the trees", 2, mean, low, high, 100.0 * float(low <= mean <= high)))
     low, high = chi2.ppf([0.025, 0.975], RUNS) / RUNS

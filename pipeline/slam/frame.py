@@ -1,0 +1,154 @@
+"""How well the place in the frame of the map is known, where the particles alone would say too much.
+
+The spread of the particles tells of errors in which they still differ. Once all of them come from one
+ancestor they share its map, and with it an error that no spread shows: coming back to it they agree, and
+would say that they know the frame as well as they know each other. So it is kept how uncertain the pose was
+where landmarks were begun, and a pose that is found by those landmarks is never told to be known better: what
+they have in common with the pose of then is an error of the frame (Julier, Uhlmann 2001: what is shared
+by an unknown part does not shrink when it is taken together).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.geometry import Float
+from pipeline.records import Int, Int32
+
+APART = 0.5  # m, or as many radians, between two marks
+KINSHIP_MOST = 0.5  # beyond it the spread says too little to be corrected
+SMALL = 1e-12  # m^2, rad^2; so that a pose without spread has a direction to grow in
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameMemory:
+    """Immutable. Columns of M marks along the way, in order, and what the particles do not show now.
+
+    Attributes:
+        serial: int64, shape (M,): landmarks born with this serial number or a later one belong to a mark.
+        pose: x, y [m], yaw [rad] there, shape (M, 3); covariance: of it, shape (M, 3, 3).
+        hidden: Of the error that all particles share, at `at`, shape (3, 3).
+        at: Where, shape (3,).
+    """
+
+    serial: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    pose: Float = field(default_factory=lambda: np.zeros((0, 3)))
+    covariance: Float = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    hidden: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    at: Float = field(default_factory=lambda: np.zeros(3))
+
+    def told(
+        self, pose: Float, spread: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float
+    ) -> tuple[Float, FrameMemory]:
+        """The covariance of a pose in the frame of the map, and the memory after it.
+
+        Args:
+            pose: shape (3,); spread: covariance that the particles show, shape (3, 3).
+            mean, birth, hits: Of the landmarks, shape (L, ...); those nearer than `reach` [m] and seen
+                `hits_min` times are what the pose was found by.
+        """
+        covariance, hidden = _with_frame(
+            pose, spread, mean, birth, hits, hits_min, reach, self.serial, self.pose, self.covariance,
+            self.hidden, self.at,
+        )  # fmt: skip
+        return covariance, replace(self, hidden=hidden, at=pose)
+
+    def marked(self, serial: int, pose: Float, covariance: Float) -> FrameMemory:
+        """With a mark here if the last one is far enough behind; `serial`: of this scan's first detection."""
+        if len(self.serial) and np.abs(pose - self.pose[-1]).max() < APART:
+            return self
+        return replace(
+            self,
+            serial=np.append(self.serial, serial),
+            pose=np.concatenate([self.pose, pose[None]]),
+            covariance=np.concatenate([self.covariance, covariance[None]]),
+        )
+
+    def forgotten(self) -> FrameMemory:
+        """Nothing hidden: the particles were put somewhere with the spread that is known."""
+        return replace(self, hidden=np.zeros((3, 3)))
+
+
+def kinship(weights: Float, founders: Int) -> float:
+    """F: how likely two particles drawn by their weights come from one founder (Wright 1922), up to a bound.
+
+    Args:
+        weights: shape (P,), sum 1; founders: int64, shape (P,).
+    """
+    share = np.bincount(founders, weights)
+    return min(float(share @ share), KINSHIP_MOST)
+
+
+def of_kin(spread: Float, F: float) -> Float:
+    """The covariance of which a spread is left when some particles are kin.
+
+    Founders drawn independently with a covariance C, of which 1/F are left, differ by C (1 - F), and their
+    mean has itself an error of C F: an outcome drawn like them lies C (1 + F) around it.
+    """
+    return spread * ((1.0 + F) / (1.0 - F))
+
+
+@compiled
+def carried(covariance: Float, dx: float, dy: float) -> Float:
+    """A Sigma A^T, A = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]]: the same error of the frame, seen at a pose that
+    lies further on by dx, dy [m]; written out, for the library's product of such small matrices is slow."""
+    C, moved = covariance, np.empty((3, 3))
+    t = C[2, 2]
+    moved[0, 0] = C[0, 0] - 2.0 * dy * C[0, 2] + dy * dy * t
+    moved[0, 1] = moved[1, 0] = C[0, 1] + dx * C[0, 2] - dy * C[1, 2] - dx * dy * t
+    moved[1, 1] = C[1, 1] + 2.0 * dx * C[1, 2] + dx * dx * t
+    moved[0, 2] = moved[2, 0] = C[0, 2] - dy * t
+    moved[1, 2] = moved[2, 1] = C[1, 2] + dx * t
+    moved[2, 2] = t
+    return moved
+
+
+@compiled
+def _with_frame(
+    pose: Float,
+    spread: Float,
+    mean: Float,
+    birth: Int,
+    hits: Int32,
+    hits_min: int,
+    reach: float,
+    serial: Int,
+    place: Float,
+    covariance: Float,
+    hidden: Float,
+    at: Float,
+) -> tuple[Float, Float]:
+    """What the pose's covariance is at least by the landmarks around, joined with the spread."""
+    least, known = np.zeros((3, 3)), 0
+    counts = np.zeros(len(serial), np.int64)
+    for j in range(len(hits)):
+        dx, dy = mean[j, 0] - pose[0], mean[j, 1] - pose[1]
+        if hits[j] < hits_min or dx * dx + dy * dy > reach * reach:
+            continue
+        m = np.searchsorted(serial, birth[j], side="right") - 1
+        if m >= 0:
+            counts[m] += 1
+            known += 1
+    if known == 0:
+        hidden = carried(hidden, pose[0] - at[0], pose[1] - at[1])
+        return spread + hidden, hidden
+    for m in range(len(serial)):
+        if counts[m]:
+            least += counts[m] / known * carried(covariance[m], pose[0] - place[m, 0], pose[1] - place[m, 1])
+    both = at_least(spread, least)
+    return both, both - spread
+
+
+@compiled
+def at_least(spread: Float, least: Float) -> Float:
+    """The covariance that is as large as both in every direction, and no larger in their common axes."""
+    L = np.linalg.cholesky(spread + SMALL * np.eye(3))
+    L_inv = np.linalg.inv(L)
+    values, axes = np.linalg.eigh(L_inv @ least @ L_inv.T)
+    B = L @ axes
+    larger = np.maximum(values, 1.0) - 1.0
+    grown: Float = spread + (B * larger) @ B.T
+    return grown
