@@ -156,6 +156,7 @@ class Mapper:
                 seen.free,
                 view_range,
                 seen.heights,
+                estimate.relative,
             )
             tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, view_range)
 

@@ -246,13 +246,14 @@ class PoseEstimate:
 
     Attributes:
         T_map_base: The pose.
-        covariance: shape (3, 3) of x, y, yaw [m, m, rad].
+        covariance: shape (3, 3) of x, y, yaw [m, m, rad], in the frame of the map.
         particles: shape (P, 3): x, y [m], yaw [rad] in the frame of the map.
         weights: shape (P,), sum 1.
         n_eff: Effective number of particles, 1 / sum of squared weights.
         landmarks: shape (L, 2) [m], the landmarks of the best particle.
         resampled: Whether the particles were resampled at this scan.
         health: How far it can be trusted.
+        relative: Covariance with respect to the landmarks around, shape (3, 3); None: `covariance`.
     """
 
     T_map_base: Pose2
@@ -263,6 +264,7 @@ class PoseEstimate:
     landmarks: Float
     resampled: bool
     health: Health = field(default_factory=Health)
+    relative: Float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

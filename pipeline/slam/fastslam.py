@@ -76,7 +76,7 @@ class FastSlam:
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
         self.state = replace(state, genealogy=genealogy, frame=frame)
         health = judged(
-            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.covariance, doubt
+            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
         )
         return replace(estimate, resampled=ancestors is not None, health=health)
 
@@ -108,7 +108,7 @@ class FastSlam:
     def lost(self, estimate: PoseEstimate) -> Health:
         """The health of an estimate that no tree has told anything of."""
         ancestors = self.state.genealogy.distinct_ancestors
-        return judged(self.state.recent, ScanTold(), estimate.n_eff, ancestors, estimate.covariance)
+        return judged(self.state.recent, ScanTold(), estimate.n_eff, ancestors, _relative(estimate))
 
     def give_up(self) -> None:
         """Judge the health anew: what the known trees said no longer counts."""
@@ -208,6 +208,10 @@ def _farthest(detections: Detections) -> float:
     return math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
 
 
+def _relative(estimate: PoseEstimate) -> Float:
+    return estimate.covariance if estimate.relative is None else estimate.relative
+
+
 def _arrays(measured: PoseMeasurement | None) -> tuple[Float, Float]:
     if measured is None:
         return np.zeros(0), np.eye(3)
@@ -246,4 +250,5 @@ def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[
         n_eff=1.0 / float(weights @ weights),
         landmarks=landmarks.mean[landmarks.hits >= p.hits_to_weigh],
         resampled=False,
+        relative=spread,
     ), frame

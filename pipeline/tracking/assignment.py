@@ -18,6 +18,7 @@ def assign(
     covariance: Float,
     pose: Float,
     pose_covariance: Float,
+    relative: Float,
     x: Float,
     P: Float,
     shared: Float,
@@ -35,7 +36,8 @@ def assign(
 
     Args:
         centre: Base frame, shape (D, 2) [m]; covariance: shape (D, 2, 2).
-        pose: x, y [m], yaw [rad], shape (3,); pose_covariance: shape (3, 3).
+        pose: x, y [m], yaw [rad], shape (3,); pose_covariance: in the frame of the map, shape (3, 3);
+            relative: with respect to the trees around.
         x, P, shared, stamp_ns, score: Columns of a `TrackTable`.
         clear_range: How far the view was free by direction; view_range: a tree nearer can be missed [m].
         gate: Largest Mahalanobis distance [sigma]; distance_max: largest distance [m].
@@ -45,7 +47,7 @@ def assign(
         detections in the frame of the map, shape (D, 2), and their covariances, shape (D, 2, 2): their own,
         and what the pose adds.
     """
-    position, R, B, packed = in_map(centre, covariance, pose, pose_covariance)
+    position, R, B, packed = in_map(centre, covariance, pose, pose_covariance, relative)
     expected, spread = expected_positions(x, P, shared, stamp_ns, now_ns, acceleration_sigma)
     row_of, _ = associate(position, packed, expected, spread, gate, distance_max)
     touched = np.zeros(x.shape[0], np.bool_)
@@ -61,11 +63,11 @@ def assign(
 
 @compiled
 def in_map(
-    centre: Float, covariance: Float, pose: Float, pose_covariance: Float
+    centre: Float, covariance: Float, pose: Float, pose_covariance: Float, relative: Float
 ) -> tuple[Float, Float, Float, Float]:
     """Detections in the frame of the map: centres, shape (D, 2) [m]; their own covariances, turned, shape
-    (D, 2, 2); those by the pose, J Sigma J^T with J = d(position) / d(x, y, yaw); and the sums of both as
-    xx, xy, yy, shape (D, 3).
+    (D, 2, 2); those by the pose, J Sigma J^T with J = d(position) / d(x, y, yaw); and how far they
+    may lie from where the trees around have them, xx, xy, yy, shape (D, 3).
 
     Args:
         centre: Base frame, shape (D, 2) [m]; covariance: shape (D, 2, 2).
@@ -83,8 +85,9 @@ def in_map(
         yy = s * s * a + 2.0 * c * s * b + c * c * e
         R[d, 0, 0], R[d, 0, 1], R[d, 1, 0], R[d, 1, 1] = xx, xy, xy, yy
         bxx, bxy, byy = by_pose(x, y, Sigma)
+        gxx, gxy, gyy = by_pose(x, y, relative)
         place[d, 0], place[d, 1] = pose[0] + x, pose[1] + y
-        packed[d, 0], packed[d, 1], packed[d, 2] = xx + bxx, xy + bxy, yy + byy
+        packed[d, 0], packed[d, 1], packed[d, 2] = xx + gxx, xy + gxy, yy + gyy
         B[d, 0, 0], B[d, 0, 1], B[d, 1, 0], B[d, 1, 1] = bxx, bxy, bxy, byy
     return place, R, B, packed
 

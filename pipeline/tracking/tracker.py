@@ -42,6 +42,7 @@ class Tracker:
         clear_range: Float,
         view_range: float,
         heights: Float | None = None,
+        relative: Float | None = None,
     ) -> None:
         """Take the detections of one scan.
 
@@ -53,6 +54,8 @@ class Tracker:
             view_range: A tree nearer than this can be missed [m].
             heights: Mean height above the ground at which each detection was seen, shape (D,) [m], NaN
                 where it is not known; None where none is.
+            relative: Covariance of the pose with respect to the trees around, which decides how far from a
+                tree its detection may lie, shape (3, 3); None takes that in the frame of the map.
         """
         p, t = self.parameters, self.tracks
         self._at, self._pose_covariance = T_map_base, pose_covariance
@@ -61,6 +64,7 @@ class Tracker:
             detections.covariance,
             T_map_base.as_array(),
             pose_covariance,
+            pose_covariance if relative is None else relative,
             t.x,
             t.P,
             t.shared,
@@ -106,7 +110,8 @@ class Tracker:
         fresh = assign_verdicts(self.tracks, columns, trees)
         own = np.tile(GATHERED_SIGMA**2 * np.eye(2), (len(fresh), 1, 1))
         from_here = self._at.inverse().apply(place[fresh])
-        _, _, B, _ = in_map(from_here, own, self._at.as_array(), self._pose_covariance)
+        Sigma = self._pose_covariance
+        _, _, B, _ = in_map(from_here, own, self._at.as_array(), Sigma, Sigma)
         self._begin(stamp_ns, place[fresh], own, B)
         t = self.tracks
         t.verdict[len(t) - len(fresh) :] = Verdict.TREE
