@@ -25,6 +25,8 @@ from app.hands import hand, name_in
 from app.replies import error_reply
 from pipeline.errors import StemmapError
 
+# Where bodies may be as long as a recording.
+UPLOADS = "/api/uploads"
 _SAFE_METHODS = frozenset({"GET", "HEAD"})
 _LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 _ANY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - compared with, not bound to
@@ -69,7 +71,7 @@ class Guard:
         token: That must be shown.
         host, port: Where the server listens.
         further_hosts: Other names of it.
-        body_limit: Largest body of a request [bytes].
+        body_limit: Largest body of a request [bytes]; upload_limit: of an upload.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class Guard:
         port: int,
         further_hosts: Iterable[str] = (),
         body_limit: int,
+        upload_limit: int = 0,
     ) -> None:
         self._app = app
         self._token = token
@@ -88,7 +91,7 @@ class Guard:
         self._port = port
         self._hosts = allowed_hosts(host, port, further_hosts)
         self._any_address = host in _ANY_ADDRESS
-        self._body_limit = body_limit
+        self._body_limit, self._upload_limit = body_limit, upload_limit
         self.cookie = f"stemmap_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -103,7 +106,7 @@ class Guard:
             return
         hand.set(name_in(headers.getlist("cookie")))
         if scope["type"] == "http":
-            await self._app(scope, _limited(receive, self._body_limit), send)
+            await self._app(scope, _limited(receive, self._limit_of(scope)), send)
         else:
             await self._app(scope, receive, send)
 
@@ -117,9 +120,15 @@ class Guard:
         if unsafe and not self._fits_origin(scope, headers):
             return error_reply(403, "the request comes from the page of another server")
         length = headers.get("content-length", "0")
-        if not length.isdecimal() or int(length) > self._body_limit:
-            return error_reply(413, f"a body may have {self._body_limit} bytes")
+        limit = self._limit_of(scope)
+        if not length.isdecimal() or int(length) > limit:
+            return error_reply(413, f"a body may have {limit} bytes")
         return None
+
+    def _limit_of(self, scope: Scope) -> int:
+        """Largest body of a request [bytes]."""
+        is_upload = scope.get("path") == UPLOADS and scope.get("method") == "POST"
+        return max(self._body_limit, self._upload_limit) if is_upload else self._body_limit
 
     def _login(self, scope: Scope, headers: Headers) -> Response | None:
         """The answer to who brings the token in the link, or brings none."""

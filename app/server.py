@@ -22,16 +22,29 @@ from app.parameter_state import ParameterState
 from app.replies import BadRequestError, error_reply, failure_reply
 from app.routes import annotations as annotation_routes
 from app.routes import page, parameter_sets, parameters, results, run, runs, sockets, story
+from app.routes import uploads as upload_routes
 from app.security import BodyTooLargeError, Guard
 from app.settings import Settings
 from app.store.records import UnknownError
+from app.uploading import Uploads
 from pipeline.errors import ParameterError, StemmapError
 
 _log = logging.getLogger(__name__)
 
 ROUTERS = tuple(
     module.router
-    for module in (page, run, runs, parameters, parameter_sets, results, annotation_routes, story, sockets)
+    for module in (
+        page,
+        run,
+        runs,
+        parameters,
+        parameter_sets,
+        results,
+        annotation_routes,
+        upload_routes,
+        story,
+        sockets,
+    )
 )
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
@@ -68,8 +81,11 @@ def build(
     """
     dashboard = Dashboard(parameter_state, Live(), Keeper(settings.folder, settings.database))
 
+    uploads = Uploads(settings.uploads, settings.upload_limit, dashboard.keeper)
+
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        await asyncio.to_thread(uploads.clear)
         dashboard.worker = (make_worker or _worker)(dashboard)
         dashboard.scene = (make_scene or _scene)(dashboard, asyncio.get_running_loop())
         await dashboard.start(source)
@@ -85,6 +101,7 @@ def build(
         port=port,
         further_hosts=settings.hosts,
         body_limit=settings.body_limit,
+        upload_limit=settings.upload_limit,
     )
     app = FastAPI(
         title="stemmap",
@@ -96,6 +113,7 @@ def build(
         redirect_slashes=False,
     )
     app.state.dashboard, app.state.settings = dashboard, settings
+    app.state.uploads = uploads
     for router in ROUTERS:
         app.include_router(router)
     _answer_errors(app)

@@ -5,6 +5,7 @@ Each can be given in the environment; a flag of the command line wins.
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import os
 import re
@@ -23,6 +24,7 @@ VARIABLES: dict[str, str] = {
     "STEMMAP_RECORDINGS": "folder whose recordings the page offers",
     "STEMMAP_FOLDER": "folder for runs, annotations and uploads (default: stemmap in your folder for data)",
     "STEMMAP_DATABASE": "PostgreSQL database for runs and annotations, postgresql://name@host/database",
+    "STEMMAP_UPLOAD_GB": "largest recording that a browser may upload, in GB (default: 20)",
 }
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
@@ -42,6 +44,7 @@ class Settings:
         body_limit: Largest body of a request [bytes].
         folder: Where runs, annotations and uploads are kept; None keeps them in memory only.
         database: Address of a PostgreSQL database for runs and annotations; empty for a file in the folder.
+        upload_limit: Largest recording that a browser may upload [bytes].
         message_limit: Largest message of a browser's websocket [bytes].
     """
 
@@ -51,6 +54,7 @@ class Settings:
     hosts: tuple[str, ...] = ()
     recordings: Path | None = None
     body_limit: int = 1_000_000
+    upload_limit: int = 20_000_000_000
     message_limit: int = 1_000_000
     folder: Path | None = None
     database: str = ""
@@ -112,6 +116,7 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
         recordings=_folder(recordings) if recordings else None,
         folder=_data_folder(given),
         database=given.get("STEMMAP_DATABASE", ""),
+        upload_limit=_gigabytes(given.get("STEMMAP_UPLOAD_GB", "20")),
     )
 
 
@@ -128,6 +133,13 @@ def _port(text: str) -> int:
     if text.isdecimal() and int(text) <= 65535:
         return int(text)
     raise StemmapError(f"{text!r} is no port", where="STEMMAP_PORT", remedy="Give a number from 0 to 65535")
+
+
+def _gigabytes(text: str) -> int:
+    with contextlib.suppress(ValueError, OverflowError):
+        if 0.0 < float(text) <= 1e6:
+            return round(1e9 * float(text))
+    raise StemmapError(f"{text!r} is no size", where="STEMMAP_UPLOAD_GB", remedy="Give a number of GB")
 
 
 def _folder(text: str) -> Path:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl, urlencode
 
 import msgspec
@@ -15,6 +18,7 @@ from app.messages import LONGEST_S, Advance, Open, Pause, Play, Seek, SetSpeed
 from app.replies import BadRequestError, body_of, error_reply, json_reply
 from app.routes.access import Dash
 from app.settings import Settings
+from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api")
 
@@ -87,28 +91,38 @@ async def open_source(request: Request, dashboard: Dash) -> Response:
 
 
 @router.get("/sources")
-def sources(request: Request) -> Response:
-    """What can be opened."""
+async def sources(request: Request, dashboard: Dash) -> Response:
+    """What can be opened; uploaded recordings with the names that they had."""
     from pipeline.sources.simulated import scenarios
 
     settings: Settings = request.app.state.settings
+    try:
+        uploaded = await dashboard.keeper.ask(lambda store: store.book.uploads())
+    except StemmapError:  # they are listed under their made-up names then
+        uploaded = {}
+    found = await asyncio.to_thread(recordings, settings.data_folders)
     return json_reply(
         {
             "scenarios": [{"uri": uri, "doc": doc} for uri, doc in scenarios().items()],
-            "recordings": recordings(settings.recordings),
+            "recordings": [_named(path, uploaded) for path in found],
         }
     )
 
 
-def recordings(folder: Path | None) -> list[str]:
-    """Paths of the files and folders in the folder of recordings, hidden ones left out."""
-    if folder is None:
-        return []
-    try:
-        names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError:
-        return []
-    return [str(folder / name) for name in names[:_MOST_RECORDINGS]]
+def _named(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, str]:
+    known = uploaded.get(path.name)
+    if known is None:
+        return str(path)
+    return {"uri": str(path), "name": known["name"], "doc": f"{known['kind']}, uploaded"}
+
+
+def recordings(folders: Sequence[Path]) -> list[Path]:
+    """Files and folders in the folders of recordings; hidden ones and finished maps are left out."""
+    found: list[Path] = []
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            found += sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    return [path for path in found if not (path / "run.json").is_file()][:_MOST_RECORDINGS]
 
 
 def what_may_be_opened(uri: str, settings: Settings) -> str | None:

@@ -84,9 +84,10 @@ class RunBook:
         now = self._clock()
         with self._engine.begin() as connection:
             _forget_deleted(connection, now - _KEPT_NS)
+            uploaded = select(_uploads.c.name).where(_uploads.c.file == beginning.name)
             values = {
                 "run": beginning.run,
-                "name": beginning.name[:200],
+                "name": connection.execute(uploaded).scalar() or beginning.name[:200],
                 "uri": beginning.uri,
                 "kind": beginning.kind[:200],
                 "odometry": beginning.odometry,

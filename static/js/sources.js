@@ -3,6 +3,7 @@
 import { get, open } from "./api.js";
 import { byId, el, setText } from "./dom.js";
 import { on, state } from "./state.js";
+import { startUpload } from "./upload.js";
 
 const dialog = byId("source-dialog");
 let asked = null; // the address that was asked for and is not there yet
@@ -33,7 +34,7 @@ function list({ scenarios = [], recordings = [] }) {
 const entry = (uri, title, doc) =>
   el("button", { type: "button", onclick: () => ask(uri) }, el("b", { text: title }), el("span", { text: doc }));
 
-async function ask(uri) {
+export async function ask(uri) {
   if (!uri) {
     say("Type a path or an address first, for example sim:stand.");
     return;
@@ -77,4 +78,5 @@ export function startSources() {
     ask(byId("source-uri").value.trim());
   });
   on("status", follow);
+  startUpload(async ({ uri }) => { if (!dialog.open) await openSources(); ask(uri); });
 }

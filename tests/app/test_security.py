@@ -43,6 +43,8 @@ ROUTES = [
     ("POST", "/api/loop"),
     ("PATCH", "/api/view"),
     ("GET", "/api/sources"),
+    ("GET", "/api/uploads"),
+    ("POST", "/api/uploads"),
     ("GET", "/api/runs"),
     ("GET", "/api/runs/compare"),
     ("GET", "/api/runs/{key}"),

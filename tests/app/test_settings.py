@@ -24,6 +24,7 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         "STEMMAP_RECORDINGS": str(tmp_path),
         "STEMMAP_FOLDER": str(tmp_path / "kept"),
         "STEMMAP_DATABASE": "postgresql://ann@server/stand",
+        "STEMMAP_UPLOAD_GB": "2.5",
     }
     assert set(given) == set(VARIABLES)
     assert from_environment(given) == Settings(
@@ -34,6 +35,7 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         tmp_path,
         folder=tmp_path / "kept",
         database="postgresql://ann@server/stand",
+        upload_limit=2_500_000_000,
     )
 
 
@@ -57,6 +59,9 @@ def test_annotations_are_kept_where_the_system_keeps_data(given: dict[str, str],
         ("STEMMAP_PORT", "80000"),
         ("STEMMAP_PORT", "-1"),
         ("STEMMAP_PORT", "http"),
+        ("STEMMAP_UPLOAD_GB", "much"),
+        ("STEMMAP_UPLOAD_GB", "-1"),
+        ("STEMMAP_UPLOAD_GB", "nan"),
         ("STEMMAP_TOKEN", "short"),
         ("STEMMAP_TOKEN", "with a\nline break in it"),
         ("STEMMAP_TOKEN", "öööööööööööööööööö"),

@@ -1,10 +1,11 @@
 // The page of all runs: the list, and beside it the chosen run or two of them compared.
 
-import { get, patch, post, request } from "../api.js";
+import { get, open, patch, post, request } from "../api.js";
 import { byId, el, setText } from "../dom.js";
 import { count, figure } from "../format.js";
 import { on } from "../state.js";
 import { startTheme } from "../theme.js";
+import { startUpload } from "../upload.js";
 import { showTwo } from "./compare.js";
 import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./words.js";
@@ -129,6 +130,10 @@ byId("toast-undo").addEventListener("click", undo);
 addEventListener("hashchange", follow);
 addEventListener("focus", load);
 on("theme", repaint);
+startUpload(async ({ uri }) => {
+  await open(uri, "auto");
+  location.href = "/";
+});
 startTheme();
 load();
 follow();

@@ -1,0 +1,42 @@
+"""A recording is dropped on the page: sent, recognised, opened; what is none is refused in words."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+from playwright.sync_api import Browser, expect
+
+from app.cli import main
+from tests.browser.conftest import opened
+from tests.browser.serving import Server
+
+DROP = """([name, content]) => {
+  const bytes = Uint8Array.from(atob(content), letter => letter.charCodeAt(0));
+  const dropped = new DataTransfer();
+  dropped.items.add(new File([bytes], name));
+  for (const type of ['dragenter', 'dragover', 'drop'])
+    document.querySelector('main').dispatchEvent(
+      new DragEvent(type, { dataTransfer: dropped, bubbles: true, cancelable: true }));
+}"""
+
+
+def test_a_dropped_recording_is_opened_and_a_picture_is_refused(chromium: Browser, tmp_path: Path):
+    run = tmp_path / "north stand.mcap"
+    assert main(["simulate", "stand", "--duration", "1", "--out", str(run)]) == 0
+    server = Server("sim:stand?duration=4", STEMMAP_FOLDER=str(tmp_path / "kept"))
+    for dashboard in opened(chromium, server.link):
+        page = dashboard.page
+        page.evaluate(DROP, ["holiday.jpg", base64.b64encode(b"\xff\xd8\xff\xe0 a picture").decode()])
+        expect(page.locator("#upload [role=alert]")).to_contain_text("holiday.jpg")
+        assert list((tmp_path / "kept" / "recordings").iterdir()) == []
+        assert [error for error in dashboard.errors if "422" not in error] == []
+        page.locator("#upload").get_by_role("button", name="Close").click()
+        page.evaluate(DROP, [run.name, base64.b64encode(run.read_bytes()).decode()])
+        expect(page.locator("#source-name")).to_contain_text("upload-")
+        dashboard.until_server(
+            "/api/status", "it.source.includes('/recordings/upload-') && it.scan_index >= 0"
+        )
+        page.locator("#source-button").click()
+        expect(page.locator("#source-list").get_by_text("north stand.mcap")).to_be_visible()
+    server.stop()
