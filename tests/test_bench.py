@@ -129,7 +129,7 @@ def test_the_list_runs_nothing(capsys: pytest.CaptureFixture[str], monkeypatch: 
 
 
 def test_wrong_words_are_said_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["bench", "speed"]) == FAILED
+    assert main(["bench", "speed"]) == WRONG_USAGE
     assert "there is no benchmark 'speed'" in capsys.readouterr().err
     assert main(["bench", "scan", "--out", str(tmp_path / "none" / "b.md")]) == FAILED
     assert "no such folder" in capsys.readouterr().err

@@ -7,9 +7,14 @@ Whatever is heavy is imported inside `run`, so that `--help` answers at once.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import difflib
 import importlib
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 
 from app.version import version
 from pipeline.errors import ParameterError, StemmapError, UsageError
@@ -45,9 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
         words.insert(0, "serve")  # `stemmap run.mcap` is what people type first
     parser = _build_parser(words[0])
     try:
+        _look_for_slip(words)
         parsed = parser.parse_args(words)
         command = importlib.import_module(f"app.cli.{parsed.command}")
-        return int(command.run(parsed))
+        with _ended_kindly():
+            return int(command.run(parsed))
     except SystemExit as stop:  # argparse has printed its line
         return int(stop.code or 0)
     except (ParameterError, UsageError) as error:
@@ -61,6 +68,32 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # `stemmap params | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
+
+
+def _look_for_slip(words: list[str]) -> None:
+    """Say of `stemmap mpa run.mcap` that there is no such command, and not that a file is missing.
+
+    Raises:
+        UsageError: The word is no source, and nearly a command.
+    """
+    if len(words) < 2 or words[0] != "serve" or words[1].startswith("-"):
+        return
+    near = difflib.get_close_matches(words[1], COMMANDS, n=1, cutoff=0.6)
+    if near and words[1] not in COMMANDS and not os.path.lexists(words[1]):
+        raise UsageError(f"there is no command {words[1]!r}", remedy=f"Did you mean `stemmap {near[0]}`?")
+
+
+@contextlib.contextmanager
+def _ended_kindly() -> Iterator[None]:
+    """A request to end (SIGTERM) is as Ctrl-C: what was begun is removed, nothing is left half-written."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _build_parser(wanted: str) -> argparse.ArgumentParser:

@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     from pipeline.files import write_beside
     from pipeline.parameters import preset
 
+    _look_for(arguments)
     examples = _examples(arguments)
     if not examples:
         raise StemmapError("there is nothing to learn from", remedy="Name scenes, or folders with labels")
@@ -64,6 +65,19 @@ def run(arguments: argparse.Namespace) -> int:
         file.write_text(text.replace('{"figure"', '\n{"figure"') + "\n", encoding="utf-8")
     print(f"{len(examples)} sets of examples, written to {arguments.out}")
     return 0
+
+
+def _look_for(arguments: argparse.Namespace) -> None:
+    """Say what is missing before scenes are simulated for an hour."""
+    if not arguments.out.absolute().parent.is_dir():
+        raise StemmapError("there is no such folder to write to", where=str(arguments.out.parent))
+    for place in arguments.labelled:
+        files = [place.with_suffix(".label")] if place.is_file() else [place / "velodyne", place / "labels"]
+        missing = [file for file in files if not file.exists()]
+        if missing:
+            raise StemmapError(
+                "there are no labelled scans", where=str(place), remedy=f"{missing[0]} is looked for"
+            )
 
 
 def _scenes(arguments: argparse.Namespace) -> list[str]:

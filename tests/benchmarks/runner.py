@@ -11,7 +11,7 @@ from dataclasses import asdict
 from datetime import date
 from pathlib import Path
 
-from pipeline.errors import StemmapError
+from pipeline.errors import StemmapError, UsageError
 from pipeline.files import write_beside
 from tests.benchmarks import cases
 from tests.benchmarks.machine import description
@@ -47,7 +47,7 @@ def run(names: Sequence[str], *, out: Path, json_file: Path | None, day: date) -
     known = descriptions()
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise StemmapError(f"there is no benchmark {unknown[0]!r}", remedy=f"Benchmarks: {', '.join(known)}")
+        raise UsageError(f"there is no benchmark {unknown[0]!r}", remedy=f"Benchmarks: {', '.join(known)}")
     for path in (out, json_file):
         if path is not None and not path.parent.is_dir():
             raise StemmapError("there is no such folder to write to", where=str(path.parent))

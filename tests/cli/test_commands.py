@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -193,6 +195,33 @@ def test_a_folder_that_cannot_be_made_fails_in_one_line(capsys, tmp_path):
     (tmp_path / "file").write_text("x")
     stemmap(capsys, "map", RUN, "--out", tmp_path / "file").refused(1, "cannot write")
     stemmap(capsys, "map", RUN, "--out", tmp_path / "file" / "below").refused(1, "cannot write")
+
+
+@pytest.mark.parametrize(("word", "meant"), [("mpa", "map"), ("maps", "map"), ("evalute", "evaluate")])
+def test_a_mistyped_command_is_named(capsys, tmp_path, monkeypatch, word, meant):
+    monkeypatch.chdir(tmp_path)
+    stemmap(capsys, word, RUN, "--out", "out").refused(2, f"no command '{word}'", f"`stemmap {meant}`")
+    stemmap(capsys, word).refused(2, f"`stemmap {meant}`")
+
+
+@pytest.mark.parametrize("ask", ["SIGINT", "SIGTERM"])
+def test_a_mapping_that_is_stopped_leaves_nothing_half_written(tmp_path, capsys, monkeypatch, ask):
+    from pipeline.export import RunFiles
+
+    add, scans = RunFiles.add, []
+
+    def then_stop(self, frame, start_ns):
+        add(self, frame, start_ns)
+        scans.append(frame.index)
+        if len(scans) == 3:
+            os.kill(os.getpid(), getattr(signal, ask))
+
+    monkeypatch.setattr(RunFiles, "add", then_stop)
+    before = signal.getsignal(signal.SIGTERM)
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "out").refused(1, "stopped")
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert scans[:3] == [0, 1, 2]
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_source_without_a_file_is_not_served(capsys, tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from app.cli import main
 from app.training.growing import Examples
 from app.training.keeping import kept_or_made, read_examples
 from pipeline.errors import StemmapError
@@ -41,3 +42,10 @@ def test_a_damaged_file_is_named(tmp_path, content):
     (tmp_path / "broken.npz").write_bytes(content)
     with pytest.raises(StemmapError, match=r"broken\.npz"):
         read_examples(tmp_path)
+
+
+def test_what_training_needs_is_looked_for_before_hours_of_simulating(tmp_path, capsys):
+    assert main(["train", "--out", str(tmp_path / "none" / "forest.json")]) == 1
+    assert "no such folder" in capsys.readouterr().err
+    assert main(["train", str(tmp_path / "place"), "--out", str(tmp_path / "forest.json")]) == 1
+    assert "no labelled scans" in capsys.readouterr().err
