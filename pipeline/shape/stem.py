@@ -1,8 +1,10 @@
 """A leaning cylinder through the visible arc of a trunk.
 
 The axis at height z is c + a (z - z0), with z0 the mean height; the residual of a point is its
-distance to the axis minus r. Gauss-Newton on the residuals divided by their sigma, with robust
-weights, and weak priors on lean and radius, which keep a short arc from becoming a wall.
+distance to the axis minus r. Gauss-Newton with robust weights, from a start that asks the middle half of
+the returns alone, and weak priors: on lean and radius, and that the returns fill the width of the trunk,
+unless they stand to one side of it. These keep a short arc from becoming a wall, and a trunk with a branch
+from becoming a wide one.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int
 from pipeline.shape.cholesky import factorise, solve
-from pipeline.shape.residuals import RAY, USED, normal_equations, settle
-from pipeline.shape.width import angular_width, visible_arc
+from pipeline.shape.residuals import BARK, RAY, TUKEY, normal_equations
+from pipeline.shape.width import angular_width, middle_half, visible_arc
 
 MODEL = 0.003  # m; what a round trunk and a normal error leave out
 RADIUS_MIN, RADIUS_MAX = 0.03, 0.6  # m; within these a fit begins
@@ -23,9 +25,12 @@ SIGMA_MIN = 0.001  # m; no range is better than that, and weights must stay fini
 # may come ring after ring: every 16th of them would be of one ring.
 MOST_POINTS = 499
 ENOUGH = 60  # points, of which a third still is an arc
-ITERATIONS = 16
-NEARLY, CONVERGED = 5e-3, 3e-4  # m; the latter is a tenth of what the best arc allows
-NEGLIGIBLE = 0.1  # sigma; a step so short against what the points tell gains nothing
+ITERATIONS = 20
+SMOOTH = 0.8  # of the variance that is taken for bark and sensor; few points may look smoother by chance
+BACK = 1.5  # sigma; what lies so much farther away than the axis is not of the trunk
+NEARLY, CONVERGED = 1e-2, 3e-4  # m; the latter is a tenth of what the best arc allows
+NEGLIGIBLE = 0.2  # sigma; a step so short against what the points tell gains nothing
+WIDTH_SIGMA, WIDTH_SIGMA_LEAST = 0.2, 0.01  # of the radius, and m: how far the width is to be believed
 COLUMNS = 11  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc, lean x, lean y
 
 
@@ -50,11 +55,10 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
     rays, some = np.empty((RAY, MOST_POINTS)), np.empty((RAY, MOST_POINTS))
     for k in range(clusters):
         n = _to_rays(points, bounds[k], bounds[k + 1], rays)
-        _start_from_width(rays, n, azimuth_step, stems[k])
         if n >= 5:
-            _fit(rays, n, some, max(range_sigma, SIGMA_MIN), stems[k])
+            _fit(rays, n, some, max(range_sigma, SIGMA_MIN), azimuth_step, stems[k])
         else:
-            stems[k, 5] = np.nan
+            _place_by_width(rays, n, azimuth_step, stems[k])
     return stems
 
 
@@ -71,13 +75,13 @@ def _to_rays(points: Float, begin: int, end: int, rays: Float) -> int:
         z0 += points[i, 2]
     for k in range(n):
         rays[3, k] -= z0 / n
-    rays[USED, :n] = 1.0
     return n
 
 
 @compiled
-def _start_from_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> None:
-    """r = R sin w / (1 - sin w), with w half the angle that the cluster fills, R its mean range."""
+def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> None:
+    """Too few points for a circle lie before their centre by r = R sin w / (1 - sin w), with w half the angle
+    that they fill and R their mean range."""
     distance = 0.0
     for i in range(n):
         distance += rays[2, i] / n
@@ -92,23 +96,34 @@ def _start_from_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> 
     stem[2] = (c * sigma_along) ** 2 + (s * sigma_across) ** 2
     stem[3] = c * s * (sigma_along**2 - sigma_across**2)
     stem[4] = (s * sigma_along) ** 2 + (c * sigma_across) ** 2
-    stem[5], stem[6] = r, np.nan
+    stem[5], stem[6] = np.nan, np.nan
     stem[7:] = 0.0
 
 
 @compiled
-def _fit(rays: Float, n: int, some: Float, sigma: float, stem: Float) -> None:
-    """From the first guess in `stem` to the answer, in place; `some` is room for a part of the rays."""
-    p = np.array([stem[0], stem[1], 0.0, 0.0, min(max(stem[5], RADIUS_MIN), RADIUS_MAX)])
+def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, stem: Float) -> None:
+    """The answer into `stem`; `some` is room for a part of the rays."""
+    half = middle_half(rays, n)
+    p = np.array([half.x, half.y, 0.0, 0.0, half.radius])
+    p[4] = min(max(half.radius, RADIUS_MIN), RADIUS_MAX)
+    p[0] += half.c * p[4]
+    p[1] += half.s * p[4]
+    least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * half.radius + 0.3 * azimuth_step * np.hypot(p[0], p[1])
     g, H, step, L = np.empty(5), np.empty((5, 5)), np.empty(5), np.empty((5, 5))
     few = _some(rays, n, some)
-    scale = 0.0  # Huber's weights first; they need no good start
-    squares = 0.0
+    within = TUKEY * np.sqrt(sigma * sigma + BARK * BARK)
+    back = BACK * sigma
+    nearly, squares, kept = False, 0.0, 0.0
     for k in range(ITERATIONS):
-        if scale == 0.0:
-            normal_equations(some, few, p, sigma, scale, g, H)
+        if nearly:
+            squares, kept = normal_equations(rays, n, p, sigma, within, back, g, H)
         else:
-            squares = normal_equations(rays, n, p, sigma, scale, g, H)
+            normal_equations(some, few, p, sigma, within, np.inf, g, H)
+        # The returns fill a trunk's width where its middle is theirs; what is hidden on one side is not told.
+        beside = half.c * p[1] - half.s * p[0] - half.across
+        told = 1.0 / (least * least + beside * beside)
+        H[4, 4] += told
+        g[4] += told * (p[4] - half.radius)
         factorise(H, L)
         solve(L, g, step)
         gain = (g * step).sum()  # squared length of the step in its own sigma
@@ -119,12 +134,11 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, stem: Float) -> None:
             step *= limit / longest
         p -= step
         p[4] = max(p[4], 0.005)
-        if scale > 0.0 and (longest < CONVERGED or gain < (NEGLIGIBLE * scale) ** 2):
+        if nearly and (longest < CONVERGED or gain < NEGLIGIBLE**2):
             break
-        if scale == 0.0 and (longest < NEARLY or k == ITERATIONS // 2):
-            scale = settle(rays, n, p, sigma)
-    # A poor fit knows less than the sensor's sigma promises.
-    _write(p, L, max(1.0, scale) ** 2, stem)
+        nearly = nearly or longest < NEARLY or k >= ITERATIONS // 2
+    # The residuals tell how rough the bark is, and a poor fit knows less than the sensor's sigma promises.
+    _write(p, L, max(SMOOTH, kept / (n * (sigma * sigma + BARK * BARK))), stem)
     stem[7], stem[8] = np.sqrt(squares / n), visible_arc(rays, n, p)
     stem[9], stem[10] = p[2], p[3]
 

@@ -5,6 +5,8 @@ For rays and the cylinder p see `pipeline.shape.residuals`.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.compiled import compiled
@@ -33,6 +35,62 @@ def angular_width(rays: Float, n: int) -> tuple[float, float]:
             turn = np.arctan2(c * rays[1, i] - s * rays[0, i], c * rays[0, i] + s * rays[1, i])
             right, left = min(right, turn), max(left, turn)
     return middle + 0.5 * (left + right), left - right
+
+
+class Middle(NamedTuple):
+    """What the middle half of a cluster's returns, counted from side to side, tells of a trunk.
+
+    Attributes:
+        c, s: Direction of the cluster, cosine and sine; across: how far to the left of it the middle is [m].
+        x, y: Front of the trunk in the middle [m].
+        radius: Beams that stand evenly over a trunk fill its radius with their middle half [m].
+    """
+
+    c: float
+    s: float
+    across: float
+    x: float
+    y: float
+    radius: float
+
+
+@compiled
+def middle_half(rays: Float, n: int) -> Middle:
+    """The quartiles ask nothing of what stands beside the trunk, as branches do."""
+    x, y = 0.0, 0.0
+    for i in range(n):
+        x += rays[0, i] * rays[2, i]
+        y += rays[1, i] * rays[2, i]
+    away = max(np.sqrt(x * x + y * y), 1e-9)
+    c, s = x / away, y / away
+    across, ordered, front = np.empty(n), np.empty(n), np.empty(n)
+    for i in range(n):
+        across[i] = rays[2, i] * (c * rays[1, i] - s * rays[0, i])
+        ordered[i] = across[i]
+    ordered.sort()
+    middle = _quantile(ordered, n, 0.5)
+    radius = _quantile(ordered, n, 0.75) - _quantile(ordered, n, 0.25)
+    m = 0
+    for i in range(n):
+        if abs(across[i] - middle) <= max(0.5 * radius, 0.02):
+            front[m] = rays[2, i] * (c * rays[0, i] + s * rays[1, i])
+            m += 1
+    if m == 0:
+        for i in range(n):
+            front[i] = rays[2, i] * (c * rays[0, i] + s * rays[1, i])
+        m = n
+    front[:m].sort()
+    reach = _quantile(front, m, 0.5)
+    return Middle(c, s, middle, c * reach - s * middle, s * reach + c * middle, radius)
+
+
+@compiled
+def _quantile(ordered: Float, n: int, part: float) -> float:
+    """Of the first n of ascending numbers, linear between two of them."""
+    at = part * (n - 1)
+    k = int(at)
+    after = min(k + 1, n - 1)
+    return float(ordered[k] + (at - k) * (ordered[after] - ordered[k]))
 
 
 @compiled

@@ -18,7 +18,8 @@ from pipeline.records import Float, Float32, Int
 NEIGHBOURS = 10
 SURFACE, FLAT = 0.35, 0.03  # smallest against middle eigenvalue of the neighbours' covariance
 WIDE, SMALL = 1.0, 0.6  # radius as a part of the distance to its sixth neighbour
-LEAST, WIDEST, SMALLEST, BALL = 0.006, 0.10, 0.025, 0.015  # m; of all, of flat discs, of others, of balls
+LEAST, WIDEST, SMALLEST, BALL = 0.006, 0.10, 0.025, 0.008  # m; of all, of ground, of other discs, of balls
+UPRIGHT = 0.7  # vertical part of the normal from which on a flat surface is ground
 BEHIND = 0.06  # m; what lies farther behind a blocking point is hidden
 GRAZING = 0.15  # sine of the angle between beam and disc below which it is not met
 MELT = 0.04  # m; what a beam meets so close together it measures as one
@@ -78,7 +79,8 @@ def _lay(
             normals[i, 0], normals[i, 1], normals[i, 2] = vectors[0, 0], vectors[1, 0], vectors[2, 0]
             radius[i] = min(max(SMALL * spacing, LEAST), SMALLEST)
             blocks[i] = min(max(WIDE * spacing, LEAST), WIDEST)
-            if values[0] < FLAT * values[1]:
+            # The side of a sparsely sampled trunk looks as flat as ground, but wide discs would stand out.
+            if values[0] < FLAT * values[1] and abs(vectors[2, 0]) > UPRIGHT:
                 radius[i] = blocks[i]
 
 

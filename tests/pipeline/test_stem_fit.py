@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as arrays
 from pipeline.parameters import preset
 from pipeline.records import Labels, Sensor
 from pipeline.shape import describe
+from pipeline.shape.residuals import BEAM
 from pipeline.shape.stem import fit_stems
 from tests.pipeline.strategies import FEW, LAW, SENSOR, arc, one_cluster
 
@@ -35,11 +36,13 @@ def fit(points, sensor=SENSOR):
     st.tuples(st.floats(-0.06, 0.06), st.floats(-0.06, 0.06)),
 )
 def test_an_arc_without_noise_gives_its_circle(radius, half_angle, distance, bearing, lean):
-    half_angle = min(half_angle, np.arccos(radius / distance) - 0.02)  # a trunk hides what lies beyond
+    # A trunk hides what lies beyond, and rays so near to its edge are not as thin as those of this arc.
+    edge = np.arcsin(max(1.0 - BEAM * distance / radius, 0.7))
+    half_angle = min(half_angle, np.arccos(radius / distance) - 0.02, edge)
     told = fit(arc(radius, half_angle, distance=distance, bearing=bearing, lean=lean), SHARP)
     true = np.array([distance * np.cos(bearing), distance * np.sin(bearing)])
-    assert np.hypot(*(told.centre[0] - true)) < 2e-3
-    assert told.radius[0] == pytest.approx(radius, abs=2e-3)
+    assert np.hypot(*(told.centre[0] - true)) < 4e-3
+    assert told.radius[0] == pytest.approx(radius, abs=4e-3)
     assert told.radial_std[0] < 1e-3
     assert told.arc[0] == pytest.approx(2 * half_angle, abs=0.1)
 
@@ -72,7 +75,7 @@ def test_the_covariance_promises_what_the_fit_keeps(radius, distance):
         bias.append(error @ true / distance)
         z_radius.append((told.radius[0] - radius) / told.radius_sigma[0])
     assert 0.4 < np.mean(nees) < 2.5, np.mean(nees)
-    assert abs(np.mean(bias)) < 0.005, np.mean(bias)
+    assert abs(np.mean(bias)) < (0.004 if distance < 4.0 else 0.006), np.mean(bias)
     assert abs(np.mean(z_radius)) < 0.5, np.mean(z_radius)
     assert np.std(z_radius) < 1.3, np.std(z_radius)
 
@@ -96,7 +99,7 @@ def test_the_centroid_lies_before_the_centre_and_the_circle_does_not():
     points = arc(0.2, np.pi / 2, distance=5.0)
     centroid = describe(points.astype(np.float32), one_cluster(points), SENSOR, PAPER)
     assert 5.0 - centroid.centre[0, 0] == pytest.approx(0.2 * 2 / np.pi, abs=4e-3)  # evenly, ends counted
-    assert abs(5.0 - fit(points, SHARP).centre[0, 0]) < 2e-3
+    assert abs(5.0 - fit(points, SHARP).centre[0, 0]) < 5e-3
 
 
 @pytest.mark.parametrize("radius", [0.1, 0.15, 0.25])
@@ -116,6 +119,38 @@ def test_a_mixed_pixel_at_each_edge_does_not_wreck_the_fit(radius, distance):
         radius_error.append(told.radius[0] - radius)
     assert np.mean(centre_error) < 0.03, np.mean(centre_error)
     assert abs(np.mean(radius_error)) < 0.025, np.mean(radius_error)
+
+
+@pytest.mark.parametrize("radius", [0.08, 0.15])
+@pytest.mark.parametrize("distance", [3.0, 5.0])
+def test_a_branch_beside_the_trunk_does_not_make_it_wide(radius, distance):
+    """A branch leaves the trunk sideways and towards the sensor; a wide circle would fit both."""
+    radius_error = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        points, true = cast(rng, radius=radius, distance=distance, sigma=0.02)
+        ahead = true / distance
+        left = np.array([-ahead[1], ahead[0]])
+        out = rng.uniform(radius, radius + 0.2, len(points) // 5)
+        branch = true + out[:, None] * (left - 0.2 * ahead) + rng.normal(0, 0.01, (len(out), 2))
+        branch = np.column_stack([branch, rng.uniform(0.3, 0.4, len(out))])
+        radius_error.append(fit(np.concatenate([points, branch])).radius[0] - radius)
+    assert abs(np.median(radius_error)) < 0.04, np.median(radius_error)
+
+
+@pytest.mark.parametrize("distance", [3.0, 5.0])
+def test_half_a_trunk_is_less_certain_than_all_of_it(distance):
+    """What hides one side hides the width too: sigma must grow with the error that comes of it."""
+    z, sigma = [], []
+    for seed in range(60):
+        points, true = cast(np.random.default_rng(seed), radius=0.15, distance=distance, sigma=0.02)
+        seen = true[0] * points[:, 1] - true[1] * points[:, 0] < 0.0
+        told, whole = fit(points[seen]), fit(points)
+        z.append((told.radius[0] - 0.15) / told.radius_sigma[0])
+        sigma.append(told.radius_sigma[0] / whole.radius_sigma[0])
+    assert np.median(sigma) > 2.0, np.median(sigma)
+    assert abs(np.mean(z)) < 1.8, np.mean(z)
+    assert np.std(z) < 1.8, np.std(z)
 
 
 def test_neighbours_do_not_disturb_one_another():

@@ -86,6 +86,16 @@ def test_beams_meet_a_trunk_where_it_is_and_not_its_far_side():
     assert place[:, 0].max() < 5.06, "nothing of the far side"
 
 
+def test_the_side_of_a_sparse_trunk_is_no_wall():
+    """Points 4 cm apart on one side of a trunk look as flat as ground: discs as wide would stand out."""
+    angle, height = np.meshgrid(np.arange(-0.6, 0.61, 0.3), np.arange(0.0, 2.0, 0.04))
+    x, y = 5.0 - 0.14 * np.cos(angle.ravel()), 0.14 * np.sin(angle.ravel())
+    s = lay_surfels(np.column_stack([x, y, height.ravel()]).astype(np.float32))
+    assert s.radius.max() < 0.03
+    level = np.column_stack([angle.ravel(), height.ravel(), np.zeros(angle.size)])
+    assert lay_surfels((level * [0.13, 1.0, 1.0]).astype(np.float32)).radius.max() > 0.03, "ground is closed"
+
+
 @pytest.mark.parametrize(
     ("uri", "why"),
     [
