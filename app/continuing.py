@@ -27,6 +27,7 @@ GIVEN_SIGMA = (0.3, 0.3, np.radians(5.0))  # m, m, rad; how well a person can te
 PAUSE_NS = 1_000_000_000  # between two runs, where the clock of the second does not follow
 FIRST_TRY, NEXT_TRY = 10, 1.3  # scans, and by which factor more before it is tried again
 HYPOTHESES = 1_000_000
+KNOWN_ALREADY = "this very recording is in the map already: it tells nothing new, its errors count twice"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,6 +139,8 @@ def _in_another_run(
         known.uri, known.digest, beginning.scans, how, (pose.x, pose.y, pose.yaw),
         0 if found is None else len(found.local), beginning.stamp_shift_ns,
     )  # fmt: skip
+    if known.digest in (part.digest for part in beginning.sources):
+        beginning.tally.warned[f"{KNOWN_ALREADY} ({known.uri})"] += 1
     beginning.truth = _truth_of(beginning.sources[0].uri)
     beginning.sources += (part,)
     beginning.tally.warned.update(warnings)

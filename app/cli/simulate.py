@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "scenario",
         metavar="SCENARIO",
         help="stand, paper, slope, dense or long, with options as in 'stand?odometry=poor&sigma=0.03' "
-        "(seed, sigma, odometry = good, normal, poor or exact, duration, trees)",
+        "(seed, sigma, odometry = good, normal, poor or exact, duration, trees, drive)",
     )
     parser.add_argument("--out", required=True, type=_mcap, metavar="RUN.mcap", help="the file to write")
     parser.add_argument(

@@ -90,6 +90,7 @@ class SimulatedRun:
         """SHA-256 (hex) of all that decides the run's bytes."""
         mounting = [*self.T_base_lidar.R.ravel().tolist(), *self.T_base_lidar.t.tolist()]
         text = f"stemmap simulation {VERSION}; {self.request}; {self.request.scenario}; {mounting}"
+        text += f"; drive {self.request.drive}" if self.request.drive else ""  # the first is as it was before
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _solids(self, times: Float, R: Float, o: Float) -> Solids:
@@ -138,5 +139,7 @@ def odometry_of(motion: Motion, request: RunRequest) -> Float:
 
 
 def stream(part: int, request: RunRequest, k: int = 0) -> np.random.Generator:
-    """A generator of its own for each part and scan, so that none shifts the numbers of another."""
-    return np.random.default_rng([part, zlib.crc32(request.name.encode()), request.seed, k])
+    """A generator of its own for each part, scan and drive, so that none shifts the numbers of another; the
+    scene is the same for all drives."""
+    drive = [request.drive] if request.drive and part != SCENE else []
+    return np.random.default_rng([part, zlib.crc32(request.name.encode()), request.seed, k, *drive])

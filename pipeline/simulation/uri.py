@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from urllib.parse import parse_qsl
 
 from pipeline.errors import UsageError
@@ -19,12 +19,13 @@ _KEYS = {
     "odometry": f"one of {', '.join([*QUALITIES, EXACT])}",
     "duration": "seconds, 1 to 3600",
     "trees": "how many, 0 to 2000",
+    "drive": "another drive through the same scene, 0 to 1000",
 }
 CLOUD = "cloud"
 _CLOUD_KEYS = {
     "file": "the cloud of a plot, .laz or .las",
     "truth": "a table (CSV) of its trees in the coordinates of the cloud",
-    **{key: meaning for key, meaning in _KEYS.items() if key != "trees"},
+    **{key: meaning for key, meaning in _KEYS.items() if key not in ("trees", "drive")},
 }
 
 
@@ -39,6 +40,7 @@ class RunRequest:
         odometry: Quality of the wheels, or "exact".
         duration_s: [s].
         trees: How many stand there.
+        drive: Other drives through the same scene have other noise.
         file, truth: Of a run through a real cloud: its file, and the table of its trees, or empty.
     """
 
@@ -48,6 +50,7 @@ class RunRequest:
     odometry: str
     duration_s: float
     trees: int
+    drive: int = field(default=0, repr=False)
     file: str = ""
     truth: str = ""
 
@@ -86,6 +89,7 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
         odometry=odometry,
         duration_s=_real(uri, "duration", values.get("duration", str(scenario.duration_s)), 1.0, 3600.0),
         trees=_whole(uri, "trees", values.get("trees", str(scenario.trees)), most),
+        drive=_whole(uri, "drive", values.get("drive", "0"), 1000),
     )
 
 

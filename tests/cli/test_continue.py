@@ -49,7 +49,7 @@ def test_into_its_own_folder_too(tmp_path):
 
 
 def test_a_second_run_finds_its_start_and_keeps_the_numbers(stand, tmp_path, capsys):
-    other = "sim:stand?duration=25&seed=4&sigma=0.03"  # the same stand seen with another noise
+    other = "sim:stand?duration=25&seed=4&sigma=0.03&drive=1"  # the same stand seen with another noise
     assert main(["map", other, "--continue", str(stand), "--out", str(tmp_path)]) == 0
     assert "stems agree" in capsys.readouterr().out
     record = json.loads((tmp_path / "run.json").read_text())
@@ -73,6 +73,25 @@ def test_a_second_run_finds_its_start_and_keeps_the_numbers(stand, tmp_path, cap
     once = json.loads((stand / "run.json").read_text())
     assert record["duration_s"] == pytest.approx(2 * once["duration_s"], abs=0.01)  # the pause is none
     assert record["distance_m"] == pytest.approx(2 * once["distance_m"], rel=0.05)  # nor is the jump a drive
+
+
+def test_the_same_recording_twice_is_warned_of(stand, tmp_path, capsys):
+    words = ["map", PLAIN, "--out", str(tmp_path / "a"), "--stop-after", "5"]
+    assert main(words) == 0
+    words = [
+        "map",
+        PLAIN,
+        "--continue",
+        str(tmp_path / "a"),
+        "--out",
+        str(tmp_path / "b"),
+        "--stop-after",
+        "5",
+    ]
+    assert main([*words, "--start", "0,0,0"]) == 0
+    assert "in the map already" in capsys.readouterr().err
+    assert main([*words, "--start", "resume"]) == 0
+    assert "in the map already" not in capsys.readouterr().err
 
 
 def test_another_stand_is_not_found_in_the_map(stand, tmp_path, capsys):

@@ -159,3 +159,14 @@ def test_truth_has_the_path_at_the_scans():
         pose = record.T_odom_base
         expected = [path.x[k], path.y[k], path.yaw[k]]
         np.testing.assert_allclose([*pose.t[:2], pose.euler()[2]], expected, atol=1e-9)
+
+
+def test_another_drive_goes_through_the_same_scene_with_other_noise():
+    first, same, other = (open_simulated(SHORT + more) for more in ("", "&drive=0", "&drive=1"))
+    assert first.description.digest == same.description.digest != other.description.digest
+    a, b = first.run.scene.truth, other.run.scene.truth
+    assert np.array_equal(a.x, b.x)
+    assert np.array_equal(a.dbh, b.dbh, equal_nan=True)
+    assert not np.array_equal(first.run.odometry, other.run.odometry)
+    assert bytes_of(first.run.sweep(3).scan) == bytes_of(same.run.sweep(3).scan)
+    assert bytes_of(first.run.sweep(3).scan) != bytes_of(other.run.sweep(3).scan)

@@ -49,6 +49,7 @@ def test_every_option_is_taken_and_the_seed_of_the_uri_wins():
         ("sim:stand?duration=1e9", "1 to 3600"),
         ("sim:stand?trees=-3", "trees"),
         ("sim:stand?trees=2001", "0 to 2000"),
+        ("sim:stand?drive=1001", "drive"),
         ("sim:paper?trees=8", "at most 7 trees"),
     ],
 )
