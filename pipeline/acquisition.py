@@ -25,13 +25,16 @@ def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[F
     R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)
     sensor_offset = R_level_base @ T_base_lidar.t
     offset_ns = step.scan.offset_ns
-    moving = parameters.deskew and offset_ns is not None and any(step.twist)
+    twist = step.twist
+    if parameters.gyro and step.turn_rate is not None:
+        twist = (twist[0], twist[1], step.turn_rate)
+    moving = parameters.deskew and offset_ns is not None and any(twist)
     points = _take(
         step.scan.points,
         offset_ns if moving and offset_ns is not None else np.zeros(0, np.int32),
         R_level_base @ T_base_lidar.R,
         sensor_offset,
-        np.asarray(step.twist, dtype=np.float64),
+        np.asarray(twist, dtype=np.float64),
         parameters.range_min,
         parameters.range_max,
     )

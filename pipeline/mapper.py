@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.growing_path import GrowingPath
+from pipeline.gyro import fused
 from pipeline.height_map import HeightMapper, HeightMapState
 from pipeline.parameters import Parameters
 from pipeline.perception import Seen, perceive
 from pipeline.records import Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step
 from pipeline.recovery import Mapped, Recovery, RecoveryState
 from pipeline.slam import BackEnd, BackEndState, Motion
+from pipeline.slam.motion import step_covariance
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
 from pipeline.turns import is_fused, is_gathered
@@ -98,7 +101,7 @@ class Mapper:
 
         with watch("slam"):
             motion, odometry = self._motion(step)
-            moved = Motion(motion, step.slack, step.doubt, step.measured)
+            moved = self._with_gyro(step, motion)
             estimate, told = self._recovery.locate(
                 step.index,
                 moved,
@@ -143,6 +146,14 @@ class Mapper:
             if self._ground.state.scans
             else 0.0,
         )
+
+    def _with_gyro(self, step: Step, motion: Pose2) -> Motion:
+        moved = Motion(motion, step.slack, step.doubt, step.measured)
+        if step.turn is None or step.T_odom_base is None or not self._parameters.acquisition.gyro:
+            return moved
+        sigma = math.sqrt(step_covariance(motion, self._parameters.slam)[2, 2])
+        turned, turn_sigma, slack, doubt = fused(motion, sigma, step.slack, step.turn)
+        return moved._replace(step=turned, slack=slack, doubt=step.doubt or doubt, turn_sigma=turn_sigma)
 
     def _track(self, stamp_ns: int, seen: Seen, estimate: PoseEstimate) -> None:
         """Each tree's own filter: section 3.5."""

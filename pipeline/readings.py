@@ -106,6 +106,15 @@ class Imu:
     orientation: Float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """How far a gyroscope says that the base turned about the vertical since the scan before: angle and its
+    standard deviation [rad]."""
+
+    angle: float
+    sigma: float
+
+
 Record = Scan | Odometry | Imu
 
 

@@ -25,6 +25,7 @@ from pipeline.readings import Stems as Stems
 from pipeline.readings import Truth as Truth
 from pipeline.readings import TruthPath as TruthPath
 from pipeline.readings import TruthTrees as TruthTrees
+from pipeline.readings import Turn as Turn
 
 # --- what the stages hand on ---------------------------------------------------------------------
 
@@ -45,6 +46,8 @@ class Step:
         doubt: Why the motion to this scan may be wrong, for people; empty when nothing says so.
         slack: What that adds to its standard deviations: position [m] and heading [rad].
         measured: The pose by another source at this scan, None where there is none.
+        turn: By a gyroscope since the scan before, None where there is none.
+        turn_rate: By a gyroscope at the scan [rad/s].
     """
 
     index: int
@@ -58,6 +61,8 @@ class Step:
     doubt: str = ""
     slack: tuple[float, float] = (0.0, 0.0)
     measured: PoseMeasurement | None = None
+    turn: Turn | None = None
+    turn_rate: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.geometry import Float, Pose2, Pose3, interpolate, wrap_angle
+from pipeline.geometry import Pose2, Pose3, interpolate, wrap_angle
+from pipeline.gyro import Gyro
 from pipeline.records import Imu, Odometry, PoseMeasurement, Record, Scan, Step
 
 OdometryChoice = Literal["auto", "wheels", "static"]
@@ -23,6 +24,9 @@ WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion that no 
 WALK_MOST = (3.0, 0.5)  # m, rad; beyond it the trees around are others
 SAME_TIME_NS = 50_000_000
 MOST_POSES = 64
+STANDS = (0.005, 0.002)  # m, rad; a robot that stands stays within it
+SETTLES_NS = 300_000_000
+TILTS_NS = 90_000_000
 
 
 def steps(
@@ -77,6 +81,10 @@ class _Joiner:
         self._odometry: deque[_Reading] = deque()
         self._T_odom_jumped = Pose2()
         self._imu: deque[Imu] = deque()
+        self._gyro = Gyro()
+        self._stands: _Reading | None = None  # where the robot has been standing since
+        self._turned_ns: int | None = None
+        self._gyro_tilt = (0, 0.0, 0.0)  # when [ns], roll and pitch [rad]
         self._poses: deque[PoseMeasurement] = deque(maxlen=MOST_POSES)
         self._slack = (0.0, 0.0)
         self._doubt = ""
@@ -99,6 +107,7 @@ class _Joiner:
             self._leave_out("odometry readings that were not later than the one before")
         elif self._use_odometry:
             self._odometry.append(self._without_jump(odometry))
+            self._watch_standing(self._odometry[-1])
             self._forget(self._odometry, odometry.stamp_ns)
 
     def _without_jump(self, odometry: Odometry) -> _Reading:
@@ -119,6 +128,13 @@ class _Joiner:
                 self._suspect("the odometry jumped", JUMP_SLACK)
         return _Reading(odometry.stamp_ns, self._T_odom_jumped @ raw, _tilt(odometry.T_odom_base))
 
+    def _watch_standing(self, reading: _Reading) -> None:
+        if self._stands is not None:
+            away = self._stands.pose.inverse() @ reading.pose
+            if np.hypot(away.x, away.y) < STANDS[0] and abs(away.yaw) < STANDS[1]:
+                return
+        self._stands = reading
+
     def add_pose(self, pose: PoseMeasurement) -> None:
         if not pose.is_sound():
             self._leave_out("measured poses without finite numbers or a positive definite covariance")
@@ -137,12 +153,25 @@ class _Joiner:
         return near if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS else None
 
     def add_imu(self, imu: Imu) -> None:
+        if self._turned_ns is None or imu.stamp_ns > self._turned_ns:
+            self._turned_ns = imu.stamp_ns
+            self._add_turn_rate(imu)
         if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
             return
         if self._imu and imu.stamp_ns <= self._imu[-1].stamp_ns:
             return
         self._imu.append(imu)
         self._forget(self._imu, imu.stamp_ns)
+
+    def _add_turn_rate(self, imu: Imu) -> None:
+        if not np.all(np.isfinite(imu.angular_velocity)):
+            return
+        settled = self._stands is not None and imu.stamp_ns - self._stands.stamp_ns > SETTLES_NS
+        fresh = bool(self._odometry) and imu.stamp_ns - self._odometry[-1].stamp_ns < STALE_NS
+        oldest = self._scans[0].stamp_ns if self._scans else imu.stamp_ns
+        if imu.stamp_ns - self._gyro_tilt[0] > TILTS_NS:  # a tilt changes the rate by its square alone
+            self._gyro_tilt = (imu.stamp_ns, *(_tilt_of(imu) or (0.0, 0.0)))
+        self._gyro.add(imu, self._gyro_tilt[1:], standing=settled and fresh, needed_ns=oldest)
 
     def _forget(self, kept: deque[_Reading] | deque[Imu], now_ns: int) -> None:
         oldest = self._scans[0].stamp_ns if self._scans else now_ns
@@ -176,6 +205,8 @@ class _Joiner:
             doubt=self._doubt,
             slack=self._slack,
             measured=self._pose_at(scan.stamp_ns),
+            turn=None if self._stepped_ns is None else self._gyro.turn(self._stepped_ns, scan.stamp_ns),
+            turn_rate=self._gyro.rate(scan.stamp_ns),
         )
         self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
         self._index += 1
@@ -218,11 +249,7 @@ class _Joiner:
         if abs(nearest.stamp_ns - stamp_ns) > STALE_NS:
             self._warn("there is no IMU reading for some scans: they are not levelled by it")
             return None
-        try:
-            roll, pitch, _ = Pose3.from_quaternion(np.zeros(3), _quaternion(nearest)).euler()
-        except ValueError:
-            return None
-        return roll, pitch
+        return _tilt_of(nearest)
 
     def _leave_out(self, reason: str) -> None:
         self._losses[reason] += 1
@@ -255,6 +282,12 @@ def _tilt(T_odom_base: Pose3) -> tuple[float, float] | None:
     return None if roll == 0.0 and pitch == 0.0 else (roll, pitch)
 
 
-def _quaternion(imu: Imu) -> Float:
-    assert imu.orientation is not None  # noqa: S101 - add_imu kept only those
-    return imu.orientation
+def _tilt_of(imu: Imu) -> tuple[float, float] | None:
+    """Roll and pitch by a reading's orientation, None where it tells none."""
+    if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
+        return None
+    try:
+        roll, pitch, _ = Pose3.from_quaternion(np.zeros(3), imu.orientation).euler()
+    except ValueError:
+        return None
+    return roll, pitch

@@ -31,6 +31,7 @@ FOUNDATION = (
     "terrain",
     "growing_path",
     "turns",
+    "gyro",
     "watch",
 )
 # One stage each: they never know one another.

@@ -11,6 +11,7 @@ from pipeline.parameters.model import Parameters
 _PAPER: dict[str, object] = {
     "acquisition.level": "none",
     "acquisition.deskew": False,
+    "acquisition.gyro": False,
     "acquisition.range_min": 0.0,
     "filters.x_min": 0.0,
     "filters.x_max": 10.0,

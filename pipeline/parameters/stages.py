@@ -19,6 +19,7 @@ class Acquisition(Stage):
     deskew: bool = choice(
         True, "De-skew", "Move each point to where it would be had the robot stood still during the sweep."
     )
+    gyro: bool = choice(True, "Gyroscope", "Take turns from the IMU's gyroscope where there is one.")
     range_min: float = number(
         0.5, "Nearest return", "m", 0.0, 10.0, 0.1, "Returns nearer than this are the robot itself."
     )

@@ -54,12 +54,14 @@ class Motion(NamedTuple):
         slack: Added to its standard deviations where the odometry is doubtful: position [m], heading [rad].
         doubt: Why, for people; empty when nothing is.
         measured: The pose by another source.
+        turn_sigma: Of the step's turn [rad] where it is known better than the odometry alone knows it.
     """
 
     step: Pose2
     slack: tuple[float, float] = (0.0, 0.0)
     doubt: str = ""
     measured: PoseMeasurement | None = None
+    turn_sigma: float | None = None
 
 
 DISTRUST = (0.1, 0.03)  # m, rad; added to a step of wheels that just slipped, for they slip again
@@ -77,11 +79,15 @@ def accumulated(
         distrust: 0 to 1, how much the odometry was wrong lately.
     """
     step = motion.step
-    slack = motion.slack[0] + distrust * DISTRUST[0], motion.slack[1] + distrust * DISTRUST[1]
+    turned = motion.turn_sigma
+    doubted = distrust * DISTRUST[1] if turned is None else 0.0  # wheels that slip turn no gyroscope
+    slack = motion.slack[0] + distrust * DISTRUST[0], motion.slack[1] + doubted
     is_news = motion.measured is not None or slack != (0.0, 0.0)
     if step.x == step.y == step.yaw == 0.0 and not is_news:
         return None
     noise = step_covariance(step, p)
+    if turned is not None:
+        noise[2, 2] = turned**2
     noise += np.diag([slack[0] ** 2, slack[0] ** 2, slack[1] ** 2])
     moved, spread = compound(before, covariance, step, noise)
     driven = math.hypot(step.x, step.y) + TURN_AS_DISTANCE * abs(wrapped(step.yaw))
