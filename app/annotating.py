@@ -38,6 +38,8 @@ class Annotating:
         rows: The annotations of the run.
         truth: What stands there: what the source knows, and over it what was annotated.
         problem: Why nothing can be annotated, empty when all is well.
+        changed: Called when something else stands.
+        edited: Called with who edited and how many annotations, after an edit.
         serial: Grows with each edit, so that a page knows when it has seen what it did.
     """
 
@@ -48,6 +50,7 @@ class Annotating:
         self.problem = ""
         self.serial = 0
         self.changed: Callable[[], None] = lambda: None
+        self.edited: Callable[[str, int], None] = lambda _who, _number: None
         self._own: TruthTrees | None = None
         self._keeper = keeper
 
@@ -109,9 +112,12 @@ class Annotating:
 
         done, rows, truth = await self._keeper.ask(work)
         if run == self.run:
+            who, number = _edits(self.rows, rows)
             self.rows, self.truth = rows, truth
             self.serial += 1
             self.changed()
+            if number:
+                self.edited(who, number)
         if isinstance(done, StaleError):
             raise done
         return done
@@ -136,6 +142,15 @@ class Annotating:
             "same_thing_m": SAME_THING,
             "trees": [row_payload(row) for row in self.rows],
         }
+
+
+def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:
+    """Who made the last edit that is still to be seen, and how many annotations differ."""
+    old = {row.id: row.version for row in before}
+    new = {row.id: row.version for row in after}
+    edited = [row for row in after if old.get(row.id) != row.version]
+    who = max(edited, key=lambda row: row.at_ns).who if edited else ""
+    return who, len(edited) + len(old.keys() - new.keys())
 
 
 def row_payload(row: Annotation) -> dict[str, Any]:

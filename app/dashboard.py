@@ -27,8 +27,9 @@ from app.parameter_state import ParameterState
 from app.scores import Scores
 from app.selection import Selection
 from app.standing_scan import BeforeAfter, counts_of
-from app.story.questions import NoStoryError, Questions
-from app.story.records import ClusterStory, TreeStory
+from app.story.asking import Asking
+from app.story.questions import NoStoryError
+from app.story.records import ClusterStory
 from app.throttle import Throttle
 from app.worker_mailbox import joined
 from app.worker_messages import Answer, Begin, FromWorker, Opened, Report, Shown, ToWorker
@@ -56,7 +57,7 @@ class Dashboard:
         self.keeper = keeper or Keeper(None)
         self.logbook = Logbook(self.keeper)
         self.annotating = Annotating(self.keeper)
-        self.annotating.changed = self._use_truth
+        self.annotating.changed, self.annotating.edited = self._use_truth, self._mark_edits
         self.live = live
         self.scores = Scores(self._tell_score)
         self.status = Status(state="starting", detail="Starting")
@@ -67,7 +68,7 @@ class Dashboard:
         self.sets = ParameterSets(self.keeper, self._show_parameters)
         self._before_after = BeforeAfter()
         self.selection = Selection()
-        self.questions = Questions(lambda question: self.worker.send(question))
+        self.asking = Asking(lambda question: self.worker.send(question), lambda: self._run)
         self._selecting: asyncio.Task[None] | None = None
         self.scene_viewers = 0
         self.scene_hand = SOMEBODY  # who moved something in the scene last
@@ -235,21 +236,8 @@ class Dashboard:
         kept = self.selection.cluster
         if kept is not None and (kept.scan, kept.cluster) == (scan, cluster):
             return kept
-        if self._run is None or self.shown is None:
-            raise NoStoryError("nothing is mapped yet", remedy="Press play, or open a run")
-        return await self.questions.cluster(
-            self._run, self.shown.frame.index if scan is None else scan, cluster
-        )
-
-    async def tree_story(self, number: int) -> TreeStory:
-        """The story of a tree as it stands.
-
-        Raises:
-            NoStoryError: There is none.
-        """
-        if self._run is None:
-            raise NoStoryError("nothing is mapped yet", remedy="Press play, or open a run")
-        return await self.questions.tree(self._run, number)
+        newest = None if self.shown is None else self.shown.frame.index
+        return await self.asking.cluster(newest if scan is None else scan, cluster)
 
     def _select(self, selection: Selection) -> None:
         self.selection = selection
@@ -284,7 +272,7 @@ class Dashboard:
                 self._show(message)
                 await self._go_round(message)
             case Answer():
-                self.questions.take(message)
+                self.asking.take(message)
 
     async def _begin(self, opened: Opened) -> None:
         """A source is open and waits: parameters that suit it first, then it plays."""
@@ -329,6 +317,11 @@ class Dashboard:
         if self.truth is None:
             self.scores.forget()
         self._score()
+
+    def _mark_edits(self, who: str, number: int) -> None:
+        if self.shown is not None:
+            self.events.annotated(who, number, self.shown.time_s)
+            self._tell_events()
 
     def _show(self, shown: Shown) -> None:
         if shown.run != self._run:  # of a run that was left

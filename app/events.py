@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pipeline.parameters.model import Value
 from pipeline.records import Frame
 
-Kind = Literal["tree", "warning", "change", "health"]
+Kind = Literal["tree", "warning", "change", "health", "annotation"]
 
 _MOST = 400
 _LONGEST = 300
@@ -20,7 +20,8 @@ class Event:
 
     Attributes:
         time_s: Since the run's first scan.
-        kind: A tree was confirmed, a warning came, parameters were changed, the pose became better or worse.
+        kind: A tree was confirmed, a warning came, parameters were changed, the pose became better or worse,
+            somebody annotated.
         text: For people.
     """
 
@@ -38,12 +39,14 @@ class Events:
         self._warnings: frozenset[str] = frozenset()
         self._health = "good"
         self._base: tuple[str, dict[str, Value]] | None = None
+        self._edits = ("", 0)
 
     def forget(self) -> None:
         """Another run begins."""
         self._events.clear()
         self._confirmed.clear()
         self._warnings, self._health, self._base = frozenset(), "good", None
+        self._edits = ("", 0)
 
     def shown(self, frame: Frame, time_s: float) -> bool:
         """Take a scan's results; returns whether anything happened. A tree that is confirmed again after the
@@ -80,7 +83,7 @@ class Events:
         undone = {
             key
             for key, event in self._events.items()
-            if event.time_s > time_s and event.kind not in ("change", "warning")
+            if event.time_s > time_s and event.kind not in ("change", "warning", "annotation")
         }
         self._events = {key: event for key, event in self._events.items() if key not in undone}
         self._confirmed = {number for number in self._confirmed if f"tree {number}" not in undone}
@@ -93,6 +96,21 @@ class Events:
         if texts:
             more = f" and {len(texts) - 3} more" if len(texts) > 3 else ""
             self._note(key, Event(time_s, "change", f"{', '.join(texts[:3])}{more}"[:_LONGEST]))
+
+    def annotated(self, who: str, number: int, time_s: float) -> None:
+        """Annotations were edited. Of edits at one time (of somebody who goes through the trees while the run
+        stands) one mark tells how many they were.
+
+        Args:
+            who: Made the last of them; empty where that is not known.
+            number: How many annotations were added, changed or deleted.
+            time_s: Of the standing scan.
+        """
+        key = f"annotation {time_s:.1f}"
+        self._edits = (key, number + (self._edits[1] if self._edits[0] == key else 0))
+        self._events.pop(key, None)
+        edits = "an annotation" if self._edits[1] == 1 else f"{self._edits[1]} annotations"
+        self._note(key, Event(time_s, "annotation", f"{who or 'Somebody'} edited {edits}"[:_LONGEST]))
 
     def as_plain(self) -> dict[str, Any]:
         """For the browsers, in the order of time."""

@@ -31,6 +31,12 @@ def picture_of(frame: Frame) -> Frame:
     )
 
 
+def for_comparison(frame: Frame) -> Frame:
+    """The picture without what is the same under all parameters or is not drawn: the raw points, the
+    gathered columns and the ground."""
+    return picture_of(replace(frame, raw=np.zeros((0, 3), np.float32), columns=None, ground=None))
+
+
 def _evenly(n: int) -> NDArray[np.int64]:
     """Rows of a table of n rows, at most MOST_POINTS of them and none twice."""
     return np.arange(n) if n <= MOST_POINTS else np.arange(MOST_POINTS) * n // MOST_POINTS

@@ -6,14 +6,14 @@ mapped with, and on nothing else: not on pauses, jumps, or which states happen t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from app.cursor import Cursor, Synchroniser
 from app.history import ParameterHistory, Snapshots
 from app.stopwatch import Stopwatch
 from app.story.history import TreeHistory
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, StemmapError
 from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path, Step
 from pipeline.sources.base import Source
@@ -99,6 +99,30 @@ class Run:
             return None
         self._mapper.restore(self._before)
         return self._map(self._step)
+
+    def map_with(self, sets: Sequence[Parameters]) -> list[Frame]:
+        """The standing scan as it comes out under each of other parameters; the run stays as it is.
+
+        Raises:
+            StemmapError: There is no scan to map, or a set cannot be mapped with.
+        """
+        if self._step is None or self._broken:
+            raise StemmapError("no scan stands here", remedy="Play, pause and ask again")
+        present, frames = self._mapper.parameters, []
+        self._broken = True
+        with self.stopwatch.aside():
+            try:
+                for parameters in sets:
+                    self._mapper.restore(self._before)
+                    self._mapper.parameters = parameters
+                    frames.append(self._mapper.process(self._step))
+            finally:
+                # Mapped once more, because a mapper goes back along its past and not forward again.
+                self._mapper.restore(self._before)
+                self._mapper.parameters = present
+                self._mapper.process(self._step)
+                self._broken = False
+        return frames
 
     def _map(self, step: Step) -> Frame:
         wanted = self._parameters.at(step.index)

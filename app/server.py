@@ -21,7 +21,7 @@ from app.neighbours import SceneLike, WorkerLike
 from app.parameter_state import ParameterState
 from app.replies import BadRequestError, error_reply, failure_reply
 from app.routes import annotations as annotation_routes
-from app.routes import page, parameter_sets, parameters, results, run, runs, sockets, story
+from app.routes import page, parameter_sets, parameters, pictures, results, run, runs, sockets, story
 from app.routes import uploads as upload_routes
 from app.security import BodyTooLargeError, Guard
 from app.settings import Settings
@@ -39,6 +39,7 @@ ROUTERS = tuple(
         runs,
         parameters,
         parameter_sets,
+        pictures,
         results,
         annotation_routes,
         upload_routes,

@@ -5,7 +5,7 @@ driver asks for the `pace` and calls `work` as often as it likes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Literal
 
 import numpy as np
@@ -241,6 +241,16 @@ class Session:
             )
         parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
         return tell_tree(frame, int(row[0]), parameters, sensor, run.start_ns, run.history)
+
+    def compare(self, sets: Sequence[Parameters]) -> list[Frame]:
+        """The standing scan under each of other parameters; the run stays as it is.
+
+        Raises:
+            StemmapError: There is none, or a set cannot be mapped with.
+        """
+        if self._run is None or self._state == "failed":
+            raise StemmapError("nothing is mapped", remedy="Press play, or open a run")
+        return self._run.map_with(sets)
 
     def fail(self, detail: str) -> None:
         """Say that the run cannot go on, and why."""

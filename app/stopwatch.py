@@ -24,6 +24,7 @@ class Stopwatch:
         self._scans = scans
         self._stages: dict[str, deque[float]] = {}
         self._totals: deque[float] = deque(maxlen=scans)
+        self._aside = False
         self._disturbances = 0
 
     def disturb(self) -> None:
@@ -38,7 +39,7 @@ class Stopwatch:
             yield
         finally:
             times = self._stages.setdefault(stage, deque(maxlen=self._scans))
-            if disturbances == self._disturbances:
+            if not self._aside and disturbances == self._disturbances:
                 times.append(self._clock() - start)
 
     @contextmanager
@@ -50,6 +51,15 @@ class Stopwatch:
         finally:
             if disturbances == self._disturbances:
                 self._totals.append(self._clock() - start)
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Measure nothing: what is mapped is not of the run."""
+        self._aside = True
+        try:
+            yield
+        finally:
+            self._aside = False
 
     def clear(self) -> None:
         """Forget what was measured."""

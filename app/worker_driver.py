@@ -19,15 +19,17 @@ import msgspec
 
 from app.messages import Advance, Command, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
 from app.pacer import Pacer
+from app.picture import for_comparison
 from app.session import Session
 from app.story.recent import Recent
 from app.worker_messages import (
     Answer,
-    AskCluster,
+    AskCompare,
     AskTree,
     Begin,
     FromWorker,
     Opened,
+    Question,
     Report,
     Shown,
     ToWorker,
@@ -91,7 +93,7 @@ class Driver:
             if command is None:
                 self._session.close()
                 return
-            if isinstance(command, AskCluster | AskTree):
+            if isinstance(command, Question):
                 self._put(self._answer(command))  # nobody who asks changes how the run goes
             else:
                 self._obey(command)
@@ -167,11 +169,14 @@ class Driver:
             case Begin():
                 self._begin(command)
 
-    def _answer(self, question: AskCluster | AskTree) -> Answer:
+    def _answer(self, question: Question) -> Answer:
         ticket = question.ticket
         try:
             if question.run != self._run:
                 raise StemmapError("the run was left")
+            if isinstance(question, AskCompare):
+                sets = [validated(values) for values in question.sets]
+                return Answer(ticket, frames=[for_comparison(f) for f in self._session.compare(sets)])
             if isinstance(question, AskTree):
                 return Answer(ticket, tree=self._session.tree_story(question.tree))
             frame = self._recent.find(question.run, question.scan)
@@ -182,7 +187,7 @@ class Driver:
             return Answer(ticket, cluster=self._session.cluster_story(frame, question.cluster))
         except StemmapError as error:
             return Answer(ticket, missing=str(error))
-        except Exception as error:  # a story that fails must not stop the run
+        except Exception as error:  # an answer that fails must not stop the run
             traceback.print_exc(file=sys.stderr)
             fault = f"this is a fault in stemmap: {type(error).__name__}: {error}"
             return Answer(ticket, missing=f"{fault}. The terminal shows where")

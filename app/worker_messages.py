@@ -105,20 +105,36 @@ class AskTree(msgspec.Struct, frozen=True, tag="ask_tree"):
     tree: int
 
 
+class AskCompare(msgspec.Struct, frozen=True, tag="ask_compare"):
+    """Map the standing scan under other parameters; the run stays as it is.
+
+    Attributes:
+        ticket, run: As in `AskCluster`.
+        sets: Parameters, already validated, as nested values.
+    """
+
+    ticket: int
+    run: int
+    sets: list[dict[str, Any]]
+
+
 class Answer(msgspec.Struct, frozen=True, tag="answer"):
-    """The story that was asked for.
+    """What was asked for.
 
     Attributes:
         ticket: Of the question.
-        cluster, tree: One of them is told, unless `missing` says why there is none.
+        cluster, tree, frames: One of them is told, unless `missing` says why there is none; the frames one
+            for each set, without raw points.
         missing: Why there is none, and what to do.
     """
 
     ticket: int
     cluster: ClusterStory | None = None
     tree: TreeStory | None = None
+    frames: list[Frame] | None = None
     missing: str = ""
 
 
 FromWorker = Opened | Shown | Report | Answer
-ToWorker = Command | Begin | AskCluster | AskTree
+Question = AskCluster | AskTree | AskCompare
+ToWorker = Command | Begin | Question

@@ -32,6 +32,6 @@ async def cluster(
 async def tree(number: _Number, dashboard: Dash) -> Response:
     """Votes, DBH, coverage and history of a tree as it stands."""
     try:
-        return json_reply(await dashboard.tree_story(number))
+        return json_reply(await dashboard.asking.tree(number))
     except NoStoryError as error:
         return failure_reply(404, error)

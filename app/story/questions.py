@@ -5,15 +5,17 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 from app.story.records import ClusterStory, TreeStory
-from app.worker_messages import Answer, AskCluster, AskTree
+from app.worker_messages import Answer, AskCluster, AskCompare, AskTree, Question
 from pipeline.errors import StemmapError
+from pipeline.records import Frame
 
 PATIENCE_S = 15.0
 _MOST_WAITING = 100
 
-Send = Callable[[AskCluster | AskTree], Awaitable[None]]
+Send = Callable[[Question], Awaitable[None]]
 
 
 class NoStoryError(StemmapError):
@@ -56,15 +58,26 @@ class Questions:
             raise NoStoryError(answer.missing or "there is no such tree")
         return answer.tree
 
+    async def compare(self, run: int, sets: list[dict[str, Any]]) -> list[Frame]:
+        """The standing scan under each of other parameters.
+
+        Raises:
+            NoStoryError: There is none, or nobody answers.
+        """
+        answer = await self._ask(AskCompare(next(self._tickets), run, sets))
+        if answer.frames is None:
+            raise NoStoryError(answer.missing or "there is nothing to compare")
+        return answer.frames
+
     def take(self, answer: Answer) -> None:
         """Hand an answer to who waits for it, if anybody still does."""
         waiting = self._waiting.get(answer.ticket)
         if waiting is not None and not waiting.done():
             waiting.set_result(answer)
 
-    async def _ask(self, question: AskCluster | AskTree) -> Answer:
+    async def _ask(self, question: Question) -> Answer:
         if len(self._waiting) >= _MOST_WAITING:
-            raise NoStoryError("too many stories are asked for at once", remedy="Try again")
+            raise NoStoryError("too much is asked for at once", remedy="Try again")
         waiting = self._waiting[question.ticket] = asyncio.get_running_loop().create_future()
         try:
             await self._send(question)

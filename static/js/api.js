@@ -1,15 +1,16 @@
 // Requests to the server. A refusal becomes an Error whose message is for people.
 
-export async function request(path, options = {}) {
+export const request = async (path, options = {}) => (await answered(path, options)).json().catch(() => null);
+
+async function answered(path, options) {
   let answer;
   try {
     answer = await fetch(path, { credentials: "same-origin", ...options });
   } catch {
     throw new Error("The server does not answer. Is stemmap still running?");
   }
-  const body = await answer.json().catch(() => null);
-  if (!answer.ok) throw new Error(wording(body, answer.status));
-  return body;
+  if (!answer.ok) throw new Error(wording(await answer.json().catch(() => null), answer.status));
+  return answer;
 }
 
 function wording(body, status) {
@@ -24,6 +25,11 @@ export const post = (path, body) =>
 
 export const patch = (path, body) =>
   request(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+
+// Bytes instead of JSON.
+export const block = async (path, options = {}) => (await answered(path, options)).arrayBuffer();
+export const blockFor = (path, body) =>
+  block(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
 
 export const get = (path) => request(path);
 export const open = (uri, odometry) => post("/api/open", { uri, odometry, seed: 0 });

@@ -12,7 +12,7 @@ import { on, state } from "./state.js";
 import { openStory } from "./story.js";
 import { colour } from "./theme.js";
 
-const NAMES = ["tree", "pole", "person", "bush", "other", "uncertain", "truth", "path", "odometry", "robot", "selection", "text", "surface", "grid", "axis", "font"];
+const NAMES = ["tree", "pole", "person", "bush", "other", "uncertain", "truth", "path", "odometry", "robot", "selection", "text", "surface", "grid", "axis", "font", "set-a", "set-b"];
 const canvas = byId("map");
 const view = new MapView();
 const pointers = new Map(); // fingers and mouse that are down
@@ -194,6 +194,6 @@ export function startMap() {
   }, { passive: false });
   byId("map-fit").addEventListener("click", () => { view.moved = false; view.fit(bounds(), true); redraw(); });
   on("annotating", lookAtNext);
-  on("map truth selection measure tab annotations annotating", redraw);
+  on("map truth selection measure tab annotations annotating compare", redraw);
   on("theme", repaint);
 }

@@ -17,6 +17,7 @@ export function drawMap(pen, view, state, colours) {
   const trees = state.map?.trees ?? [];
   drawClusters(pen, view, state.map?.clusters, colours);
   for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected, colours);
+  state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0, colours));
   drawNumbers(pen, view, trees, state.selected, colours);
   if (state.selectedCluster) drawRing(pen, view, state.selectedCluster, colours);
   if (state.map) drawRobot(pen, view, state.map, colours);
@@ -107,6 +108,20 @@ function drawClusters(pen, view, clusters, colours) {
     const [px, py] = view.toScreen(clusters.x[k], clusters.y[k]);
     pen.fillStyle = colours[verdictOf(clusters.verdict[k])[1]];
     pen.fillRect(px - 2.5, py - 2.5, 5, 5);
+  }
+}
+
+// What one of two compared sets takes for trees: half a disc, the left half for A and the right one for B.
+function drawHalves(pen, view, { x, y, verdict }, left, colours) {
+  Object.assign(pen, { fillStyle: colours[left ? "set-a" : "set-b"], strokeStyle: colours.surface, lineWidth: 1 });
+  for (let k = 0; k < x.length; k += 1) {
+    if (verdict[k] !== "tree") continue;
+    const [px, py] = view.toScreen(x[k], y[k]);
+    pen.beginPath();
+    pen.arc(px, py, 6, Math.PI / 2, (3 * Math.PI) / 2, !left);
+    pen.closePath();
+    pen.fill();
+    pen.stroke();
   }
 }
 

@@ -5,7 +5,7 @@ import { clock } from "./format.js";
 import { on, state } from "./state.js";
 import { post, command } from "./api.js";
 
-const NAMES = { tree: "tree confirmed", warning: "warning", change: "parameters changed", health: "SLAM health" };
+const NAMES = { tree: "tree confirmed", warning: "warning", change: "parameters changed", health: "SLAM health", annotation: "annotated" };
 let start = null; // of a loop whose end is not set yet [s]
 
 function showMarks() {

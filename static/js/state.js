@@ -13,6 +13,7 @@ export const state = {
   selected: null,    // number of a tree
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when it was selected
   view: null,        // layers and choices of the 3D scene
+  compare: null,     // clusters of the standing scan by set A and by set B, while they are compared
   measure: null,     // {from, to, fixed} while a distance is measured on the map
   events: [],        // [{t, kind, text}] in the order of time
   loop: null,        // {from_s, to_s}: the part that is played again and again

@@ -3,7 +3,7 @@
 import { byId } from "./dom.js";
 import { changed } from "./state.js";
 
-const NAMES = ["trees", "clusters", "story", "tune", "annotate", "scores", "plots"];
+export const NAMES = ["trees", "clusters", "story", "tune", "annotate", "scores", "plots"];
 let current = NAMES[0];
 
 export const visible = (name) => name === current;

@@ -59,6 +59,19 @@ def test_a_slider_that_moves_is_one_change_and_one_that_came_back_is_none():
     assert [kind for _, kind, _ in marks(events)] == ["tree"]
 
 
+def test_edits_at_one_time_are_one_mark_that_counts_them_and_stay_when_parameters_change():
+    events = Events()
+    events.annotated("Ann", 1, 0.5)
+    assert marks(events) == [(0.5, "annotation", "Ann edited an annotation")]
+    events.annotated("Bob", 2, 0.5)
+    events.annotated("", 1, 0.9)
+    events.changed({"a": 1}, {"a": 2}, 0.1)
+    assert [(t, text) for t, kind, text in marks(events) if kind == "annotation"] == [
+        (0.5, "Bob edited 3 annotations"),
+        (0.9, "Somebody edited an annotation"),
+    ]
+
+
 def test_of_more_trees_than_marks_none_is_confirmed_again():
     events = Events()
     assert events.shown(seen(0, 600), 0.0)

@@ -30,6 +30,8 @@ ROUTES = [
     ("POST", "/api/parameters/preset"),
     ("POST", "/api/parameters/reset"),
     ("GET", "/api/parameters.toml"),
+    ("GET", "/api/stages"),
+    ("POST", "/api/compare"),
     ("GET", "/api/sets"),
     ("POST", "/api/sets"),
     ("POST", "/api/sets/use"),

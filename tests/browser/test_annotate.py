@@ -66,6 +66,8 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     expect(page.locator("#annotate-count")).to_contain_text(f"1 of {len(found)} found trees judged")
     (row,) = rows(person)
     assert (row["kind"], row["x"], row["y"]) == ("tree", first["x"], first["y"])
+    mark = page.locator("#marks .mark.annotation")
+    expect(mark).to_have_attribute("title", re.compile(r"0:15\.0 annotated: .+ edited an annotation"))
     (second, *_) = sorted(
         (tree for tree in found if tree is not first), key=lambda tree: (tree["observations"], tree["number"])
     )

@@ -1,0 +1,107 @@
+// Two sets of parameters on the same scan, side by side; on the map half discs, A the left and B the right half.
+
+import { blockFor } from "./api.js";
+import { byId, el, setText } from "./dom.js";
+import { fillComparison } from "./compare_tables.js";
+import { keepFresh, shownOver } from "./overlay.js";
+import { newEye, pixel, PointPicture, unpack } from "./points.js";
+import { changed, on, state } from "./state.js";
+import { colour } from "./theme.js";
+import { savedSets, tuning, use } from "./tune.js";
+import { verdictOf } from "./verdicts.js";
+
+const EVERY = 700; // [ms] of quiet between two comparisons: the worker has a run to map
+const IN_FORCE = "in force";
+const eye = { ...newEye(), tilt: 0, scale: 9 };
+const sides = {};
+let data = null, planned = false;
+
+const nameOf = (side) => sides[side].list.value;
+
+function build() {
+  for (const [k, side] of ["a", "b"].entries()) {
+    const list = el("select", { "aria-label": `Set ${side.toUpperCase()}`, "data-set": side, onchange: refresh });
+    const canvas = el("canvas", { tabindex: "0", role: "img", "aria-label": `Clusters by set ${side.toUpperCase()}` });
+    const take = el("button", { class: "small", text: "Use", title: "Take this set for the run", onclick: () => use(nameOf(side)) });
+    sides[side] = { k, list, canvas, take, picture: new PointPicture(canvas, eye, redraw) };
+    byId(`compare-${side}`).replaceChildren(el("div", { class: "compare-head" }, el("i", { class: `sign ${side}`, text: side.toUpperCase() }), list, take), canvas);
+  }
+  byId("compare-swap").addEventListener("click", () => {
+    [sides.a.list.value, sides.b.list.value] = [nameOf("b"), nameOf("a")];
+    refresh();
+  });
+  new ResizeObserver(redraw).observe(byId("compare-pictures"));
+}
+
+// The sets that can be compared: what is in force, presets, saved sets. What was chosen stays chosen.
+function fillLists() {
+  const option = ({ name, doc }) => el("option", { value: name, text: name, title: doc ?? "" });
+  const names = JSON.stringify([tuning.presets, savedSets().map(({ name }) => name)]);
+  for (const { list, k } of Object.values(sides)) {
+    if (list.dataset.shown === names) continue;
+    const before = list.dataset.shown ? list.value : k === 0 ? state.parameters?.preset ?? "" : "";
+    list.dataset.shown = names;
+    list.replaceChildren(el("option", { value: "", text: IN_FORCE }), el("optgroup", { label: "Presets" }, ...tuning.presets.map(option)),
+      ...(savedSets().length ? [el("optgroup", { label: "Saved sets" }, ...savedSets().map(option))] : []));
+    list.value = before;
+    if (list.selectedIndex < 0) list.value = "";
+  }
+}
+
+function redraw() {
+  if (planned) return;
+  planned = true;
+  requestAnimationFrame(() => { planned = false; if (data && shownOver("compare")) for (const side of ["a", "b"]) draw(side); });
+}
+
+function draw(side) {
+  const { k, picture, canvas, list } = sides[side];
+  const { arrays, pictures } = data;
+  const { clusters, verdicts } = pictures[k];
+  const plain = pixel(colour("path"));
+  const colours = clusters.verdict.map((verdict) => pixel(colour(verdictOf(verdict)[1])));
+  const labels = arrays[`labels${k}`], circles = arrays[`circles${k}`];
+  picture.begin().points(arrays[`points${k}`], (n) => (labels[n] < 0 ? plain : colours[labels[n]]), 2).end();
+  for (let n = 0; n < clusters.x.length; n += 1) {
+    const [x, y, r, z] = circles.subarray(4 * n, 4 * n + 4);
+    const [letter, meaning] = verdictOf(clusters.verdict[n]);
+    if (meaning === "tree") picture.ring(x, y, Math.max(Number.isFinite(r) ? r : 0, 0.25), z, colour(`set-${side}`));
+    else picture.letter(x, y, z, letter, colour("text"), colour("ground"));
+  }
+  picture.robot(colour("robot"));
+  canvas.setAttribute("aria-label", `Set ${side.toUpperCase()}, ${list.selectedOptions[0]?.text}: ${verdicts.tree ?? 0} trees of ${clusters.x.length} clusters`);
+}
+
+const refresh = keepFresh(async () => {
+  if (!shownOver("compare")) return;
+  fillLists();
+  const lead = byId("compare-lead");
+  for (const { take, list } of Object.values(sides)) take.disabled = list.value === "";
+  if (!state.map) {
+    data = null;
+    setText(lead, "No scan yet. Press play, or open a run.");
+    return;
+  }
+  try {
+    data = unpack(await blockFor("/api/compare", { a: nameOf("a"), b: nameOf("b") }));
+    setText(lead, `Scan ${data.pictures[0].index}, mapped with both sets from the same state. On the map: left half A, right half B.`);
+    byId("over-compare").dataset.scan = String(data.pictures[0].index);
+    fillComparison(data, sides.a.list.selectedOptions[0]?.text, sides.b.list.selectedOptions[0]?.text);
+  } catch (error) {
+    setText(lead, error.message);
+  }
+  show();
+}, EVERY);
+
+function show() {
+  state.compare = shownOver("compare") && data ? data.pictures.map(({ clusters }) => clusters) : null;
+  changed("compare");
+  redraw();
+}
+
+export function startCompare() {
+  build();
+  on("over", () => (shownOver("compare") ? refresh() : show()));
+  on("map parameters sets specs", () => shownOver("compare") && refresh());
+  on("theme", redraw);
+}

@@ -1,0 +1,70 @@
+// Ctrl+K: everything that can be done, found by typing.
+
+import { ACTIONS, presentActions } from "./actions.js";
+import { byId, el } from "./dom.js";
+
+const MOST = 60; // entries that are listed; nobody reads farther
+let found = [], chosen = 0, before = null;
+
+const dialog = () => byId("palette");
+
+export function openPalette() {
+  before = document.activeElement;
+  byId("palette-find").value = "";
+  dialog().showModal();
+  sift();
+}
+
+// All words must occur; titles that begin with what was typed come first.
+function search(text) {
+  const words = text.toLowerCase().split(/\s+/).filter(Boolean);
+  const all = [...ACTIONS.map(([title, keys, , run]) => [title, keys, run]), ...presentActions()];
+  const fitting = all.filter(([title]) => words.every((word) => title.toLowerCase().includes(word)));
+  const rank = ([title]) => (title.toLowerCase().startsWith(words.join(" ")) ? 0 : title.toLowerCase().split(/\W+/).some((word) => words.length && word.startsWith(words[0])) ? 1 : 2);
+  return fitting.map((entry, place) => ({ entry, place, rank: rank(entry) })).sort((a, b) => a.rank - b.rank || a.place - b.place).map(({ entry }) => entry);
+}
+
+function sift() {
+  const all = search(byId("palette-find").value.trim());
+  found = all.slice(0, MOST);
+  chosen = 0;
+  byId("palette-list").replaceChildren(...found.map(([title, keys], place) =>
+    el("li", { id: `palette-${place}`, role: "option", onclick: () => run(place), onpointermove: () => choose(place) }, el("span", { text: title }), ...keys.split(" ").filter(Boolean).map((key) => el("kbd", { text: key })))));
+  byId("palette-none").hidden = found.length > 0;
+  byId("palette-more").textContent = all.length > MOST ? `and ${all.length - MOST} more; type to narrow them down` : "";
+  choose(0);
+}
+
+function choose(place) {
+  if (!found.length) return byId("palette-find").removeAttribute("aria-activedescendant");
+  chosen = (place + found.length) % found.length;
+  for (const [k, row] of [...byId("palette-list").children].entries()) row.setAttribute("aria-selected", String(k === chosen));
+  byId("palette-find").setAttribute("aria-activedescendant", `palette-${chosen}`);
+}
+
+function run(place) {
+  const entry = found[place];
+  if (!entry) return;
+  dialog().close();
+  entry[2]();
+}
+
+function key(event) {
+  const step = { ArrowDown: 1, ArrowUp: -1, PageDown: 8, PageUp: -8 }[event.key];
+  if (step) {
+    event.preventDefault();
+    choose(Math.abs(step) === 1 ? chosen + step : Math.min(found.length - 1, Math.max(0, chosen + step)));
+    byId(`palette-${chosen}`)?.scrollIntoView({ block: "nearest" });
+  } else if (event.key === "Enter") {
+    event.preventDefault();
+    run(chosen);
+  }
+}
+
+export function startPalette() {
+  byId("palette-find").addEventListener("input", sift);
+  byId("palette-find").addEventListener("keydown", key);
+  byId("palette-button").addEventListener("click", openPalette);
+  dialog().addEventListener("click", (event) => event.target === dialog() && dialog().close()); // beside it
+  dialog().addEventListener("close", () => document.activeElement === document.body && before?.focus());
+}

@@ -1,0 +1,96 @@
+"""Ctrl+K finds whatever can be done, and the sheet of keys names every key that acts."""
+
+from __future__ import annotations
+
+import re
+
+from playwright.sync_api import expect
+
+from tests.browser.dashboard import Dashboard
+
+
+def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.pause()
+    dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
+    page.locator("#map").press("Control+k")
+    find = page.get_by_role("combobox", name="What do you want to do?")
+    expect(find).to_be_focused()
+    find.fill("preset paper")
+    options = page.locator("#palette-list [role=option]")
+    expect(options.first).to_contain_text("Use the preset paper")
+    find.press("Enter")
+    dashboard.until_server("/api/parameters", "it.preset === 'paper'")
+    expect(page.locator("#palette")).to_be_hidden()
+
+    dashboard.scene.locator("canvas").first.press("Control+k")
+    find.fill("eps")
+    expect(options.first).to_contain_text("Radius eps (0.25 m)")
+    find.press("Enter")
+    expect(page.locator("[id='tune-clustering.eps']")).to_be_focused()
+
+    page.keyboard.press("Control+k")  # also while somebody types
+    find.fill("layer raw")
+    find.press("Enter")
+    dashboard.scene.wait_for_function(
+        "() => window.__viserSceneTree.getState()['/world/robot/scan/raw'].visibility === false"
+    )
+    page.keyboard.press("Control+k")
+    find.fill("layer raw")
+    expect(options.first).to_contain_text("show")
+    options.first.click()
+    page.keyboard.press("Control+k")
+    find.fill("no such thing")
+    expect(page.locator("#palette-none")).to_be_visible()
+    find.fill("preset forest")
+    find.press("Enter")
+    dashboard.until_server("/api/parameters", "it.preset === 'forest'")
+    number = page.locator("#trees tbody tr").first.get_attribute("data-tree")
+    page.keyboard.press("Control+k")
+    find.fill(f"tree {number}")
+    page.locator("#palette-list [role=option]", has_text=re.compile(f"^Tree {number}$")).click()
+    expect(page.locator("#panel-story")).to_have_attribute("data-story", f"tree {number}")
+    page.locator("#map").press("Escape")
+    assert dashboard.errors == []
+
+
+def test_the_arrows_choose_and_the_list_is_read_aloud(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("#palette-button").click()
+    find = page.locator("#palette-find")
+    for place in (1, 2):
+        find.press("ArrowDown")
+        expect(find).to_have_attribute("aria-activedescendant", f"palette-{place}")
+        expect(page.locator(f"#palette-{place}")).to_have_attribute("aria-selected", "true")
+    find.press("Escape")
+    expect(page.locator("#palette")).to_be_hidden()
+    expect(page.locator("#palette-button")).to_be_focused()
+
+
+def test_the_sheet_names_every_key_that_acts(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("#map").press("?")
+    told = page.locator("#keys-list kbd").all_inner_texts()
+    acting = page.evaluate(
+        "() => import('/static/js/actions.js').then(all => all.ACTIONS.map(row => row[2]).filter(Boolean))"
+    )
+    shown = {" ": "space", "Escape": "esc"}
+    assert {shown.get(key, key) for key in acting} <= set(told)
+    assert {"ctrl+k", "1", "0", "y", "n", "ctrl+z", "←", "→", "f", "t", "b"} <= set(told)
+    page.keyboard.press("Escape")
+
+
+def test_every_control_has_a_name_and_every_parameter_its_sentence(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Tune")
+    assert page.evaluate(NAMELESS) == []
+    docs = page.evaluate("() => [...document.querySelectorAll('.tune-row label')].map(label => label.title)")
+    specs = dashboard.ask("/api/parameters")["specs"]
+    assert docs == [f"{spec['doc']} ({spec['name']})" for spec in specs]
+    assert dashboard.errors == []
+
+
+NAMELESS = """() => [...document.querySelectorAll('button, input, select, a[href], canvas, dialog')]
+  .filter(node => !(node.getAttribute('aria-label') || node.labels?.length || node.title
+    || node.textContent.trim() || node.getAttribute('aria-labelledby')))
+  .map(node => node.outerHTML.slice(0, 120))"""
