@@ -335,7 +335,9 @@ class Dashboard:
         self.path_xy = np.column_stack([self.path.x, self.path.y])
         distance = self.parameters.parameters.evaluation.match_distance
         counts = self._before_after.shown(counts_of(shown.frame, self.truth, distance))
-        self.live.show({**map_payload(shown), **counts}, self.path_xy)
+        payload = map_payload(shown)
+        payload["layers"] |= self.scene.counts
+        self.live.show({**payload, **counts}, self.path_xy)
         if self.events.shown(shown.frame, shown.time_s):
             self._tell_events()
         self.logbook.shown(self._glance(shown))

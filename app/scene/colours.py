@@ -26,6 +26,8 @@ PATH: Rgb = (150, 156, 164)
 ODOMETRY: Rgb = (96, 101, 108)
 ROBOT: Rgb = (214, 45, 45)
 PARTICLES: Rgb = (235, 110, 110)
+VOXELS: Rgb = (120, 120, 230)
+ERROR: Rgb = (226, 59, 59)
 SELECTION: Rgb = (86, 180, 233)
 
 _VERDICTS: dict[Verdict, Rgb] = {

@@ -49,6 +49,11 @@ class GroundNode:
             self._node.visible = visible and self._faces > 0
 
     @property
+    def faces(self) -> int:
+        """Of its mesh."""
+        return self._faces
+
+    @property
     def area(self) -> float:
         """Of the known cells [m^2]."""
         return 0.0 if self._shown is None else len(self._shown.place) * self._shown.cell**2

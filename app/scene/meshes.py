@@ -25,6 +25,14 @@ def cylinder(sides: int = 20) -> Mesh:
     return vertices.astype(np.float32), np.array(faces, dtype=np.uint32)
 
 
+def box() -> Mesh:
+    """A box of side 1 with a corner in the origin."""
+    vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float32)
+    squares = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    faces = [face for a, b, c, d in squares for face in ((a, b, c), (a, c, d))]
+    return vertices, np.array(faces, dtype=np.uint32)
+
+
 def circles(
     centres: NDArray[np.floating], radii: NDArray[np.floating], z: NDArray[np.floating]
 ) -> NDArray[np.float32]:

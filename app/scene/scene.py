@@ -14,7 +14,9 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene.camera import WORLD, Follower
+from app.scene.error_node import ErrorNode
 from app.scene.hotkeys import add_hotkeys
+from app.scene.map_cloud import Accumulated, MapCloud
 from app.scene.map_nodes import MapNodes, Ring
 from app.scene.robot_nodes import ROBOT, RobotNodes
 from app.scene.scan_nodes import ScanNodes, Vector
@@ -22,6 +24,7 @@ from app.scene.server import silenced, start_server
 from app.scene.tune_panel import TunePanel
 from app.scene.tuning import SceneCommands, Tuning, Value
 from app.scene.view import View
+from app.scene.voxel_node import VoxelNode
 from pipeline.geometry import Pose2
 from pipeline.parameters import Parameters, preset
 from pipeline.records import Frame, TruthTrees
@@ -54,6 +57,7 @@ class Scene:
         self._truth: TruthTrees | None = None
         self._selected: int | None = None
         self._ring: Ring = None
+        self._accumulated = Accumulated()
         self._build()
 
     @property
@@ -102,7 +106,17 @@ class Scene:
     @property
     def view(self) -> dict[str, Any]:
         """What people chose to see, for the page."""
-        return self._view.as_plain()
+        return {**self._view.as_plain(), "counts": self.counts}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How much the layers show of which only the scene knows."""
+        return {
+            "ground": self._map.ground.faces,
+            "voxels": self._voxels.count,
+            "gathered": self._gathered.count,
+            "errors": self._errors.count,
+        }
 
     def choose(self, name: str, value: str | bool) -> None:
         """Show or hide a layer, follow the robot or not, or colour and label by something else.
@@ -117,6 +131,7 @@ class Scene:
         """Forget the run: an empty scene, the panel as it is."""
         self._frame, self._path = None, np.zeros((0, 2))
         self._truth = self._selected = self._ring = None
+        self._accumulated = Accumulated()
         with self._server.atomic():
             self._server.scene.reset()
             self._add_nodes()
@@ -161,6 +176,9 @@ class Scene:
         self._robot = RobotNodes(scene)
         self._scan = ScanNodes(scene, ROBOT, functools.partial(self._cross, self._on_cluster))
         self._map = MapNodes(scene, functools.partial(self._cross, self._on_tree))
+        self._voxels = VoxelNode(scene, f"{ROBOT}/scan")
+        self._gathered = MapCloud(scene, self._accumulated)
+        self._errors = ErrorNode(scene)
 
     def _renew(self) -> None:
         old = self._server
@@ -190,6 +208,18 @@ class Scene:
             self._map.show(self._frame, self._selected, self._ring, self._view)
             self._robot.show(self._frame, self._path, self._view, self._map.ground)
             self._scan.show(self._frame, self._view)
+            self._gathered.show(self._frame, self._view.layers["gathered"])
+            self._show_more(self._frame)
+
+    def _show_more(self, frame: Frame) -> None:
+        """The layers that are made only while people want to see them."""
+        size = self._parameters.filters.voxel_size
+        self._voxels.show(frame.filtered, size, self._view.layers["voxels"])
+        if self._view.layers["errors"]:
+            wanted = self._parameters.evaluation
+            self._errors.show(frame.trees, self._truth, self._path, wanted, self._map.ground)
+        else:
+            self._errors.hide()
 
     def _repaint(self) -> None:
         if self._frame is None:
@@ -199,6 +229,8 @@ class Scene:
             self._robot.repaint(self._view)
             self._scan.repaint(self._frame, self._view)
             self._map.repaint(self._frame, self._selected, self._ring, self._view)
+            self._gathered.repaint(self._view.layers["gathered"])
+            self._show_more(self._frame)
 
     # --- what people do; each runs in viser's thread and crosses over ---------------------------
 

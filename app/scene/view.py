@@ -10,6 +10,7 @@ from pipeline.errors import ParameterError
 
 COLOUR_BY = ("verdict", "stage", "cluster", "height", "eccentricity")
 LABEL_BY = ("eccentricity", "verdict", "DBH", "none")
+# In the order of their keys, 1 to 9 and 0.
 LAYERS = {
     "ground": "Ground",
     "raw": "Raw scan",
@@ -17,17 +18,23 @@ LAYERS = {
     "clusters": "Clusters",
     "fits": "Fitted circles",
     "labels": "Labels",
+    "gathered": "Accumulated map",
+    "trees": "Trees",
+    "truth": "Ground truth",
+    "errors": "Errors (10 times as long)",
     "particles": "Particles",
     "path": "Path",
     "odometry": "Path by odometry",
-    "trees": "Trees",
-    "truth": "Ground truth",
+    "voxels": "Voxels",
 }
+# Off until somebody asks for them: they cost time to draw, or cover what lies below.
+OFF_AT_FIRST = ("odometry", "voxels", "gathered", "errors")
 # What a layer is drawn in while people colour by verdict; those that are not named have many colours.
 COLOURS = {
     "ground": colours.GROUND,
     "raw": colours.RAW,
     "filtered": colours.FILTERED,
+    "voxels": colours.VOXELS,
     "clusters": colours.TREE,
     "fits": colours.TREE,
     "particles": colours.PARTICLES,
@@ -35,6 +42,7 @@ COLOURS = {
     "odometry": colours.ODOMETRY,
     "trees": colours.TREE,
     "truth": colours.TRUTH,
+    "errors": colours.ERROR,
 }
 CHOICES = {"colour_by": COLOUR_BY, "label_by": LABEL_BY}
 
@@ -46,7 +54,9 @@ class View:
     colour_by: str = COLOUR_BY[0]
     label_by: str = LABEL_BY[0]
     follow: bool = True
-    layers: dict[str, bool] = field(default_factory=lambda: {name: name != "odometry" for name in LAYERS})
+    layers: dict[str, bool] = field(
+        default_factory=lambda: {name: name not in OFF_AT_FIRST for name in LAYERS}
+    )
 
     def choose(self, name: str, value: str | bool) -> None:
         """Switch a layer or following, or choose by what is coloured or labelled.

@@ -9,6 +9,7 @@ const EVERY = 500; // [ms] between two fillings of the counts
 const TITLES = { colour_by: "Colour by", label_by: "Labels" };
 const counts = {};
 let countedAt = 0;
+const newest = {}; // counts by layer, as the scan or a choice told them last
 
 const choose = (name, value) => patch("/api/view", { name, value }).catch(() => {});
 
@@ -44,7 +45,7 @@ function show() {
 
 function count() {
   countedAt = performance.now();
-  const known = { ...state.map?.layers, path: state.path.length, truth: state.truth?.length ?? 0 };
+  const known = { ...newest, labels: undefined, path: state.path.length, odometry: state.odometry.filter(Boolean).length, truth: state.truth?.length ?? 0 };
   for (const [name, cell] of Object.entries(counts)) setText(cell, known[name] === undefined ? "" : known[name].toLocaleString("en"));
 }
 
@@ -60,6 +61,7 @@ export function startLayers() {
   byId("look-top").addEventListener("click", () => pressInScene("t"));
   byId("look-behind").addEventListener("click", () => pressInScene("b"));
   byId("follow").addEventListener("click", toggleFollow);
-  on("view", show);
+  on("view", () => { Object.assign(newest, state.view?.counts); show(); });
+  on("map", () => Object.assign(newest, state.map?.layers));
   on("map truth", () => !byId("layer-list").hidden && performance.now() - countedAt > EVERY && count());
 }

@@ -289,6 +289,10 @@ class FakeScene:
     def view(self) -> dict[str, Any]:
         return {"follow": True}
 
+    @property
+    def counts(self) -> dict[str, int]:
+        return {"voxels": 0}
+
     def choose(self, name: str, value: str | bool, /) -> None:
         if name == "nothing":
             raise ParameterError("there is no such layer")
