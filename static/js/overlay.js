@@ -15,6 +15,7 @@ export function openOver(name) {
     byId(`${each}-button`).setAttribute("aria-pressed", String(each === current));
   }
   byId("scene").closest(".scene").classList.toggle("covered", current !== null);
+  if (current && matchMedia("(max-width: 700px)").matches) byId(`over-${current}`).scrollIntoView();
   changed("over");
 }
 

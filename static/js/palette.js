@@ -20,7 +20,7 @@ function search(text) {
   const words = text.toLowerCase().split(/\s+/).filter(Boolean);
   const all = [...ACTIONS.map(([title, keys, , run]) => [title, keys, run]), ...presentActions()];
   const fitting = all.filter(([title]) => words.every((word) => title.toLowerCase().includes(word)));
-  const rank = ([title]) => (title.toLowerCase().startsWith(words.join(" ")) ? 0 : title.toLowerCase().split(/\W+/).some((word) => words.length && word.startsWith(words[0])) ? 1 : 2);
+  const rank = ([title]) => (/^Tree \d/.test(title) && !/\d/.test(text) ? 3 : title.toLowerCase().startsWith(words.join(" ")) ? 0 : title.toLowerCase().split(/\W+/).some((word) => words.length && word.startsWith(words[0])) ? 1 : 2);
   return fitting.map((entry, place) => ({ entry, place, rank: rank(entry) })).sort((a, b) => a.rank - b.rank || a.place - b.place).map(({ entry }) => entry);
 }
 
