@@ -45,7 +45,7 @@ T = TypeVar("T")
 # that is sought: rarely enough that a short way shows no flicker.
 _REPORT_S = 0.25
 _GLIMPSE_S = 0.5
-COMPILING = "Compiling for this machine; it takes a minute or two, and only the first time"
+COMPILING = "Compiling for this machine; this can take a minute or two, and only the first time"
 
 
 class Driver:
