@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.compiled import compiled
 from pipeline.direction import direction_turn
@@ -118,24 +119,56 @@ def on_the_grid(points: Float32) -> tuple[Float32, Float32]:
 
 @compiled
 def _height_above(points: Float32, height: Float) -> Float32:
-    sectors, rings = height.shape
-    h = height.astype(np.float32)
+    rings = height.shape[1]
+    corners = _corners(height)
+    node, f, g = _nodes(*on_the_grid(points), height.shape[0], rings)
+    one = np.float32(1.0)
     above = np.empty(points.shape[0], np.float32)
-    sector, ring = on_the_grid(points)
-    half, one, last = np.float32(0.5), np.float32(1.0), np.float32(rings - 1)
     for i in range(points.shape[0]):
-        if not ring[i] >= np.float32(0.0):
-            above[i] = np.nan
-            continue
-        turn = sector[i] + np.float32(sectors - 0.5)
-        around = np.int32(turn)
-        f = turn - np.float32(around)
-        before = around - sectors if around >= sectors else around
-        after = before + 1 if before + 1 < sectors else 0
-        out = min(max(ring[i] - half, np.float32(0.0)), last)
-        k = np.int32(out)
-        g, beyond = out - np.float32(k), min(k + 1, rings - 1)
-        near = (one - f) * h[before, k] + f * h[after, k]
-        far = (one - f) * h[before, beyond] + f * h[after, beyond]
-        above[i] = points[i, 2] - ((one - g) * near + g * far)
+        j = node[i]
+        near = (one - f[i]) * corners[j, 0] + f[i] * corners[j, 1]
+        far = (one - f[i]) * corners[j, 2] + f[i] * corners[j, 3]
+        above[i] = points[i, 2] - ((one - g[i]) * near + g[i] * far)
     return above
+
+
+@compiled
+def _corners(height: Float) -> Float32:
+    """Of each node, sector times rings plus ring, its height, that of the next one around, and of the two
+    beyond these: float32, shape (N, 4) [m], in one row, so that a point touches one place."""
+    sectors, rings = height.shape
+    corners = np.empty((sectors * rings, 4), np.float32)
+    for s in range(sectors):
+        after = s + 1 if s + 1 < sectors else 0
+        for k in range(rings):
+            row, beyond = corners[s * rings + k], min(k + 1, rings - 1)
+            row[0], row[1] = height[s, k], height[after, k]
+            row[2], row[3] = height[s, beyond], height[after, beyond]
+    return corners
+
+
+@compiled
+def _nodes(
+    sector: Float32, ring: Float32, sectors: int, rings: int
+) -> tuple[NDArray[np.uint32], Float32, Float32]:
+    """The node before each point, and which part of the way to the next one it lies around and outwards; of
+    what has no ring that is not a number.
+
+    A plain loop over plain rows, so that the processor takes eight points at once; the parts are left in
+    the two rows that are given, which come from `on_the_grid`.
+    """
+    node = np.empty(sector.shape[0], np.uint32)
+    zero, half, last = np.float32(0.0), np.float32(0.5), np.float32(rings - 1)
+    shift, nan = np.float32(sectors - 0.5), np.float32(np.nan)
+    circle, ray = np.int32(sectors), np.int32(rings)
+    for i in range(sector.shape[0]):
+        known = ring[i] >= zero
+        turn = sector[i] + shift if known else zero
+        around = np.int32(turn)
+        sector[i] = turn - np.float32(around)
+        around = around - circle if around >= circle else around
+        out = min(max(ring[i] - half, zero), last) if known else zero
+        k = np.int32(out)
+        ring[i] = out - np.float32(k) if known else nan
+        node[i] = np.uint32(around * ray + k)
+    return node, sector, ring

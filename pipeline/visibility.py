@@ -4,6 +4,7 @@ hidden one."""
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.compiled import compiled
 from pipeline.direction import direction_bin
@@ -27,8 +28,8 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
         sensor_offset: shape (3,) [m].
     """
     looked = np.zeros(BINS, np.bool_)
-    for i in range(raw.shape[0]):
-        looked[direction_bin(raw[i, 0] + sensor_offset[0], raw[i, 1] + sensor_offset[1], BINS)] = True
+    for k in _directions(raw, sensor_offset):
+        looked[k] = True
     free = np.full(BINS, np.inf)
     for i in range(filtered.shape[0]):
         x, y = filtered[i, 0] + sensor_offset[0], filtered[i, 1] + sensor_offset[1]
@@ -45,6 +46,26 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
     for k in range(BINS):
         safe[k] = min(free[k], free[(k + 1) % BINS], free[k - 1])
     return safe
+
+
+@compiled
+def _directions(points: Float32, sensor_offset: Float) -> NDArray[np.uint16]:
+    """The `direction_bin` of each point, written without branches over plain rows, so that the processor
+    takes several at once."""
+    n = points.shape[0]
+    xs, ys = np.empty(n), np.empty(n)
+    for i in range(n):
+        xs[i], ys[i] = points[i, 0], points[i, 1]
+    bins = np.empty(n, np.uint16)
+    at_x, at_y, last = sensor_offset[0], sensor_offset[1], np.int32(BINS - 1)
+    for i in range(n):
+        x, y = xs[i] + at_x, ys[i] + at_y
+        length = abs(x) + abs(y)
+        side = y / length if length > 0.0 else 0.0
+        behind = -1.0 - side if y < 0.0 else 3.0 - side
+        turn = ((1.0 + side if x >= 0.0 else behind) + 1.0) * 0.25
+        bins[i] = min(np.int32(turn * BINS), last)  # never negative, so that cutting off rounds down
+    return bins
 
 
 @compiled

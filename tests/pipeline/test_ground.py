@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from pipeline.ground import find_terrain, height_above, in_band
 from pipeline.parameters import preset
-from pipeline.terrain import heights_of_places, shows_ground
-from tests.pipeline.strategies import FEW
+from pipeline.terrain import SECTORS, Terrain, heights_of_places, shows_ground
+from tests.pipeline.strategies import FEW, LAW, seeds
 
 FOREST = preset("forest").ground
 SENSOR_HEIGHT = 0.8
@@ -156,3 +156,18 @@ def test_an_echo_far_below_the_ground_is_a_ghost():
     with_ghosts = np.concatenate([points, ghosts])
     above = height_above(points, find_terrain(with_ghosts, FOREST))
     assert np.abs(above[np.hypot(points[:, 0], points[:, 1]) < 10.0]).max() < 0.3
+
+
+@LAW
+@given(seeds, st.integers(1, 48))
+def test_heights_of_many_points_are_those_of_each(seed, rings):
+    random = np.random.default_rng(seed)
+    nodes = random.normal(-1.0, 0.3, (SECTORS, rings))
+    points = random.normal(0.0, random.uniform(0.1, 80.0), (200, 3)).astype(np.float32)
+    points[:50] = np.round(points[:50])
+    points[50:53, 0] = np.nan, np.inf, -np.inf
+    above = height_above(points, Terrain(nodes, np.ones(nodes.shape, bool)))
+    assert np.all(np.isnan(above[50:53]))
+    known = np.delete(points, slice(50, 53), axis=0)
+    wanted = heights_of_places(known.astype(np.float64), nodes)
+    np.testing.assert_allclose(np.delete(above, slice(50, 53)), wanted, atol=2e-3)

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.direction import direction_bin
-from pipeline.visibility import BINS, clear_range, in_free_view
-from tests.pipeline.strategies import LAW
+from pipeline.visibility import BINS, FIELD, clear_range, in_free_view
+from tests.pipeline.strategies import LAW, seeds
 
 AROUND = np.linspace(-np.pi, np.pi, 1440, endpoint=False)
 POSE = np.array([1.0, 2.0, 0.5])
@@ -89,3 +89,20 @@ def test_bins_ascend_with_the_angle_and_differ_by_at_most_twofold(bins):
 def test_the_origin_has_a_direction_too():
     assert direction_bin(0.0, 0.0, 360) == direction_bin(1.0, 0.0, 360)
     assert direction_bin(-0.0, -0.0, 360) == 180
+
+
+@LAW
+@given(seeds, st.floats(0.0, 40.0))
+def test_the_free_distance_is_that_of_the_nearest_point_by_direction(seed, spread):
+    random = np.random.default_rng(seed)
+    raw = random.normal(0.0, spread, (300, 3)).astype(np.float32)
+    raw[:60, :2] = np.round(raw[:60, :2])  # on the axes, on the diagonals, at the origin
+    sensor = np.array([0.25, -0.5, 1.0]) * float(random.integers(0, 2))
+    nearest, looked = np.full(BINS, np.inf), np.zeros(BINS, bool)
+    for x, y in raw[:, :2] + sensor[:2]:
+        k = direction_bin(x, y, BINS)
+        looked[[(k + j) % BINS for j in range(-FIELD, FIELD + 1)]] = True
+        nearest[k] = min(nearest[k], np.hypot(x, y))
+    free = np.where(looked, nearest, 0.0)
+    wanted = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
+    np.testing.assert_allclose(clear_range(raw, raw, sensor), wanted)
