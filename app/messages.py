@@ -38,6 +38,10 @@ class Status:
         warnings: The newest last, each once.
         revision: Of the parameters in force.
         going_to: The sought time or scan in words while it is not reached yet, else empty.
+        live: Whether the source is a robot that is heard live.
+        robot: Its namespace, empty for none.
+        robots: The namespaces of all robots that publish scans where it is heard.
+        recording: Where a live run is recorded to, or why it is no more; empty where it is not.
     """
 
     state: State
@@ -59,6 +63,10 @@ class Status:
     warnings: list[str] = field(default_factory=list)
     revision: int = 0
     going_to: str = ""
+    live: bool = False
+    robot: str = ""
+    robots: list[str] = field(default_factory=list)
+    recording: str = ""
 
 
 class Play(msgspec.Struct, frozen=True, tag="play"):
@@ -96,11 +104,19 @@ class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
 
 
 class Open(msgspec.Struct, frozen=True, tag="open"):
-    """Leave the present run and open another source."""
+    """Leave the present run and open another source.
+
+    Attributes:
+        uri, odometry, seed: What is mapped, and how.
+        record: Path of the file that a live run is recorded to; empty for none. No browser may say it.
+        publish: Whether a live run's results go back to the robot's network.
+    """
 
     uri: str
     odometry: str = "auto"
     seed: int = 0
+    record: str = ""
+    publish: bool = False
 
 
 Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from pipeline.errors import SourceError
 from pipeline.sources.base import SourceDescription
+from pipeline.steps import OdometryChoice
+
+
+def odometry_used(description: SourceDescription, choice: OdometryChoice) -> OdometryChoice:
+    """The choice as the synchroniser needs it: live, no scan waits for an odometry that nobody sends."""
+    waits_in_vain = description.in_order_of_arrival and not description.has_odometry
+    return "static" if waits_in_vain else choice
 
 
 def odometry_warnings(description: SourceDescription, choice: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path as FilePath
@@ -13,7 +14,7 @@ import numpy as np
 from app.continuing import Beginning, Continued, at_origin, go_on
 from app.driven import breaks_of, driven
 from app.finished import as_written
-from app.odometry import odometry_warnings
+from app.odometry import odometry_used, odometry_warnings
 from app.preset_words import changed_values, preset_words
 from app.saved_run import FORMAT, SavedRun
 from app.stopwatch import Stopwatch
@@ -46,7 +47,13 @@ class Progress(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OfflineRun:
-    """What to map, and how; `stop_after` so many scans."""
+    """What to map, and how.
+
+    Attributes:
+        stop_after: So many scans.
+        revisions: Other parameters, each from a scan on, in their order.
+        on_frame: Told of each scan's results.
+    """
 
     source: Source
     preset: str
@@ -56,6 +63,8 @@ class OfflineRun:
     truth_trees: TruthTrees | None = None
     continued: Continued | None = None
     stop_after: int | None = None
+    revisions: tuple[tuple[int, Parameters], ...] = ()
+    on_frame: Callable[[Frame, Mapper], None] | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -116,10 +125,13 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopw
     begun = _beginning(plan, mapper)
     tally, start_ns, frame = begun.tally, begun.start_ns, None
     left_out = Counter[str]()
-    to_map = begun.steps(plan.source, plan.odometry, left_out)
+    to_map = begun.steps(plan.source, odometry_used(description, plan.odometry), left_out)
     for step in islice(to_map, plan.stop_after):
+        _use_revisions(plan, mapper, step.index)
         with stopwatch.whole_scan():
             frame = mapper.process(step)
+        if plan.on_frame is not None:
+            plan.on_frame(frame, mapper)
         start_ns = frame.stamp_ns if start_ns is None else start_ns
         files.add(frame, start_ns)
         tally.add(frame)
@@ -159,6 +171,25 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopw
     further = {"terrain.csv": terrain_text(mapper.height_map)}
     files.finish(frame.trees, path, start_ns, record, state, further)
     return outcome
+
+
+def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
+    in_force = [parameters for first, parameters in plan.revisions if first <= scan]
+    if in_force and in_force[-1] is not mapper.parameters:
+        mapper.parameters = in_force[-1]
+
+
+def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
+    """The revisions for run.json: what each changed."""
+    told: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
+    before = plan.parameters.flat()
+    for first, parameters in plan.revisions:
+        after = parameters.flat()
+        changes = {name: value for name, value in after.items() if value != before[name]}
+        if changes:
+            told.append({"revision": len(told), "from_scan": first, "changes": changes})
+        before = after
+    return told
 
 
 def _beginning(plan: OfflineRun, mapper: Mapper) -> Beginning:
@@ -221,7 +252,7 @@ def _run_record(
         "preset": plan.preset,
         "changed": changed_values(plan.preset, plan.parameters),
         "parameters": plan.parameters.model_dump(),
-        "revisions": [{"revision": 0, "from_scan": 0, "changes": {}}],
+        "revisions": _changes(plan),
         "scans": frame.index + 1,
         "duration_s": round(driven_s_m[0], 6),
         "distance_m": round(driven_s_m[1], 3),

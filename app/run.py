@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from app.cursor import Cursor, Synchroniser
+from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
+from app.live_cursor import LiveCursor
 from app.stopwatch import Stopwatch
 from app.story.history import TreeHistory
 from pipeline.errors import SourceError, StemmapError
@@ -40,7 +41,7 @@ class Run:
     Args:
         source: What is mapped; closed by `close`.
         mapper: Fresh, for this source.
-        synchronise: Joins the source's records to steps.
+        cursor: Reads the source's steps.
         parameters: In force from the first scan on.
         stopwatch: The one that the mapper measures with.
     """
@@ -49,7 +50,7 @@ class Run:
         self,
         source: Source,
         mapper: MapperLike,
-        synchronise: Synchroniser,
+        cursor: Cursor | LiveCursor,
         parameters: Parameters,
         stopwatch: Stopwatch,
     ) -> None:
@@ -59,7 +60,7 @@ class Run:
         self.standing = -1
         self.history = TreeHistory()
         self._mapper = mapper
-        self._cursor = Cursor(source, synchronise)
+        self._cursor = cursor
         self._parameters = ParameterHistory(parameters)
         self._snapshots: Snapshots[Any] = Snapshots(mapper.snapshot())
         self._step: Step | None = None

@@ -6,15 +6,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path as FilePath
 from typing import Literal
 
 import numpy as np
 
-from app.cursor import Synchroniser
+from app.cursor import Cursor, Synchroniser
+from app.live_cursor import LiveCursor
 from app.messages import LONGEST_S, State, Status
 from app.odometry import odometry_warnings
+from app.robot.recording import Recording
+from app.robot.source import LiveSource
 from app.run import MakeMapper, Run
-from app.session_status import clock, describe
+from app.session_status import clock, describe, opened_of
 from app.stopwatch import Stopwatch
 from app.story.records import ClusterStory, TreeStory
 from app.story.telling import make_ready, tell_cluster, tell_tree
@@ -24,9 +28,9 @@ from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path
 from pipeline.sources.base import Source
 
-OpenSource = Callable[[str, int], Source]
+OpenSource = Callable[[str, int], Source | LiveSource]
 MakeSynchroniser = Callable[[str], Synchroniser]
-Pace = Literal["idle", "replay", "hurry"]
+Pace = Literal["idle", "replay", "hurry", "live"]
 
 _NS = 1_000_000_000
 _MOST_WARNINGS = 20
@@ -58,7 +62,9 @@ class Session:
         self._parameters = parameters
         self._revision = 0
         self._asked: tuple[str, str, int] | None = None
+        self._record, self._publish = "", False
         self._run: Run | None = None
+        self._robot: LiveSource | None = None
         self._state: State = "starting"
         self._detail = ""
         self._target_index: int | None = None
@@ -68,9 +74,12 @@ class Session:
 
     @property
     def pace(self) -> Pace:
-        """Whether a scan is to be mapped at once (on the way to a sought scan), in its time, or not."""
-        if self._run is None or self._state == "failed":
+        """Whether a scan is to be mapped at once (on the way to a sought scan), in its time, as soon as it
+        comes (of a robot that is heard live), or not."""
+        if self._state == "failed" or (self._run is None and self._robot is None):
             return "idle"
+        if self._robot is not None:
+            return "live" if self._run is None or self._state == "playing" else "idle"
         if self._seeking:
             return "hurry"
         return "replay" if self._state == "playing" else "idle"
@@ -96,16 +105,46 @@ class Session:
         """Time of the next scan; None at the end of the run."""
         return self._run.peek_ns() if self._run else None
 
-    def open(self, uri: str, odometry: str, seed: int) -> Opened:
-        """Leave the present run and stand, paused, before the first scan of another source.
+    def open(
+        self, uri: str, odometry: str, seed: int, record: str = "", *, publish: bool = False
+    ) -> Opened | None:
+        """Leave the present run and stand, paused, before the first scan of another source. A robot is
+        recorded to the file `record`, unless that is empty, and told of its map if `publish` says so.
+
+        Returns:
+            What was opened; None of a robot that is still to be heard, see `listen`.
 
         Raises:
             SourceError: It cannot be read.
         """
         self._leave()
-        self._asked = (uri, odometry, seed)
-        synchronise = self._make_synchroniser(odometry)
+        self._asked, self._record, self._publish = (uri, odometry, seed), record, publish
         source = self._open_source(uri, seed)
+        if isinstance(source, LiveSource):
+            try:
+                source.use(Recording(FilePath(record)) if record else None, publish=publish)
+            except SourceError:
+                source.close()
+                raise
+            self._robot, self._state, self._detail = source, "waiting", ""
+            return None
+        return self._begin(source, odometry, seed)
+
+    def listen(self) -> Opened | None:
+        """Of a robot: what was opened, once it is heard; None before and after.
+
+        Raises:
+            SourceError: What it sends cannot be read.
+        """
+        if self._robot is None or self._asked is None:
+            return None
+        self._warn(self._robot.notices())
+        if self._run is not None or not self._robot.listen():
+            return None
+        return self._begin(self._robot, *self._asked[1:])
+
+    def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
+        synchronise = self._make_synchroniser(odometry)
         try:
             warnings = odometry_warnings(source.description, odometry)
         except SourceError:
@@ -113,10 +152,13 @@ class Session:
             raise
         stopwatch = Stopwatch()
         mapper = self._make_mapper(source, self._parameters, seed, stopwatch)
-        self._run = Run(source, mapper, synchronise, self._parameters, stopwatch)
+        cursor: Cursor | LiveCursor = Cursor(source, synchronise)
+        if isinstance(source, LiveSource):
+            cursor = LiveCursor(source, odometry)
+        self._run = Run(source, mapper, cursor, self._parameters, stopwatch)
         self._state, self._detail = "paused", ""
         self._warn((*source.description.warnings, *warnings))
-        return _opened(self._run)
+        return opened_of(self._run)
 
     def prepare(self) -> None:
         """Have all ready for the first scan, which can take a minute the first time on a machine.
@@ -145,9 +187,11 @@ class Session:
             return self._arrive(run)
         frame = run.map_next()
         if frame is None:
-            self._state = "finished"
+            self._state = "finished" if self._robot is None else self._state
         else:
             self._warn(frame.warnings)
+            if self._robot is not None:
+                self._robot.mapped(frame, run.path)
         if self._has_arrived(run) or (frame is None and self._seeking):
             return self._arrive(run)
         return frame
@@ -162,13 +206,16 @@ class Session:
             SourceError: It cannot be read.
         """
         opened = None
+        if self._run is None and self._robot is not None and self._state != "failed":
+            return None  # it plays when it is heard
         if self._run is None or self._state == "failed":
             if self._asked is None:
                 return None
-            opened = self.open(*self._asked)
+            opened = self.open(*self._asked, self._record, publish=self._publish)
         elif self._state == "finished":
             self._seek_index(0)
-        self._state, self._detail = "playing", ""
+        if self._run is not None:
+            self._state, self._detail = "playing", ""
         return opened
 
     def pause(self) -> None:
@@ -178,7 +225,7 @@ class Session:
 
     def advance(self, scans: int) -> None:
         """Pause, and stand so many scans further or back."""
-        if self._run is None:
+        if self._run is None or self._is_live():
             return
         here = self._run.standing if self._target_index is None else self._target_index
         self._settle()
@@ -186,7 +233,7 @@ class Session:
 
     def seek(self, time_s: float) -> None:
         """Stand at the last scan not later than a time; the run then goes on as it did before."""
-        if self._run is None or not math.isfinite(time_s):
+        if self._run is None or not math.isfinite(time_s) or self._is_live():
             return
         if self._state != "playing":
             self._settle()
@@ -211,7 +258,10 @@ class Session:
         if self._seeking:  # see `_arrive`
             return None
         stands = self._state != "playing" and run.standing >= 0
-        run.use(parameters, run.standing + (0 if stands else 1))
+        from_scan = run.standing + (0 if stands else 1)
+        run.use(parameters, from_scan)
+        if self._robot is not None:
+            self._robot.use_parameters(revision, from_scan, parameters)
         return run.map_again() if stands and self._state != "failed" else None
 
     def cluster_story(self, frame: Frame, cluster: int) -> ClusterStory:
@@ -261,6 +311,7 @@ class Session:
         """How the run goes; what only a clock can tell is left at 0."""
         return describe(
             self._run,
+            self._robot,
             state=self._state,
             detail=self._detail,
             uri=self._asked[0] if self._asked else "",
@@ -273,6 +324,12 @@ class Session:
     def close(self) -> None:
         """Let go of the source."""
         self._leave()
+
+    def _is_live(self) -> bool:
+        """Whether the run is of a robot, in whose time nobody can go; a person is told so."""
+        if self._robot is not None:
+            self._warn(["a live run goes on as it comes: to step and seek, open its recording"])
+        return self._robot is not None
 
     @property
     def _seeking(self) -> bool:
@@ -325,7 +382,9 @@ class Session:
     def _leave(self) -> None:
         if self._run is not None:
             self._run.close()
-        self._run = None
+        elif self._robot is not None:
+            self._robot.close()
+        self._run = self._robot = None
         self._warnings.clear()
         self._forget_target()
 
@@ -335,20 +394,3 @@ class Session:
             self._warnings[warning] = None
         while len(self._warnings) > _MOST_WARNINGS:
             del self._warnings[next(iter(self._warnings))]
-
-
-def _opened(run: Run) -> Opened:
-    description = run.source.description
-    truth = run.source.truth()
-    end_s = None
-    if description.start_ns is not None and description.end_ns is not None:
-        end_s = (description.end_ns - description.start_ns) / _NS
-    return Opened(
-        uri=description.uri,
-        kind=description.kind,
-        preset=description.preset,
-        scans=description.scans,
-        end_s=end_s,
-        truth=truth.trees if truth else None,
-        digest=description.digest,
-    )

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from app.driven import driven
 from app.messages import State, Status
+from app.robot.source import LiveSource
 from app.run import Run
+from app.worker_messages import Opened
 
 _NS = 1_000_000_000
 
 
 def describe(
     run: Run | None,
+    robot: LiveSource | None,
     *,
     state: State,
     detail: str,
@@ -23,6 +28,35 @@ def describe(
     going_to: str,
 ) -> Status:
     """The status of a run, or of none; speed, rate and lateness are the driver's to fill in."""
+    status = _of_run(run, state, detail, uri, time_s, warnings, revision, going_to)
+    return status if robot is None else _live(status, robot)
+
+
+def _live(status: Status, robot: LiveSource) -> Status:
+    """The same with what is heard of the robot."""
+    silent = robot.waiting_for() if status.state in ("playing", "waiting") else ""
+    return replace(
+        status,
+        state="waiting" if silent else status.state,
+        detail=silent or status.detail,
+        live=True,
+        robot=robot.robot,
+        robots=robot.robots,
+        scans_behind=robot.scans_waiting,
+        recording=robot.recording,
+    )
+
+
+def _of_run(
+    run: Run | None,
+    state: State,
+    detail: str,
+    uri: str,
+    time_s: float,
+    warnings: tuple[str, ...],
+    revision: int,
+    going_to: str,
+) -> Status:
     if run is None:
         return Status(state=state, detail=detail, source=uri, warnings=list(warnings), revision=revision)
     description = run.source.description
@@ -52,3 +86,21 @@ def clock(seconds: float) -> str:
     """A time as the page writes it: minutes and seconds."""
     whole = int(seconds)
     return f"{whole // 60}:{whole % 60:02d}"
+
+
+def opened_of(run: Run) -> Opened:
+    """What the web process is told of a run that was opened."""
+    description = run.source.description
+    truth = run.source.truth()
+    end_s = None
+    if description.start_ns is not None and description.end_ns is not None:
+        end_s = (description.end_ns - description.start_ns) / _NS
+    return Opened(
+        uri=description.uri,
+        kind=description.kind,
+        preset=description.preset,
+        scans=description.scans,
+        end_s=end_s,
+        truth=truth.trees if truth else None,
+        digest=description.digest,
+    )

@@ -9,6 +9,7 @@ import contextlib
 import ipaddress
 import os
 import re
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,6 +119,17 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
         database=given.get("STEMMAP_DATABASE", ""),
         upload_limit=_gigabytes(given.get("STEMMAP_UPLOAD_GB", "20")),
     )
+
+
+def recordings_place(settings: Settings, now_s: float) -> Path:
+    """A new recording's file in the data folder, named by the time [s since 1970].
+
+    Raises:
+        StemmapError: There is no data folder.
+    """
+    if settings.folder is None:
+        raise StemmapError("there is no data folder", remedy="Name a file: --record FILE.mcap")
+    return settings.folder / "recordings" / time.strftime("live-%Y%m%d-%H%M%S.mcap", time.gmtime(now_s))
 
 
 def _data_folder(given: Mapping[str, str]) -> Path | None:

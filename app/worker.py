@@ -31,8 +31,11 @@ _GRACE_S = 1.0
 
 def new_session() -> Session:
     """A session on the real pipeline, for the worker and for commands that map in process."""
+    from app.opening import open_any
+    from app.robot.source import LiveSource
+    from app.warming import warm_up
     from pipeline.mapper import Mapper
-    from pipeline.sources import SourceOptions, open_source
+    from pipeline.sources import SourceOptions
     from pipeline.steps import OdometryChoice, steps
 
     choices: dict[str, OdometryChoice] = {"auto": "auto", "wheels": "wheels", "static": "static"}
@@ -43,8 +46,14 @@ def new_session() -> Session:
             parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed, watch=watch
         )
 
+    def open_ready(uri: str, seed: int) -> Source | LiveSource:
+        source = open_any(uri, SourceOptions(seed=seed))
+        if isinstance(source, LiveSource):  # it is not listened to before this session asks for its scans
+            warm_up()
+        return source
+
     return Session(
-        open_source=lambda uri, seed: open_source(uri, SourceOptions(seed=seed)),
+        open_source=open_ready,
         make_mapper=make_mapper,
         make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
         parameters=Parameters(),

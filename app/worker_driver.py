@@ -46,6 +46,8 @@ T = TypeVar("T")
 _REPORT_S = 0.25
 _GLIMPSE_S = 0.5
 COMPILING = "Compiling for this machine; this can take a minute or two, and only the first time"
+# How often a robot is asked for what came: a little of a scan's time, and less than 1 % of a core.
+_LISTEN_S = 0.005
 
 
 class Driver:
@@ -117,12 +119,17 @@ class Driver:
         pace = self._session.pace
         if pace == "idle":
             return None
+        if pace == "live":
+            return _LISTEN_S if self._guarded(self._session.next_ns) is None else 0.0
         if pace == "hurry" or not self._prepared:
             return 0.0
         stamp_ns = self._guarded(self._session.next_ns)
         return 0.0 if stamp_ns is None else self._pacer.delay(stamp_ns, self._clock())
 
     def _map(self) -> None:
+        if self._session.pace == "live" and self._session.next_ns() is None:
+            self._listen()
+            return
         if not self._prepared:
             self._prepare()
             return
@@ -138,8 +145,21 @@ class Driver:
         self._glimpse_at = now + _GLIMPSE_S
         self._show(self._session.frame)
         standing = self._session.pace == "idle"
-        if standing or self._reported is None or now >= self._reported[1] + _REPORT_S:
+        if standing:
             self._report()
+        else:
+            self._report_when_due(now)
+
+    def _report_when_due(self, now: float) -> None:
+        if self._reported is None or now >= self._reported[1] + _REPORT_S:
+            self._report()
+
+    def _listen(self) -> None:
+        """Nothing is to be mapped of a robot: look what is heard of it."""
+        opened = self._session.listen()
+        if opened is not None:
+            self._tell_opened(opened)
+        self._report_when_due(self._clock())
 
     def _obey(self, command: Command | Begin) -> None:
         self._pacer.release()
@@ -196,7 +216,11 @@ class Driver:
         self._run += 1
         opening = f"Opening {command.uri}"
         self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
-        self._tell_opened(self._session.open(command.uri, command.odometry, command.seed))
+        opened = self._session.open(
+            command.uri, command.odometry, command.seed, command.record, publish=command.publish
+        )
+        if opened is not None:
+            self._tell_opened(opened)
 
     def _play(self) -> None:
         self._held = False
@@ -250,25 +274,28 @@ class Driver:
 
     def _report(self) -> None:
         now = self._clock()
-        if self._session.pace != "idle" and not self._prepared:
+        if self._session.pace not in ("idle", "live") and not self._prepared:
             # Nothing plays yet: the first scan is read, and on a new machine all is compiled, before.
             self._tell(self._preparing(), now)
             return
-        playing = self._session.pace == "replay"
+        playing = self._session.pace in ("replay", "live")
         status = self._session.status()
         if status.going_to and now >= self._long_way_at:  # a short way would only flicker
             status = replace(status, detail=f"Going to {status.going_to} …")
         status = replace(
             status,
             speed=self._pacer.speed,
-            scan_rate_hz=round(self._pacer.rate_hz, 2) if playing else 0.0,
-            scans_behind=self._pacer.behind(now) if playing else 0,
+            scan_rate_hz=round(self._pacer.rate_hz, 2) if playing and status.state != "waiting" else 0.0,
+            scans_behind=self._behind(status, now) if playing else 0,
         )
         self._tell(status, now)
 
     def _tell(self, status: Status, now: float) -> None:
         self._reported = (status, now)
         self._put(Report(status))
+
+    def _behind(self, status: Status, now: float) -> int:
+        return status.scans_behind if status.live else self._pacer.behind(now)
 
     def _guarded(self, work: Callable[[], T]) -> T | None:
         """Do some work; what goes wrong becomes the state "failed", and the worker lives on."""

@@ -115,7 +115,20 @@ class Turn:
     sigma: float
 
 
-Record = Scan | Odometry | Imu
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """What a source noticed on the way, for people: it becomes a warning of the next step.
+
+    Attributes:
+        stamp_ns: When.
+        text: In words.
+    """
+
+    stamp_ns: int
+    text: str
+
+
+Record = Scan | Odometry | Imu | PoseMeasurement | Notice
 
 
 @dataclass(frozen=True, slots=True)

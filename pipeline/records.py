@@ -16,6 +16,7 @@ from pipeline.readings import Float32 as Float32
 from pipeline.readings import Imu as Imu
 from pipeline.readings import Int as Int
 from pipeline.readings import Int32 as Int32
+from pipeline.readings import Notice as Notice
 from pipeline.readings import Odometry as Odometry
 from pipeline.readings import PoseMeasurement as PoseMeasurement
 from pipeline.readings import Record as Record

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.geometry import Pose2, Pose3, interpolate, wrap_angle
 from pipeline.gyro import Gyro
-from pipeline.records import Imu, Odometry, PoseMeasurement, Record, Scan, Step
+from pipeline.records import Imu, Notice, Odometry, PoseMeasurement, Record, Scan, Step
 
 OdometryChoice = Literal["auto", "wheels", "static"]
 WAIT = 5  # scans that wait for the odometry that follows them before they go without
@@ -30,7 +30,7 @@ TILTS_NS = 90_000_000
 
 
 def steps(
-    records: Iterable[Record | PoseMeasurement],
+    records: Iterable[Record],
     *,
     odometry: OdometryChoice = "auto",
     first_index: int = 0,
@@ -49,16 +49,9 @@ def steps(
         losses: Counts what was left out, by reason.
     """
     counted = Counter[str]() if losses is None else losses
-    joiner = _Joiner(use_odometry=odometry != "static", index=first_index, losses=counted)
+    joiner = Joiner(use_odometry=odometry != "static", index=first_index, losses=counted)
     for record in records:
-        if isinstance(record, Scan):
-            joiner.add_scan(record)
-        elif isinstance(record, Odometry):
-            joiner.add_odometry(record)
-        elif isinstance(record, PoseMeasurement):
-            joiner.add_pose(record)
-        else:
-            joiner.add_imu(record)
+        joiner.add(record)
         yield from joiner.ready()
     yield from joiner.ready(end=True)
 
@@ -72,7 +65,15 @@ class _Reading:
     tilt: tuple[float, float] | None
 
 
-class _Joiner:
+class Joiner:
+    """Takes records one by one, in the order in which they came, and gives the steps that are ready.
+
+    Args:
+        use_odometry: Else poses are left aside and no scan waits for one.
+        index: Number of the first step.
+        losses: Counts what was left out, by reason.
+    """
+
     def __init__(self, *, use_odometry: bool, index: int, losses: Counter[str]) -> None:
         self._losses = losses
         self._use_odometry = use_odometry
@@ -92,14 +93,28 @@ class _Joiner:
         self._last_stamp: int | None = None
         self._warnings: list[str] = []
 
-    def add_scan(self, scan: Scan) -> None:
+    def add(self, record: Record) -> None:
+        """Take a record of any kind."""
+        match record:
+            case Scan():
+                self._add_scan(record)
+            case Odometry():
+                self._add_odometry(record)
+            case PoseMeasurement():
+                self._add_pose(record)
+            case Imu():
+                self._add_imu(record)
+            case Notice():
+                self._warn(record.text)
+
+    def _add_scan(self, scan: Scan) -> None:
         if self._last_stamp is not None and scan.stamp_ns <= self._last_stamp:
             self._leave_out("scans that were not later than the one before")
             return
         self._last_stamp = scan.stamp_ns
         self._scans.append(scan)
 
-    def add_odometry(self, odometry: Odometry) -> None:
+    def _add_odometry(self, odometry: Odometry) -> None:
         T = odometry.T_odom_base
         if not (np.all(np.isfinite(T.t)) and np.all(np.isfinite(T.R))):
             self._leave_out("odometry readings without finite numbers")
@@ -135,7 +150,7 @@ class _Joiner:
                 return
         self._stands = reading
 
-    def add_pose(self, pose: PoseMeasurement) -> None:
+    def _add_pose(self, pose: PoseMeasurement) -> None:
         if not pose.is_sound():
             self._leave_out("measured poses without finite numbers or a positive definite covariance")
         elif self._poses and pose.stamp_ns <= self._poses[-1].stamp_ns:
@@ -152,7 +167,7 @@ class _Joiner:
         near = min(self._poses, key=lambda pose: abs(pose.stamp_ns - stamp_ns), default=None)
         return near if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS else None
 
-    def add_imu(self, imu: Imu) -> None:
+    def _add_imu(self, imu: Imu) -> None:
         if self._turned_ns is None or imu.stamp_ns > self._turned_ns:
             self._turned_ns = imu.stamp_ns
             self._add_turn_rate(imu)

@@ -19,7 +19,19 @@ from collections.abc import Iterator
 from app.version import version
 from pipeline.errors import ParameterError, StemmapError, UsageError
 
-COMMANDS = ("serve", "map", "merge", "info", "simulate", "evaluate", "export", "params", "train", "bench")
+COMMANDS = (
+    "serve",
+    "map",
+    "merge",
+    "recover",
+    "info",
+    "simulate",
+    "evaluate",
+    "export",
+    "params",
+    "train",
+    "bench",
+)
 
 DONE, FAILED, WRONG_USAGE, DONE_WITH_LOSSES = 0, 1, 2, 3
 

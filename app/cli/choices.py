@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of .bin or .pcd scans "
-    "or of TreeManagerState_<i>.csv stems, a whole cloud (.laz, .las), or a simulated run such as sim:stand"
+    "or of TreeManagerState_<i>.csv stems, a whole cloud (.laz, .las), a robot that is heard live "
+    "(zenoh:tcp/host:7447, velodyne:ADDRESS:PORT?from=SENSOR), or a simulated run such as sim:stand"
 )
 
 
@@ -82,6 +83,52 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
         type=_mount,
         help="where the LiDAR stands on the robot, in metres and degrees (default: what the source says)",
     )
+
+
+def add_live_flags(parser: argparse.ArgumentParser) -> None:
+    """--record and --publish."""
+    parser.add_argument(
+        "--record",
+        metavar="FILE.mcap",
+        nargs="?",
+        const="",
+        help="record a live run, with its results, to be replayed; without a name into the data folder",
+    )
+    parser.add_argument(
+        "--publish",
+        action="store_true",
+        help="send pose, path and trees of a live run to the robot's network, for RViz and Foxglove",
+    )
+
+
+def recording_place(arguments: argparse.Namespace) -> str:
+    """The file that --record means, "" where nothing is recorded.
+
+    Raises:
+        ParameterError: The source is no live one.
+    """
+    import time
+
+    from app.robot.address import is_live
+
+    if (arguments.record is not None or arguments.publish) and not is_live(arguments.source):
+        raise ParameterError(
+            "--record and --publish are of a robot that is heard live", remedy="Leave them away"
+        )
+    if arguments.publish and not arguments.source.lower().startswith("zenoh:"):
+        raise ParameterError("a sensor has no network to publish to", remedy="Leave --publish away")
+    if arguments.record is None:
+        return ""
+    if arguments.record:
+        return str(Path(arguments.record).expanduser().absolute())
+    from app.settings import from_environment, recordings_place
+
+    return str(recordings_place(from_environment(), time.time()))
+
+
+def says_parameters(arguments: argparse.Namespace) -> bool:
+    """Whether the command line says anything about the parameters."""
+    return bool(arguments.preset or arguments.config or arguments.assignments)
 
 
 def _topic(text: str) -> tuple[str, str]:

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING
 from app.cli.choices import (
     SOURCE_HELP,
     add_force_flag,
+    add_live_flags,
     add_parameter_flags,
     add_run_flags,
     add_source_flags,
     chosen_parameters,
+    says_parameters,
     source,
     source_options,
 )
@@ -36,6 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_parameter_flags(parser)
     add_run_flags(parser)
     add_source_flags(parser)
+    add_live_flags(parser)
     parser.add_argument(
         "--truth", metavar="FILE", type=Path, help="ground truth trees (CSV), to be judged by"
     )
@@ -111,23 +114,30 @@ def _run_plot(arguments: argparse.Namespace) -> int:
 
 
 def _run_scans(arguments: argparse.Namespace) -> int:
+    from app.cli.listening import begin_recording, heard, recording_of, told_of_frames
     from app.continuing import Continued
     from app.offline import OfflineRun, map_run
+    from app.opening import open_any
     from app.overwriting import check_folder
+    from app.replaying import recorded_parameters
     from app.saved_run import read_saved_run
-    from pipeline.sources import open_source
     from pipeline.truth_table import read_truth_trees
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     saved = read_saved_run(arguments.continued) if arguments.continued else None
     if arguments.seed is None:
         arguments.seed = saved.seed if saved else 0
-    with closing(open_source(arguments.source, source_options(arguments))) as opened:
+    with (
+        closing(open_any(arguments.source, source_options(arguments))) as opened,
+        heard(opened, recording_of(arguments), publish=arguments.publish),
+    ):
+        revisions = () if saved or says_parameters(arguments) else recorded_parameters(opened.description)
         preset_name, parameters = chosen_parameters(
             arguments,
             saved.preset if saved else opened.description.preset,
-            saved.chosen_parameters() if saved else None,
+            saved.chosen_parameters() if saved else revisions[0][1] if revisions else None,
         )
+        begin_recording(opened, parameters)
         plan = OfflineRun(
             source=opened,
             preset=preset_name,
@@ -137,6 +147,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             truth_trees=truth_trees,
             continued=Continued(saved, _in_the_map(arguments.start)) if saved else None,
             stop_after=arguments.stop_after,
+            revisions=revisions,
+            on_frame=told_of_frames(opened),
         )
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)

@@ -6,7 +6,15 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from app.cli.choices import SOURCE_HELP, add_parameter_flags, add_run_flags, chosen_parameters, source
+from app.cli.choices import (
+    SOURCE_HELP,
+    add_live_flags,
+    add_parameter_flags,
+    add_run_flags,
+    chosen_parameters,
+    recording_place,
+    source,
+)
 from app.settings import DEFAULT_PORT, VARIABLES, from_environment
 from pipeline.errors import SourceError
 
@@ -38,6 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_parameter_flags(parser)
     add_run_flags(parser)
+    add_live_flags(parser)
     parser.add_argument("--no-browser", action="store_true", help="print the link, open no browser")
     width = max(map(len, VARIABLES))
     table = "\n".join(f"  {name:{width}}  {meaning}" for name, meaning in VARIABLES.items())
@@ -52,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.port is not None:
         settings = replace(settings, port=arguments.port)
     _look_for(arguments.source)
+    record = recording_place(arguments)
     chosen_parameters(arguments, "forest")  # a mistyped flag is said now, not on the page
 
     from app.messages import Open
@@ -60,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     return serve(
         settings,
-        source=Open(arguments.source, arguments.odometry, arguments.seed),
+        source=Open(arguments.source, arguments.odometry, arguments.seed, record, arguments.publish),
         parameter_state=ParameterState(lambda suggested: chosen_parameters(arguments, suggested)),
         open_browser=not arguments.no_browser,
     )
@@ -75,6 +85,10 @@ def _look_for(uri: str) -> None:
         raise SourceError(
             "there is no such file or folder", where=uri, remedy="Simulated runs begin with sim:"
         )
+    if scheme in ("zenoh", "velodyne"):
+        from app.robot.address import parse_address
+
+        parse_address(uri)
     if scheme == "sim":
         from pipeline.simulation.uri import parse_uri
 

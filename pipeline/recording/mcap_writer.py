@@ -13,7 +13,7 @@ from pipeline.geometry import Pose3
 from pipeline.recording import messages
 from pipeline.recording.quality_of_service import BAG_METADATA, offered_qos_profiles
 from pipeline.recording.truth_json import MEDIA_TYPE, NAME, truth_json
-from pipeline.records import Odometry, Record, Scan, Sensor, Truth
+from pipeline.records import Imu, Odometry, Record, Scan, Sensor, Truth
 
 CHUNK_SIZE = 1 << 20
 TOPICS = {
@@ -94,7 +94,7 @@ class _Run:
             self._write("/odom", stamp, messages.odometry(record))
             moved = messages.transform(stamp, messages.ODOM, messages.BASE, record.T_odom_base)
             self._write("/tf", stamp, moved)
-        else:
+        elif isinstance(record, Imu):
             self._write("/imu/data", stamp, messages.imu(record))
 
     def finish(self) -> None:

@@ -105,6 +105,11 @@ def imu(record: Imu) -> Message:
     )
 
 
+def text(content: str) -> bytes:
+    """std_msgs/String in CDR."""
+    return encode(_TYPES["std_msgs/msg/String"](data=content))
+
+
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Pose3) -> Message:
     """tf2_msgs/TFMessage with one transform."""
     moved = _TYPES["geometry_msgs/msg/Transform"](

@@ -12,7 +12,7 @@ from pipeline.sources.formats import READABLE, Opener, expected_format, file_for
 __all__ = ["Source", "SourceDescription", "SourceOptions", "open_source"]
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+]+):")
-_LIVE = ("zenoh", "udp", "tcp", "ros2", "dds")
+_LIVE = ("udp", "tcp", "ros2", "dds")
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> Source:
@@ -49,9 +49,13 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
         return open_simulated(uri, options)
     if scheme == "file":
         return open_source(uri[len("file:") :].removeprefix("//"), options)
+    if scheme in ("zenoh", "velodyne"):
+        raise SourceError("a live robot cannot be read as a file", where=uri, remedy="Watch it or map it.")
     if scheme in _LIVE:
         raise SourceError(
-            "this version does not read live input", where=uri, remedy="Record it first and open the file."
+            f"this version does not read {scheme}: live",
+            where=uri,
+            remedy="ROS 2 is heard over Zenoh, as zenoh:tcp/host:7447; or record it and open the file.",
         )
     raise UsageError(f"unknown kind of source {scheme!r}", where=uri, remedy=f"Readable are: {READABLE}.")
 

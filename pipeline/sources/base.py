@@ -28,6 +28,21 @@ class RecordedTopic:
     fits: str
 
 
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """Parameters that were in force from a scan on.
+
+    Attributes:
+        revision: Its number in the run.
+        from_scan: The first scan that was mapped with them.
+        values: Values by stage and name; checked by whoever uses them.
+    """
+
+    revision: int
+    from_scan: int
+    values: dict[str, dict[str, bool | int | float | str]]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceDescription:
     """What is known of a source before its first scan is read.
@@ -44,6 +59,8 @@ class SourceDescription:
         preset: The preset that suits this kind of source.
         topics: What a recording of messages holds; () where there are no topics.
         warnings: What a person should know, e.g. that there is no odometry.
+        in_order_of_arrival: Whether records come as they came to a live run, not sorted by their time.
+        revisions: The parameters that a recorded run was mapped with, in the order of their scans.
     """
 
     uri: str
@@ -59,6 +76,8 @@ class SourceDescription:
     preset: str = "forest"
     topics: tuple[RecordedTopic, ...] = ()
     warnings: tuple[str, ...] = ()
+    in_order_of_arrival: bool = False
+    revisions: tuple[Revision, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

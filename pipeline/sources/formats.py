@@ -12,10 +12,12 @@ Opener = Callable[[str, Path, SourceOptions], Source]
 
 
 def _mcap(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.live_recording import open_live_recording
     from pipeline.sources.mcap_file import open_mcap
     from pipeline.sources.ros import open_ros
 
-    return open_ros(uri, lambda: open_mcap(path), [path], options)
+    live = open_live_recording(uri, path, options)
+    return live or open_ros(uri, lambda: open_mcap(path), [path], options)
 
 
 def _db3(uri: str, path: Path, options: SourceOptions) -> Source:

@@ -41,12 +41,20 @@ class RosSource:
         container: The recording; the source closes it.
         paths: Its files, for the digest.
         options: Topics and mounting, where the user knows better.
+        make_clock: From stamp minus time of writing of each topic's first message.
 
     Raises:
         SourceError: It holds no scans, or none of the first ones can be read.
     """
 
-    def __init__(self, uri: str, container: Container, paths: list[Path], options: SourceOptions) -> None:
+    def __init__(
+        self,
+        uri: str,
+        container: Container,
+        paths: list[Path],
+        options: SourceOptions,
+        make_clock: Callable[[list[int | None]], Clock] = Clock,
+    ) -> None:
         self._uri, self._container = uri, container
         channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
         decoder = MessageDecoder(channels.values())
@@ -57,7 +65,7 @@ class RosSource:
         self._records = RecordDecoder(channels, decoder, self._mounting.tree)
         self._losses: dict[str, int] = {}
         named = [t for t in (self._topics.scan, self._topics.odometry, self._topics.imu) if t is not None]
-        self._clock = Clock([self._clock_offset(topic) for topic in named])
+        self._clock = make_clock([self._clock_offset(topic) for topic in named])
         self._moving = self._moving_numbers()
         self._wanted = self._moving.union(*(topic.numbers for topic in named))
         self._truth, sensor = self._read_truth()
@@ -85,14 +93,21 @@ class RosSource:
         losses: dict[str, int] = {}
         self._losses = losses
         for stamped in by_stamp(self._arrivals(start_ns, losses), losses):
-            if isinstance(stamped.content, Odometry):
-                yield stamped.content
-                continue
-            record = self._records.record(stamped.content, stamped.stamp_ns, losses)
-            if isinstance(record, Scan):
-                yield self._upright(record)
-            elif record is not None:
-                yield record
+            yield from self._decoded(stamped, losses)
+
+    def records_of(
+        self, message: Message, losses: dict[str, int], from_ns: int | None = None
+    ) -> Iterator[Record]:
+        """The records that one message gives, whenever it came, unless they lie before a time; what cannot be
+        used is counted."""
+        if message.channel in self._wanted:
+            for stamped in self._times_of(message, losses):
+                if from_ns is None or stamped.stamp_ns >= from_ns:
+                    yield from self._decoded(stamped, losses)
+
+    def use_clock(self, clock: Clock) -> None:
+        """Tell times by another clock from now on."""
+        self._clock = clock
 
     def truth(self) -> Truth | None:
         """The truth that a simulated recording carries."""
@@ -110,11 +125,26 @@ class RosSource:
         """The messages that are read, with their time, in the order of writing."""
         log_start = None if start_ns is None else start_ns - self._clock.offset_ns - WINDOW_NS
         for message in self._container.messages(self._wanted, log_start, losses):
-            plain = replace(message, payload=plain_message(message.payload))
-            moving = message.channel in self._moving
-            for arrival in self._transforms(plain, losses) if moving else self._stamped(plain, losses):
+            for arrival in self._times_of(message, losses):
                 if start_ns is None or arrival.stamp_ns >= start_ns:
                     yield arrival
+
+    def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
+        """What a message holds, with its time."""
+        plain = replace(message, payload=plain_message(message.payload))
+        if message.channel in self._moving:
+            return self._transforms(plain, losses)
+        return self._stamped(plain, losses)
+
+    def _decoded(self, stamped: Stamped[Message | Odometry], losses: dict[str, int]) -> Iterator[Record]:
+        if isinstance(stamped.content, Odometry):
+            yield stamped.content
+            return
+        record = self._records.record(stamped.content, stamped.stamp_ns, losses)
+        if isinstance(record, Scan):
+            yield self._upright(record)
+        elif record is not None:
+            yield record
 
     def _stamped(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         time_ns = self._clock.time_of(header_stamp(self._channels[message.channel], message.payload), message)

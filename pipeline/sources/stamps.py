@@ -33,6 +33,7 @@ class Clock:
     """
 
     def __init__(self, offsets_ns: list[int | None]) -> None:
+        self.offsets_ns = offsets_ns
         known = [offset for offset in offsets_ns if offset is not None]
         self.by_stamp = (
             bool(known) and len(known) == len(offsets_ns) and max(known) - min(known) <= STAMP_LIMIT_NS // 6

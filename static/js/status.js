@@ -76,13 +76,29 @@ function show() {
   document.title = `${shortSource(status.source)} · stemmap`;
 }
 
-const shortSource = (uri) => (uri ?? "").split("/").filter(Boolean).pop() ?? "";
+const shortSource = (uri) => (uri ?? "").split("?")[0].split("/").filter(Boolean).pop() ?? "";
+
+// "Live robot1": a robot is heard now; its name stands in every state but the failed one.
+function stateWord(status) {
+  const word = status.live && status.state === "playing" ? "Live" : (WORDS[status.state] ?? status.state);
+  return status.live && status.robot && status.state !== "failed" ? `${word} ${status.robot}` : word;
+}
+
+function robotsTitle(status) {
+  return status?.live && status.robots.length ? `Robots that send scans: ${status.robots.map((name) => name || "(no namespace)").join(", ")}` : "";
+}
 
 function showState() {
   const box = byId("state");
   const name = state.connected ? (state.status?.state ?? "starting") : "lost";
   if (box.dataset.state !== name) box.dataset.state = name;
-  setText(box.querySelector("b"), state.connected ? (WORDS[name] ?? name) : state.lostAt ? "No connection" : "Connecting");
+  setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.lostAt ? "No connection" : "Connecting");
+  box.title = robotsTitle(state.status);
+  const recording = state.status?.recording ?? "";
+  byId("recording").hidden = !recording;
+  byId("recording").classList.toggle("bad", recording.startsWith("not"));
+  setText(byId("recording"), `${recording.startsWith("not") ? "⚠" : "●"} ${recording.split(",")[0].split(":")[0]}`);
+  byId("recording").title = recording;
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
   const quiet = state.status?.state === "playing" && performance.now() - state.heardAt > OLD_AFTER;
   byId("figures").classList.toggle("old", quiet);

@@ -45,7 +45,7 @@ function show() {
     button.setAttribute("aria-label", name === "pause" ? "Pause" : "Play");
     button.querySelector("path").setAttribute("d", ICONS[name]);
   }
-  for (const each of document.querySelectorAll(".buttons button")) each.disabled = !ready();
+  for (const each of document.querySelectorAll(".buttons button")) each.disabled = !ready() || (status.live && each !== button);
   const line = byId("timeline");
   line.disabled = !(status.end_s > 0);
   if (!dragging && !seeking) {
@@ -54,7 +54,7 @@ function show() {
     setText(byId("time-now"), clock(status.time_s));
   }
   line.setAttribute("aria-valuetext", clock(Number(line.value)));
-  setText(byId("time-end"), status.end_s === null && status.scan_index >= 0 ? "open end" : clock(status.end_s));
+  setText(byId("time-end"), status.live ? "live" : status.end_s === null && status.scan_index >= 0 ? "open end" : clock(status.end_s));
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(status.speed);
   showWarnings(status.warnings ?? []);

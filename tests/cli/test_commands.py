@@ -160,7 +160,7 @@ def test_a_file_of_parameters_that_does_not_fit_is_named(capsys, tmp_path, conte
         ("sim:paper?speed=3", 2, "speed"),
         ("sim:paper?duration=x", 2, "duration"),
         ("none.mcap", 1, "no such file"),
-        ("zenoh:tcp/host:7447", 1, "live"),
+        ("dds:robot", 1, "live"),
         ("ftp://host/x", 2, "ftp"),
         ("x\0y", 1, "no such file"),
     ],

@@ -23,6 +23,7 @@ def bytes_of(record: Record) -> bytes:
         return b"".join(column.tobytes() for column in columns if column is not None)
     if isinstance(record, Odometry):
         return record.T_odom_base.R.tobytes() + record.T_odom_base.t.tobytes()
+    assert isinstance(record, Imu)
     orientation = np.zeros(4) if record.orientation is None else record.orientation
     parts = (record.angular_velocity, record.linear_acceleration, orientation)
     return b"".join(np.ascontiguousarray(part).tobytes() for part in parts)

@@ -1,0 +1,84 @@
+"""Reads the steps of a robot that is heard live: each once, and never waiting for one."""
+
+from __future__ import annotations
+
+from array import array
+from collections import Counter, deque
+from typing import cast
+
+from app.odometry import odometry_used
+from app.robot.source import LiveSource
+from pipeline.errors import SourceError
+from pipeline.records import Step
+from pipeline.steps import Joiner, OdometryChoice
+
+
+class LiveCursor:
+    """Stands before the next step, as `app.cursor.Cursor` does; where that finds none, none came yet.
+
+    Args:
+        source: The robot. The cursor does not close it.
+        odometry: The choice of odometry.
+    """
+
+    def __init__(self, source: LiveSource, odometry: str) -> None:
+        self._source = source
+        self.losses = Counter[str]()
+        used = odometry_used(source.description, cast(OdometryChoice, odometry))
+        self._joiner = Joiner(use_odometry=used != "static", index=0, losses=self.losses)
+        self._ready: deque[Step] = deque()
+        self._stamps = array("q")
+
+    @property
+    def known(self) -> int:
+        """How many steps were read so far."""
+        return len(self._stamps)
+
+    def stamp_ns(self, index: int) -> int:
+        """Time of a step that was read before."""
+        return self._stamps[index]
+
+    def index_at(self, stamp_ns: int) -> None:
+        """Nobody can go to a time of a live run."""
+        del stamp_ns
+
+    def peek(self) -> Step | None:
+        """The next step without taking it; None when it has not come.
+
+        Raises:
+            SourceError: What comes cannot be read.
+        """
+        while not self._ready:
+            records = self._source.take()
+            if not records:
+                return None
+            for record in records:
+                self._joiner.add(record)
+                self._ready.extend(self._joiner.ready())
+        return self._ready[0]
+
+    def take(self) -> Step | None:
+        """The next step; None when it has not come.
+
+        Raises:
+            SourceError: What comes cannot be read.
+        """
+        step = self.peek()
+        if step is None:
+            return None
+        self._ready.popleft()
+        self._stamps.append(step.scan.stamp_ns)
+        return step
+
+    def go_to(self, index: int) -> None:
+        """Stand before the next step, which is where it stands.
+
+        Raises:
+            SourceError: Another is asked for.
+        """
+        if index != self.known:
+            raise SourceError(
+                "a live run cannot be read again",
+                where=self._source.uri,
+                remedy="Open its recording",
+            )

@@ -1,0 +1,122 @@
+"""Which of a robot's topics are read: found by type, as in recordings, before any message came."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from app.robot.ros_graph import Publisher
+from pipeline.errors import SourceError
+from pipeline.sources.container import Channel
+from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, TRANSFORMS, VELODYNE_SCAN
+
+SCAN_TYPES = (POINT_CLOUD, VELODYNE_SCAN)
+#: What we publish ourselves is nobody's LiDAR and nobody's odometry.
+OWN = "stemmap"
+_DERIVED = ("camera", "depth", "image", "map", "ground", "cluster", "filtered", "voxel")
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What is read of a robot.
+
+    Attributes:
+        robot: Its namespace, "" for none.
+        channels: To subscribe to; their numbers count from 1.
+        warnings: What else there was.
+    """
+
+    robot: str
+    channels: tuple[Channel, ...]
+    warnings: tuple[str, ...]
+
+
+def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], where: str) -> Choice | None:
+    """Choose the topics of one robot.
+
+    Args:
+        publishers: Alive now.
+        robot: Namespace that is wanted, "" for the first one by name that sends scans.
+        topics: Topic by role where the user named it.
+        where: The address, for errors.
+
+    Returns:
+        None while there is no scan of such a robot.
+
+    Raises:
+        SourceError: A topic that the user named is of another type.
+    """
+    there = [p for p in publishers if OWN not in p.topic.split("/")[:-1]]
+    named = topics.get("scan")
+    scans = [p for p in there if p.msgtype in SCAN_TYPES]
+    fitting = [p for p in scans if (not robot or p.robot == robot) and (named is None or p.topic == named)]
+    if not fitting:
+        _refuse_wrong_type(there, topics, "scan", SCAN_TYPES, where)
+        return None
+    scan = min(fitting, key=lambda p: (_derived(p), p.msgtype == VELODYNE_SCAN, p.robot, p.topic))
+    mine = [p for p in there if p.robot in (scan.robot, "")]
+    odometry = _of_role(mine, topics, "odometry", ODOMETRY, _odometry_rank, where)
+    imu = _of_role(mine, topics, "imu", IMU, _imu_rank, where)
+    transforms = sorted({p.topic: p for p in mine if p.msgtype == TRANSFORMS}.values(), key=lambda p: p.topic)
+    chosen = [p for p in (scan, odometry, imu, *transforms) if p is not None]
+    channels = tuple(Channel(k, p.topic, p.msgtype, "cdr", "", "", 0) for k, p in enumerate(chosen, 1))
+    return Choice(scan.robot, channels, tuple(_warnings(scans, scan, robot, named)))
+
+
+def _of_role(
+    there: list[Publisher],
+    topics: dict[str, str],
+    role: str,
+    msgtype: str,
+    rank: Callable[[Publisher], tuple[object, ...]],
+    where: str,
+) -> Publisher | None:
+    named = topics.get(role)
+    fitting = [p for p in there if p.msgtype == msgtype and (named is None or p.topic == named)]
+    if not fitting:
+        _refuse_wrong_type(there, topics, role, (msgtype,), where)
+        return None
+    return min(fitting, key=rank)
+
+
+def _refuse_wrong_type(
+    there: list[Publisher], topics: dict[str, str], role: str, types: tuple[str, ...], where: str
+) -> None:
+    wrong = [p for p in there if p.topic == topics.get(role) and p.msgtype not in types]
+    if wrong:
+        raise SourceError(
+            f"the topic {wrong[0].topic} is of the type {wrong[0].msgtype}",
+            where=where,
+            remedy=f"Name one of the type {' or '.join(types)} with {role}=NAME.",
+        )
+
+
+def _derived(publisher: Publisher) -> bool:
+    """Whether the name says that a cloud is no raw sweep of a LiDAR."""
+    return any(word in publisher.topic.lower() for word in _DERIVED)
+
+
+def _odometry_rank(publisher: Publisher) -> tuple[object, ...]:
+    name = publisher.topic.lower()
+    return any(word in name for word in ("gps", "map", "slam")), not name.endswith("odom"), publisher.topic
+
+
+def _imu_rank(publisher: Publisher) -> tuple[object, ...]:
+    return "raw" in publisher.topic.lower(), publisher.topic  # raw ones come without an orientation
+
+
+def _warnings(scans: list[Publisher], scan: Publisher, robot: str, named: str | None) -> list[str]:
+    warnings = []
+    others = sorted({p.robot or "(no namespace)" for p in scans} - {scan.robot or "(no namespace)"})
+    if others and not robot:
+        warnings.append(
+            f"there are more robots: {', '.join(others[:10])}; {scan.robot or 'the one without a namespace'} "
+            "is mapped, robot=NAME in the address chooses another"
+        )
+    more = sorted({p.topic for p in scans if p.robot == scan.robot} - {scan.topic})
+    if more and named is None:
+        warnings.append(
+            f"{scan.topic} is read; there is also {', '.join(more[:10])}; scan=NAME in the address "
+            "chooses another"
+        )
+    return warnings

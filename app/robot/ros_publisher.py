@@ -1,0 +1,88 @@
+"""Our results on the robot's network, declared as rmw_zenoh declares a node's topics."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import time
+from typing import Any
+
+from app.robot.ros_graph import ADMIN, PUBLISHER, data_key
+from pipeline.recording import outputs
+from pipeline.records import Frame, Path
+
+NODE = "stemmap"
+#: The map is said anew at most so often; the pose at every scan.
+_MAP_PAUSE_S = 1.0
+# Reliability, durability (1 keeps the last message for who comes late), history and depth; the rest is usual.
+_VOLATILE, _LATCHED = "::,10:,:,:,,", ":1:,1:,:,:,,"
+
+
+class RosPublisher:
+    """Publishes pose, path and trees below `/<robot>/stemmap/`.
+
+    Args:
+        session: Of zenoh, to the robot's router.
+        domain: ROS_DOMAIN_ID.
+        robot: The robot's namespace, "" for none.
+    """
+
+    def __init__(self, session: Any, domain: int, robot: str) -> None:  # noqa: ANN401
+        self._prefix = f"/{robot}/stemmap" if robot else "/stemmap"
+        self._tokens: list[Any] = []
+        self._publishers: dict[str, _Topic] = {}
+        self._map_at = -_MAP_PAUSE_S
+        namespace = f"/{robot}".replace("/", "%") if robot else "%"
+        head = f"{ADMIN}/{domain}/{session.info.zid()}/0"
+        tail = f"%/{namespace}/{NODE}"
+        self._declare(session, f"{head}/0/NN/{tail}")
+        for number, topic in enumerate(outputs.TYPES, 1):
+            key = data_key(domain, self.name(topic), outputs.TYPES[topic], outputs.type_hash(topic))
+            qos = _LATCHED if topic in outputs.LATCHED else _VOLATILE
+            name = self.name(topic).replace("/", "%")
+            kind, kind_hash = key.split("/")[-2:]
+            token = f"{head}/{number}/{PUBLISHER}/{tail}/{name}/{kind}/{kind_hash}/{qos}"
+            self._declare(session, token)
+            self._publishers[topic] = _Topic(session, key, token, latched=topic in outputs.LATCHED)
+
+    def name(self, topic: str) -> str:
+        """The full name of a topic."""
+        return f"{self._prefix}/{topic}"
+
+    def add(self, frame: Frame, path: Path) -> None:
+        """Publish what a scan gave."""
+        messages = outputs.pose_messages(frame)
+        now = time.monotonic()
+        if now >= self._map_at + _MAP_PAUSE_S:
+            self._map_at = now
+            messages |= outputs.map_messages(frame, path)
+        for topic, payload in messages.items():
+            self._publishers[topic].put(payload)
+
+    def _declare(self, session: Any, token: str) -> None:  # noqa: ANN401
+        self._tokens.append(session.liveliness().declare_token(token))
+
+
+class _Topic:
+    """One topic; its messages carry a number, a time and who sent them, as rmw_zenoh's do."""
+
+    def __init__(self, session: Any, key: str, token: str, *, latched: bool) -> None:  # noqa: ANN401
+        import zenoh
+        from zenoh import ext
+
+        self._gid = hashlib.sha256(token.encode()).digest()[:16]
+        self._sequence = 0
+        self._publisher = ext.declare_advanced_publisher(
+            session,
+            key,
+            encoding="application/cdr",
+            # A listener that is too slow must not hold up the map.
+            congestion_control=zenoh.CongestionControl.DROP,
+            cache=ext.CacheConfig(1) if latched else None,
+            publisher_detection=latched,
+        )
+
+    def put(self, payload: bytes) -> None:
+        self._sequence += 1
+        head = struct.pack("<qqB", self._sequence, time.time_ns(), len(self._gid))
+        self._publisher.put(payload, attachment=head + self._gid)

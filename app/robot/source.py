@@ -1,0 +1,304 @@
+"""A live robot as a source: what came is taken when somebody asks, and never waited for unless wanted."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+from app.robot.address import VelodyneAddress, ZenohAddress, parse_address
+from app.robot.choosing import SCAN_TYPES, Choice, choose
+from app.robot.inbox import Inbox
+from app.robot.recording import Recording
+from app.robot.ros_graph import Publisher
+from app.robot.ros_publisher import RosPublisher
+from app.robot.velodyne_link import VelodyneLink
+from app.robot.zenoh_link import ZenohLink
+from pipeline.errors import SourceError
+from pipeline.parameters import Parameters
+from pipeline.records import Frame, Path, Record, Truth
+from pipeline.sources.arrivals import ArrivalReader
+from pipeline.sources.base import SourceDescription, SourceOptions
+from pipeline.sources.container import Channel
+
+KIND, VELODYNE_KIND = "ROS 2 over Zenoh", "Velodyne sensor"
+#: A robot's nodes come up one after another: so long after its LiDAR its topics are counted.
+_SETTLE_S = 1.0
+_POLL_S = 0.005
+#: Nothing for so long is worth a word; a LiDAR of 5 Hz pauses for 0.2 s.
+SILENT_S = 1.0
+
+
+class Link(Protocol):
+    """What a source needs of `ZenohLink`."""
+
+    problem: str
+    losses: dict[str, int]
+    scans: int
+    version: int
+
+    @property
+    def session(self) -> Any: ...  # noqa: ANN401
+    @property
+    def place(self) -> str: ...
+    @property
+    def nothing(self) -> str: ...
+    @property
+    def silence_s(self) -> float | None: ...
+    def publishers(self) -> list[Publisher]: ...
+    def robots(self) -> list[str]: ...
+    def subscribe(self, channels: Sequence[Channel]) -> None: ...
+    def close(self) -> None: ...
+
+
+class LiveSource:
+    """What a robot sends, from now on. It cannot be read again: its recording can.
+
+    Args:
+        address: Where it is to be heard.
+        options: Topics and mounting, where the user knows better.
+        make_link: Of the address and the inbox.
+        kind: Of the source, for people.
+    """
+
+    def __init__(
+        self,
+        address: ZenohAddress | VelodyneAddress,
+        options: SourceOptions,
+        make_link: Callable[[Any, Inbox], Link] = ZenohLink,
+        kind: str = KIND,
+    ) -> None:
+        self.uri = address.uri
+        self._address, self._options, self._kind = address, options, kind
+        self._topics = {**address.topics, **options.topics}
+        self._inbox = Inbox()
+        self._link = make_link(address, self._inbox)
+        self._choice: Choice | None = None
+        self._reader: ArrivalReader | None = None
+        self._seen_s: float | None = None
+        self._there: bool | None = None
+        self._ending = threading.Event()
+        self._notices: list[str] = []
+        self._early: list[Record] = []
+        self._version = -1
+        self._began_ns = time.time_ns()
+        self._recording: Recording | None = None
+        self._publishes = False
+        self._publisher: RosPublisher | None = None
+
+    # --- as a source -----------------------------------------------------------------------------
+
+    @property
+    def description(self) -> SourceDescription:
+        """What is known; `ready` says whether it is.
+
+        Raises:
+            SourceError: Nothing was heard yet.
+        """
+        known = None if self._reader is None else self._reader.description
+        if known is None or self._choice is None:
+            raise SourceError("nothing was heard yet", where=self.uri, remedy="Look whether the robot sends.")
+        digest = f"live:{self.uri}:{self._began_ns}"  # no other run is this one
+        return replace(known, digest=digest, warnings=(*known.warnings, *self._choice.warnings))
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was left out so far: on the way, in the queue, and what could not be read."""
+        read = {} if self._reader is None else self._reader.losses
+        return {**self._link.losses, **self._inbox.losses, **read}
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """Yield records as they come, until `stop`; waits for them.
+
+        Raises:
+            SourceError: What comes cannot be read, or all of it again is asked for.
+        """
+        if start_ns is not None:
+            raise SourceError("a live run cannot be read again", where=self.uri, remedy="Open its recording.")
+        while not self._ending.is_set():
+            records = self.take()
+            yield from records
+            if not records:
+                self._ending.wait(_POLL_S)
+        if self._reader is not None:
+            yield from self._reader.finish()
+
+    def truth(self) -> Truth | None:
+        """Nobody knows."""
+        return None
+
+    def close(self) -> None:
+        """Leave the robot, and end the recording."""
+        self._ending.set()
+        self._link.close()
+        if self._recording is not None:
+            self._recording.close()
+
+    # --- as something live -----------------------------------------------------------------------
+
+    @property
+    def ready(self) -> bool:
+        """Whether the description is known."""
+        return self._reader is not None and self._reader.description is not None
+
+    @property
+    def robot(self) -> str:
+        """The robot's namespace, "" for none, or before it is known."""
+        return "" if self._choice is None else self._choice.robot
+
+    @property
+    def robots(self) -> list[str]:
+        """The namespaces of all robots that publish scans now."""
+        return self._link.robots()
+
+    @property
+    def scans_waiting(self) -> int:
+        """Scans that came and are not mapped yet."""
+        return self._inbox.scans_waiting
+
+    @property
+    def scans_come(self) -> int:
+        """Scans that came so far."""
+        return self._link.scans
+
+    @property
+    def recording(self) -> str:
+        """The recording in words, "" where there is none."""
+        return "" if self._recording is None else self._recording.words
+
+    def use(self, recording: Recording | None, *, publish: bool) -> None:
+        """Record what comes, and publish what comes of it; said before anything is heard."""
+        self._recording, self._publishes = recording, publish
+
+    def mapped(self, frame: Frame, path: Path) -> None:
+        """What came of a scan."""
+        if self._publisher is not None:
+            self._publisher.add(frame, path)
+        if self._recording is not None:
+            self._recording.add_frame(frame, path)
+
+    def use_parameters(self, revision: int, from_scan: int, parameters: Parameters) -> None:
+        """Parameters that are in force from a scan on."""
+        if self._recording is not None:
+            self._recording.add_parameters(revision, from_scan, parameters.model_dump())
+
+    def stop(self) -> None:
+        """End `records`; safe in a signal's handler."""
+        self._ending.set()
+
+    def listen(self) -> bool:
+        """Take what came before the description was known; whether it is known now.
+
+        Raises:
+            SourceError: What comes cannot be read.
+        """
+        if not self.ready:
+            self._early = self.take()
+        return self.ready
+
+    def wait(self) -> bool:
+        """Listen until the description is known, or until `stop`; whether it is known.
+
+        Raises:
+            SourceError: What comes cannot be read.
+        """
+        while not self.listen() and not self._ending.is_set():
+            self._ending.wait(_POLL_S)
+        return self.ready
+
+    def take(self) -> list[Record]:
+        """The records of the next message that gives any; [] when nothing is there.
+
+        Raises:
+            SourceError: What comes cannot be read.
+        """
+        self._look_around()
+        if self._early:
+            records, self._early = self._early, []
+            return records
+        if self._reader is None:
+            return []
+        while (message := self._inbox.take()) is not None:
+            if self._recording is not None:
+                self._recording.add(message)
+            records = self._reader.add(message)
+            if records:
+                return records
+        return []
+
+    def notices(self) -> list[str]:
+        """What happened since this was asked last: the robot lost, or back."""
+        told, self._notices = self._notices, []
+        return told
+
+    def waiting_for(self) -> str:
+        """Why nothing comes, in words; "" while scans come."""
+        silence_s = self._link.silence_s
+        if self._choice is not None and silence_s is not None and silence_s < SILENT_S:
+            return ""
+        since = "" if silence_s is None else f"Nothing heard for {silence_s:.0f} s"
+        if self._link.problem:
+            reason = f"{self._link.problem}; it is tried again every second"
+        elif self._choice is None:
+            reason = f"{self._link.place}; {self._link.nothing}"
+        elif self._there is False:
+            reason = f"{self._name()} is gone; the map goes on when it is back"
+        else:
+            reason = f"{self._choice.channels[0].topic} is announced and silent"
+        return f"{since}: {reason}" if since else f"Waiting: {reason}"
+
+    # --- inside ----------------------------------------------------------------------------------
+
+    def _name(self) -> str:
+        return f"robot {self.robot}" if self.robot else "the robot"
+
+    def _look_around(self) -> None:
+        if self._recording is not None:
+            self._recording.flush_when_due()
+        if self._choice is None:
+            self._choose()
+            return
+        if self._version == self._link.version:
+            return
+        self._version = self._link.version
+        publishers = self._link.publishers()
+        scan = self._choice.channels[0].topic
+        there = any(p.topic == scan and p.msgtype in SCAN_TYPES for p in publishers)
+        if there != self._there:
+            if self._there is not None:
+                self._notices.append(f"{self._name()} is back" if there else f"{self._name()} is lost")
+            self._there = there
+
+    def _choose(self) -> None:
+        choice = choose(self._link.publishers(), self._address.robot, self._topics, self.uri)
+        if choice is None:
+            self._seen_s = None
+            return
+        now = time.monotonic()
+        self._seen_s = now if self._seen_s is None else self._seen_s
+        if now - self._seen_s < _SETTLE_S:
+            return
+        topics = {"scan": choice.channels[0].topic}
+        options = replace(self._options, topics=topics)
+        self._reader = ArrivalReader(self.uri, self._kind, choice.channels, options)
+        self._choice = choice
+        if self._recording is not None:
+            told = {"uri": self.uri, "topics": [channel.topic for channel in choice.channels]}
+            self._recording.begin(choice.channels, told, choice.robot)
+        if self._publishes and self._link.session is not None:
+            self._publisher = RosPublisher(self._link.session, self._address.domain, choice.robot)
+        self._link.subscribe(choice.channels)
+
+
+def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
+    """Begin to listen; returns at once.
+
+    Raises:
+        SourceError: The address is none.
+    """
+    address, chosen = parse_address(uri), options or SourceOptions()
+    if isinstance(address, VelodyneAddress):
+        return LiveSource(address, chosen, VelodyneLink, VELODYNE_KIND)
+    return LiveSource(address, chosen)
