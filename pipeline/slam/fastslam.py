@@ -18,7 +18,7 @@ from pipeline.health import Health
 from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
-from pipeline.slam.frame import FrameMemory, kinship, of_kin
+from pipeline.slam.frame import FrameMemory
 from pipeline.slam.health import TOLD, Recent, ScanTold, is_astray, judged, remembered, scan_told
 from pipeline.slam.landmarks import laid
 from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
@@ -236,8 +236,6 @@ def _rules(p: Slam) -> Rules:
 def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[PoseEstimate, FrameMemory]:
     pose = moved_poses(state.pose, state.motion)
     mean, spread = weighted_pose(pose, weights, state.motion, state.motion_covariance)
-    if state.genealogy.founders is not None:
-        spread = of_kin(spread, kinship(weights, state.genealogy.founders[1]))
     landmarks = state.map_of(state.best)
     covariance, frame = state.frame.told(
         mean, spread, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach

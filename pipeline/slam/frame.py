@@ -19,7 +19,6 @@ from pipeline.geometry import Float
 from pipeline.records import Int, Int32
 
 APART = 0.5  # m, or as many radians, between two marks
-KINSHIP_MOST = 0.5  # beyond it the spread says too little to be corrected
 SMALL = 1e-12  # m^2, rad^2; so that a pose without spread has a direction to grow in
 
 
@@ -70,25 +69,6 @@ class FrameMemory:
     def forgotten(self) -> FrameMemory:
         """Nothing hidden: the particles were put somewhere with the spread that is known."""
         return replace(self, hidden=np.zeros((3, 3)))
-
-
-def kinship(weights: Float, founders: Int) -> float:
-    """F: how likely two particles drawn by their weights come from one founder (Wright 1922), up to a bound.
-
-    Args:
-        weights: shape (P,), sum 1; founders: int64, shape (P,).
-    """
-    share = np.bincount(founders, weights)
-    return min(float(share @ share), KINSHIP_MOST)
-
-
-def of_kin(spread: Float, F: float) -> Float:
-    """The covariance of which a spread is left when some particles are kin.
-
-    Founders drawn independently with a covariance C, of which 1/F are left, differ by C (1 - F), and their
-    mean has itself an error of C F: an outcome drawn like them lies C (1 + F) around it.
-    """
-    return spread * ((1.0 + F) / (1.0 - F))
 
 
 @compiled

@@ -23,6 +23,7 @@ def anchor(
     covariance: Float,
     T_map_base: Pose2,
     pose_covariance: Float,
+    relative: Float,
     reach: float,
     distance_max: float,
     miss: float,
@@ -32,15 +33,16 @@ def anchor(
     Args:
         tracks: Changed in place; nothing is removed.
         landmarks: shape (L, 2) [m]; covariance: xx, xy, yy, shape (L, 3) [m^2].
-        T_map_base: Where the robot is; pose_covariance: of it, shape (3, 3).
+        T_map_base: Where the robot is; pose_covariance: of it, shape (3, 3); relative:
+            with respect to the landmarks around.
         reach: trees farther from it are left alone [m].
         distance_max: A landmark farther from a tree than this is another tree's [m].
         miss: What a tree without a landmark loses of its score.
     """
     here = T_map_base.as_array()
     _anchor(
-        tracks.x, tracks.P, tracks.shared, tracks.score, landmarks, covariance, here, pose_covariance, reach,
-        distance_max, miss,
+        tracks.x, tracks.P, tracks.shared, tracks.score, landmarks, covariance, here, pose_covariance,
+        relative, reach, distance_max, miss,
     )  # fmt: skip
 
 
@@ -54,6 +56,7 @@ def _anchor(
     covariance: Float,
     here: Float,
     pose_covariance: Float,
+    relative: Float,
     reach: float,
     distance_max: float,
     miss: float,
@@ -65,7 +68,11 @@ def _anchor(
         if dx * dx + dy * dy < reach * reach:
             rows[n] = t
             place[n, 0], place[n, 1] = x[t, 0], x[t, 1]
-            spread[n, 0], spread[n, 1], spread[n, 2] = P[t, 0, 0], P[t, 0, 1], P[t, 1, 1]
+            # What tree and landmark share with the frame of the map is no reason to disagree.
+            of_pose = by_pose(dx, dy, relative)
+            spread[n, 0] = P[t, 0, 0] - shared[t, 0, 0] + of_pose[0]
+            spread[n, 1] = P[t, 0, 1] - shared[t, 0, 1] + of_pose[1]
+            spread[n, 2] = P[t, 1, 1] - shared[t, 1, 1] + of_pose[2]
             n += 1
     landmark_of, distance2 = associate(place[:n], spread[:n], landmarks, covariance, np.inf, distance_max)
     for k in range(n):

@@ -22,6 +22,7 @@ def assign(
     x: Float,
     P: Float,
     shared: Float,
+    hits: Int,
     stamp_ns: Int,
     score: Float,
     clear_range: Float,
@@ -38,7 +39,7 @@ def assign(
         centre: Base frame, shape (D, 2) [m]; covariance: shape (D, 2, 2).
         pose: x, y [m], yaw [rad], shape (3,); pose_covariance: in the frame of the map, shape (3, 3);
             relative: with respect to the trees around.
-        x, P, shared, stamp_ns, score: Columns of a `TrackTable`.
+        x, P, shared, hits, stamp_ns, score: Columns of a `TrackTable`.
         clear_range: How far the view was free by direction; view_range: a tree nearer can be missed [m].
         gate: Largest Mahalanobis distance [sigma]; distance_max: largest distance [m].
 
@@ -48,7 +49,7 @@ def assign(
         and what the pose adds.
     """
     position, R, B, packed = in_map(centre, covariance, pose, pose_covariance, relative)
-    expected, spread = expected_positions(x, P, shared, stamp_ns, now_ns, acceleration_sigma)
+    expected, spread = expected_positions(x, P, shared, hits, stamp_ns, now_ns, acceleration_sigma)
     row_of, _ = associate(position, packed, expected, spread, gate, distance_max)
     touched = np.zeros(x.shape[0], np.bool_)
     for d in range(row_of.shape[0]):

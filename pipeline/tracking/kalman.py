@@ -90,16 +90,17 @@ def _correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None
 
 @compiled
 def expected_positions(
-    x: Float, P: Float, shared: Float, stamp_ns: Int, now_ns: int, acceleration_sigma: float
+    x: Float, P: Float, shared: Float, hits: Int, stamp_ns: Int, now_ns: int, acceleration_sigma: float
 ) -> tuple[Float, Float]:
     """Where each tree is expected now, shape (T, 2) [m], and its own covariance xx, xy, yy, shape (T, 3):
-    what it shares with the pose that looks for it is no reason to look farther."""
+    what it shares with the pose that looks for it is no reason to look farther. Of the pose's error in a
+    single view, a part is of that view alone, so of `hits` views one part in so many counts."""
     place, spread = np.empty((x.shape[0], 2)), np.empty((x.shape[0], 3))
     for t in range(x.shape[0]):
         dt = (now_ns - stamp_ns[t]) * 1e-9
         noise = 0.25 * dt**4 * acceleration_sigma * acceleration_sigma
         place[t, 0], place[t, 1] = x[t, 0] + dt * x[t, 2], x[t, 1] + dt * x[t, 3]
-        C, B = P[t], shared[t]
+        C, B = P[t], shared[t] * (1.0 - 1.0 / max(hits[t], 1))
         spread[t, 0] = C[0, 0] - B[0, 0] + dt * (C[0, 2] + C[2, 0]) + dt * dt * C[2, 2] + noise
         spread[t, 1] = C[0, 1] - B[0, 1] + dt * (C[0, 3] + C[2, 1]) + dt * dt * C[2, 3]
         spread[t, 2] = C[1, 1] - B[1, 1] + dt * (C[1, 3] + C[3, 1]) + dt * dt * C[3, 3] + noise

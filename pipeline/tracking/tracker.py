@@ -32,6 +32,7 @@ class Tracker:
         self.tracks = TrackTable.empty()
         self.next_number = 1
         self._at, self._pose_covariance = Pose2(), np.zeros((3, 3))  # of the scan that is processed
+        self._relative = np.zeros((3, 3))
 
     def process(
         self,
@@ -59,15 +60,17 @@ class Tracker:
         """
         p, t = self.parameters, self.tracks
         self._at, self._pose_covariance = T_map_base, pose_covariance
+        self._relative = pose_covariance if relative is None else relative
         row_of, touched, position, R, B = assign(
             detections.centre,
             detections.covariance,
             T_map_base.as_array(),
             pose_covariance,
-            pose_covariance if relative is None else relative,
+            self._relative,
             t.x,
             t.P,
             t.shared,
+            t.hits,
             t.stamp_ns,
             t.score,
             clear_range,
@@ -96,8 +99,8 @@ class Tracker:
         """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.anchor`)."""
         p = self.parameters
         anchor(
-            self.tracks, landmarks, covariance, T_map_base, self._pose_covariance, reach, p.distance_max,
-            1.0 / p.misses_per_hit,
+            self.tracks, landmarks, covariance, T_map_base, self._pose_covariance, self._relative, reach,
+            p.distance_max, 1.0 / p.misses_per_hit,
         )  # fmt: skip
         touched = np.ones(len(self.tracks), np.bool_)
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius).with_score()

@@ -22,7 +22,7 @@ def tracks(rows):
 
 def held(table, landmarks, reach=20.0):
     landmarks = np.asarray(landmarks, np.float64).reshape(-1, 2)
-    anchor(table, landmarks, np.repeat(COVARIANCE, len(landmarks), 0), Pose2(), SURE, reach, 2.0, 1.0)
+    anchor(table, landmarks, np.repeat(COVARIANCE, len(landmarks), 0), Pose2(), SURE, SURE, reach, 2.0, 1.0)
     return table
 
 

@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 
 from pipeline.geometry import Pose2
 from pipeline.parameters import preset
-from pipeline.slam.frame import FrameMemory, at_least, carried, kinship, of_kin
+from pipeline.slam.frame import FrameMemory, at_least, carried
 from pipeline.slam.landmarks import laid
 from pipeline.tracking import Tracker
 from pipeline.tracking.shared import split, weight
 from tests.benchmarks.cases.consistency import Errors, one_run
+from tests.benchmarks.stands import STRAIGHT
 from tests.pipeline.strategies import LAW, NOTHING_SEEN, detections, seeds
 
 POSE = np.diag([0.1, 0.1, 0.0]) ** 2
@@ -107,16 +108,6 @@ def test_the_larger_of_two_covariances_is_as_large_as_both(seed):
     np.testing.assert_allclose(at_least(A, 2.0 * A), 2.0 * A, atol=1e-7)
 
 
-@LAW
-@given(seeds, st.integers(2, 12))
-def test_kin_are_corrected_so_that_an_outcome_like_them_lies_as_told(seed, founders):
-    shares = np.random.default_rng(seed).dirichlet(np.full(founders, 5.0))
-    F = kinship(shares, np.arange(founders))
-    # With unit variance of a founder: spread 1 - F, an outcome's distance from the mean 1 + F.
-    if F < 0.5:
-        np.testing.assert_allclose(of_kin(np.eye(3) * (1.0 - F), F), np.eye(3) * (1.0 + F))
-
-
 def test_an_error_of_the_heading_moves_what_lies_far_from_where_it_was_made():
     C = carried(np.diag([0.0, 0.0, 0.01**2]), 20.0, 0.0)
     np.testing.assert_allclose(np.sqrt(np.diag(C)), [0.0, 0.2, 0.01])
@@ -169,3 +160,11 @@ def test_normalised_errors_of_simulated_runs_are_those_of_honest_sigmas():
     assert 1.0 < np.mean(errors.pose) < 5.6
     assert 0.4 < np.mean(errors.trees) < 4.2
     assert 0.7 < np.mean(errors.innovations) < 1.3
+
+
+def test_straight_on_past_few_trees_sigmas_stay_honest_and_no_loop_is_seen():
+    errors = Errors()
+    for seed in range(200, 205):
+        one_run(seed, 60, errors, STRAIGHT)
+    assert errors.astray == 0
+    assert 0.8 < np.mean(errors.pose) < 6.0
