@@ -20,7 +20,6 @@ from pipeline.records import Detections, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
 from pipeline.slam.frame import FrameMemory
 from pipeline.slam.health import TOLD, Recent, ScanTold, is_astray, judged, remembered, scan_told
-from pipeline.slam.landmarks import laid
 from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
 from pipeline.slam.motion import Motion, accumulated, moved_poses, weighted_pose
 from pipeline.slam.pairs import Room, room_for
@@ -119,14 +118,10 @@ class FastSlam:
         return self.state.genealogy.path(self.state.best)
 
     def landmarks(self) -> tuple[Float, Float]:
-        """All landmarks of the best particle, laid to the pose that is told: positions, shape (L, 2) [m],
-        and covariances xx, xy, yy, shape (L, 3) [m^2]."""
-        s = self.state
-        landmarks = s.map_of(s.best)
-        if (s.maps.block == s.maps.block[s.best]).all():  # put into one map: no particle has learnt anything
-            return landmarks.mean, landmarks.covariance
-        told, _ = weighted_pose(s.pose, normalised(s.log_weight), np.zeros(3), np.zeros((3, 3)))
-        return laid(landmarks.mean, landmarks.covariance, s.pose[s.best], told)
+        """All landmarks of the best particle: positions, shape (L, 2) [m], and covariances xx, xy, yy,
+        shape (L, 3) [m^2]."""
+        landmarks = self.state.map_of(self.state.best)
+        return landmarks.mean, landmarks.covariance
 
     def _moved(self, state: SlamState, motion: Motion) -> SlamState:
         moved = accumulated(

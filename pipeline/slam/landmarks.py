@@ -84,19 +84,3 @@ def merge_duplicates(
             score[j] = max(score[j], score[k])
             birth[j] = min(birth[j], birth[k])
             score[k] = 0.0
-
-
-@compiled
-def laid(mean: Float, covariance: Float, seen_from: Float, told: Float) -> tuple[Float, Float]:
-    """Landmarks, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3), moved as one with a pose, both
-    x, y [m], yaw [rad]: what stands around `seen_from` then stands alike around `told`."""
-    c, s = np.cos(told[2] - seen_from[2]), np.sin(told[2] - seen_from[2])
-    place, spread = np.empty_like(mean), np.empty_like(covariance)
-    for j in range(mean.shape[0]):
-        dx, dy = mean[j, 0] - seen_from[0], mean[j, 1] - seen_from[1]
-        place[j, 0], place[j, 1] = told[0] + c * dx - s * dy, told[1] + s * dx + c * dy
-        xx, xy, yy = covariance[j, 0], covariance[j, 1], covariance[j, 2]
-        spread[j, 0] = c * c * xx - 2.0 * c * s * xy + s * s * yy
-        spread[j, 1] = c * s * (xx - yy) + (c * c - s * s) * xy
-        spread[j, 2] = s * s * xx + 2.0 * c * s * xy + c * c * yy
-    return place, spread

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from pipeline.geometry import Pose2
 from pipeline.parameters import preset
 from pipeline.slam.frame import FrameMemory, at_least, carried
-from pipeline.slam.landmarks import laid
 from pipeline.tracking import Tracker
 from pipeline.tracking.shared import split, weight
 from tests.benchmarks.cases.consistency import Errors, one_run
@@ -134,19 +133,6 @@ def test_marks_stand_apart():
         memory = memory.marked(k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3))
     assert 15 <= len(memory.serial) <= 20
     assert np.all(np.diff(memory.pose[:, 0]) > 0.49)
-
-
-@LAW
-@given(seeds)
-def test_landmarks_that_are_laid_elsewhere_look_the_same_from_there(seed):
-    rng = np.random.default_rng(seed)
-    mean = rng.normal(size=(4, 2))
-    full = np.array([spd(rng, 2) for _ in range(4)])
-    a, b = Pose2(*rng.normal(size=3)), Pose2(*rng.normal(size=3))
-    place, spread = laid(mean, full.reshape(-1, 4)[:, [0, 1, 3]], a.as_array(), b.as_array())
-    np.testing.assert_allclose(b.inverse().apply(place), a.inverse().apply(mean), atol=1e-9)
-    C = b.rotation() @ a.rotation().T
-    np.testing.assert_allclose(spread, (C @ full @ C.T).reshape(-1, 4)[:, [0, 1, 3]], atol=1e-9)
 
 
 # --- the outcome ----------------------------------------------------------------------------------
