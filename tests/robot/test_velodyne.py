@@ -157,7 +157,7 @@ def test_a_sensor_is_heard_over_the_network_and_lost(request):
                 return len(scans) >= 15
 
             until(enough)
-            assert source.waiting_for() == ""
+            until(lambda: source.waiting_for() == "")
         assert all(isinstance(record, Scan) for record in scans)
         assert source.losses.keys() == {NO_DATA}
         until(lambda: not source.take() and "the robot is lost" in source.notices())
