@@ -15,7 +15,7 @@ from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int
 from pipeline.shape.cholesky import factorise, solve
-from pipeline.shape.residuals import BARK, RAY, TUKEY, normal_equations
+from pipeline.shape.residuals import BARK, BEAM, RAY, TUKEY, normal_equations
 from pipeline.shape.width import angular_width, middle_half, visible_arc
 
 MODEL = 0.003  # m; what a round trunk and a normal error leave out
@@ -104,11 +104,13 @@ def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> No
 def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, stem: Float) -> None:
     """The answer into `stem`; `some` is room for a part of the rays."""
     half = middle_half(rays, n)
-    p = np.array([half.x, half.y, 0.0, 0.0, half.radius])
-    p[4] = min(max(half.radius, RADIUS_MIN), RADIUS_MAX)
+    # The outermost beams leave a part of the trunk between them and the next, less what their width catches.
+    coarse = 0.5 * max(azimuth_step - 2.0 * BEAM, 0.0) * np.hypot(half.x, half.y)
+    width = half.radius + coarse
+    p = np.array([half.x, half.y, 0.0, 0.0, min(max(width, RADIUS_MIN), RADIUS_MAX)])
     p[0] += half.c * p[4]
     p[1] += half.s * p[4]
-    least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * half.radius + 0.3 * azimuth_step * np.hypot(p[0], p[1])
+    least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * width + 0.3 * azimuth_step * np.hypot(p[0], p[1])
     g, H, step, L = np.empty(5), np.empty((5, 5)), np.empty(5), np.empty((5, 5))
     few = _some(rays, n, some)
     within = TUKEY * np.sqrt(sigma * sigma + BARK * BARK)
@@ -123,7 +125,7 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
         beside = half.c * p[1] - half.s * p[0] - half.across
         told = 1.0 / (least * least + beside * beside)
         H[4, 4] += told
-        g[4] += told * (p[4] - half.radius)
+        g[4] += told * (p[4] - width)
         factorise(H, L)
         solve(L, g, step)
         gain = (g * step).sum()  # squared length of the step in its own sigma
