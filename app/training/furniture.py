@@ -40,7 +40,8 @@ class Furniture:
         return solids
 
     def tree(self, x: float, y: float) -> None:
-        """A trunk, mostly with a crown, at times with branches, suckers at its foot or a stake."""
+        """A trunk, mostly with a crown, at times with branches, further stems, ivy, shrubs at its foot or a
+        stake."""
         rng = self._rng
         radius = 0.5 * float(rng.uniform(0.08, 0.2) if rng.random() < 0.35 else rng.uniform(0.15, 0.7))
         height = float(np.clip(5.0 + 30.0 * radius, 3.0, 12.0) * rng.uniform(0.8, 1.2))
@@ -60,7 +61,11 @@ class Furniture:
             self._branch(owner, start + (end - start) * (at / height))
         if rng.random() < 0.93:
             self._crown(start + (end - start) * (base / height), height - base, float(rng.uniform(0.8, 3.5)))
-        if rng.random() < 0.2:
+        if rng.random() < 0.12:
+            self._further_stems(owner, foot, radius, 0.7 * height)
+        if rng.random() < 0.12:
+            self._ivy(start, end, radius)
+        for _ in range(int(rng.integers(1, 4)) if rng.random() < 0.35 else 0):
             angle, away = rng.uniform(0.0, 2.0 * np.pi), float(rng.uniform(0.0, 0.9))
             x_beside, y_beside = x + away * np.cos(angle), y + away * np.sin(angle)
             self.shrub(x_beside, y_beside, float(rng.uniform(0.2, 0.8)), float(rng.uniform(0.3, 1.6)))
@@ -237,6 +242,27 @@ class Furniture:
                 yaw=rng.uniform(0.0, np.pi),
                 free_path=path,
                 reflectivity=0.5,
+            )
+
+    def _further_stems(self, owner: int, foot: Float, radius: float, height: float) -> None:
+        """One to three more stems that part from the trunk at its foot."""
+        rng = self._rng
+        for _ in range(int(rng.integers(1, 4))):
+            angle, lean = rng.uniform(0.0, 2.0 * np.pi), np.tan(np.radians(rng.uniform(3.0, 15.0)))
+            way = np.array([np.cos(angle), np.sin(angle), 0.0])
+            start = foot + rng.uniform(0.0, 1.5) * radius * way - np.array([0.0, 0.0, 0.3])
+            end = start + height * (lean * way + np.array([0.0, 0.0, 1.0]))
+            thick = float(rng.uniform(0.5, 0.9)) * radius
+            self._builder.cone(owner, start, end, (thick, 0.35 * thick), roughness=0.02 * thick)
+
+    def _ivy(self, start: Float, end: Float, radius: float) -> None:
+        """Leaves that climb a trunk to some height."""
+        rng, owner = self._rng, self._owner(FOLIAGE)
+        thick, top = radius + float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.2, 0.6))
+        for part in np.arange(0.05, top, 0.08):
+            half = [thick * rng.uniform(0.8, 1.2), thick * rng.uniform(0.8, 1.2), rng.uniform(0.3, 0.6)]
+            self._builder.ellipsoid(
+                owner, start + part * (end - start), half, free_path=float(rng.uniform(0.05, 0.25))
             )
 
     def _branch(self, owner: int, start: Float) -> None:

@@ -23,9 +23,12 @@ class Plan:
     Attributes:
         method: "extra" cuts at random places, "best" at the best one of a random choice of figures.
         trees, depth, least: Their number, their depth, and the least examples in a leaf.
+        leaves: Most leaves of a tree; cuts that tell most come first. None: as many as there are.
         figures: Part of the figures that is tried at each cut.
         same, other, simulated: What an example counts from a real scene of this kind of sensor, of the
             other kind, and from a simulated scene.
+        tree: What a tree counts: by it the share of votes that parts trees from all else best is the
+            same for both kinds of sensor.
         upright: How many times more poles and persons count: they are few and hard to tell.
     """
 
@@ -33,18 +36,20 @@ class Plan:
     trees: int
     depth: int
     least: int
+    leaves: int | None
     figures: float
     same: float
     other: float
     simulated: float
-    upright: float = 1.0
+    tree: float
+    upright: float
 
 
 # A sensor that looks one way sees a trunk from one side and no higher than its field of view: trained on
 # simulated parks too, it finds fewer real ones (docs/trunks.md has the figures).
 PLANS = {
-    ALL_AROUND: Plan("best", 20, 12, 20, 0.3, same=5.0, other=1.0, simulated=1.0, upright=2.0),
-    ONE_WAY: Plan("extra", 80, 9, 8, 0.3, same=1.0, other=1.0, simulated=0.0),
+    ALL_AROUND: Plan("best", 16, 18, 6, 300, 0.3, same=5.0, other=1.0, simulated=1.0, tree=0.67, upright=2.0),
+    ONE_WAY: Plan("extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.25, upright=1.0),
 }
 
 
@@ -91,6 +96,7 @@ def grow(examples: list[Examples], kind: str, seed: int = 0) -> Grown:
     figures = np.concatenate([e.figures for e in examples]).astype(np.float32)
     label = np.concatenate([e.label for e in examples])
     weight = np.concatenate([np.full(len(e.label), float(_weight(e, kind, plan))) for e in examples])
+    weight[label == TREE] *= plan.tree
     weight[np.isin(label, UPRIGHT)] *= plan.upright
     used = (label != DOUBTFUL) & (weight > 0.0)
     figures, label, weight = figures[used], label[used], weight[used]
@@ -99,6 +105,7 @@ def grow(examples: list[Examples], kind: str, seed: int = 0) -> Grown:
         plan.trees,
         max_depth=plan.depth,
         min_samples_leaf=plan.least,
+        max_leaf_nodes=plan.leaves,
         max_features=plan.figures,
         random_state=seed,
     ).fit(figures, label == TREE, weight)
@@ -147,7 +154,7 @@ def as_json(grown: dict[str, Grown], scenes: list[str]) -> dict[str, Any]:
 
 def _node(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
     if tree.children_left[row] < 0:
-        return {"share": share[row].tolist()}
+        return {"share": [int(v) if v in (0.0, 1.0) else v for v in share[row].tolist()]}
     yes = _node(tree, share, tree.children_left[row])
     no = _node(tree, share, tree.children_right[row])
     if "share" in yes and yes == no:

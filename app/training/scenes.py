@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from app.training.growing import DOUBTFUL, Examples
+from app.training.stands import furnished_stand
 from app.training.streets import simulate_street
 from pipeline import ground
 from pipeline.acquisition import acquire
@@ -17,7 +18,10 @@ from pipeline.gathering.forest import CLASSES, Forest
 from pipeline.geometry import Pose2, Pose3
 from pipeline.parameters import Parameters
 from pipeline.records import Columns, Float, Int, Sensor, Step, TruthTrees, Verdict
+from pipeline.simulation.run import open_run
+from pipeline.simulation.uri import parse_uri
 from pipeline.sources import open_source
+from pipeline.sources.simulated import SimulatedSource
 from pipeline.steps import steps
 from pipeline.terrain import height_above
 from pipeline.visibility import clear_range
@@ -41,7 +45,7 @@ _VERDICT_OF_KIND = {
 
 
 def gathered(
-    run: Iterable[Step], sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, every: int
+    run: Iterable[Step], sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters
 ) -> Iterator[Columns]:
     """The columns of a run mapped with the poses it tells, after each of MARKS scans and at the end."""
     taken = 0
@@ -49,7 +53,7 @@ def gathered(
     before = b""
     for step in run:
         repeated = step.scan.points.tobytes()
-        if step.index % every or repeated == before:
+        if repeated == before:
             continue
         before = repeated
         raw, offset = acquire(step, T_base_lidar, parameters.acquisition)
@@ -66,11 +70,11 @@ def gathered(
         yield gathering.columns
 
 
-def _gathered_from(uri: str, parameters: Parameters, *, every: int, static: bool) -> Iterator[Columns]:
-    with closing(open_source(uri)) as source:
+def _gathered_from_place(folder: Path, parameters: Parameters) -> Iterator[Columns]:
+    with closing(open_source(str(folder))) as source:
         about = source.description
-        run = steps(source.records(), odometry="static" if static else "auto")
-        yield from gathered(run, about.sensor, about.T_base_lidar, parameters, every)
+        run = steps(source.records(), odometry="static")
+        yield from gathered(run, about.sensor, about.T_base_lidar, parameters)
 
 
 def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: float) -> Iterator[Examples]:
@@ -78,23 +82,28 @@ def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: flo
     street = simulate_street(seed, one_way=one_way)
     name = f"{'park' if one_way else 'street'} {seed}"
     sure, any_trunk = street.trunk[street.seen >= LEAST_RETURNS], street.trunk[street.seen > 0]
-    for columns in gathered(street.steps, street.sensor, street.T_base_lidar, parameters, 1):
+    for columns in gathered(street.steps, street.sensor, street.T_base_lidar, parameters):
         near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
         label = _label_by_points(axis, street.points, street.label, sure, any_trunk)
         yield Examples(name, True, not one_way, axis, figures, label)
 
 
-def simulated_examples(uri: str, parameters: Parameters, every: int) -> Iterator[Examples]:
-    """Of a simulated run."""
-    with closing(open_source(uri)) as source:
-        truth = source.truth()
-    assert truth is not None  # noqa: S101 - simulated runs know all
-    assert truth.trees is not None  # noqa: S101
-    for columns in _gathered_from(uri, parameters, every=every, static=False):
-        yield Examples(
-            uri, True, True, columns.axis, columns.figures, label_by_truth(columns.axis, truth.trees)
-        )
+def stand_examples(
+    uri: str, parameters: Parameters, every: int, *, furnished: bool = False
+) -> Iterator[Examples]:
+    """Of a simulated run, as it is or with more of what is no tree; of so many scans one is made."""
+    source = SimulatedSource(uri, open_run(furnished_stand(uri) if furnished else parse_uri(uri)))
+    about, truth = source.description, source.run.scene.truth
+    run = steps(source.records(every=every))
+    for columns in gathered(run, about.sensor, about.T_base_lidar, parameters):
+        label = label_by_truth(columns.axis, truth)
+        yield Examples(stand_name(uri, furnished), True, True, columns.axis, columns.figures, label)
+
+
+def stand_name(uri: str, furnished: bool) -> str:
+    """Of the scene of a simulated run."""
+    return f"furnished {uri}" if furnished else uri
 
 
 def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
@@ -117,7 +126,7 @@ def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Ite
     with closing(open_source(str(folder))) as source:
         all_around = source.description.sensor.rings > 0
     sure, any_trunk = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
-    for columns in _gathered_from(str(folder), parameters, every=1, static=True):
+    for columns in _gathered_from_place(folder, parameters):
         near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
         kind = _label_by_points(axis, points, label, sure, any_trunk)

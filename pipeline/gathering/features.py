@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiled import compiled
-from pipeline.gathering.columns import ARC
+from pipeline.gathering.columns import ARC, HIGH
 from pipeline.gathering.memory import SLICE, SLICES
 from pipeline.geometry import Float
 
 # Bands of height above the ground, as slices: first, one past the last.
 BANDS = np.array([[1, 4], [4, 7], [7, 11], [11, 16], [16, 30]])
-CLEAN = 0.5  # of the returns around a clean slice lie at the axis
+CLEAN, CLEAN_NEAR = 0.5, 0.7  # of the returns around a clean slice lie at the axis, see `_stem`
 GAP = 2  # slices that a stem may be hidden over
 
 _BAND_WORDS = ("0.2-0.8", "0.8-1.4", "1.4-2.2", "2.2-3.2", "3.2-6")
@@ -43,8 +43,10 @@ NAMES = tuple(
         "residual of the radius",
         "thick above",
         "wide above",
+        "voxels to 3 m",
     ]
     + [f"alone beyond 0.45 m {band} m" for band in _BAND_WORDS[:4]]
+    + [f"alone within 0.45 m {band} m" for band in _BAND_WORDS[:4]]
 )
 COUNT = len(NAMES)
 UNSEEN = -1.0  # of a figure of a band that no return tells anything of
@@ -106,12 +108,21 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
     out[k + 19] = last * SLICE / max(out[k + 6], SLICE)
     _circle(rows, last, out[k + 20 : k + 23])
     _above(rows, last, out[k + 23 : k + 25])
+    out[k + 25] = rows[1:HIGH, 3].sum()
     for b in range(4):
-        near, ring = 0.0, 0.0
-        for s in range(BANDS[b, 0], BANDS[b, 1]):
-            near += rows[s, 0] + rows[s, 1]
-            ring += rows[s, 2]
-        out[k + 25 + b] = near / (near + ring) if near > 0.0 else UNSEEN
+        _nearer(rows, BANDS[b, 0], BANDS[b, 1], out[k + 26 + b : k + 31 + b : 4])
+
+
+@compiled
+def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
+    """Of what lies nearer than 0.9 m, the part nearer than 0.45 m, and of that the part at the axis."""
+    inside, near, ring = 0.0, 0.0, 0.0
+    for s in range(first, end):
+        inside += rows[s, 0]
+        near += rows[s, 0] + rows[s, 1]
+        ring += rows[s, 2]
+    out[0] = near / (near + ring) if near > 0.0 else UNSEEN
+    out[1] = inside / near if inside > 0.0 else UNSEEN
 
 
 @compiled
@@ -198,16 +209,31 @@ def _band(rows: Float, first: int, end: int, out: Float) -> None:
 
 @compiled
 def _stem(rows: Float) -> tuple[int, int, int, int, int]:
-    """Slices: lowest with a return, first and last clean one of the run, their number, highest return."""
-    bottom, first, last, clean, top = SLICES, SLICES, 0, 0, 0
+    """Slices: lowest with a return, first and last clean one of the run, their number, highest return.
+
+    A thick neighbour returns more than a thin stem does and leaves it no clean slice; there a slice is
+    clean by what lies nearer than the neighbour.
+    """
+    bottom, top = SLICES, 0
     for s in range(1, SLICES):
-        if rows[s, 0] <= 0.0:
-            continue
-        bottom = min(bottom, s)
-        top = s
-        at_axis = rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2])
-        if at_axis and (clean == 0 or s - last <= GAP + 1):
+        if rows[s, 0] > 0.0:
+            bottom = min(bottom, s)
+            top = s
+    first, last, clean = _run(rows, CLEAN, 1.0)
+    if clean == 0:
+        first, last, clean = _run(rows, CLEAN_NEAR, 0.0)
+    return bottom, first, last, clean, top
+
+
+@compiled
+def _run(rows: Float, part: float, ring: float) -> tuple[int, int, int]:
+    """First and last clean slice of the run, and their number: slices in which such a part of the returns
+    lies at the axis; those of the ring count so much."""
+    first, last, clean = SLICES, 0, 0
+    for s in range(1, SLICES):
+        at_axis = rows[s, 0] >= part * (rows[s, 0] + rows[s, 1] + ring * rows[s, 2])
+        if rows[s, 0] > 0.0 and at_axis and (clean == 0 or s - last <= GAP + 1):
             first = min(first, s)
             last = s
             clean += 1
-    return bottom, first, last, clean, top
+    return first, last, clean

@@ -20,8 +20,7 @@ from pipeline.records import Bool, Columns, Float32, Int, Verdict
 GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
 SAME = 0.35  # m; a column found again so near is the one of before
 FOLD = 25  # scans after which a snapshot no longer repeats them one by one; as many are kept
-VOXELS, CLEAN_SLICES = NAMES.index("voxels a slice"), NAMES.index("clean slices")
-LEAST_VOXELS = 6.0
+VOXELS, LEAST_VOXELS = NAMES.index("voxels to 3 m"), 6.0
 GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
 
 
@@ -151,7 +150,7 @@ def no_columns() -> Columns:
 
 def _too_few(figures: Float) -> Bool:
     """Columns of so few voxels that chance can pile them up."""
-    few: Bool = figures[:, VOXELS] * figures[:, CLEAN_SLICES] < LEAST_VOXELS
+    few: Bool = figures[:, VOXELS] < LEAST_VOXELS
     return few
 
 

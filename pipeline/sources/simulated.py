@@ -43,8 +43,9 @@ class SimulatedSource:
         )
         self.losses: dict[str, int] = {}
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """All records in the order of time; at the same time IMU, odometry, scan.
+    def records(self, start_ns: int | None = None, *, every: int = 1) -> Iterator[Record]:
+        """All records in the order of time; at the same time IMU, odometry, scan. Of so many scans one is
+        made: what is not asked for costs nothing.
 
         A scan bears the time at which its sweep starts, so readings taken while the sensor turns follow
         it. They go on to the end of the last sweep, so that every sweep can be undistorted.
@@ -56,7 +57,7 @@ class SimulatedSource:
             yield self.run.imu_record(tick)
             if tick % per_odometry == 0:
                 yield self.run.odometry_record(tick // per_odometry)
-            if tick % per_scan == 0 and tick // per_scan < self.run.scans:
+            if tick % (per_scan * every) == 0 and tick // per_scan < self.run.scans:
                 yield self.run.sweep(tick // per_scan).scan
 
     def truth(self) -> Truth:

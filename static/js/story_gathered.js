@@ -5,13 +5,14 @@ import { figure, percent } from "./format.js";
 import { verdictOf } from "./verdicts.js";
 
 const HINTS = {
-  filled: "part of this height in which something was seen", alone: "part of the returns at this height that lies at the axis itself",
+  filled: "part of this height in which something was seen", "alone within": "part of the returns nearer than 0.45 m that lies at the axis itself",
+  "alone beyond": "part of the returns nearer than 0.9 m that lies nearer than 0.45 m", alone: "part of the returns at this height that lies at the axis itself",
   "ring open": "part of the surroundings at this height that is free", "lowest return": "height of the lowest return, m",
   "clean from": "from this height on the stem stands alone, m", "clean to": "up to this height the stem stands alone, m",
   "clean slices": "slices of 0.2 m in which the stem stands alone", "highest return": "height of the highest return, m",
   headroom: "how far above its top the view was free, m", "looked at up to": "how high any scan looked there, m",
   tilt: "shift of the axis per metre of height", wobble: "how far the slices lie beside one straight axis, m",
-  spread: "how wide the slices are, m", "voxels a slice": "filled voxels in a slice", "returns a voxel": "logarithm of the returns in a voxel",
+  spread: "how wide the slices are, m", "voxels a slice": "filled voxels in a slice", "voxels to 3 m": "filled voxels at the axis up to 3 m", "returns a voxel": "logarithm of the returns in a voxel",
   "returns around": "part of the returns that lies around the axis", crown: "part of the returns above the stem",
   gone: "part of the scans with free view in which nothing stood there", "returns a slice": "logarithm of the returns in a slice",
   thick: "width across the long side, m", wide: "width along the long side, m", uneven: "how unevenly wide the slices are",

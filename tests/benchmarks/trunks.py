@@ -30,6 +30,7 @@ from pipeline.parameters import preset
 from pipeline.plot.circle import FIGURES, best_circle, fit_circle
 from pipeline.records import Float, Frame, Int
 from pipeline.sources import open_source
+from pipeline.sources.simulated import SimulatedSource
 from pipeline.steps import steps
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
@@ -53,7 +54,7 @@ def main() -> None:
     parser.add_argument("--examples", type=Path, help="folder that `stemmap train --examples` filled")
     parser.add_argument("--scenes", default="stand,slope,dense")
     parser.add_argument("--seeds", default="1,2,3,4,5")
-    parser.add_argument("--every", type=int, default=1, help="take every so many-th simulated scan")
+    parser.add_argument("--every", type=int, default=1, help="make every so many-th simulated scan")
     arguments = parser.parse_args()
     examples = [] if arguments.examples is None else read_examples(arguments.examples)
     for part in arguments.parts:
@@ -71,8 +72,11 @@ def main() -> None:
 def mapped(
     uri: str, *, odometry: str, every: int = 1, forest: Forest | None = None, exact: bool = False
 ) -> tuple[Frame, Float, Stopwatch]:
-    """A run mapped to its end: the last frame, the path (N, 2) [m], and the times."""
+    """A run mapped to its end: the last frame, the path (N, 2) [m], and the times. Of a simulated run every
+    so many-th scan is made."""
     parameters = preset("forest").replace(EXACT_POSES if exact else {})
+    # As many scans are gathered as in a whole run.
+    parameters = parameters.replace({"gathering.every": max(parameters.gathering.every // every, 1)})
     watch = Stopwatch(scans=100_000)
     frame: Frame | None = None
     with closing(open_source(uri)) as source:
@@ -85,10 +89,10 @@ def mapped(
             watch=watch,
             forest=forest,
         )
-        for step in steps(source.records(), odometry="static" if odometry == "static" else "auto"):
-            if step.index % every == 0:
-                with watch.whole_scan():
-                    frame = mapper.process(step)
+        records = source.records(every=every) if isinstance(source, SimulatedSource) else source.records()
+        for step in steps(records, odometry="static" if odometry == "static" else "auto"):
+            with watch.whole_scan():
+                frame = mapper.process(step)
     assert frame is not None
     return frame, np.stack([mapper.path.x, mapper.path.y], axis=1), watch
 

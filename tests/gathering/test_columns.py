@@ -103,3 +103,14 @@ def test_no_axis_is_examined_twice():
     axis, _ = examined(trunk(2.03, 1.52, 0.15))
     apart = np.abs(axis[:, None, :2] - axis[None, :, :2]).max(axis=2)
     assert (apart[~np.eye(len(axis), dtype=bool)] >= 0.02).all()
+
+
+def test_a_thick_neighbour_does_not_hide_that_a_thin_stem_stands_alone():
+    thin, thick = trunk(2.0, 2.0, 0.05), trunk(2.7, 2.0, 0.2)
+    axis, profiles = examined(np.concatenate([thin[::8], thick, thick]))
+    nearest = np.hypot(*(axis[:, :2] - 2.0).T).argmin()
+    figures = dict(zip(NAMES, figures_of(axis, profiles)[nearest], strict=True))
+    assert figures["alone 0.8-1.4 m"] < 0.4
+    assert figures["alone within 0.45 m 0.8-1.4 m"] > 0.95
+    assert figures["clean slices"] >= 15
+    assert figures["voxels to 3 m"] > 6
