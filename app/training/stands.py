@@ -30,7 +30,7 @@ def furnished_stand(uri: str) -> FurnishedStand:
     """Read what `parse_uri` reads; a scenario without an entry in FURNITURE stays as it is.
 
     Raises:
-        SourceError: See `parse_uri`.
+        UsageError: See `parse_uri`.
     """
     asked = parse_uri(uri)
     return FurnishedStand(**{f.name: getattr(asked, f.name) for f in fields(asked)})
