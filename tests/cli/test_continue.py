@@ -60,9 +60,10 @@ def test_a_second_run_finds_its_start_and_keeps_the_numbers(stand, tmp_path, cap
     assert abs(second["pose"][2]) < 0.02
     before = {row["tree"]: row for row in rows(stand)}
     after = {row["tree"]: row for row in rows(tmp_path)}
-    assert set(before) <= set(after)
-    for number, row in before.items():
-        assert abs(float(row["x_m"]) - float(after[number]["x_m"])) < 0.3, number
+    kept = set(before) & set(after)
+    assert len(kept) >= 0.95 * len(before)  # what the second drive adds may turn a verdict
+    for number in kept:
+        assert abs(float(before[number]["x_m"]) - float(after[number]["x_m"])) < 0.3, number
     places = np.array([[float(row["x_m"]), float(row["y_m"])] for row in before.values()])
     for number in set(after) - set(before):  # what the first run missed may be found, but nothing twice
         x, y = float(after[number]["x_m"]), float(after[number]["y_m"])
@@ -109,7 +110,8 @@ def test_a_start_that_is_given_is_taken(stand, tmp_path):
     (second,) = json.loads((tmp_path / "run.json").read_text())["continued"]
     assert second["start"] == "given"
     numbers = {row["tree"] for row in rows(stand)}
-    assert numbers <= {row["tree"] for row in rows(tmp_path)}
+    kept = numbers & {row["tree"] for row in rows(tmp_path)}
+    assert len(kept) >= 0.95 * len(numbers)  # more views may turn a verdict
 
 
 @pytest.mark.parametrize(
