@@ -6,6 +6,14 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# A kernel compiles at its first call, and a busy machine is slow; the same examples come each time, so that a
+# failure can be repeated and is never somebody else's.
+settings.register_profile(
+    "stemmap", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("stemmap")
 
 ROOT = Path(__file__).resolve().parents[1]
 _WORKERS = 2
