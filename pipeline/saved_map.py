@@ -17,6 +17,7 @@ from pipeline.mapper import Mapper, MapperState
 from pipeline.parameters import Parameters
 from pipeline.records import Columns, Int, Trees
 from pipeline.slam import GraphState, SlamState
+from pipeline.slam.frame import FrameMemory
 from pipeline.slam.genealogy import BLOCK
 from pipeline.slam.maps import is_sound
 from pipeline.tracking import Tracker
@@ -107,6 +108,18 @@ def _check_slam(slam: SlamState) -> None:
         raise ValueError("the path has other columns")
     if past.founders is not None and any(len(f) != P or not _within(f, 1 << 20) for f in past.founders):
         raise ValueError("the particles have other founders")
+    _check_frame(slam.frame)
+
+
+def _check_frame(frame: FrameMemory) -> None:
+    marks, template = len(frame.serial), FrameMemory()
+    for f in fields(FrameMemory):
+        column, wanted = getattr(frame, f.name), getattr(template, f.name)
+        if column.shape != ((marks, *wanted.shape[1:]) if len(wanted) == 0 else wanted.shape):
+            raise ValueError(f"{f.name} of the frame has another shape")
+    if np.any(np.diff(frame.serial) < 0):
+        raise ValueError("the marks of the frame are out of order")
+    _check_finite(frame.pose, frame.covariance, frame.hidden, frame.at)
 
 
 def _check_finite(*columns: Float) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int, Int32
+from pipeline.slam.motion import wrapped
 
 APART = 0.5  # m, or as many radians, between two marks
 SMALL = 1e-12  # m^2, rad^2; so that a pose without spread has a direction to grow in
@@ -57,8 +58,11 @@ class FrameMemory:
 
     def marked(self, serial: int, pose: Float, covariance: Float) -> FrameMemory:
         """With a mark here if the last one is far enough behind; `serial`: of this scan's first detection."""
-        if len(self.serial) and np.abs(pose - self.pose[-1]).max() < APART:
-            return self
+        if len(self.serial):
+            away = pose - self.pose[-1]
+            away[2] = wrapped(away[2])
+            if np.abs(away).max() < APART:
+                return self
         return replace(
             self,
             serial=np.append(self.serial, serial),
@@ -125,7 +129,8 @@ def _with_frame(
 @compiled
 def at_least(spread: Float, least: Float) -> Float:
     """The covariance that is as large as both in every direction, and no larger in their common axes."""
-    L = np.linalg.cholesky(spread + SMALL * np.eye(3))
+    # Two particles far apart spread along a line; what rounding leaves of the rest grows with the distance.
+    L = np.linalg.cholesky(spread + SMALL * max(1.0, np.trace(spread)) * np.eye(3))
     L_inv = np.linalg.inv(L)
     values, axes = np.linalg.eigh(L_inv @ least @ L_inv.T)
     B = L @ axes

@@ -127,6 +127,24 @@ def test_what_the_particles_forgot_is_remembered_where_the_landmarks_stand():
     np.testing.assert_allclose(told, thin)
 
 
+def test_a_spread_along_a_line_may_be_as_long_as_a_forest():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        away = rng.normal(size=3) * [1e3, 1e3, 1.0]
+        line = np.outer(away, away)
+        both = at_least(line, np.eye(3) * 0.01)
+        assert np.all(np.isfinite(both))
+        assert np.linalg.eigvalsh(both - line).min() > -1e-6
+
+
+def test_a_robot_that_heads_backwards_makes_no_marks_while_it_stands():
+    memory = FrameMemory()
+    for k in range(10):
+        yaw = (np.pi - 0.001) * (-1.0) ** k
+        memory = memory.marked(k, np.array([0.0, 0.0, yaw]), np.eye(3))
+    assert len(memory.serial) == 1
+
+
 def test_marks_stand_apart():
     memory = FrameMemory()
     for k in range(100):

@@ -22,6 +22,7 @@ from pipeline.geometry import Pose2
 from pipeline.records import Float, Float32, Int
 from pipeline.saved_map import SavedMap
 from pipeline.saving import decode, encode, read_archive, write_archive
+from pipeline.slam.frame import FrameMemory
 from tests.pipeline.test_mapper import as_bytes, fed, mapper, run
 
 
@@ -78,6 +79,22 @@ def test_a_placed_robot_stands_where_it_was_put():
 
 
 # --- what is not a saved map ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        FrameMemory(serial=np.arange(5)),
+        FrameMemory(np.array([3, 1]), np.zeros((2, 3)), np.zeros((2, 3, 3))),
+        FrameMemory(hidden=np.full((3, 3), np.nan)),
+        FrameMemory(at=np.zeros(2)),
+    ],
+    ids=["marks without poses", "marks out of order", "no number", "a pose of two numbers"],
+)
+def test_a_frame_that_compiled_code_would_read_beyond_is_refused(changed):
+    state, _, _ = saved()
+    with pytest.raises(ValueError, match=r"frame|finite"):
+        replace(state, slam=replace(state.slam, frame=changed)).state()
 
 
 def test_a_tree_changed_anywhere_is_refused_or_read():
