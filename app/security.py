@@ -8,6 +8,7 @@ is another origin, but not another site).
 
 from __future__ import annotations
 
+import base64
 import hmac
 import html
 import ipaddress
@@ -15,6 +16,7 @@ import secrets
 import socket
 from collections.abc import Iterable
 from http.cookies import CookieError, SimpleCookie
+from typing import Literal
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from starlette.datastructures import Headers
@@ -27,6 +29,7 @@ from pipeline.errors import StemmapError
 
 # Where bodies may be as long as a recording.
 UPLOADS = "/api/uploads"
+Role = Literal["owner", "viewer"]
 _SAFE_METHODS = frozenset({"GET", "HEAD"})
 _LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 _ANY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - compared with, not bound to
@@ -46,6 +49,19 @@ _LEAD_ON = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemma
 def new_token() -> str:
     """A token that nobody guesses."""
     return secrets.token_urlsafe(24)
+
+
+def viewer_token(token: str) -> str:
+    """The token of the link for those who may look and not touch. It comes of the other one, so that it
+    outlives a restart as that does, and nobody can go the way back."""
+    made = hmac.new(token.encode(), b"stemmap viewer", "sha256").digest()
+    return base64.urlsafe_b64encode(made[:24]).decode()
+
+
+def role_of(scope: Scope) -> Role:
+    """What the guard found out about who asks."""
+    role: Role = scope.get("state", {}).get("role", "viewer")
+    return role
 
 
 def session_value(token: str, port: int) -> str:
@@ -86,8 +102,9 @@ class Guard:
         upload_limit: int = 0,
     ) -> None:
         self._app = app
-        self._token = token
-        self._session = session_value(token, port)
+        tokens: tuple[tuple[Role, str], ...] = (("owner", token), ("viewer", viewer_token(token)))
+        self._tokens = tokens
+        self._sessions = tuple((role, session_value(given, port)) for role, given in tokens)
         self._port = port
         self._hosts = allowed_hosts(host, port, further_hosts)
         self._any_address = host in _ANY_ADDRESS
@@ -100,7 +117,9 @@ class Guard:
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        refusal = self._refusal(scope, headers) or self._login(scope, headers)
+        refusal = (
+            self._refusal(scope, headers) or self._login(scope, headers) or self._restraint(scope, headers)
+        )
         if refusal is not None:
             await refusal(scope, receive, send)
             return
@@ -125,6 +144,18 @@ class Guard:
             return error_reply(413, f"a body may have {limit} bytes")
         return None
 
+    def _restraint(self, scope: Scope, headers: Headers) -> Response | None:
+        """The answer to who may look and wants to touch; the role of all others is kept in the scope."""
+        role = self._role(headers)
+        scope.setdefault("state", {})["role"] = role
+        if role == "owner" or scope["type"] == "websocket" or scope["method"] in _SAFE_METHODS:
+            return None
+        return error_reply(
+            403,
+            "this link is for looking only",
+            remedy="Ask who runs stemmap for the link that may change things",
+        )
+
     def _limit_of(self, scope: Scope) -> int:
         """Largest body of a request [bytes]."""
         is_upload = scope.get("path") == UPLOADS and scope.get("method") == "POST"
@@ -135,16 +166,18 @@ class Guard:
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] in _SAFE_METHODS:
             query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
             given = [value for name, value in query if name == "token"]
-            if given and self._is_token(given[-1]):
+            role = self._role_by_token(given[-1]) if given else None
+            if role is not None:
                 rest = [(name, value) for name, value in query if name != "token"]
-                return self._welcome(rest, from_elsewhere=headers.get("sec-fetch-site") == "cross-site")
-        if self._has_cookie(headers) or self._has_bearer(headers):
+                from_elsewhere = headers.get("sec-fetch-site") == "cross-site"
+                return self._welcome(role, rest, from_elsewhere=from_elsewhere)
+        if self._role(headers) is not None:
             return None
         if scope["type"] == "http" and "text/html" in headers.get("accept", ""):
             return HTMLResponse(_LOGIN_PAGE, 401, {"Cache-Control": "no-store"})
         return error_reply(401, "the token is missing or wrong", remedy="Open the link that stemmap printed")
 
-    def _welcome(self, query: list[tuple[str, str]], *, from_elsewhere: bool) -> Response:
+    def _welcome(self, role: Role, query: list[tuple[str, str]], *, from_elsewhere: bool) -> Response:
         """Give the cookie and lead on to the page without the token.
 
         A strict cookie is not sent along a redirect that began in a file or on another site; from a
@@ -156,7 +189,7 @@ class Guard:
             reply = HTMLResponse(_LEAD_ON.format(target=html.escape(target)))
         reply.headers["Cache-Control"] = "no-store"
         reply.headers["Referrer-Policy"] = "no-referrer"
-        reply.set_cookie(self.cookie, self._session, path="/", httponly=True, samesite="strict")
+        reply.set_cookie(self.cookie, dict(self._sessions)[role], path="/", httponly=True, samesite="strict")
         return reply
 
     def _knows_host(self, headers: Headers) -> bool:
@@ -178,25 +211,31 @@ class Guard:
     def _fits_origin(self, scope: Scope, headers: Headers) -> bool:
         origins = headers.getlist("origin")
         if not origins:
-            return scope["type"] == "http" or self._has_bearer(headers)
+            return scope["type"] == "http" or self._role_by_bearer(headers) is not None
         host = headers["host"].lower()
         return len(origins) == 1 and origins[0].lower() in (f"http://{host}", f"https://{host}")
 
-    def _has_cookie(self, headers: Headers) -> bool:
+    def _role(self, headers: Headers) -> Role | None:
+        return self._role_by_cookie(headers) or self._role_by_bearer(headers)
+
+    def _role_by_cookie(self, headers: Headers) -> Role | None:
         # Several cookies of one name can be sent; one of another path must not hide ours.
-        return any(
-            _same(value, self._session)
+        given = [
+            value
             for line in headers.getlist("cookie")
             for part in line.split(";")
             if (value := _cookie_value(part, self.cookie)) is not None
+        ]
+        return next(
+            (role for role, session in self._sessions for value in given if _same(value, session)), None
         )
 
-    def _has_bearer(self, headers: Headers) -> bool:
+    def _role_by_bearer(self, headers: Headers) -> Role | None:
         scheme, _, given = headers.get("authorization", "").partition(" ")
-        return scheme.lower() == "bearer" and self._is_token(given.strip())
+        return self._role_by_token(given.strip()) if scheme.lower() == "bearer" else None
 
-    def _is_token(self, given: str) -> bool:
-        return _same(given, self._token)
+    def _role_by_token(self, given: str) -> Role | None:
+        return next((role for role, token in self._tokens if _same(given, token)), None)
 
 
 def _same(given: str, secret: str) -> bool:

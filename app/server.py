@@ -23,7 +23,7 @@ from app.replies import BadRequestError, error_reply, failure_reply
 from app.routes import annotations as annotation_routes
 from app.routes import page, parameter_sets, parameters, pictures, results, run, runs, sockets, story
 from app.routes import uploads as upload_routes
-from app.security import BodyTooLargeError, Guard
+from app.security import BodyTooLargeError, Guard, viewer_token
 from app.settings import Settings
 from app.store.records import UnknownError
 from app.uploading import Uploads
@@ -114,7 +114,7 @@ def build(
         redirect_slashes=False,
     )
     app.state.dashboard, app.state.settings = dashboard, settings
-    app.state.uploads = uploads
+    app.state.uploads, app.state.viewer_token = uploads, viewer_token(token)
     for router in ROUTERS:
         app.include_router(router)
     _answer_errors(app)

@@ -18,7 +18,7 @@ from starlette.types import ASGIApp
 from app.first_page import page_that_leads_to, show_in_browser
 from app.messages import Open
 from app.parameter_state import ParameterState
-from app.security import new_token
+from app.security import new_token, viewer_token
 from app.server import build
 from app.settings import DEFAULT_PORT, Settings
 from pipeline.errors import StemmapError
@@ -31,8 +31,15 @@ _OF_THE_PORT = (errno.EADDRINUSE, errno.EACCES)
 _OTHER_HOST = "Give an address of this machine with --host, or leave it away"
 
 
-def serve(settings: Settings, *, source: Open, parameter_state: ParameterState, open_browser: bool) -> int:
-    """Serve the dashboard until SIGINT or SIGTERM.
+def serve(
+    settings: Settings,
+    *,
+    source: Open,
+    parameter_state: ParameterState,
+    open_browser: bool,
+    viewer: bool = False,
+) -> int:
+    """Serve the dashboard until SIGINT or SIGTERM; with `viewer` print the link for looking only too.
 
     Raises:
         StemmapError: The port is in use, or the address is not one of this machine.
@@ -42,6 +49,9 @@ def serve(settings: Settings, *, source: Open, parameter_state: ParameterState, 
     token = settings.token or new_token()
     app = build(settings, port=port, token=token, source=source, parameter_state=parameter_state)
     link = f"http://{_name(settings.host)}:{port}/?token={token}"
+    if viewer:
+        looking = f"http://{_name(settings.host)}:{port}/?token={viewer_token(token)}"
+        print(f"for looking only: {looking}", flush=True)  # noqa: T201
     server = _Server(uvicorn_config(app, settings), settings, link, open_browser=open_browser)
     with contextlib.closing(listening):
         asyncio.run(server.serve(sockets=[listening]))

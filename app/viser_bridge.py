@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import socket
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -45,8 +46,22 @@ def client_page() -> Path:
     return Path(viser.__file__).parent / "client" / "build" / "index.html"
 
 
-async def bridge(browser: WebSocket, viser: ViserServer) -> None:
-    """Carry messages between a browser and viser until one of them leaves."""
+async def bridge(
+    browser: WebSocket,
+    viser: ViserServer,
+    *,
+    looks_only: bool = False,
+    touched: Callable[[], None] = lambda: None,
+) -> None:
+    """Carry messages between a browser and viser until one of them leaves.
+
+    Args:
+        browser: Not accepted yet.
+        viser: Where viser listens.
+        looks_only: The browser may move its own camera and nothing else.
+        touched: Called before a message that may change something.
+    """
+    touched = (lambda: None) if looks_only else touched
     protocols = [Subprotocol(p) for p in browser.scope["subprotocols"] if p.startswith("viser-v")]
     try:
         upstream = await _connect(viser, protocols[:_PROTOCOLS])
@@ -56,7 +71,7 @@ async def bridge(browser: WebSocket, viser: ViserServer) -> None:
         return
     async with upstream:
         await browser.accept(upstream.subprotocol)
-        await _carry(browser, upstream)
+        await _carry(browser, upstream, looks_only, touched)
     if browser.application_state is WebSocketState.CONNECTED:
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # it has just left by itself
             await browser.close()
@@ -84,11 +99,13 @@ async def _connect(viser: ViserServer, protocols: list[Subprotocol]) -> ClientCo
         raise
 
 
-async def _carry(browser: WebSocket, upstream: ClientConnection) -> None:
+async def _carry(
+    browser: WebSocket, upstream: ClientConnection, looks_only: bool, touched: Callable[[], None]
+) -> None:
     """Both directions at once; the first that ends, ends the other."""
     directions = {
         asyncio.create_task(_to_browser(browser, upstream)),
-        asyncio.create_task(_to_viser(browser, upstream)),
+        asyncio.create_task(_to_viser(browser, upstream, looks_only, touched)),
     }
     try:
         await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
@@ -108,9 +125,12 @@ async def _to_browser(browser: WebSocket, upstream: ClientConnection) -> None:
             await (browser.send_bytes(message) if isinstance(message, bytes) else browser.send_text(message))
 
 
-async def _to_viser(browser: WebSocket, upstream: ClientConnection) -> None:
+async def _to_viser(
+    browser: WebSocket, upstream: ClientConnection, looks_only: bool, touched: Callable[[], None]
+) -> None:
     with contextlib.suppress(ConnectionClosed):
         while (event := await browser.receive())["type"] != "websocket.disconnect":
             message = event.get("bytes")
-            if message is not None and is_allowed(message):
+            if message is not None and is_allowed(message, looks_only=looks_only):
+                touched()
                 await upstream.send(message)

@@ -5,7 +5,7 @@ sensible size. All others are dropped: viser would open a public tunnel, or take
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -103,15 +103,17 @@ class _Command(_FromBrowser, frozen=True, tag="CommandTriggerMessage"):
 
 
 _Allowed = _Camera | _Pointer | _Click | _Drag | _Controls | _ControlsStart | _ControlsEnd | _Gui | _Command
-_decoder = msgspec.msgpack.Decoder(_Allowed)
+_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_Allowed)
+# A camera is a browser's own; all else is everybody's.
+_viewers_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_Camera)
 
 
-def is_allowed(message: bytes) -> bool:
-    """Whether a browser may send this to viser."""
+def is_allowed(message: bytes, *, looks_only: bool = False) -> bool:
+    """Whether a browser, or one that may look and not touch, may send this to viser."""
     if len(message) > LARGEST:
         return False
     try:
-        decoded = _decoder.decode(message)
+        decoded = (_viewers_decoder if looks_only else _decoder).decode(message)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return False
     return _is_finite(msgspec.to_builtins(decoded))

@@ -47,6 +47,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_parameter_flags(parser)
     add_run_flags(parser)
     add_live_flags(parser)
+    parser.add_argument(
+        "--viewer", action="store_true", help="print a second link too, for who may look and not touch"
+    )
     parser.add_argument("--no-browser", action="store_true", help="print the link, open no browser")
     width = max(map(len, VARIABLES))
     table = "\n".join(f"  {name:{width}}  {meaning}" for name, meaning in VARIABLES.items())
@@ -73,6 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         source=Open(arguments.source, arguments.odometry, arguments.seed, record, arguments.publish),
         parameter_state=ParameterState(lambda suggested: chosen_parameters(arguments, suggested)),
         open_browser=not arguments.no_browser,
+        viewer=arguments.viewer,
     )
 
 

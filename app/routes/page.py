@@ -8,7 +8,8 @@ from pathlib import Path, PurePosixPath
 from fastapi import APIRouter, Request
 from starlette.responses import FileResponse, Response
 
-from app.replies import error_reply
+from app.replies import error_reply, json_reply
+from app.security import role_of
 from app.static_files import page_folder, plotly_script
 from app.viser_bridge import client_page
 
@@ -43,6 +44,14 @@ def page(request: Request) -> Response:
 def runs_page(request: Request) -> Response:
     """The page of all runs."""
     return _file(request, page_folder() / "runs.html", _PAGE_POLICY)
+
+
+@router.get("/api/access")
+def access(request: Request) -> Response:
+    """What the link allows, and for who may change things the link for those who may look."""
+    role = role_of(request.scope)
+    link = f"/?token={request.app.state.viewer_token}" if role == "owner" else None
+    return json_reply({"role": role, "viewer_link": link})
 
 
 @router.get("/static/plotly.min.js")

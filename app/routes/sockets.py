@@ -12,8 +12,10 @@ from msgspec import Meta
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from app.dashboard import Dashboard
+from app.hands import hand
 from app.live import Listener
 from app.routes.access import Dash
+from app.security import role_of
 from app.viser_bridge import bridge
 
 router = APIRouter()
@@ -52,7 +54,7 @@ async def live(browser: WebSocket, dashboard: Dash) -> None:
     with dashboard.live.listener() as listener:
         sending = asyncio.create_task(_send(browser, listener))
         try:
-            await _receive(browser, dashboard)
+            await _receive(browser, dashboard, may_touch=role_of(browser.scope) == "owner")
         finally:
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
@@ -64,13 +66,15 @@ async def _send(browser: WebSocket, listener: Listener) -> None:
         await browser.send_text(message.decode())
 
 
-async def _receive(browser: WebSocket, dashboard: Dashboard) -> None:
+async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_touch: bool) -> None:
     while (event := await browser.receive())["type"] != "websocket.disconnect":
         try:
             wanted = _decoder.decode(event.get("text") or b"")
         except (msgspec.MsgspecError, UnicodeDecodeError):
             await browser.close(_REFUSED, "not a message of the page")
             return
+        if not may_touch:  # a selection is everybody's
+            continue
         if isinstance(wanted, _SelectCluster):
             dashboard.select_cluster_soon(wanted.scan, wanted.cluster)
         else:
@@ -84,8 +88,13 @@ async def viser(browser: WebSocket, dashboard: Dash) -> None:
     if dashboard.scene_viewers >= _MOST_BROWSERS:
         await browser.close(_TRY_AGAIN_LATER)
         return
+    name = hand.get()
+
+    def sign() -> None:
+        dashboard.scene_hand = name
+
     dashboard.scene_viewers += 1
     try:
-        await bridge(browser, dashboard.scene)
+        await bridge(browser, dashboard.scene, looks_only=role_of(browser.scope) != "owner", touched=sign)
     finally:
         dashboard.scene_viewers -= 1

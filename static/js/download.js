@@ -19,7 +19,3 @@ export const csvText = (rows) => rows.map((row) => `${row.map(cell).join(",")}\n
 export const saveCsv = (name, rows) => save(name, new Blob([csvText(rows)], { type: "text/csv" }));
 
 export const saveCanvas = (name, canvas) => canvas.toBlob((blob) => blob && save(name, blob), "image/png");
-
-export async function saveUrl(name, address) {
-  save(name, await (await fetch(address)).blob());
-}

@@ -1,5 +1,6 @@
 // The live connection: takes what the server tells, says when it is lost, and comes back by itself.
 
+import { looksOnly } from "./access.js";
 import { state, changed } from "./state.js";
 
 const FIRST_WAIT = 500, LONGEST_WAIT = 5000;

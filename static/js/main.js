@@ -16,6 +16,7 @@ import { startOverlay } from "./overlay.js";
 import { startPalette } from "./palette.js";
 import { startPlots } from "./plots.js";
 import { startScene } from "./scene.js";
+import { startShare } from "./share.js";
 import { startScores } from "./scores.js";
 import { startSources } from "./sources.js";
 import { startStages } from "./stages.js";
@@ -30,5 +31,5 @@ import { startTuning } from "./tune.js";
 import { startWelcome } from "./welcome.js";
 
 for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startAnnotateScene, startTunePanel, startTuning, startOverlay, startStages, startCompare,
-  startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startPalette, startDrawer, startWelcome]) start();
+  startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startPalette, startDrawer, startWelcome, startShare]) start();
 connect();

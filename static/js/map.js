@@ -3,6 +3,7 @@
 import { draft } from "./annotate.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "./annotate_map.js";
 import { byId, setText } from "./dom.js";
+import { saveCanvas } from "./download.js";
 import { figure, NONE } from "./format.js";
 import { select, selectCluster } from "./live.js";
 import { measureAt, measuredText, measureTowards, measuring } from "./measure.js";
@@ -192,6 +193,7 @@ export function startMap() {
     view.zoom(Math.exp(-event.deltaY * 0.0015), ...place(event));
     redraw();
   }, { passive: false });
+  byId("map-png").addEventListener("click", () => saveCanvas("map.png", canvas));
   byId("map-fit").addEventListener("click", () => { view.moved = false; view.fit(bounds(), true); redraw(); });
   on("annotating", lookAtNext);
   on("map truth selection measure tab annotations annotating compare", redraw);

@@ -2,6 +2,7 @@
 
 import { get } from "./api.js";
 import { byId, el, setText } from "./dom.js";
+import { saveCsv } from "./download.js";
 import { select } from "./live.js";
 import { on, state } from "./state.js";
 import { visible } from "./tabs.js";
@@ -125,7 +126,25 @@ function clearHistory() {
   Object.assign(history, none());
 }
 
+async function savePng() {
+  const plot = byId("plot");
+  if (plot.hidden || !plot.data) return;
+  await (await load()).downloadImage(plot, { format: "png", scale: 2, width: 900, height: 700, filename: plot.dataset.kind });
+}
+
+// A matrix as a table with the numbers of the trees at its sides; curves one under the other.
+function saveTable() {
+  const plot = byId("plot");
+  if (plot.hidden || !plot.data) return;
+  const [first] = plot.data;
+  const rows = first.type === "heatmap" ? [["tree", ...first.x], ...first.z.map((row, k) => [first.y[k], ...row])]
+    : [["time_s", "curve", "value"], ...plot.data.flatMap(({ x, y, name }) => x.map((time, k) => [time, name, y[k]]))];
+  saveCsv(`${plot.dataset.kind}.csv`, rows);
+}
+
 export function startPlots() {
+  byId("plot-png").addEventListener("click", savePng);
+  byId("plot-csv").addEventListener("click", saveTable);
   on("map", recordMap);
   on("status", recordStatus);
   on("tab theme", draw);

@@ -14,12 +14,13 @@ import pytest_asyncio
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 
-from app.security import Guard, allowed_hosts, new_token, session_value
+from app.security import Guard, allowed_hosts, new_token, session_value, viewer_token
 from tests.app.server_for_tests import BEARER, COOKIE, HOST, PORT, TOKEN, build_app, routes, running, served
 
 ROUTES = [
     ("GET", "/"),
     ("GET", "/runs"),
+    ("GET", "/api/access"),
     ("GET", "/static/plotly.min.js"),
     ("GET", "/static/index.html"),
     ("GET", "/static/no-such-file.js"),
@@ -161,6 +162,58 @@ async def test_our_own_origin_may(client: httpx.AsyncClient) -> None:
     headers = {**COOKIE, "Origin": f"http://{HOST}"}
     answer = await client.post("/api/command", headers=headers, json={"type": "pause"})
     assert answer.status_code == 202
+
+
+VIEWER = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
+VIEWERS_COOKIE = {"Cookie": f"stemmap_{PORT}={session_value(viewer_token(TOKEN), PORT)}"}
+
+
+@pytest.mark.parametrize(("method", "path"), ROUTES)
+@pytest.mark.parametrize("who", [VIEWER, VIEWERS_COOKIE])
+async def test_who_may_look_changes_nothing(
+    client: httpx.AsyncClient, method: str, path: str, who: dict[str, str]
+) -> None:
+    answer = await client.request(method, path, headers=who)
+    if method == "GET":
+        assert answer.status_code not in (401, 403)
+        assert TOKEN not in answer.text
+    else:
+        assert answer.status_code == 403
+        assert answer.json()["error"]["what"] == "this link is for looking only"
+
+
+async def test_the_viewers_link_becomes_a_cookie_that_looks(client: httpx.AsyncClient) -> None:
+    link = (await client.get("/api/access", headers=BEARER)).json()
+    assert link == {"role": "owner", "viewer_link": f"/?token={viewer_token(TOKEN)}"}
+    answer = await client.get(link["viewer_link"])
+    assert answer.status_code == 303
+    cookie = {"Cookie": answer.headers["set-cookie"].split(";")[0]}
+    assert cookie == VIEWERS_COOKIE
+    assert (await client.get("/api/access", headers=cookie)).json() == {"role": "viewer", "viewer_link": None}
+    assert viewer_token(viewer_token(TOKEN)) not in (TOKEN, viewer_token(TOKEN))
+    # Who has both may do what the stronger one may.
+    both = {"Cookie": f"{VIEWERS_COOKIE['Cookie']}; {COOKIE['Cookie']}"}
+    assert (await client.get("/api/access", headers=both)).json()["role"] == "owner"
+
+
+async def test_who_may_look_hears_and_selects_nothing() -> None:
+    async with served() as (host, dashboard):
+        looks = connect(f"ws://{host}/api/live", additional_headers=VIEWER, proxy=None)
+        async with (
+            looks as viewer,
+            connect(f"ws://{host}/api/live", additional_headers=BEARER, proxy=None) as owner,
+        ):
+            await viewer.send('{"type": "select", "tree": 3}')
+            await (await viewer.ping())  # what was sent before it is read
+            await owner.send('{"type": "select", "tree": 5}')
+            chosen = []
+            async with asyncio.timeout(10):
+                while 5 not in chosen:
+                    message = json.loads(await viewer.recv())
+                    if message["type"] == "selection":
+                        chosen.append(message["tree"])
+        assert 3 not in chosen
+        assert dashboard.selection.tree == 5
 
 
 async def test_the_link_becomes_a_cookie_and_a_clean_address(client: httpx.AsyncClient) -> None:

@@ -17,9 +17,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from app.security import viewer_token
 from app.viser_messages import LARGEST, is_allowed
 from tests.app.fakes import FakeScene
-from tests.app.server_for_tests import BEARER, served
+from tests.app.server_for_tests import BEARER, TOKEN, served
 
 VERSION = Subprotocol("viser-v1.1.1")
 
@@ -144,6 +145,37 @@ async def test_messages_pass_both_ways_and_forbidden_ones_do_not() -> None:
             async with asyncio.timeout(10):
                 assert await heard.get() == pack(SLIDER)
         assert heard.empty()
+
+
+@pytest.mark.parametrize("message", [SLIDER, CLICK, COMMAND])
+def test_who_may_look_moves_the_camera_alone(message: dict[str, Any]) -> None:
+    assert is_allowed(pack(CAMERA), looks_only=True)
+    assert not is_allowed(pack(message), looks_only=True)
+
+
+async def test_a_viewers_messages_stop_at_the_bridge() -> None:
+    heard: asyncio.Queue[bytes | str] = asyncio.Queue()
+
+    async def handler(connection: ServerConnection) -> None:
+        async for message in connection:
+            heard.put_nowait(message)
+
+    looks = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
+    named = {**BEARER, "Cookie": "stemmap_name=Ann"}
+    async with fake_viser(handler) as scene, served(scene) as (host, dashboard):
+        at = f"ws://{host}/viser"
+        async with connect(at, additional_headers=looks, proxy=None, subprotocols=[VERSION]) as page:
+            for message in (SLIDER, CLICK, COMMAND, CAMERA):
+                await page.send(pack(message))
+            async with asyncio.timeout(10):
+                assert await heard.get() == pack(CAMERA)
+        assert heard.empty()
+        assert dashboard.scene_hand == "somebody"
+        async with connect(at, additional_headers=named, proxy=None, subprotocols=[VERSION]) as page:
+            await page.send(pack(SLIDER))
+            async with asyncio.timeout(10):
+                assert await heard.get() == pack(SLIDER)
+        assert dashboard.scene_hand == "Ann"
 
 
 async def closed(connection: ClientConnection | ServerConnection) -> None:

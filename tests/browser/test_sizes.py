@@ -12,7 +12,7 @@ from tests.browser.serving import Server
 SPILLS = """() => [...document.querySelectorAll('header *, main *, footer *')].filter(node => {
   const box = node.getBoundingClientRect();
   if (!box.width || getComputedStyle(node).visibility === 'hidden') return false;
-  if (node.closest('.scroll, svg, .figures')) return false; // scrolls or is cut by itself
+  if (node.closest('.scroll, svg, .figures, .tabs')) return false; // scrolls or is cut by itself
   return box.right > innerWidth + 1 || box.left < -1;
 }).map(node => `${node.tagName}#${node.id}.${node.className}`)"""
 

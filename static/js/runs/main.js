@@ -1,5 +1,6 @@
 // The page of all runs: the list, and beside it the chosen run or two of them compared.
 
+import { startAccess } from "../access.js";
 import { get, open, patch, post, request } from "../api.js";
 import { byId, el, setText } from "../dom.js";
 import { count, figure } from "../format.js";
@@ -135,5 +136,6 @@ startUpload(async ({ uri }) => {
   location.href = "/";
 });
 startTheme();
+startAccess();
 load();
 follow();

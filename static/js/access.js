@@ -1,0 +1,26 @@
+// Whether this browser may touch or only look. The server refuses in any case; here it is shown.
+
+import { get } from "./api.js";
+import { byId, el } from "./dom.js";
+
+// What changes something for everybody.
+const TOUCHED = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#panel-annotate", "#panel-tune", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#source-button", "#notice-open"];
+
+export let access = { role: "owner", viewer_link: null };
+export const looksOnly = () => access.role === "viewer";
+
+export async function startAccess() {
+  try {
+    access = await get("/api/access");
+  } catch {
+    return; // not connected; what may not be done is refused anyway
+  }
+  if (!looksOnly()) return;
+  document.body.classList.add("viewer");
+  for (const selector of TOUCHED) for (const node of document.querySelectorAll(selector)) node.inert = true;
+  const end = document.querySelector(".strip-end");
+  end.prepend(el("span", { id: "looks-only", class: "looks-only", text: "View only", title: "This link is for looking only. Ask who runs stemmap for the link that may change things" }));
+  // The panel of sliders in the scene belongs to viser; a veil over it says that it cannot be moved.
+  document.querySelector(".scene")?.append(el("div", { class: "veil", title: "View only: parameters cannot be changed" }));
+  if (byId("welcome-open")) byId("welcome-open").hidden = true;
+}

@@ -1,0 +1,61 @@
+"""Links for others: to a moment of a run with its camera, and for looking only."""
+
+from __future__ import annotations
+
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import opened
+from tests.browser.serving import Server
+
+AT = """() => window.__viserMutable?.cameraControl?.getPosition(
+  window.__viserMutable.camera.position.clone()).toArray() ?? []"""
+POINTS = (
+    "() => window.__viserSceneTree?.getState()['/world/robot/scan/raw']?.message.props.points.length > 100"
+)
+
+
+def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server: Server):
+    for dashboard in opened(chromium, server.link):
+        page = dashboard.page
+        dashboard.until_server("/api/status", "it.scan_index > 5")
+        dashboard.pause()
+        dashboard.command({"type": "seek", "time_s": 4.05})
+        dashboard.until("() => document.querySelector('#time-now').textContent === '0:04.0'")
+        dashboard.scene.wait_for_function(POINTS)
+        dashboard.scene.evaluate(
+            "() => window.__viserMutable.cameraControl.setLookAt(1, 12, 3, 0, 0, 0, false)"
+        )
+        dashboard.scene.wait_for_function(f"() => Math.abs(({AT})()[1] - 12) < 0.01")
+        page.get_by_role("button", name="Share").click()
+        moment = page.locator("#share-here").input_value()
+        viewers = page.locator("#share-viewer").input_value()
+        page.get_by_role("button", name="Close").click()
+        dashboard.command({"type": "seek", "time_s": 9.05})
+        dashboard.until("() => document.querySelector('#time-now').textContent === '0:09.0'")
+
+        page.goto(f"{moment}&fixedDpr=0.3")
+        dashboard.until("() => document.querySelector('#time-now').textContent === '0:04.0'")
+        dashboard.scene.wait_for_function(f"() => Math.abs(({AT})()[1] - 12) < 0.02")
+        assert "run=" not in page.url
+        assert dashboard.errors == []
+        looks(chromium, viewers, dashboard.ask("/api/status")["scan_index"])
+
+
+def looks(chromium: Browser, link: str, scan: int) -> None:
+    for viewer in opened(chromium, link):
+        page = viewer.page
+        expect(page.locator("#looks-only")).to_be_visible()
+        expect(page.locator("#trees tbody tr").first).to_be_visible()
+        viewer.scene.wait_for_function(POINTS)
+        page.locator("#map").press("ArrowRight")
+        page.locator("#map").press("y")
+        refused = page.evaluate(
+            "() => fetch('/api/command', { method: 'POST', body: '{\"type\": \"play\"}',"
+            " headers: { 'Content-Type': 'application/json' } }).then(answer => answer.status)"
+        )
+        assert refused == 403
+        page.locator("#trees tbody tr").first.click()
+        expect(page.locator("#panel-story")).to_have_attribute("data-story", "tree 1")
+        status = viewer.ask("/api/status")
+        assert (status["scan_index"], status["state"]) == (scan, "paused")
+        assert [error for error in viewer.errors if "403" not in error] == []
