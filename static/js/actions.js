@@ -1,5 +1,6 @@
 // Everything that can be done with the dashboard, in one table: the keys, their sheet and the palette come from it.
 
+import { edits } from "./access.js";
 import { annotating, judge, draft, next, redo as redoEdit, toggleAdding, undo as undoEdit } from "./annotate.js";
 import { post } from "./api.js";
 import { byId } from "./dom.js";
@@ -20,7 +21,7 @@ import { openParameter, openSearch } from "./tune_panel.js";
 const click = (id) => () => byId(id).click();
 const openDrawer = () => byId("side").classList.add("open");
 const toTab = (name) => () => { openDrawer(); openTab(name); byId(`tab-${name}`).focus(); };
-const inAnnotate = (run) => () => { if (!annotating()) toTab("annotate")(); run(); };
+const inAnnotate = (run) => edits(() => { if (!annotating()) toTab("annotate")(); run(); });
 const named = (name) => name[0].toUpperCase() + name.slice(1);
 
 export function showSheet() {
@@ -41,27 +42,27 @@ function leave() {
 
 // title, keys as the sheet shows them, key of the event ("" where it has none of its own), what it does
 export const ACTIONS = [
-  ["Play or pause", "space", " ", togglePlay],
-  ["One scan back", "←", "", () => advance(-1)], ["One scan forward", "→", "", () => advance(1)],
-  ["Ten scans back", "shift ←", "", () => advance(-10)], ["Ten scans forward", "shift →", "", () => advance(10)],
-  ["Loop: set its beginning, then its end; leave it", "l", "l", setLoop],
-  ["Follow the robot in the scene, or stop following", "f", "", toggleFollow],
-  ["Look at the robot from above", "t", "", () => pressInScene("t")], ["Look at the robot from behind", "b", "", () => pressInScene("b")],
+  ["Play or pause", "space", " ", edits(togglePlay)],
+  ["One scan back", "←", "", edits(() => advance(-1))], ["One scan forward", "→", "", edits(() => advance(1))],
+  ["Ten scans back", "shift ←", "", edits(() => advance(-10))], ["Ten scans forward", "shift →", "", edits(() => advance(10))],
+  ["Loop: set its beginning, then its end; leave it", "l", "l", edits(setLoop)],
+  ["Follow the robot in the scene, or stop following", "f", "", edits(toggleFollow)],
+  ["Look at the robot from above", "t", "", edits(() => pressInScene("t"))], ["Look at the robot from behind", "b", "", edits(() => pressInScene("b"))],
   ["Measure a distance on the map", "m", "m", toggleMeasure],
   ["Show the whole map", "", "", click("map-fit")],
   ["Stages: raw, filtered, clusters and trunks side by side", "s", "s", () => openOver("stages")],
-  ["Compare two sets of parameters on this scan (A | B)", "c", "c", () => openOver("compare")],
+  ["Compare two sets of parameters on this scan (A | B)", "c", "c", edits(() => openOver("compare"))],
   ["Find a tree", "/", "/", findTree],
   ["Find a parameter", "p", "p", () => { openDrawer(); openSearch(); }],
-  ["Undo a change of a parameter", "ctrl+z", "", undo, "in the tab Tune: undo a change of a parameter"],
-  ["Redo a change of a parameter", "ctrl+shift+z", "", redo, "in the tab Tune: do it again"],
-  ["Reset all parameters to the preset", "", "", () => reset([])],
-  ["Save the parameters as a set", "", "", () => { toTab("tune")(); byId("tune-save").click(); }],
+  ["Undo a change of a parameter", "ctrl+z", "", edits(undo), "in the tab Tune: undo a change of a parameter"],
+  ["Redo a change of a parameter", "ctrl+shift+z", "", edits(redo), "in the tab Tune: do it again"],
+  ["Reset all parameters to the preset", "", "", edits(() => reset([]))],
+  ["Save the parameters as a set", "", "", edits(() => { toTab("tune")(); byId("tune-save").click(); })],
   ["Download the parameters as a file", "", "", click("tune-download")],
-  ["Take parameters from a file", "", "", () => { toTab("tune")(); byId("tune-upload").click(); }],
-  ["Layers of the scene", "", "", click("layers-button")],
+  ["Take parameters from a file", "", "", edits(() => { toTab("tune")(); byId("tune-upload").click(); })],
+  ["Layers of the scene", "", "", edits(click("layers-button"))],
   ["Light or dark", "", "", click("theme-button")],
-  ["Open another run", "", "", openSources],
+  ["Open another run", "", "", edits(openSources)],
   ["All runs: look at them, compare two, play one again", "", "", click("runs-link")],
   ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv")],
   ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],
@@ -78,10 +79,10 @@ export const ACTIONS = [
 // What depends on the run, as [title, keys, what it does].
 export function presentActions() {
   const layers = (state.view?.layers ?? []).map(({ title, on: seen }, place) =>
-    [`Layer ${title}: ${seen ? "hide" : "show"}`, place < 10 ? String((place + 1) % 10) : "", () => toggleLayer(place)]);
+    [`Layer ${title}: ${seen ? "hide" : "show"}`, place < 10 ? String((place + 1) % 10) : "", edits(() => toggleLayer(place))]);
   const tabs = TABS.map((name) => [`Tab ${named(name)}`, "", toTab(name)]);
-  const sets = [...tuning.presets.map(({ name }) => [`Use the preset ${name}`, "", () => use(name)]), ...savedSets().map(({ name }) => [`Use the saved set ${name}`, "", () => use(name)])];
-  const speeds = [...byId("speed").options].map(({ value, text }) => [`Speed ${text}`, "", () => post("/api/command", { type: "set_speed", factor: Number(value) })]);
+  const sets = [...tuning.presets.map(({ name }) => [`Use the preset ${name}`, "", edits(() => use(name))]), ...savedSets().map(({ name }) => [`Use the saved set ${name}`, "", edits(() => use(name))])];
+  const speeds = [...byId("speed").options].map(({ value, text }) => [`Speed ${text}`, "", edits(() => post("/api/command", { type: "set_speed", factor: Number(value) }))]);
   const parameters = tuning.specs.map(({ name, stage, title }) =>
     [`${stage}: ${title} (${shown(state.parameters?.values[name], specOf(name))}${isChanged(name) ? ", changed" : ""})`, "", () => openParameter(name)]);
   const trees = (state.map?.trees ?? []).map(({ number }) => [`Tree ${number}`, "", () => { openDrawer(); openStory("tree"); select(number); }]);

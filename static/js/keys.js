@@ -1,5 +1,6 @@
 // Keyboard shortcuts, also while the scene has the focus.
 
+import { edits, looksOnly } from "./access.js";
 import { ACTIONS, showSheet } from "./actions.js";
 import { ANNOTATE_KEYS, annotateKey } from "./annotate_keys.js";
 import { byId, el } from "./dom.js";
@@ -14,9 +15,9 @@ const PRESSED = "button, a, summary, [role=tab], [role=checkbox], input[type=che
 
 const actions = {
   ...Object.fromEntries(ACTIONS.filter(([, , key]) => key).map(([, , key, run]) => [key, run])),
-  ...Object.fromEntries([..."1234567890"].map((key, place) => [key, () => toggleLayer(place)])),
-  ArrowLeft: (event) => advance(event.shiftKey ? -10 : -1),
-  ArrowRight: (event) => advance(event.shiftKey ? 10 : 1),
+  ...Object.fromEntries([..."1234567890"].map((key, place) => [key, edits(() => toggleLayer(place))])),
+  ArrowLeft: edits((event) => advance(event.shiftKey ? -10 : -1)),
+  ArrowRight: edits((event) => advance(event.shiftKey ? 10 : 1)),
 };
 
 function act(event, inScene) {
@@ -31,7 +32,7 @@ function act(event, inScene) {
     return;
   }
   const target = event.target;
-  if (!target.matches?.(TYPES) && (annotateKey(event, inScene) || tuneKey(event))) {
+  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event, inScene) || tuneKey(event))) {
     take();
     return;
   }
@@ -39,7 +40,7 @@ function act(event, inScene) {
   if (target.matches?.(TYPES) || (event.key === " " && target.matches?.(PRESSED))) return;
   if (target.matches?.("input[type=range]") && event.key.startsWith("Arrow")) return;
   if (!inScene && ["f", "t", "b"].includes(event.key)) {
-    pressInScene(event.key); // viser listens to these itself when it has the focus
+    if (!looksOnly()) pressInScene(event.key); // viser listens to these itself when it has the focus
     return;
   }
   const action = actions[event.key];

@@ -86,5 +86,11 @@ export function select(tree) {
 
 export function selectCluster(scan, cluster) {
   chosen = null; // which tree it is, the server says
+  if (looksOnly()) {
+    const { x = [], y = [], verdict = [] } = (state.map?.index === scan && state.map.clusters) || {};
+    Object.assign(state, { selected: null, selectedCluster: { scan, cluster, verdict: verdict[cluster], x: x[cluster], y: y[cluster], time_s: state.status?.time_s } });
+    changed("selection"); // of this page alone
+    return;
+  }
   send({ type: "select_cluster", scan, cluster });
 }

@@ -1,5 +1,6 @@
 // Ctrl+K: everything that can be done, found by typing.
 
+import { mayDo } from "./access.js";
 import { ACTIONS, presentActions } from "./actions.js";
 import { byId, el } from "./dom.js";
 
@@ -18,7 +19,7 @@ export function openPalette() {
 // All words must occur; titles that begin with what was typed come first.
 function search(text) {
   const words = text.toLowerCase().split(/\s+/).filter(Boolean);
-  const all = [...ACTIONS.map(([title, keys, , run]) => [title, keys, run]), ...presentActions()];
+  const all = [...ACTIONS.map(([title, keys, , run]) => [title, keys, run]), ...presentActions()].filter(([, , run]) => mayDo(run));
   const fitting = all.filter(([title]) => words.every((word) => title.toLowerCase().includes(word)));
   const rank = ([title]) => (/^Tree \d/.test(title) && !/\d/.test(text) ? 3 : title.toLowerCase().startsWith(words.join(" ")) ? 0 : title.toLowerCase().split(/\W+/).some((word) => words.length && word.startsWith(words[0])) ? 1 : 2);
   return fitting.map((entry, place) => ({ entry, place, rank: rank(entry) })).sort((a, b) => a.rank - b.rank || a.place - b.place).map(({ entry }) => entry);

@@ -6,6 +6,7 @@ import { byId, el, setText } from "./dom.js";
 import { clock } from "./format.js";
 import { on, state } from "./state.js";
 
+const PATIENCE = 120_000; // [ms] for a run to open
 const frame = byId("scene");
 const controls = () => frame.contentWindow?.__viserMutable?.cameraControl ?? null;
 const rounded = (values) => values.map((value) => value.toFixed(2)).join(",");
@@ -17,8 +18,11 @@ function camera() {
   return rounded([...from.toArray(), ...to.toArray()]);
 }
 
+// Rounded up, or the seek would end at the scan before.
+const seconds = () => (Math.ceil(1000 * (state.status?.time_s ?? 0)) / 1000).toFixed(3);
+
 function hereLink() {
-  const query = new URLSearchParams({ run: state.status?.source ?? "", t: (state.status?.time_s ?? 0).toFixed(1) });
+  const query = new URLSearchParams({ run: state.status?.source ?? "", t: seconds() });
   const seen = camera();
   if (seen) query.set("camera", seen);
   return `${location.origin}/?${query}`;
@@ -58,7 +62,7 @@ async function follow() {
   if (!run || looksOnly()) return;
   try {
     if (state.status?.source !== run) await open(run, "auto");
-    await until(() => state.status?.source === run && state.status.scan_index >= 0);
+    if (!await until(() => state.status?.source === run && state.status.scan_index >= 0)) return;
     if (!Number.isFinite(time)) return;
     await command("pause");
     await command("seek", { time_s: Math.max(0, time) });
@@ -80,8 +84,10 @@ async function lookFrom(values) {
   }
 }
 
+// Whether it came to hold; after PATIENCE nobody waits for the moment any more.
 const until = (holds) => new Promise((resolve) => {
-  const look = () => (holds() ? resolve() : setTimeout(look, 200));
+  const end = performance.now() + PATIENCE;
+  const look = () => (holds() || performance.now() > end ? resolve(holds()) : setTimeout(look, 200));
   look();
 });
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+
 from playwright.sync_api import Browser, expect
 
 from tests.browser.conftest import opened
+from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
 
 AT = """() => window.__viserMutable?.cameraControl?.getPosition(
@@ -29,6 +32,8 @@ def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server
         page.get_by_role("button", name="Share").click()
         moment = page.locator("#share-here").input_value()
         viewers = page.locator("#share-viewer").input_value()
+        stands_s = dashboard.ask("/api/status")["time_s"]
+        assert 0.0 <= float(moment.split("t=")[1].split("&")[0]) - stands_s < 0.002
         page.get_by_role("button", name="Close").click()
         dashboard.command({"type": "seek", "time_s": 9.05})
         dashboard.until("() => document.querySelector('#time-now').textContent === '0:09.0'")
@@ -56,6 +61,40 @@ def looks(chromium: Browser, link: str, scan: int) -> None:
         assert refused == 403
         page.locator("#trees tbody tr").first.click()
         expect(page.locator("#panel-story")).to_have_attribute("data-story", "tree 1")
+        nothing_that_changes_is_offered(viewer)
         status = viewer.ask("/api/status")
         assert (status["scan_index"], status["state"]) == (scan, "paused")
         assert [error for error in viewer.errors if "403" not in error] == []
+        # One request was refused, the one above: it is heard of by its answer and in the console.
+        assert len(viewer.errors) <= 2
+
+
+def nothing_that_changes_is_offered(viewer: Dashboard) -> None:
+    page = viewer.page
+    map_ = page.locator("#map")
+    map_.press("Control+k")
+    find = page.get_by_role("combobox", name="What do you want to do?")
+    for word in (
+        "preset paper",
+        "play or pause",
+        "speed 2",
+        "annotate:",
+        "A | B",
+        "open another",
+        "layer raw",
+    ):
+        find.fill(word)
+        expect(page.locator("#palette-none")).to_be_visible()
+    find.fill("stages")
+    find.press("Enter")
+    expect(page.locator("#over-stages")).to_have_attribute("data-scan", re.compile(r"\d+"))
+    map_.press("Escape")
+    map_.press("c")
+    expect(page.locator("#over-compare")).to_be_hidden()
+    for name in ("Tune", "Annotate"):
+        panel = viewer.tab(name)
+        expect(panel.locator("> *").first).to_be_attached()
+        assert panel.locator("> *").evaluate_all("nodes => nodes.every(node => node.inert)")
+    map_.press("n")
+    viewer.tab("Clusters").locator("#cluster-table tbody tr").first.click()
+    expect(page.locator("#panel-story")).to_have_attribute("data-story", re.compile("^cluster "))
