@@ -1,22 +1,29 @@
 """Reads the steps of a source in order, and again from any scan that was read before.
 
-Reading again starts a second before the scan, so that the synchroniser has what it needs, and is
-checked: where the scan before it does not come out exactly as the first time, all is read from the
-start. So going back never changes what is mapped; at worst it is slow.
+Reading again starts a second before the scan, so that the synchroniser has what it needs; what it had
+learnt until then is kept and given to it. That is checked: where the scan before it does not come out
+exactly as the first time, all is read from the start. So going back never changes what is mapped; at
+worst it is slow.
 """
 
 from __future__ import annotations
 
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Protocol
 
 from pipeline.errors import SourceError
-from pipeline.records import Record, Step
+from pipeline.records import Learnt, Record, Step
 from pipeline.sources.base import Source
 
-Synchroniser = Callable[[Iterator[Record]], Iterator[Step]]
+
+class Synchroniser(Protocol):
+    """Joins records to steps; see `pipeline.steps.steps`."""
+
+    def __call__(self, records: Iterator[Record], *, after: Learnt | None = None) -> Iterator[Step]: ...
+
 
 _LEAD_IN_NS = 1_000_000_000
 
@@ -34,6 +41,7 @@ class Cursor:
         self._synchronise = synchronise
         self._stamps = array("q")
         self._marks = array("q")
+        self._learnt: list[Learnt] = []
         self._next = 0
         self._ahead: Step | None = None
         self._failure: Exception | None = None
@@ -86,6 +94,7 @@ class Cursor:
         if step.index == len(self._stamps):
             self._stamps.append(step.scan.stamp_ns)
             self._marks.append(_mark(step))
+            self._learnt.append(step.learnt)
         return step
 
     def go_to(self, index: int) -> None:
@@ -107,15 +116,15 @@ class Cursor:
             raise
         self._next = index
 
-    def _read(self, start_ns: int | None) -> Iterator[Step]:
-        return self._synchronise(self._source.records(start_ns))
+    def _read(self, start_ns: int | None, after: Learnt | None = None) -> Iterator[Step]:
+        return self._synchronise(self._source.records(start_ns), after=after)
 
     def _resumed(self, anchor: int) -> Iterator[Step] | None:
         """Steps after `anchor`, read from shortly before it; None when it comes out differently."""
         stamp_ns = self._stamps[anchor]
         # Scans of equal time cannot be told apart by it, so they are counted.
         wanted = anchor - bisect_left(self._stamps, stamp_ns)
-        steps = self._read(stamp_ns - _LEAD_IN_NS)
+        steps = self._read(stamp_ns - _LEAD_IN_NS, self._learnt[anchor])
         for step in steps:
             if step.scan.stamp_ns < stamp_ns:
                 continue
@@ -151,5 +160,7 @@ def _mark(step: Step) -> int:
             step.roll,
             step.pitch,
             step.tilt_known,
+            step.turn,
+            step.turn_rate,
         )
     )

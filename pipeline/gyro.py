@@ -1,7 +1,8 @@
 """The gyroscope: how far the robot turned between two scans, and what that says of its wheels.
 
 Wheels that slip tell a wrong turn, a gyroscope does not; it has a bias instead, which is seen while the robot
-stands. Turn rates are about the vertical: (w_y sin roll + w_z cos roll) / cos pitch.
+stands. Turn rates are about the vertical: (w_y sin roll + w_z cos roll) / cos pitch. It may hang upside down
+where nobody said how it is mounted, or tell degrees, so it is not asked before it turned as the wheels did.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections import deque
 import numpy as np
 
 from pipeline.geometry import Pose2, wrap_angle
-from pipeline.records import Imu, Turn
+from pipeline.records import Imu, Learnt, Turn
 
 KEEP_NS = 3_000_000_000
 GAP_NS = 60_000_000  # a longer time without a reading is a hole
@@ -26,6 +27,7 @@ SCALE = 0.01  # of the turn
 BIAS_UNKNOWN, BIAS_KNOWN = 0.01, 5e-4  # rad/s
 WANDERS = 10.0  # s, over which an unknown bias errs alike: short scans must not take it for noise
 CONTRADICTION, CONTRADICTION_LEAST = 4.0, 0.01  # sigma, rad
+PROOF, ALIKE = 0.1, 3.0  # rad by the wheels; and what a gyroscope that is right may differ by, as a factor
 HALF_TRACK = 0.5  # m; wheels that told a turn wrongly by an angle slipped by so much of it
 SLIPPED = "the wheels and the gyroscope tell different turns: the wheels slip"
 
@@ -38,6 +40,8 @@ class Gyro:
         self._block: list[float] = []
         self._blocks, self._bias = 0, 0.0
         self._same = 0
+        self._turned = (0.0, 0.0, 0.0)
+        self._proven = False
 
     def add(self, imu: Imu, tilt: tuple[float, float], *, standing: bool, needed_ns: int) -> None:
         """One reading more, later than those before it.
@@ -70,6 +74,29 @@ class Gyro:
             self._blocks = min(self._blocks + 1, BLOCKS_MOST)
             self._bias += (mean - self._bias) / self._blocks
 
+    def learnt(self, stamp_ns: int) -> Learnt:
+        """What the readings so far have taught, as of a time."""
+        block = tuple(self._block)
+        return Learnt(stamp_ns, self._bias, self._blocks, block, self._same, self._turned, self._proven)
+
+    def go_on_from(self, learnt: Learnt) -> None:
+        """Know what was learnt before; readings are kept as they are."""
+        self._bias, self._blocks, self._block = learnt.bias, learnt.blocks, list(learnt.block)
+        self._same, self._turned, self._proven = learnt.same, learnt.turned, learnt.proven
+
+    @property
+    def proven(self) -> bool:
+        """Whether it was seen to turn as the wheels do."""
+        return self._proven
+
+    def compare(self, by_wheels: float, turn: Turn) -> None:
+        """Take both turns of one step [rad]; the slope of a line through all of them proves the gyroscope."""
+        way, square, product = self._turned
+        way, square = way + abs(by_wheels), square + by_wheels**2
+        self._turned = (way, square, product + by_wheels * turn.angle)
+        alike = square < ALIKE * self._turned[2] < ALIKE**2 * square
+        self._proven = self._proven or (way >= PROOF and alike)
+
     @property
     def bias(self) -> float:
         """Of the turn rate [rad/s], 0 before the robot stood."""
@@ -92,7 +119,12 @@ class Gyro:
     def rate(self, stamp_ns: int) -> float | None:
         """The turn rate around a time [rad/s]; None where readings are missing."""
         near = [rate for _, rate in self._between(stamp_ns - AROUND_NS, stamp_ns + AROUND_NS)]
-        return None if not near or self._same >= DEAD else float(np.mean(near)) - self._bias
+        return None if not near or self._is_dead else float(np.mean(near)) - self._bias
+
+    @property
+    def _is_dead(self) -> bool:
+        """Whether it says the same again and again, or has said nothing else yet."""
+        return self._same >= min(DEAD, max(len(self._readings) - 1, 1))
 
     def _between(self, from_ns: int, to_ns: int) -> list[tuple[int, float]]:
         found = []
@@ -106,7 +138,7 @@ class Gyro:
     def _integral(self, from_ns: int, to_ns: int) -> float | None:
         """Of the rate by trapezoids [rad]; the rate stays as it is before the first and after the last."""
         inside = self._between(from_ns - GAP_NS, to_ns + GAP_NS)
-        if self._same >= DEAD or not inside or to_ns <= from_ns:
+        if self._is_dead or not inside or to_ns <= from_ns:
             return None
         at = np.array([(stamp - from_ns) * 1e-9 for stamp, _ in inside])
         end, gap = (to_ns - from_ns) * 1e-9, GAP_NS * 1e-9

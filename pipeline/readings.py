@@ -116,6 +116,32 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True)
+class Learnt:
+    """What the readings up to a step have taught of the gyroscope: who reads on from there needs it.
+
+    Attributes:
+        stamp_ns: Of the step.
+        bias: Of the turn rate [rad/s]; blocks: how many it is the mean of; block: the readings of the next.
+        same: How many readings in a row were the same.
+        turned: Sums over the steps, of the wheels' turns [rad], of their squares, and of their products with
+            those of the gyroscope [rad^2].
+        proven: Whether it was seen to turn as the wheels do.
+        stands: Since when the robot stands, and where by odometry; None before the first odometry.
+        tilt: When it was last taken [ns], roll and pitch [rad].
+    """
+
+    stamp_ns: int = 0
+    bias: float = 0.0
+    blocks: int = 0
+    block: tuple[float, ...] = ()
+    same: int = 0
+    turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    proven: bool = False
+    stands: tuple[int, Pose2] | None = None
+    tilt: tuple[int, float, float] = (0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
 class Notice:
     """What a source noticed on the way, for people: it becomes a warning of the next step.
 

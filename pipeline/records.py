@@ -16,6 +16,7 @@ from pipeline.readings import Float32 as Float32
 from pipeline.readings import Imu as Imu
 from pipeline.readings import Int as Int
 from pipeline.readings import Int32 as Int32
+from pipeline.readings import Learnt as Learnt
 from pipeline.readings import Notice as Notice
 from pipeline.readings import Odometry as Odometry
 from pipeline.readings import PoseMeasurement as PoseMeasurement
@@ -49,6 +50,7 @@ class Step:
         measured: The pose by another source at this scan, None where there is none.
         turn: By a gyroscope since the scan before, None where there is none.
         turn_rate: By a gyroscope at the scan [rad/s].
+        learnt: What the readings so far have taught of the gyroscope.
     """
 
     index: int
@@ -64,6 +66,7 @@ class Step:
     measured: PoseMeasurement | None = None
     turn: Turn | None = None
     turn_rate: float | None = None
+    learnt: Learnt = field(default_factory=Learnt)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

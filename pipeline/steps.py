@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from pipeline.geometry import Pose2, Pose3, interpolate, wrap_angle
 from pipeline.gyro import Gyro
-from pipeline.records import Imu, Notice, Odometry, PoseMeasurement, Record, Scan, Step
+from pipeline.records import Imu, Learnt, Notice, Odometry, PoseMeasurement, Record, Scan, Step, Turn
 
 OdometryChoice = Literal["auto", "wheels", "static"]
 WAIT = 5  # scans that wait for the odometry that follows them before they go without
@@ -27,6 +27,7 @@ MOST_POSES = 64
 STANDS = (0.005, 0.002)  # m, rad; a robot that stands stays within it
 SETTLES_NS = 300_000_000
 TILTS_NS = 90_000_000
+FASTEST = 20.0  # rad/s; a robot that maps trees, whatever it shakes like, does not turn this fast
 
 
 def steps(
@@ -35,6 +36,7 @@ def steps(
     odometry: OdometryChoice = "auto",
     first_index: int = 0,
     losses: Counter[str] | None = None,
+    after: Learnt | None = None,
 ) -> Iterator[Step]:
     """Join scans with the pose by odometry, interpolated to their time, and the tilt.
 
@@ -47,9 +49,11 @@ def steps(
         odometry: "static" leaves poses aside: the robot stands still.
         first_index: Number of the first step.
         losses: Counts what was left out, by reason.
+        after: What had been learnt until a step of an earlier reading, where the records begin shortly before
+            that step.
     """
     counted = Counter[str]() if losses is None else losses
-    joiner = Joiner(use_odometry=odometry != "static", index=first_index, losses=counted)
+    joiner = Joiner(use_odometry=odometry != "static", index=first_index, losses=counted, after=after)
     for record in records:
         joiner.add(record)
         yield from joiner.ready()
@@ -72,9 +76,12 @@ class Joiner:
         use_odometry: Else poses are left aside and no scan waits for one.
         index: Number of the first step.
         losses: Counts what was left out, by reason.
+        after: See `steps`.
     """
 
-    def __init__(self, *, use_odometry: bool, index: int, losses: Counter[str]) -> None:
+    def __init__(
+        self, *, use_odometry: bool, index: int, losses: Counter[str], after: Learnt | None = None
+    ) -> None:
         self._losses = losses
         self._use_odometry = use_odometry
         self._index = index
@@ -83,7 +90,11 @@ class Joiner:
         self._T_odom_jumped = Pose2()
         self._imu: deque[Imu] = deque()
         self._gyro = Gyro()
-        self._stands: _Reading | None = None  # where the robot has been standing since
+        self._after = after
+        if after is not None:
+            self._gyro.go_on_from(after)
+        self._stands: tuple[int, Pose2] | None = None  # since when the robot has been standing, and where
+        self._stepped: Pose2 | None = None  # the odometry of the step before
         self._turned_ns: int | None = None
         self._gyro_tilt = (0, 0.0, 0.0)  # when [ns], roll and pitch [rad]
         self._poses: deque[PoseMeasurement] = deque(maxlen=MOST_POSES)
@@ -145,10 +156,10 @@ class Joiner:
 
     def _watch_standing(self, reading: _Reading) -> None:
         if self._stands is not None:
-            away = self._stands.pose.inverse() @ reading.pose
+            away = self._stands[1].inverse() @ reading.pose
             if np.hypot(away.x, away.y) < STANDS[0] and abs(away.yaw) < STANDS[1]:
                 return
-        self._stands = reading
+        self._stands = (reading.stamp_ns, reading.pose)
 
     def _add_pose(self, pose: PoseMeasurement) -> None:
         if not pose.is_sound():
@@ -181,12 +192,17 @@ class Joiner:
     def _add_turn_rate(self, imu: Imu) -> None:
         if not np.all(np.isfinite(imu.angular_velocity)):
             return
-        settled = self._stands is not None and imu.stamp_ns - self._stands.stamp_ns > SETTLES_NS
+        if np.abs(imu.angular_velocity).max() > FASTEST:
+            self._leave_out("readings of the gyroscope that no robot turns as fast as")
+            return
+        settled = self._stands is not None and imu.stamp_ns - self._stands[0] > SETTLES_NS
         fresh = bool(self._odometry) and imu.stamp_ns - self._odometry[-1].stamp_ns < STALE_NS
+        still = settled and fresh and self._after is None
         oldest = self._scans[0].stamp_ns if self._scans else imu.stamp_ns
-        if imu.stamp_ns - self._gyro_tilt[0] > TILTS_NS:  # a tilt changes the rate by its square alone
+        # A tilt changes the rate by its square alone; counted so that it does not hang on the first reading.
+        if imu.stamp_ns // TILTS_NS != self._gyro_tilt[0] // TILTS_NS:
             self._gyro_tilt = (imu.stamp_ns, *(_tilt_of(imu) or (0.0, 0.0)))
-        self._gyro.add(imu, self._gyro_tilt[1:], standing=settled and fresh, needed_ns=oldest)
+        self._gyro.add(imu, self._gyro_tilt[1:], standing=still, needed_ns=oldest)
 
     def _forget(self, kept: deque[_Reading] | deque[Imu], now_ns: int) -> None:
         oldest = self._scans[0].stamp_ns if self._scans else now_ns
@@ -208,6 +224,7 @@ class Joiner:
     def _join(self, scan: Scan) -> Step:
         pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
+        turn = self._turn_to(scan.stamp_ns, pose)
         step = Step(
             index=self._index,
             scan=scan,
@@ -220,13 +237,27 @@ class Joiner:
             doubt=self._doubt,
             slack=self._slack,
             measured=self._pose_at(scan.stamp_ns),
-            turn=None if self._stepped_ns is None else self._gyro.turn(self._stepped_ns, scan.stamp_ns),
-            turn_rate=self._gyro.rate(scan.stamp_ns),
+            turn=turn if self._gyro.proven else None,
+            turn_rate=self._gyro.rate(scan.stamp_ns) if self._gyro.proven or pose is None else None,
+            learnt=replace(self._gyro.learnt(scan.stamp_ns), stands=self._stands, tilt=self._gyro_tilt),
         )
+        if self._after is not None and scan.stamp_ns >= self._after.stamp_ns:
+            step = replace(step, learnt=self._after)
+            self._gyro.go_on_from(self._after)
+            self._stands, self._gyro_tilt, self._after = self._after.stands, self._after.tilt, None
         self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
+        self._stepped = pose
         self._index += 1
         self._warnings.clear()
         return step
+
+    def _turn_to(self, stamp_ns: int, pose: Pose2 | None) -> Turn | None:
+        """By the gyroscope since the step before, compared with the odometry where that has no doubt."""
+        turn = None if self._stepped_ns is None else self._gyro.turn(self._stepped_ns, stamp_ns)
+        if turn is None or pose is None or self._stepped is None or self._doubt or self._after is not None:
+            return turn
+        self._gyro.compare(float(wrap_angle(pose.yaw - self._stepped.yaw)), turn)
+        return turn
 
     def _motion_at(
         self, stamp_ns: int

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -139,7 +141,7 @@ def test_a_known_turn_scatters_the_heading_by_its_own_sigma():
 # --- a run ----------------------------------------------------------------------------------------
 
 
-def run(wheel_turn, rate, *, bias=0.01):
+def told_by_robot(wheel_turn, rate, *, bias=0.01):
     """Two seconds of standing and two of driving a circle of which the wheels tell another turn."""
     records = [shaken(ms, bias + (rate if ms > 2000 else 0.0)) for ms in range(0, 4000, 10)]
     for ms in range(0, 4001, 20):
@@ -147,7 +149,11 @@ def run(wheel_turn, rate, *, bias=0.01):
         pose = Pose3.from_euler(np.array([0.5 * t, 0.0, 0.0]), 0.0, 0.0, wheel_turn * t)
         records.append(Odometry(START + ms * MS, pose))
     records += [scan(START + ms * MS) for ms in range(100, 3950, 100)]
-    return list(steps(sorted(records, key=lambda r: r.stamp_ns)))
+    return sorted(records, key=lambda r: r.stamp_ns)
+
+
+def run(wheel_turn, rate):
+    return list(steps(told_by_robot(wheel_turn, rate)))
 
 
 def headings(parameters, run_steps):
@@ -173,6 +179,50 @@ def test_slipping_wheels_are_told():
 def test_a_robot_that_stands_does_not_turn_with_the_noise():
     yaw, _ = headings(FOREST, run(wheel_turn=0.3, rate=0.3))
     np.testing.assert_array_equal(yaw[:18], 0.0)
+
+
+@pytest.mark.parametrize("seen", [-1.0, 0.0, 57.3], ids=["upside down", "on its side", "in degrees"])
+def test_a_gyroscope_that_never_turned_as_the_wheels_is_not_asked(seen):
+    driven = run(wheel_turn=0.3, rate=0.3 * seen)
+    off = FOREST.replace({"acquisition.gyro": False})
+    np.testing.assert_array_equal(headings(FOREST, driven)[0], headings(off, driven)[0])
+    assert all(step.turn_rate is None for step in driven)
+
+
+def test_one_mad_reading_turns_no_robot():
+    records = told_by_robot(0.3, 0.3)
+    at = next(k for k, r in enumerate(records) if isinstance(r, Imu) and r.stamp_ns == START + 3000 * MS)
+    records[at] = shaken(3000, 100.0)
+    losses = Counter[str]()
+    driven = list(steps(records, losses=losses))
+    assert abs(headings(FOREST, driven)[0][-1] - 0.3 * 1.9) < 0.01
+    assert list(losses.values()) == [1]
+
+
+def test_a_unit_that_has_said_but_one_number_tells_nothing():
+    gyro = Gyro()
+    for ms in range(0, 100, 10):
+        gyro.add(reading(ms, 0.0), (0.0, 0.0), standing=False, needed_ns=START)
+    assert gyro.turn(START, START + 90 * MS) is None
+    gyro.add(reading(100, 0.1), (0.0, 0.0), standing=False, needed_ns=START)
+    assert gyro.turn(START, START + 100 * MS) is not None
+
+
+@pytest.mark.parametrize("at", [3, 12, 19, 25, 36])
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.2)])
+def test_who_reads_on_from_a_scan_with_what_was_learnt_gets_the_same_steps(at, tilt):
+    records = [
+        reading((r.stamp_ns - START) / MS, r.angular_velocity[2], tilt) if isinstance(r, Imu) else r
+        for r in told_by_robot(0.32, 0.3)
+    ]
+    whole = list(steps(records))
+    learnt = whole[at].learnt
+    later = [r for r in records if r.stamp_ns >= learnt.stamp_ns - 1000 * MS]
+    again = [s for s in steps(later, after=learnt) if s.scan.stamp_ns >= learnt.stamp_ns]
+    wanted = [(s.turn, s.turn_rate, s.learnt) for s in whole[at:]]
+    assert [(s.turn, s.turn_rate, s.learnt) for s in again] == wanted
+    assert whole[-1].learnt.blocks > 0
+    assert whole[-1].learnt.proven
 
 
 def test_scans_are_deskewed_by_the_rate_of_the_gyroscope():
