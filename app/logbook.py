@@ -172,8 +172,10 @@ class Logbook:
                 store.book.update(page.record, standing)
                 return page.record
 
-            with contextlib.suppress(StemmapError):
+            try:
                 page.record = await self._ask(work)
+            except StemmapError:  # it was logged; what was not written is still to be written
+                page.dirty = True
 
     async def _ask(self, work: Any) -> Any:  # noqa: ANN401 - as the keeper's
         try:

@@ -8,7 +8,7 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,7 @@ class Uploads:
     def __init__(self, folder: Path | None, limit: int, keeper: Keeper) -> None:
         self._folder, self.limit, self._keeper = folder, limit, keeper
         self._under_way = 0
+        self._awaited = 0  # bytes that uploads under way have not written yet
 
     def room(self) -> int:
         """Bytes that an upload may have now.
@@ -54,7 +55,7 @@ class Uploads:
         Raises:
             UploadError: There is no folder for uploads.
         """
-        return max(0, min(self.limit, shutil.disk_usage(self._place()).free - SPARE_BYTES))
+        return max(0, min(self.limit, self._free() - self._awaited))
 
     async def take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
         """Take a file of so many bytes; returns where it lies and what it is.
@@ -71,7 +72,10 @@ class Uploads:
             self._under_way -= 1
 
     async def _take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
-        room = await asyncio.to_thread(self.room)
+        free = await asyncio.to_thread(self._free)
+        room = max(
+            0, min(self.limit, free - self._awaited)
+        )  # what others were promised while this waited too
         if size > room:
             why = "the limit" if size > self.limit else "what the disk has free"
             raise UploadError(
@@ -84,7 +88,7 @@ class Uploads:
         suffix = suffix if _SUFFIX.match(suffix) else ""
         part = self._place() / f"{_PART}{secrets.token_hex(8)}{suffix}"
         try:
-            await _write(part, size, stream)
+            await self._write(part, size, stream)
             kind = await _look_at(part, name)
             made_up = f"upload-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}{suffix}"
             place = part.with_name(made_up)
@@ -96,6 +100,23 @@ class Uploads:
         with contextlib.suppress(StemmapError):  # then it is listed under its made-up name
             await self._keeper.ask(lambda store: store.book.add_upload(made_up, _shown(name), kind, size))
         return {"uri": str(place), "name": _shown(name), "kind": kind, "bytes": size}
+
+    def _free(self) -> int:
+        return shutil.disk_usage(self._place()).free - SPARE_BYTES
+
+    async def _write(self, part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
+        awaited = size
+
+        def wrote(length: int) -> None:
+            nonlocal awaited
+            awaited -= length
+            self._awaited -= length
+
+        self._awaited += size
+        try:
+            await _write(part, size, stream, wrote)
+        finally:
+            self._awaited -= awaited
 
     def clear(self) -> None:
         """Remove what servers left that were ended in the middle of an upload."""
@@ -118,8 +139,8 @@ class Uploads:
         return self._folder
 
 
-async def _write(part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
-    """Write the file in large pieces, each in a thread.
+async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Callable[[int], None]) -> None:
+    """Write the file in large pieces, each in a thread; `wrote` is told the length of each.
 
     Raises:
         UploadError: The browser left, sends nothing any more, or sends another length than it said.
@@ -133,6 +154,7 @@ async def _write(part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
             if len(waiting) >= _CHUNK:
                 written += len(waiting)
                 await asyncio.to_thread(file.write, bytes(waiting))
+                wrote(len(waiting))
                 waiting.clear()
         written += len(waiting)
         await asyncio.to_thread(file.write, bytes(waiting))

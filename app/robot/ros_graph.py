@@ -12,6 +12,8 @@ from dataclasses import dataclass
 ADMIN = "@ros2_lv"
 PUBLISHER = "MP"
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)::msg::dds_::([A-Za-z][A-Za-z0-9_]*)_")
+#: What cannot be said as a key of Zenoh is no name of ROS: empty parts, wildcards.
+_NAME = re.compile(r"(?:/[A-Za-z0-9_.~-]+)+")
 #: A network that says more of itself than this is not a robot's.
 MOST_ENDPOINTS = 5000
 _LONGEST = 1000
@@ -39,9 +41,10 @@ def publisher_of(token: str) -> Publisher | None:
         return None
     msgtype = _TYPE.fullmatch(parts[10])
     topic = parts[9].replace("%", "/")
-    if msgtype is None or not topic.startswith("/"):
+    namespace = parts[7].replace("%", "/")
+    if msgtype is None or not _NAME.fullmatch(topic) or not (namespace == "/" or _NAME.fullmatch(namespace)):
         return None
-    return Publisher(parts[7].replace("%", "/").strip("/"), topic, f"{msgtype[1]}/msg/{msgtype[2]}")
+    return Publisher(namespace.strip("/"), topic, f"{msgtype[1]}/msg/{msgtype[2]}")
 
 
 def data_key(domain: int, topic: str, msgtype: str, type_hash: str = "*") -> str:

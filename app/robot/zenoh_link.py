@@ -128,7 +128,8 @@ class ZenohLink:
         """Leave the router."""
         self._closing.set()
         self._thread.join(timeout=2.0)
-        session, self._session = self._session, None
+        with self._lock:
+            session, self._session = self._session, None
         if session is not None:
             with contextlib.suppress(Exception):  # a session that is broken already is as good as closed
                 session.close()
@@ -138,12 +139,17 @@ class ZenohLink:
 
         while not self._closing.is_set():
             try:
-                session = zenoh.open(zenoh.Config.from_json5(configuration(self._address.endpoint)))
+                session: Any = zenoh.open(zenoh.Config.from_json5(configuration(self._address.endpoint)))
             except Exception as error:  # zenoh has one class for all, and does not promise it
                 self.problem = f"no connection to {self._address.endpoint}: {_short(error)}"
                 self._closing.wait(_RETRY_S)
                 continue
-            self._session = session
+            with self._lock:
+                closing = self._closing.is_set()
+                self._session = None if closing else session
+            if closing:  # nobody waited for it any more
+                session.close()
+                return
             self._kept.append(
                 session.liveliness().declare_subscriber(
                     f"{ADMIN}/{self._address.domain}/**", self._note_token, history=True

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-from app import child
+from app import child, logbook
 from app.comparing import compare
 from app.dashboard import Dashboard
 from app.logbook import MOST_PATH_POINTS, thinned
 from app.messages import Open
 from app.settings import Settings
 from app.worker_messages import Begin, Shown
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, StemmapError
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, running
 
@@ -82,6 +82,27 @@ async def test_what_comes_later_is_written_when_the_run_is_left(both: Running) -
     rows = {row["uri"]: row for row in await runs(client)}
     assert (rows["fake:"]["scans"], rows["fake:"]["trees"]) == (5, 5)
     assert rows["other:"]["scans"] == 3
+
+
+async def test_what_the_database_refused_is_written_when_it_answers_again(
+    both: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, dashboard = both
+    monkeypatch.setattr(logbook, "_PAUSE_S", 0.01)
+    await play(dashboard, scan=1)
+    refused = asyncio.Event()
+
+    async def refuse(_work: object) -> None:
+        refused.set()
+        raise StemmapError("the disk is full")
+
+    with monkeypatch.context() as full:
+        full.setattr(dashboard.keeper, "ask", refuse)
+        await show(dashboard, 4, 6)
+        await asyncio.wait_for(refused.wait(), 20)
+    async with asyncio.timeout(20):
+        while (await runs(client))[0]["scans"] != 5:
+            await asyncio.sleep(0.01)
 
 
 async def test_a_run_that_showed_nothing_leaves_no_record(both: Running) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 import socket
 import time
 from collections.abc import AsyncIterator
@@ -100,6 +101,39 @@ async def test_too_large_empty_and_without_a_length(
         full = await send(client, b"good")
         assert (full.status_code, "the disk has free" in full.text) == (413, True)
     assert kept(recordings) == []
+
+
+async def test_two_uploads_at_once_share_the_room(recordings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(recordings.parent)._replace(free=uploading.SPARE_BYTES + 100)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _place: usage)
+    go_on = asyncio.Event()
+
+    async def slow() -> AsyncIterator[bytes]:
+        await go_on.wait()
+        yield b"good" + bytes(66)
+
+    async def quick(size: int) -> AsyncIterator[bytes]:
+        yield b"good".ljust(size)
+
+    uploads = Uploads(recordings, 1000, Keeper(None))
+    assert uploads.room() == 100
+    first = asyncio.create_task(uploads.take("a.mcap", 70, slow()))
+    async with asyncio.timeout(30):
+        while uploads.room() == 100:
+            await asyncio.sleep(0.01)
+    assert uploads.room() == 30
+    with pytest.raises(UploadError, match="what the disk has free"):
+        await uploads.take("b.mcap", 40, quick(40))
+    go_on.set()
+    await first
+    assert uploads.room() == 100  # of the disk, which this test holds still
+    with pytest.raises(UploadError, match="3 of 40 bytes"):
+        await uploads.take("b.mcap", 40, quick_short())
+    assert uploads.room() == 100
+
+
+async def quick_short() -> AsyncIterator[bytes]:
+    yield b"goo"
 
 
 async def test_without_a_folder_nothing_is_taken() -> None:

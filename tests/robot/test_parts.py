@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,6 +12,7 @@ from app.robot.address import VelodyneAddress, ZenohAddress, is_live, parse_addr
 from app.robot.choosing import choose
 from app.robot.inbox import DROPPED, MOST_BYTES, MOST_SCANS, Inbox
 from app.robot.ros_graph import Publisher, RosGraph, data_key, publisher_of
+from app.robot.zenoh_link import ZenohLink
 from pipeline.errors import SourceError
 from pipeline.sources.container import Message
 from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, TRANSFORMS
@@ -84,6 +87,51 @@ def test_any_text_is_a_token_or_none(text: str):
     graph.add(f"@ros2_lv/{text}")
     graph.remove(text)
     assert graph.publishers() == []
+
+
+ODD = st.text(st.sampled_from("%ab0_*$#?~. -é"), min_size=1, max_size=12)
+
+
+@given(ODD, ODD)
+def test_what_is_read_from_a_token_can_be_listened_to(topic: str, namespace: str):
+    zenoh = pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed")
+    kind = "sensor_msgs::msg::dds_::PointCloud2_"
+    found = publisher_of(f"@ros2_lv/0/abc/0/1/MP/%/{namespace}/driver/{topic}/{kind}/RIHS01_00/::,10:,:,:,,")
+    if found is not None:
+        assert not set("*$#?") & set(found.topic + found.robot)
+        zenoh.KeyExpr(data_key(0, found.topic, found.msgtype))
+        zenoh.KeyExpr(data_key(0, f"/{found.robot}/stemmap/pose".replace("//", "/"), found.msgtype))
+
+
+@pytest.mark.parametrize("topic", ["%", "%a%", "%a%%b", "%*", "%a$*", "points"])
+def test_a_topic_that_is_no_name_is_passed_over(topic: str):
+    kind = "sensor_msgs::msg::dds_::PointCloud2_"
+    token = "@ros2_lv/0/abc/0/1/MP/%/%red/driver/{}/" + kind + "/RIHS01_00/q"
+    assert publisher_of(token.format("%red%points")) == Publisher("red", "/red/points", POINT_CLOUD)
+    assert publisher_of(token.format(topic)) is None
+
+
+def test_a_session_that_opens_after_the_end_is_closed(monkeypatch: pytest.MonkeyPatch):
+    zenoh = pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed")
+    closed, go_on = threading.Event(), threading.Event()
+
+    class Session:
+        def close(self) -> None:
+            closed.set()
+
+    def slow(_configuration: object) -> Session:
+        assert go_on.wait(60)
+        return Session()
+
+    monkeypatch.setattr(zenoh, "open", slow)
+    address = parse_address("zenoh:tcp/127.0.0.1:9")
+    assert isinstance(address, ZenohAddress)
+    link = ZenohLink(address, Inbox())
+    link._closing.set()  # as `close` does, which does not wait for ever
+    go_on.set()
+    assert closed.wait(60)
+    link._thread.join(60)
+    assert link.session is None
 
 
 def there(*topics: tuple[str, str, str]) -> list[Publisher]:
