@@ -15,7 +15,7 @@ from pipeline.perception import Seen, perceive
 from pipeline.records import Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step
 from pipeline.recovery import Mapped, Recovery, RecoveryState
 from pipeline.slam import BackEnd, BackEndState, Motion
-from pipeline.slam.motion import step_covariance
+from pipeline.slam.motion import noise_of, step_variances
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
 from pipeline.turns import is_fused, is_gathered
@@ -151,7 +151,8 @@ class Mapper:
         moved = Motion(motion, step.slack, step.doubt, step.measured)
         if step.turn is None or step.T_odom_base is None or not self._parameters.acquisition.gyro:
             return moved
-        sigma = math.sqrt(step_covariance(motion, self._parameters.slam)[2, 2])
+        _, variance = step_variances(motion.x, motion.y, motion.yaw, noise_of(self._parameters.slam))
+        sigma = math.sqrt(variance)
         turned, turn_sigma, slack, doubt = fused(motion, sigma, step.slack, step.turn)
         return moved._replace(step=turned, slack=slack, doubt=step.doubt or doubt, turn_sigma=turn_sigma)
 

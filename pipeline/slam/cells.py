@@ -27,6 +27,7 @@ class Cells(NamedTuple):
     cell: Int32
 
 
+@compiled
 def cells_for(landmarks: int) -> Cells:
     """Empty cells with room for so many landmarks."""
     return Cells(
@@ -41,16 +42,22 @@ def per_metre(radius: float) -> float:
 
 
 @compiled
-def cell_of(u: float, v: float) -> int:
-    """The number of the cell that holds a place, which is given in cells."""
-    return (int(np.floor(u)) & (SIDE - 1)) * SIDE + (int(np.floor(v)) & (SIDE - 1))
+def cell_of(u: int, v: int) -> int:
+    """The number of a cell in a row and a column of the plane."""
+    return (u & (SIDE - 1)) * SIDE + (v & (SIDE - 1))
+
+
+@compiled
+def first_of_four(x: float, y: float, scale: float) -> tuple[int, int]:
+    """Row and column of the first of the two by two cells that hold all within the radius of a place."""
+    return int(np.floor(scale * x - 0.5)), int(np.floor(scale * y - 0.5))
 
 
 @compiled
 def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
     """Put the first rows of `mean`, shape (L, 2) [m], into empty cells, `scale` of them a metre."""
     for j in range(known - 1, -1, -1):
-        at = cell_of(scale * mean[j, 0], scale * mean[j, 1])
+        at = cell_of(int(np.floor(scale * mean[j, 0])), int(np.floor(scale * mean[j, 1])))
         cells.cell[j] = at
         cells.following[j] = cells.head[at]
         cells.head[at] = j
@@ -68,8 +75,9 @@ def holds_unseen(
     cells: Cells, mean: Float, seen: Bool, x: float, y: float, radius2: float, scale: float
 ) -> bool:
     """Whether a landmark that was not seen stands within a radius (its square is given) of a place."""
-    for i in range(4):
-        at = cells.head[cell_of(scale * x - 0.5 + (i & 1), scale * y - 0.5 + (i >> 1))]
+    u, v = first_of_four(x, y, scale)
+    for quarter in range(4):
+        at = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
         while at >= 0:
             dx, dy = mean[at, 0] - x, mean[at, 1] - y
             if not seen[at] and dx * dx + dy * dy <= radius2:

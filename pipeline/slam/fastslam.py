@@ -18,14 +18,16 @@ from pipeline.health import Health
 from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
+from pipeline.slam.draws import draws
 from pipeline.slam.frame import FrameMemory
-from pipeline.slam.health import TOLD, Recent, ScanTold, is_astray, judged, remembered, scan_told
-from pipeline.slam.maps import ROOM, blocks_in_reach, take_ancestors, with_room
-from pipeline.slam.motion import Motion, accumulated, moved_poses, weighted_pose
-from pipeline.slam.pairs import Room, room_for
+from pipeline.slam.gaussian import rows_of
+from pipeline.slam.health import Recent, ScanTold, is_astray, judged, remembered, scan_of
+from pipeline.slam.maps import take_ancestors
+from pipeline.slam.motion import Motion, accumulated
 from pipeline.slam.resampling import low_variance_ancestors, normalised
+from pipeline.slam.scan import against_slip, estimated, use_scan
 from pipeline.slam.state import SlamState
-from pipeline.slam.update import Near, Rules, near_for, observe, predict
+from pipeline.slam.update import Rules
 
 PLACED = 1  # tells the draws of a placing from those of a scan
 
@@ -36,9 +38,8 @@ class FastSlam:
 
     def __init__(self, parameters: Slam, seed: int) -> None:
         self.parameters = parameters
-        self._seed = seed
+        self.seed = seed
         self.state = SlamState.at_origin(parameters.particles)
-        self._near, self._room = near_for(0), room_for(0, 0)  # memory of the kernels, no state
 
     def process(
         self, index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
@@ -52,18 +53,18 @@ class FastSlam:
             clear_range: shape (bins,) [m]: how far the view is free by direction (see visibility).
         """
         p = self.parameters
-        rng = np.random.default_rng([self._seed, index])
-        noise = rng.standard_normal((p.particles, 3))
-        offset = float(rng.random())
+        noise, offset = draws(self.seed, index, p.particles)
         motion = Motion(motion) if isinstance(motion, Pose2) else motion
         state = self._moved(self.state.with_particles(p.particles), motion)
-        scan, ancestors, doubt = ScanTold(), None, motion.doubt
+        ancestors, doubt = None, motion.doubt
         used = index == 0 or state.since_update >= p.update_distance
         if used:
-            state, slipped = self._against_slip(state, detections)
+            state, scan, weights, slipped = self._observed(
+                state, detections, clear_range, noise, motion.measured
+            )
             doubt = doubt or ("the trees contradict the odometry: corrected by them" if slipped else "")
-            state, scan = self._observed(state, detections, clear_range, noise, motion.measured)
-        weights = normalised(state.log_weight)
+        else:
+            scan, weights = ScanTold(), normalised(state.log_weight)
         estimate, frame = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
         if used and len(detections.cluster):
             serial = state.detections - len(detections.cluster)
@@ -86,7 +87,7 @@ class FastSlam:
             index: Number of the scan, for the draws.
             T_map_base: The pose; covariance: of x, y [m], yaw [rad], shape (3, 3).
         """
-        rng = np.random.default_rng([self._seed, index, PLACED])
+        rng = np.random.default_rng([self.seed, index, PLACED])
         noise = rng.standard_normal((self.parameters.particles, 3))
         values, axes = np.linalg.eigh(covariance)
         pose = T_map_base.as_array() + noise @ (axes * np.sqrt(np.maximum(values, 0.0))).T
@@ -136,22 +137,6 @@ class FastSlam:
             since_update=state.since_update + moved[2],
         )
 
-    def _against_slip(self, state: SlamState, detections: Detections) -> tuple[SlamState, bool]:
-        """Put the motion right where the scan contradicts the map that the best particle knows well."""
-        if len(detections.cluster) < slip.FEWEST or not state.recent.mapped:
-            return state, False
-        p, known = self.parameters, state.map_of(state.best)
-        landmarks = known.mean[known.hits >= p.hits_to_weigh]
-        motion = slip.motion_by_trees(
-            state.pose[state.best], state.motion, state.motion_covariance, detections, landmarks,
-            p.view_range, p.gate,
-        )  # fmt: skip
-        if motion is None:
-            return state, False
-        covariance = state.motion_covariance + np.diag(slip.SIGMA**2)
-        recent = replace(state.recent, distrust=1.0)
-        return replace(state, motion=motion, motion_covariance=covariance, recent=recent), True
-
     def _observed(
         self,
         state: SlamState,
@@ -159,24 +144,23 @@ class FastSlam:
         clear_range: Float,
         noise: Float,
         measured: PoseMeasurement | None,
-    ) -> tuple[SlamState, ScanTold]:
-        p, found = self.parameters, len(detections.cluster)
-        centre = detections.centre
-        reach = max(p.view_range, _farthest(detections) + p.distance_max) if found else p.view_range
-        rules = _rules(p)
-        moved = predict(state.pose, state.motion, state.motion_covariance, noise, rules.use_proposal)
-        blocks, lengths, rows = blocks_in_reach(state.maps, moved, reach, found)
-        maps = with_room(state.maps, found, rows)
-        known = int(lengths.max()) * ROOM
-        told = np.zeros((len(moved), TOLD))
-        observe(
-            state.pose, moved, state.log_weight, maps, blocks, lengths, state.motion,
-            state.motion_covariance, noise, centre, detections.covariance.reshape(-1, 4)[:, [0, 1, 3]],
-            clear_range, reach, state.detections, rules, *self._memory(known + found, found), told,
-            *_arrays(measured),
+    ) -> tuple[SlamState, ScanTold, Float, bool]:
+        """The state after a scan, what it told, the weights, and whether it put the motion right."""
+        rules, found = rules_of(self.parameters), len(detections.cluster)
+        centre, R = detections.centre, rows_of(detections.covariance)
+        motion, covariance, recent, slipped = state.motion, state.motion_covariance, state.recent, False
+        if recent.mapped:
+            slipped, motion = against_slip(
+                state.pose, state.maps, state.best, motion, covariance, centre, R, rules
+            )
+        if slipped:
+            covariance = covariance + np.diag(slip.SIGMA**2)
+            recent = replace(recent, distrust=1.0)
+        maps, weights, mean, odometry = use_scan(
+            state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
+            state.detections, rules, *_arrays(measured),
         )  # fmt: skip
-        state.log_weight[:] -= state.log_weight.max()
-        scan = scan_told(told, normalised(state.log_weight), found, state.motion_covariance)
+        scan = scan_of(mean, odometry, found)
         state = replace(
             state,
             maps=maps,
@@ -184,17 +168,10 @@ class FastSlam:
             motion_covariance=np.zeros((3, 3)),
             since_update=0.0,
             detections=state.detections + found,
-            best=int(np.argmax(state.log_weight)),
-            recent=remembered(state.recent, scan, state.since_update),
+            best=int(state.log_weight.argmax()),
+            recent=remembered(recent, scan, state.since_update),
         )
-        return state, scan
-
-    def _memory(self, landmarks: int, found: int) -> tuple[Near, Room]:
-        """Memory for so many landmarks in reach of a particle and so many detections."""
-        if landmarks > len(self._near.hits) or found > len(self._room.best):
-            landmarks, found = 2 * landmarks, 2 * found
-            self._near, self._room = near_for(landmarks), room_for(found, landmarks)
-        return self._near, self._room
+        return state, scan, weights, slipped
 
 
 def _farthest(detections: Detections) -> float:
@@ -213,7 +190,8 @@ def _arrays(measured: PoseMeasurement | None) -> tuple[Float, Float]:
     return measured.T_map_base.as_array(), measured.covariance
 
 
-def _rules(p: Slam) -> Rules:
+def rules_of(p: Slam) -> Rules:
+    """What the kernels ask of the parameters."""
     return Rules(
         use_proposal=p.method != "fastslam1",
         gate=p.gate,
@@ -229,8 +207,7 @@ def _rules(p: Slam) -> Rules:
 
 
 def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[PoseEstimate, FrameMemory]:
-    pose = moved_poses(state.pose, state.motion)
-    mean, spread = weighted_pose(pose, weights, state.motion, state.motion_covariance)
+    pose, mean, spread, n_eff = estimated(state.pose, weights, state.motion, state.motion_covariance)
     landmarks = state.map_of(state.best)
     covariance, frame = state.frame.told(
         mean, spread, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
@@ -240,7 +217,7 @@ def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[
         covariance=covariance,
         particles=pose,
         weights=weights,
-        n_eff=1.0 / float(weights @ weights),
+        n_eff=n_eff,
         landmarks=landmarks.mean[landmarks.hits >= p.hits_to_weigh],
         resampled=False,
         relative=spread,

@@ -44,6 +44,15 @@ def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
 
 
 @compiled
+def rows_of(covariance: Float) -> Float:
+    """xx, xy, yy, shape (D, 3), of covariances of shape (D, 2, 2)."""
+    rows = np.empty((covariance.shape[0], 3))
+    for d in range(covariance.shape[0]):
+        rows[d, 0], rows[d, 1], rows[d, 2] = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
+    return rows
+
+
+@compiled
 def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
     """The covariance R[d] (xx, xy, yy) turned by the angle of cosine c and sine s."""
     xx, xy, yy = R[d, 0], R[d, 1], R[d, 2]

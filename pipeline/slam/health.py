@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +83,11 @@ def scan_told(told: Float, weights: Float, detections: int, motion_covariance: F
         detections: Their number.
         motion_covariance: Of the odometry since the scan before, shape (3, 3).
     """
-    mean = weights @ told
+    return scan_of(*mean_told(told, weights, motion_covariance), detections)
+
+
+def scan_of(mean: Float, odometry: float, detections: int) -> ScanTold:
+    """What `mean_told` gives, by name."""
     recognised = float(mean[RECOGNISED])
     return ScanTold(
         detections=detections,
@@ -93,15 +96,27 @@ def scan_told(told: Float, weights: Float, detections: int, motion_covariance: F
         found=float(mean[FOUND]),
         missed=float(mean[MISSED]),
         innovation=float(mean[INNOVATION]) / (2.0 * recognised) if recognised > 0.5 else float("nan"),
-        odometry=math.sqrt(_mahalanobis2(mean[SHIFT], motion_covariance)),
+        odometry=odometry,
     )
+
+
+@compiled
+def mean_told(told: Float, weights: Float, motion_covariance: Float) -> tuple[Float, float]:
+    """The mean of what the particles tell, shape (TOLD,), and how far it lies from the odometry [sigma]."""
+    mean = np.zeros(TOLD)
+    for p in range(told.shape[0]):
+        for i in range(TOLD):
+            mean[i] += weights[p] * told[p, i]
+    return mean, np.sqrt(_mahalanobis2(mean[SHIFT], motion_covariance))
 
 
 @compiled
 def _mahalanobis2(shift: Float, covariance: Float) -> float:
     """d^T P^-1 d of three numbers by elimination; P has no less than the floor on its diagonal, for an
     odometry that stands still has no sigma."""
-    P = covariance + np.diag(SIGMA_FLOOR**2)
+    P = covariance.copy()
+    for i in range(3):
+        P[i, i] += SIGMA_FLOOR[i] ** 2
     d = shift.copy()
     square = 0.0
     for i in range(3):
@@ -128,9 +143,15 @@ def remembered(recent: Recent, scan: ScanTold, driven: float) -> Recent:
         odometry=max(scan.odometry, (1.0 - FADING) * recent.odometry),
         alone=0.0 if scan.recognised >= FEWEST else recent.alone + driven,
         mapped=recent.mapped or scan.recognised > 0.5,
-        distrust=(1.0 - FADING) * recent.distrust if recent.distrust > 0.01 else 0.0,
+        distrust=fading_distrust(recent.distrust),
         strange=_strange(recent.strange, scan),
     )
+
+
+@compiled
+def fading_distrust(distrust: float) -> float:
+    """The distrust after one scan more, see Recent."""
+    return (1.0 - FADING) * distrust if distrust > 0.01 else 0.0
 
 
 def is_astray(recent: Recent) -> bool:

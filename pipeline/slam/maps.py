@@ -97,26 +97,49 @@ def _with_pool(block: Int32, places: Int32, rows: int) -> Maps:
     )
 
 
+@compiled
 def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
     """The same maps with places for so many landmarks more each, and so many free rows in the pool."""
-    places = int(maps.places.max(initial=0)) + landmarks
-    k = maps.block.shape[1]
+    particles, k = maps.block.shape
+    places = landmarks
+    for p in range(particles):
+        places = max(places, maps.places[p] + landmarks)
+    block = maps.block
     if places > k * ROOM:
-        more = max(-(-places // ROOM), 2 * k) - k
-        maps = maps._replace(block=np.pad(maps.block, ((0, 0), (0, more)), constant_values=-1))
-    missing = rows - int(maps.free_count[0])
-    if missing <= 0:
-        return maps
-    n = len(maps.owners)
-    missing = max(missing, n // 2)
-    empty = _with_pool(maps.block, maps.places, missing)
-    grown = {
-        name: np.concatenate([getattr(maps, name), getattr(empty, name)])
-        for name in ("mean", "covariance", "hits", "score", "birth", "box", "owners", "free")
-    }
-    free = int(maps.free_count[0])
-    grown["free"][free : free + missing] = np.arange(n, n + missing)
-    return maps._replace(**grown, free_count=np.array([free + missing]))
+        block = np.full((particles, max((places + ROOM - 1) // ROOM, 2 * k)), -1, np.int32)
+        block[:, :k] = maps.block
+    n, free = len(maps.owners), maps.free_count[0]
+    if rows <= free:
+        return _with_block(maps, block)
+    more = max(rows - free, n // 2)
+    grown = Maps(
+        block,
+        maps.places,
+        np.zeros((n + more, ROOM, 2)),
+        np.zeros((n + more, ROOM, 3)),
+        np.zeros((n + more, ROOM), np.int32),
+        np.zeros((n + more, ROOM), np.float32),
+        np.zeros((n + more, ROOM), np.int64),
+        np.empty((n + more, 4)),
+        np.zeros(n + more, np.int32),
+        np.zeros(n + more, np.int32),
+        np.array([free + more]),
+    )
+    grown.mean[:n], grown.covariance[:n] = maps.mean, maps.covariance
+    grown.hits[:n], grown.score[:n], grown.birth[:n] = maps.hits, maps.score, maps.birth
+    grown.box[:n], grown.owners[:n] = maps.box, maps.owners
+    grown.box[n:, :2], grown.box[n:, 2:] = np.inf, -np.inf
+    grown.free[:free] = maps.free[:free]
+    grown.free[free : free + more] = np.arange(n, n + more)
+    return grown
+
+
+@compiled
+def _with_block(maps: Maps, block: Int32) -> Maps:
+    return Maps(
+        block, maps.places, maps.mean, maps.covariance, maps.hits, maps.score, maps.birth, maps.box,
+        maps.owners, maps.free, maps.free_count,
+    )  # fmt: skip
 
 
 def taken(maps: Maps, rows: Int) -> Maps:
@@ -184,6 +207,26 @@ def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
 
 
 @compiled
+def well_known(maps: Maps, p: int, hits: int, x: float, y: float, reach: float) -> Float:
+    """Where the landmarks of one particle with so many hits stand, shape (L, 2) [m], within a reach of a
+    place."""
+    near = np.empty((maps.places[p], 2))
+    n = 0
+    for k in range((maps.places[p] + ROOM - 1) // ROOM):
+        b = maps.block[p, k]
+        dx = max(maps.box[b, 0] - x, 0.0, x - maps.box[b, 2])
+        dy = max(maps.box[b, 1] - y, 0.0, y - maps.box[b, 3])
+        if not dx * dx + dy * dy < reach * reach:
+            continue
+        for o in range(min(ROOM, maps.places[p] - k * ROOM)):
+            dx, dy = maps.mean[b, o, 0] - x, maps.mean[b, o, 1] - y
+            if maps.hits[b, o] >= hits and dx * dx + dy * dy < reach * reach:
+                near[n, 0], near[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+                n += 1
+    return near[:n]
+
+
+@compiled
 def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[Int32, Int32, int]:
     """The blocks of each particle that may hold landmarks in reach of its pose.
 
@@ -211,6 +254,13 @@ def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[
                 rows += maps.owners[b] > 1
         length[p] = n
     return near, length, rows
+
+
+@compiled
+def widen(maps: Maps, b: int, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
+    """Let the bounding box of row b of the pool hold these places too."""
+    maps.box[b, 0], maps.box[b, 1] = min(maps.box[b, 0], x_min), min(maps.box[b, 1], y_min)
+    maps.box[b, 2], maps.box[b, 3] = max(maps.box[b, 2], x_max), max(maps.box[b, 3], y_max)
 
 
 @compiled

@@ -13,21 +13,34 @@ from pipeline.parameters.stages import Slam
 from pipeline.records import PoseMeasurement
 
 
+@compiled
 def wrapped(angle: float) -> float:
     """The same direction between -pi and pi."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def step_covariance(step: Pose2, p: Slam) -> Float:
-    """Covariance of one step of the odometry in its own frame: x, y [m], yaw [rad], shape (3, 3).
+class Noise(NamedTuple):
+    """How the odometry errs: position [m/sqrt m], heading [rad/sqrt m], and heading [rad/sqrt rad]."""
 
-    Variances grow with the distance and the turn, so many short steps scatter as one long one does.
+    distance: float
+    turn_distance: float
+    turn: float
+
+
+def noise_of(p: Slam) -> Noise:
+    """As the parameters have it."""
+    return Noise(p.noise_distance, math.radians(p.noise_turn_distance), math.radians(p.noise_turn))
+
+
+@compiled
+def step_variances(x: float, y: float, yaw: float, noise: Noise) -> tuple[float, float]:
+    """Variances of one step of the odometry in its own frame: of x and of y [m^2], and of yaw [rad^2].
+
+    They grow with the distance and the turn, so many short steps scatter as one long one does.
     """
-    distance = math.hypot(step.x, step.y)
-    position = p.noise_distance**2 * distance
-    yaw = math.radians(p.noise_turn_distance) ** 2 * distance
-    yaw += math.radians(p.noise_turn) ** 2 * abs(step.yaw)
-    return np.array([[position, 0.0, 0.0], [0.0, position, 0.0], [0.0, 0.0, yaw]])
+    distance = np.hypot(x, y)
+    heading = noise.turn_distance**2 * distance + noise.turn**2 * abs(yaw)
+    return noise.distance**2 * distance, heading
 
 
 def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -> tuple[Float, Float]:
@@ -37,13 +50,27 @@ def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -
         motion: x, y [m], yaw [rad], shape (3,); covariance: shape (3, 3).
         step: In the frame where the motion ends; step_noise: its covariance, shape (3, 3).
     """
-    yaw = float(motion[2])
-    c, s = math.cos(yaw), math.sin(yaw)
-    dx, dy = c * step.x - s * step.y, s * step.x + c * step.y
+    return compounded(motion, covariance, step.x, step.y, step.yaw, step_noise)
+
+
+@compiled
+def compounded(
+    motion: Float, covariance: Float, x: float, y: float, yaw: float, noise: Float
+) -> tuple[Float, Float]:
+    """See `compound`: F P F^T + G Q G^T, where F moves the error of the motion along, and G turns that of
+    the step into its frame."""
+    c, s = np.cos(motion[2]), np.sin(motion[2])
+    dx, dy = c * x - s * y, s * x + c * y
+    moved = np.array([motion[0] + dx, motion[1] + dy, wrapped(motion[2] + yaw)])
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    moved = np.array([motion[0] + dx, motion[1] + dy, wrapped(yaw + step.yaw)])
-    return moved, F @ covariance @ F.T + G @ step_noise @ G.T
+    spread = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for a in range(3):
+                for b in range(3):
+                    spread[i, j] += F[i, a] * covariance[a, b] * F[j, b] + G[i, a] * noise[a, b] * G[j, b]
+    return moved, spread
 
 
 class Motion(NamedTuple):
@@ -65,6 +92,7 @@ class Motion(NamedTuple):
 
 
 DISTRUST = (0.1, 0.03)  # m, rad; added to a step of wheels that just slipped, for they slip again
+UNKNOWN = -1.0  # a sigma that nobody told
 TURN_AS_DISTANCE = 1.0  # m/rad; a robot that turns on the spot sees the trees anew as well
 
 
@@ -79,19 +107,62 @@ def accumulated(
         distrust: 0 to 1, how much the odometry was wrong lately.
     """
     step = motion.step
-    turned = motion.turn_sigma
-    doubted = distrust * DISTRUST[1] if turned is None else 0.0  # wheels that slip turn no gyroscope
-    slack = motion.slack[0] + distrust * DISTRUST[0], motion.slack[1] + doubted
-    is_news = motion.measured is not None or slack != (0.0, 0.0)
-    if step.x == step.y == step.yaw == 0.0 and not is_news:
-        return None
-    noise = step_covariance(step, p)
-    if turned is not None:
-        noise[2, 2] = turned**2
-    noise += np.diag([slack[0] ** 2, slack[0] ** 2, slack[1] ** 2])
-    moved, spread = compound(before, covariance, step, noise)
-    driven = math.hypot(step.x, step.y) + TURN_AS_DISTANCE * abs(wrapped(step.yaw))
-    return moved, spread, max(driven, p.update_distance) if is_news else driven  # news must not wait
+    news = motion.measured is not None
+    turn_sigma = UNKNOWN if motion.turn_sigma is None else motion.turn_sigma
+    moved, motion_after, spread, driven = advanced(
+        before, covariance, step.x, step.y, step.yaw, *motion.slack, turn_sigma, news, distrust, noise_of(p),
+        p.update_distance,
+    )  # fmt: skip
+    return (motion_after, spread, driven) if moved else None
+
+
+@compiled
+def advanced(
+    before: Float,
+    covariance: Float,
+    x: float,
+    y: float,
+    yaw: float,
+    slack: float,
+    slack_yaw: float,
+    turn_sigma: float,
+    news: bool,
+    distrust: float,
+    noise: Noise,
+    update_distance: float,
+) -> tuple[bool, Float, Float, float]:
+    """The same by numbers, and first whether anything moved or is new.
+
+    Args:
+        x, y, yaw: The step [m, rad]; slack, slack_yaw, turn_sigma: of it, see Motion; UNKNOWN means None.
+        news: Whether another source told the pose.
+        update_distance: After so much a scan is used [m].
+    """
+    slack += distrust * DISTRUST[0]
+    if turn_sigma < 0.0:
+        slack_yaw += distrust * DISTRUST[1]  # but wheels that slip turn no gyroscope
+    news = news or slack != 0.0 or slack_yaw != 0.0
+    if x == 0.0 and y == 0.0 and yaw == 0.0 and not news:
+        return False, before.copy(), covariance.copy(), 0.0
+    position, heading = step_variances(x, y, yaw, noise)
+    if turn_sigma >= 0.0:
+        heading = turn_sigma * turn_sigma
+    moved, spread = stepped(
+        before, covariance, x, y, yaw, position + slack * slack, heading + slack_yaw * slack_yaw
+    )
+    driven = np.hypot(x, y) + TURN_AS_DISTANCE * abs(wrapped(yaw))
+    return True, moved, spread, max(driven, update_distance) if news else driven  # news must not wait
+
+
+@compiled
+def stepped(
+    motion: Float, covariance: Float, x: float, y: float, yaw: float, position: float, heading: float
+) -> tuple[Float, Float]:
+    """A motion and then a step whose errors are independent; see `compounded` and `step_variances`."""
+    noise = np.zeros((3, 3))
+    noise[0, 0] = noise[1, 1] = position
+    noise[2, 2] = heading
+    return compounded(motion, covariance, x, y, yaw, noise)
 
 
 @compiled
@@ -121,6 +192,15 @@ def moved_poses(pose: Float, motion: Float) -> Float:
         moved[p, 0] = pose[p, 0] + c * motion[0] - s * motion[1]
         moved[p, 1] = pose[p, 1] + s * motion[0] + c * motion[1]
         moved[p, 2] = (pose[p, 2] + motion[2] + np.pi) % (2.0 * np.pi) - np.pi
+    return moved
+
+
+@compiled
+def moved_pose(pose: Float, motion: Float) -> Float:
+    """One pose, shape (3,), after a motion in its own frame."""
+    one = np.empty((1, 3))
+    one[0] = pose
+    moved: Float = moved_poses(one, motion)[0]
     return moved
 
 

@@ -12,8 +12,10 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Bool, Int
-from pipeline.slam.cells import Cells, cell_of
+from pipeline.slam.cells import Cells, cell_of, first_of_four
 from pipeline.slam.gaussian import Pose, expected_spread
+
+FEW = 64  # rows
 
 
 class Room(NamedTuple):
@@ -38,19 +40,20 @@ class Room(NamedTuple):
     taken: Bool
 
 
+@compiled
 def room_for(detections: int, landmarks: int) -> Room:
-    """Room for every pair."""
-    pairs = detections * max(landmarks, 1)
+    """Room for every pair; the detections take their turns by number."""
+    pairs = detections * landmarks
     return Room(
-        detection=np.empty(pairs, np.int64),
-        landmark=np.empty(pairs, np.int64),
-        cost=np.empty(pairs),
-        order=np.empty(pairs, np.int64),
-        best=np.empty(detections),
-        second=np.empty(detections),
-        landmark_of=np.empty(detections, np.int64),
-        turn=np.arange(detections),
-        taken=np.empty(landmarks, np.bool_),
+        np.empty(pairs, np.int64),
+        np.empty(pairs, np.int64),
+        np.empty(pairs),
+        np.empty(pairs, np.int64),
+        np.empty(detections),
+        np.empty(detections),
+        np.empty(detections, np.int64),
+        np.arange(detections),
+        np.empty(landmarks, np.bool_),
     )
 
 
@@ -74,7 +77,7 @@ def likely_pairs(
         centre: shape (D, 2) [m], base frame; R: xx, xy, yy, shape (D, 3).
         mean, covariance: Of the landmarks; cells: which hold them, `scale` a metre.
         gate2: Square of the largest Mahalanobis distance; distance_max: largest distance [m].
-        room: Its first `turn` of the scan has every detection once.
+        room: Its `turn` has every detection once; the order of the pairs and of the turns is left in it.
     """
     pairs = 0
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
@@ -85,7 +88,7 @@ def likely_pairs(
         ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
         wx, wy = pose.x + ax, pose.y + ay
         s0, s1, s2 = expected_spread(pose, c, s, ax, ay, R, d)
-        u, v = scale * wx - 0.5, scale * wy - 0.5
+        u, v = first_of_four(wx, wy, scale)
         for quarter in range(4):
             j = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
             while j >= 0:
@@ -113,9 +116,9 @@ def likely_pairs(
 
 @compiled
 def _sort(cost: Float, order: Int, n: int) -> None:
-    """Order the first n rows by cost, equal ones by row: Shell's sort, which needs no memory and is quick
-    where the rows stand nearly in order, as they do after the first particle."""
-    gap = n // 2
+    """Order the first n rows by cost, equal ones by row: Shell's sort, which needs no memory. Few rows that
+    stand nearly in order, as they do after the first particle, want its last pass alone."""
+    gap = n // 2 if n > FEW else min(n, 1)
     while gap > 0:
         for i in range(gap, n):
             row = order[i]

@@ -9,11 +9,17 @@ from pipeline.geometry import Float
 from pipeline.records import Int
 
 
+@compiled
 def normalised(log_weight: Float) -> Float:
     """Weights that sum to 1 from logarithms up to a constant, shape (P,)."""
-    weights = np.exp(log_weight - log_weight.max())
-    total: Float = weights / weights.sum()
-    return total
+    weights = np.empty(log_weight.shape[0])
+    greatest, total = log_weight.max(), 0.0
+    for p in range(log_weight.shape[0]):
+        weights[p] = np.exp(log_weight[p] - greatest)
+        total += weights[p]
+    for p in range(log_weight.shape[0]):
+        weights[p] /= total
+    return weights
 
 
 @compiled

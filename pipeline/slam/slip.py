@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.compiled import compiled
-from pipeline.geometry import Float, Pose2
-from pipeline.records import Detections
-from pipeline.slam.motion import moved_poses
+from pipeline.geometry import Float
+from pipeline.slam.motion import moved_pose
 
 SEARCH = 8.0  # m around where the odometry has the robot
 TURNS = np.radians(np.arange(-12.0, 12.5, 2.0))
@@ -23,33 +22,40 @@ MARGIN = 2  # detections more than at any other place
 SIGMA = np.array([0.15, 0.15, np.radians(1.5)])  # of the offset that is found: m, m, rad
 
 
+@compiled
 def motion_by_trees(
     before: Float,
     motion: Float,
     covariance: Float,
-    detections: Detections,
+    centre: Float,
+    R: Float,
     known: Float,
-    reach: float,
     gate: float,
-) -> Float | None:
-    """How the robot really moved, shape (3,); None where the scan contradicts nothing or tells nothing.
+) -> tuple[bool, Float]:
+    """Whether the scan says how the robot really moved, and that motion, shape (3,); not where it
+    contradicts nothing or tells nothing.
 
     Args:
         before: x, y [m], yaw [rad] in the frame of the map.
         motion: By the odometry since then, shape (3,); covariance: shape (3, 3).
-        known: Well known landmarks, shape (L, 2) [m]; those within `reach` [m] are asked.
+        centre: Detections in the base frame, shape (D, 2) [m]; R: their covariance xx, xy, yy, (D, 3).
+        known: Well known landmarks within SEARCH of what the robot can see, shape (L, 2) [m].
         gate: [sigma].
     """
-    if len(detections.cluster) < FEWEST:
-        return None
-    pose = moved_poses(before[None], motion)[0]
-    near = known[np.hypot(known[:, 0] - pose[0], known[:, 1] - pose[1]) < reach + SEARCH]
-    sigma = np.sqrt(0.5 * np.trace(detections.covariance, axis1=1, axis2=2))
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    if not contradicts(pose, detections.centre, sigma, near, spread, gate):
-        return None
-    sure, place = offset(pose, detections.centre, sigma, near)
-    return (Pose2(*before).inverse() @ Pose2(*place)).as_array() if sure else None
+    sigma = np.sqrt(0.5 * (R[:, 0] + R[:, 2]))
+    spread = np.empty(3)
+    for i in range(3):
+        spread[i] = np.sqrt(max(covariance[i, i], 0.0))
+    pose = moved_pose(before, motion)
+    if not contradicts(pose, centre, sigma, known, spread, gate):
+        return False, motion.copy()
+    sure, place = offset(pose, centre, sigma, known)
+    if not sure:
+        return False, motion.copy()
+    c, s = np.cos(before[2]), np.sin(before[2])
+    dx, dy = place[0] - before[0], place[1] - before[1]
+    turn = (place[2] - before[2] + np.pi) % (2.0 * np.pi) - np.pi
+    return True, np.array([c * dx + s * dy, c * dy - s * dx, turn])
 
 
 @compiled

@@ -14,7 +14,7 @@ from pipeline.slam.cells import Cells, cells_for, clear, fill, per_metre
 from pipeline.slam.gaussian import draw, rotated
 from pipeline.slam.health import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.landmarks import kalman_update, merge_duplicates
-from pipeline.slam.maps import ROOM, Maps, own_block
+from pipeline.slam.maps import ROOM, Maps, own_block, widen
 from pipeline.slam.motion import correct_by_pose
 from pipeline.slam.pairs import Room
 from pipeline.slam.proposal import recognise
@@ -75,21 +75,22 @@ class Near(NamedTuple):
     cells: Cells
 
 
+@compiled
 def near_for(landmarks: int) -> Near:
     """Columns with room for so many landmarks."""
     n = landmarks
     return Near(
-        block=np.empty(n, np.int32),
-        place=np.empty(n, np.int32),
-        mean=np.empty((n, 2)),
-        covariance=np.empty((n, 3)),
-        hits=np.empty(n, np.int32),
-        score=np.empty(n, np.float32),
-        birth=np.empty(n, np.int64),
-        seen=np.empty(n, np.bool_),
-        changed=np.empty(n, np.bool_),
-        free=np.empty((n, 2), np.int32),
-        cells=cells_for(n),
+        np.empty(n, np.int32),
+        np.empty(n, np.int32),
+        np.empty((n, 2)),
+        np.empty((n, 3)),
+        np.empty(n, np.int32),
+        np.empty(n, np.float32),
+        np.empty(n, np.int64),
+        np.empty(n, np.bool_),
+        np.empty(n, np.bool_),
+        np.empty((n, 2), np.int32),
+        cells_for(n),
     )
 
 
@@ -152,8 +153,6 @@ def observe(
     mu = np.empty(3)
     P = np.zeros((3, 3))
     scale = per_metre(rules.distance_max)
-    for i in range(centre.shape[0]):
-        room.turn[i] = i
     for p in range(pose.shape[0]):
         before_c, before_s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
         x, y, yaw = pose[p, 0], pose[p, 1], pose[p, 2]
@@ -288,11 +287,17 @@ def _miss(
 def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
     """Keep what changed; a landmark without score leaves its place free."""
     k, b = -1, 0
+    x_min = y_min = np.inf
+    x_max = y_max = -np.inf
     for j in range(all_near):
         gone = near.score[j] <= 0.0
         if not (near.changed[j] or gone):
             continue
         if near.block[j] != k:  # rows of one block stand together
+            if k >= 0:
+                widen(maps, b, x_min, y_min, x_max, y_max)
+                x_min = y_min = np.inf
+                x_max = y_max = -np.inf
             k = near.block[j]
             b = own_block(maps, p, k)
         o = near.place[j]
@@ -304,8 +309,9 @@ def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
         for a in range(3):
             maps.covariance[b, o, a] = near.covariance[j, a]
         maps.hits[b, o], maps.score[b, o], maps.birth[b, o] = near.hits[j], near.score[j], near.birth[j]
-        maps.box[b, 0], maps.box[b, 1] = min(maps.box[b, 0], x), min(maps.box[b, 1], y)
-        maps.box[b, 2], maps.box[b, 3] = max(maps.box[b, 2], x), max(maps.box[b, 3], y)
+        x_min, y_min, x_max, y_max = min(x_min, x), min(y_min, y), max(x_max, x), max(y_max, y)
+    if k >= 0:
+        widen(maps, b, x_min, y_min, x_max, y_max)
 
 
 @compiled

@@ -15,7 +15,7 @@ from pipeline.parameters import preset
 from pipeline.slam import FastSlam
 from pipeline.slam.landmarks import VARIANCE_MIN, kalman_update
 from pipeline.slam.maps import ROOM, own_block, take_ancestors, with_room
-from pipeline.slam.motion import compound, moved_poses, step_covariance
+from pipeline.slam.motion import compound, moved_poses, noise_of, step_variances
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.state import SlamState
 from tests.pipeline.strategies import ALL_FREE, FEW, LAW, NOTHING_SEEN, detections, seeds
@@ -49,11 +49,17 @@ def seen_from(pose, world=TREES, rng=None, sigma=0.0, reach=8.0):
 # --- motion ---------------------------------------------------------------------------------------
 
 
+def _noise(step, p):
+    """Covariance of one step."""
+    position, yaw = step_variances(step.x, step.y, step.yaw, noise_of(p))
+    return np.diag([position, position, yaw])
+
+
 def moved_in(parts, step, p=FOREST):
     """A motion of equal parts, with its covariance."""
     motion, covariance = np.zeros(3), np.zeros((3, 3))
     for _ in range(parts):
-        motion, covariance = compound(motion, covariance, step, step_covariance(step, p))
+        motion, covariance = compound(motion, covariance, step, _noise(step, p))
     return motion, covariance
 
 
@@ -77,7 +83,7 @@ def test_the_covariance_of_a_motion_is_the_scatter_of_drawn_motions():
     rng = np.random.default_rng(0)
     step = Pose2(0.3, 0.05, 0.2)
     p = FOREST.model_copy(update={"noise_turn_distance": 3.0})
-    sigma = np.sqrt(np.diag(step_covariance(step, p)))
+    sigma = np.sqrt(np.diag(_noise(step, p)))
     drawn = np.zeros((40_000, 3))
     for _ in range(6):
         noisy = np.array([step.x, step.y, step.yaw]) + sigma * rng.standard_normal(drawn.shape)

@@ -17,8 +17,9 @@ from pipeline.health import Health
 from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, PoseEstimate
 from pipeline.slam import slip
+from pipeline.slam.gaussian import rows_of
 from pipeline.slam.health import Recent, ScanTold, is_astray, judged
-from pipeline.slam.motion import Motion, accumulated, compound
+from pipeline.slam.motion import Motion, accumulated, compound, moved_pose
 from pipeline.slam.pose_graph.keyframe import observe
 from pipeline.slam.pose_graph.smoother import Additions
 from pipeline.slam.pose_graph.state import NOTHING, GraphState
@@ -106,10 +107,13 @@ class GraphSlam:
         if not s.recent.mapped:
             return False
         known = s.landmarks.mean[s.landmarks.hits >= p.hits_to_weigh]
-        motion = slip.motion_by_trees(
-            s.pose, s.motion, s.motion_covariance, detections, known, p.view_range, p.gate
-        )
-        if motion is None:
+        pose = moved_pose(s.pose, s.motion)
+        near = np.hypot(known[:, 0] - pose[0], known[:, 1] - pose[1]) < p.view_range + slip.SEARCH
+        slipped, motion = slip.motion_by_trees(
+            s.pose, s.motion, s.motion_covariance, detections.centre, rows_of(detections.covariance),
+            known[near], p.gate,
+        )  # fmt: skip
+        if not slipped:
             return False
         s.motion, s.motion_covariance = motion, s.motion_covariance + np.diag(slip.SIGMA**2)
         s.recent = replace(s.recent, distrust=1.0)

@@ -100,7 +100,7 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
     from pipeline.geometry import Pose2, wrap_angle
     from pipeline.parameters import Parameters
     from pipeline.slam import FastSlam
-    from pipeline.slam.motion import step_covariance
+    from pipeline.slam.motion import noise_of, step_variances
     from pipeline.tracking import Tracker
     from pipeline.visibility import BINS
     from tests.benchmarks.stands import RING
@@ -116,7 +116,8 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
         told = Pose2()
         if stride is not None:
             truth = truth @ stride
-            sigma = np.sqrt(np.diag(step_covariance(stride, parameters.slam)))
+            along, turn = step_variances(stride.x, stride.y, stride.yaw, noise_of(parameters.slam))
+            sigma = np.sqrt([along, along, turn])
             noise = sigma * random.standard_normal(3)
             told = Pose2(stride.x + noise[0], stride.y + noise[1], stride.yaw + noise[2])
         found = _detections(truth, trees_there, random)

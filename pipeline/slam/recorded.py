@@ -1,0 +1,186 @@
+"""Recorded steps in one compiled loop: what `FastSlam.process` gives one by one, to the byte, without the
+interpreter in between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.compiled import compiled
+from pipeline.geometry import Float
+from pipeline.records import Bool, Float32, Int
+from pipeline.slam import slip
+from pipeline.slam.draws import draws
+from pipeline.slam.fastslam import FastSlam, rules_of
+from pipeline.slam.frame import FrameMemory
+from pipeline.slam.health import RECOGNISED, TOLD, fading_distrust, remembered, scan_of
+from pipeline.slam.maps import Maps, take_ancestors
+from pipeline.slam.motion import UNKNOWN, Noise, advanced, noise_of
+from pipeline.slam.resampling import low_variance_ancestors, normalised
+from pipeline.slam.scan import against_slip, estimated, use_scan
+from pipeline.slam.update import Rules
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """What a filter takes in over T steps.
+
+    Attributes:
+        motion: shape (T, 3): x, y [m], yaw [rad] by the odometry from each step to the next.
+        centre: Detections of all steps in the base frame, shape (N, 2) [m]; covariance: xx, xy, yy,
+            shape (N, 3) [m^2]; first: shape (T + 1,): the rows of step t are first[t] to first[t + 1].
+        clear_range: See FastSlam.process, one for all steps.
+    """
+
+    motion: Float
+    centre: Float
+    covariance: Float
+    first: Int
+    clear_range: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Driven:
+    """Of each step the estimate: pose, shape (T, 3), and N_eff, shape (T,)."""
+
+    pose: Float
+    n_eff: Float
+
+
+def _all_draws(slam: FastSlam, first_index: int, steps: int) -> tuple[Float, Float]:
+    particles = slam.parameters.particles
+    noise, offset = np.empty((steps, particles, 3)), np.empty(steps)
+    for t in range(steps):
+        noise[t], offset[t] = draws(slam.seed, first_index + t, particles)
+    return noise, offset
+
+
+class _Told(NamedTuple):
+    """Of each step, in this order: the estimate; whether its detections were used, and if so whether they
+    put the motion right, how far it was since the last ones [m], the best particle, and what `mean_told`
+    gives; the particles before resampling, and their ancestors, the first of them -1 where there was none."""
+
+    pose: Float
+    n_eff: Float
+    used: Bool
+    slipped: Bool
+    driven: Float
+    best: Int
+    mean: Float
+    odometry: Float
+    particles: Float32
+    ancestors: Int
+
+
+def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
+    """Take recorded steps into a filter, the first of them having this number; its state is then that after
+    the last one, but for the memory of the frame (see FrameMemory), which begins anew: no covariance in the
+    frame of the map is told of these steps."""
+    p, state = slam.parameters, slam.state.with_particles(slam.parameters.particles)
+    maps, motion, motion_covariance, since_update, told = _drive(
+        state.pose, state.log_weight, state.maps, state.motion, state.motion_covariance,
+        state.since_update, state.detections, state.best, state.recent.mapped, state.recent.distrust,
+        *_all_draws(slam, first_index, len(recorded.motion)), first_index, recorded.motion,
+        recorded.centre, recorded.covariance, recorded.first, recorded.clear_range,
+        rules_of(p), noise_of(p), p.update_distance, p.resample_below,
+    )  # fmt: skip
+    genealogy, recent, best = state.genealogy, state.recent, state.best
+    found = np.diff(recorded.first)
+    for t in range(len(recorded.motion)):
+        if told.used[t]:
+            before = replace(recent, distrust=1.0) if told.slipped[t] else recent
+            scan = scan_of(told.mean[t], told.odometry[t], int(found[t]))
+            recent, best = remembered(before, scan, told.driven[t]), int(told.best[t])
+        ancestors = told.ancestors[t] if told.ancestors[t, 0] >= 0 else None
+        genealogy = genealogy.with_scan(told.particles[t], ancestors, best)
+    slam.state = replace(
+        state, maps=maps, motion=motion, motion_covariance=motion_covariance, since_update=since_update,
+        detections=state.detections + int(found[told.used].sum()), best=best, genealogy=genealogy,
+        recent=recent, frame=FrameMemory(),
+    )  # fmt: skip
+    return Driven(told.pose, told.n_eff)
+
+
+@compiled
+def _drive(
+    pose: Float,
+    log_weight: Float,
+    maps: Maps,
+    motion: Float,
+    motion_covariance: Float,
+    since_update: float,
+    detections: int,
+    best: int,
+    mapped: bool,
+    distrust: float,
+    normal: Float,
+    offset: Float,
+    first_index: int,
+    steps: Float,
+    centres: Float,
+    covariances: Float,
+    first: Int,
+    clear_range: Float,
+    rules: Rules,
+    noise: Noise,
+    update_distance: float,
+    resample_below: float,
+) -> tuple[Maps, Float, Float, float, _Told]:
+    """See `drive`; `pose` and `log_weight` are changed in place."""
+    particles, n = pose.shape[0], steps.shape[0]
+    told = _room(n, particles)
+    nothing, no_covariance = np.zeros(0), np.eye(3)
+    for t in range(n):
+        _moved, motion, motion_covariance, driven = advanced(
+            motion, motion_covariance, steps[t, 0], steps[t, 1], steps[t, 2], 0.0, 0.0, UNKNOWN, False,
+            distrust, noise, update_distance,
+        )  # fmt: skip
+        since_update += driven
+        used = first_index + t == 0 or since_update >= update_distance
+        if used:
+            centre, R = centres[first[t] : first[t + 1]], covariances[first[t] : first[t + 1]]
+            if mapped:
+                told.slipped[t], motion = against_slip(
+                    pose, maps, best, motion, motion_covariance, centre, R, rules
+                )
+            if told.slipped[t]:
+                distrust = 1.0
+                motion_covariance = motion_covariance + np.diag(slip.SIGMA**2)
+            maps, weights, mean, odometry = use_scan(
+                pose, log_weight, maps, motion, motion_covariance, normal[t], centre, R, clear_range,
+                detections, rules, nothing, no_covariance,
+            )  # fmt: skip
+            best = int(log_weight.argmax())
+            told.used[t], told.driven[t], told.best[t] = True, since_update, best
+            told.mean[t], told.odometry[t] = mean, odometry
+            mapped = mapped or mean[RECOGNISED] > 0.5
+            distrust = fading_distrust(distrust)
+            detections += centre.shape[0]
+            motion, motion_covariance, since_update = np.zeros(3), np.zeros((3, 3)), 0.0
+        else:
+            weights = normalised(log_weight)
+        now, told.pose[t], _spread, told.n_eff[t] = estimated(pose, weights, motion, motion_covariance)
+        told.particles[t] = now
+        if used and told.n_eff[t] < resample_below * particles:
+            told.ancestors[t] = low_variance_ancestors(weights, offset[t])
+            take_ancestors(told.ancestors[t], pose, maps)
+            log_weight[:] = 0.0
+    return maps, motion, motion_covariance, since_update, told
+
+
+@compiled
+def _room(n: int, particles: int) -> _Told:
+    return _Told(
+        np.empty((n, 3)),
+        np.empty(n),
+        np.zeros(n, np.bool_),
+        np.zeros(n, np.bool_),
+        np.zeros(n),
+        np.zeros(n, np.int64),
+        np.zeros((n, TOLD)),
+        np.zeros(n),
+        np.empty((n, particles, 3), np.float32),
+        np.full((n, particles), -1),
+    )
