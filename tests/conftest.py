@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,17 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def _annotations_apart(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Servers that tests start keep nothing in the folder of the person who runs the tests."""
     os.environ["STEMMAP_FOLDER"] = str(tmp_path_factory.mktemp("annotations"))
+
+
+@pytest.fixture(autouse=True)
+def _compiling_is_not_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a command says is compared to the letter, whether or not its kernels were compiled before."""
+
+    def unheard(_tell: Callable[[], None]) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    # `app.cli.waiting` takes it from there each time; workers have their own name for it.
+    monkeypatch.setattr("pipeline.compiled.on_compiling", unheard)
 
 
 @pytest.fixture(scope="session")
