@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from typing import Any
 
@@ -29,7 +30,9 @@ async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
     """
     pose, how = (Pose2(), "same recording") if same_source else await _laid(a, b)
     place_a, place_b = _places(a), pose.apply(_places(b))
-    pairs, only_a, only_b = _paired(a["map"]["trees"], b["map"]["trees"], place_a, place_b)
+    pairs, only_a, only_b = await asyncio.to_thread(
+        _paired, a["map"]["trees"], b["map"]["trees"], place_a, place_b
+    )
     shifts = np.array([pair["shift_m"] for pair in pairs])
     return {
         "how": how,

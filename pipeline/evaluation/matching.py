@@ -18,18 +18,53 @@ def match(found: Float, truth: Float, distance_max: float) -> Int:
         found, truth: shape (N, 2) and (M, 2) [m], same frame.
         distance_max: [m].
     """
-    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
 
     truth_of = np.full(len(found), -1, np.int64)
-    if len(found) == 0 or len(truth) == 0:
+    rows, columns = _near(found, truth, distance_max)
+    if not len(rows):
         return truth_of
-    distance = np.hypot(*(found[:, None, :] - truth[None, :, :]).transpose(2, 0, 1))
-    # One forbidden pair costs more than all allowed ones together.
-    forbidden = (min(len(found), len(truth)) + 1) * distance_max
-    rows, columns = linear_sum_assignment(np.where(distance <= distance_max, distance, forbidden))
-    good = distance[rows, columns] <= distance_max
-    truth_of[rows[good]] = columns[good]
+    # Groups of rows that share no allowed pair are solved apart: the sums add up, and thousands of trees take
+    # milliseconds where one matrix of all of them takes the cube of their number.
+    size = len(found) + len(truth)
+    graph = coo_array((np.ones(len(rows), np.bool_), (rows, columns + len(found))), shape=(size, size))
+    _, group_of = connected_components(graph, directed=False)
+    group = group_of[rows]
+    order = np.argsort(group, kind="stable")
+    for part in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        _solve(found, truth, distance_max, rows[part], columns[part], truth_of)
     return truth_of
+
+
+def _near(found: Float, truth: Float, distance_max: float) -> tuple[Int, Int]:
+    """The rows of the pairs within `distance_max`; what is not finite has no partner."""
+    from scipy.spatial import cKDTree
+
+    mine, others = (np.flatnonzero(np.isfinite(each).all(axis=1)) for each in (found, truth))
+    if not len(mine) or not len(others):
+        return mine[:0], mine[:0]
+    reach = distance_max * (1.0 + 1e-9)  # the library's rounding is not ours
+    pairs = cKDTree(found[mine]).sparse_distance_matrix(cKDTree(truth[others]), reach, output_type="ndarray")
+    rows, columns = mine[pairs["i"]], others[pairs["j"]]
+    near = np.hypot(*(found[rows] - truth[columns]).T) <= distance_max
+    return rows[near], columns[near]
+
+
+def _solve(found: Float, truth: Float, distance_max: float, rows: Int, columns: Int, truth_of: Int) -> None:
+    """Write the best partners of a group into `truth_of`, given its allowed pairs."""
+    from scipy.optimize import linear_sum_assignment
+
+    if len(rows) == 1:
+        truth_of[rows] = columns
+        return
+    mine, others = np.unique(rows), np.unique(columns)
+    distance = np.hypot(*(found[mine][:, None, :] - truth[others][None, :, :]).transpose(2, 0, 1))
+    # One forbidden pair costs more than all allowed ones together.
+    forbidden = (min(len(mine), len(others)) + 1) * distance_max
+    chosen, partner = linear_sum_assignment(np.where(distance <= distance_max, distance, forbidden))
+    good = distance[chosen, partner] <= distance_max
+    truth_of[mine[chosen[good]]] = others[partner[good]]
 
 
 def matched_rows(trees: Trees, truth: TruthTrees, distance_max: float) -> tuple[Int, Int]:
