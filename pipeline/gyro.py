@@ -25,7 +25,7 @@ DEAD = 20  # the same reading so many times is no gyroscope
 NOISE = 1e-3  # rad/sqrt(s), of a small MEMS gyroscope on a robot that shakes
 SCALE = 0.01  # of the turn
 BIAS_UNKNOWN, BIAS_KNOWN = 0.01, 5e-4  # rad/s
-WANDERS = 10.0  # s, over which an unknown bias errs alike: short scans must not take it for noise
+WANDERS = 10.0  # s, over which what is left of a bias errs alike: short scans must not take it for noise
 CONTRADICTION, CONTRADICTION_LEAST = 4.0, 0.01  # sigma, rad
 PROOF, ALIKE = 0.1, 3.0  # rad by the wheels; and what a gyroscope that is right may differ by, as a factor
 HALF_TRACK = 0.5  # m; wheels that told a turn wrongly by an angle slipped by so much of it
@@ -38,7 +38,7 @@ class Gyro:
     def __init__(self) -> None:
         self._readings: deque[tuple[int, float]] = deque()
         self._block: list[float] = []
-        self._blocks, self._bias = 0, 0.0
+        self._blocks, self._bias, self._scatter = 0, 0.0, 0.0
         self._same = 0
         self._turned = (0.0, 0.0, 0.0)
         self._proven = False
@@ -73,15 +73,18 @@ class Gyro:
         if sigma < STILL_SIGMA and abs(mean) < STILL_MOST:
             self._blocks = min(self._blocks + 1, BLOCKS_MOST)
             self._bias += (mean - self._bias) / self._blocks
+            self._scatter += (sigma - self._scatter) / self._blocks
 
     def learnt(self, stamp_ns: int) -> Learnt:
         """What the readings so far have taught, as of a time."""
         block = tuple(self._block)
-        return Learnt(stamp_ns, self._bias, self._blocks, block, self._same, self._turned, self._proven)
+        of_bias = stamp_ns, self._bias, self._scatter, self._blocks, block
+        return Learnt(*of_bias, self._same, self._turned, self._proven)
 
     def go_on_from(self, learnt: Learnt) -> None:
         """Know what was learnt before; readings are kept as they are."""
-        self._bias, self._blocks, self._block = learnt.bias, learnt.blocks, list(learnt.block)
+        self._bias, self._scatter = learnt.bias, learnt.scatter
+        self._blocks, self._block = learnt.blocks, list(learnt.block)
         self._same, self._turned, self._proven = learnt.same, learnt.turned, learnt.proven
 
     @property
@@ -109,11 +112,11 @@ class Gyro:
             return None
         seconds = (to_ns - from_ns) * 1e-9
         angle -= self._bias * seconds
+        bias_sigma = BIAS_UNKNOWN
         if self._blocks:
-            of_bias = BIAS_KNOWN * seconds
-        else:
-            of_bias = BIAS_UNKNOWN * math.sqrt(seconds * max(seconds, WANDERS))
-        variance = NOISE**2 * seconds + of_bias**2 + (SCALE * angle) ** 2
+            bias_sigma = math.hypot(BIAS_KNOWN, self._scatter / math.sqrt(BLOCK * self._blocks))
+        of_bias = bias_sigma**2 * seconds * max(seconds, WANDERS)
+        variance = NOISE**2 * seconds + of_bias + (SCALE * angle) ** 2
         return Turn(angle, math.sqrt(variance))
 
     def rate(self, stamp_ns: int) -> float | None:

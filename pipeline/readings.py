@@ -121,7 +121,8 @@ class Learnt:
 
     Attributes:
         stamp_ns: Of the step.
-        bias: Of the turn rate [rad/s]; blocks: how many it is the mean of; block: the readings of the next.
+        bias: Of the turn rate; scatter: of the readings around it [rad/s]; blocks: how many it is the mean
+            of; block: the readings of the next.
         same: How many readings in a row were the same.
         turned: Sums over the steps, of the wheels' turns [rad], of their squares, and of their products with
             those of the gyroscope [rad^2].
@@ -132,6 +133,7 @@ class Learnt:
 
     stamp_ns: int = 0
     bias: float = 0.0
+    scatter: float = 0.0
     blocks: int = 0
     block: tuple[float, ...] = ()
     same: int = 0

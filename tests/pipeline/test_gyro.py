@@ -73,6 +73,20 @@ def test_a_bias_is_learnt_while_the_robot_stands_and_never_while_it_moves():
     assert after.sigma < 0.1 * before.sigma
 
 
+@pytest.mark.parametrize("blocks", [1, 10])
+def test_the_sigma_of_a_turn_knows_how_well_the_bias_was_learnt(blocks):
+    z = []
+    for seed in range(40):
+        gyro, rates = Gyro(), 0.02 * np.random.default_rng(seed).standard_normal(50 * blocks + 400)
+        for k, rate in enumerate(rates):
+            gyro.add(reading(10 * k, rate), (0.0, 0.0), standing=k < 50 * blocks, needed_ns=START)
+        first = START + 500 * blocks * MS
+        turn = gyro.turn(first, first + 3900 * MS)
+        assert turn is not None
+        z.append(turn.angle / turn.sigma)
+    assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.3
+
+
 def test_a_robot_that_is_turned_by_hand_teaches_no_bias():
     assert told(lambda _: 0.5, 2000, standing=True).bias == 0.0
     assert told(lambda t: 0.09 * np.sign(np.sin(40 * t)), 2000, standing=True).bias == 0.0
