@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -64,23 +65,26 @@ def chromium(playwright: Playwright) -> Iterator[Browser]:
 
 @pytest.fixture(scope="session")
 def server(chromium: Browser) -> Iterator[Server]:
-    running = Server()
-    yield running
-    running.stop()
+    with Server() as running:
+        yield running
 
 
+@contextmanager
 def opened(chromium: Browser, link: str, width: int = 1260, height: int = 720) -> Iterator[Dashboard]:
     """The dashboard in a browser of its own, past the card of the first visit."""
     context = chromium.new_context(viewport={"width": width, "height": height})
-    context.set_default_timeout(PATIENCE_MS)
-    page = context.new_page()
-    dashboard = Dashboard(page)
-    page.goto(f"{link}&fixedDpr=0.3")
-    page.get_by_role("button", name="Keep watching").click()
-    yield dashboard
-    context.close()
+    try:
+        context.set_default_timeout(PATIENCE_MS)
+        page = context.new_page()
+        dashboard = Dashboard(page)
+        page.goto(f"{link}&fixedDpr=0.3")
+        page.get_by_role("button", name="Keep watching").click()
+        yield dashboard
+    finally:  # a page that a failed test left would go on drawing, and slow down all that come
+        context.close()
 
 
 @pytest.fixture(scope="module")
 def dashboard(chromium: Browser, server: Server) -> Iterator[Dashboard]:
-    yield from opened(chromium, server.link)
+    with opened(chromium, server.link) as made:
+        yield made

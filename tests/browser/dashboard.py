@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any, cast
 
 from playwright.sync_api import ConsoleMessage, Frame, Locator, Page, Response
 
 # Of a machine that is busy and compiles the kernels first.
 PATIENCE_S = 150
+# The first run of a fresh checkout compiles before anything is shown.
+COMPILING_S = 600
+STANDS = "['playing', 'paused', 'finished']"
 
 # What software rendering says of itself is not an error of ours.
 HARMLESS = ("GPU stall", "GL Driver Message", "Automatic fallback to software WebGL")
@@ -62,16 +66,44 @@ class Dashboard:
             assert time.monotonic() < deadline, f"{path} never fulfils {condition}: {self.ask(path)}"
             self.page.wait_for_timeout(100)
 
+    def eventually(self, holds: Callable[[], bool], told: Callable[[], object]) -> None:
+        """Wait until something holds that is asked of the page and the server in several steps."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not holds():
+            assert time.monotonic() < deadline, f"it never came about: {told()}"
+            self.page.wait_for_timeout(100)
+
+    def drawn(self) -> None:
+        """Wait until what was planned to be drawn on the page is drawn."""
+        self.page.evaluate(
+            "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        )
+
     # --- playing ---------------------------------------------------------------------------------
 
     def pause(self) -> None:
         """Stand still, wherever the run is."""
-        self.until(
-            "() => ['playing', 'paused', 'finished'].includes(document.querySelector('#state').dataset.state)"
+        self.page.wait_for_function(
+            f"() => {STANDS}.includes(document.querySelector('#state').dataset.state)",
+            polling=200,
+            timeout=1000 * COMPILING_S,
         )
         if self.state == "playing":
             self.page.locator("#play").click()
         self.until("() => ['paused', 'finished'].includes(document.querySelector('#state').dataset.state)")
+
+    def stand(self, time_s: float = 22.55) -> None:
+        """Stand in the middle of the run with the values of the preset, whatever was before.
+
+        Args:
+            time_s: Between two scans, so that the one before it is not taken for the end of the way.
+        """
+        self.pause()
+        self.page.evaluate(PRESET, "forest")
+        self.until_server("/api/parameters", "it.preset === 'forest' && it.changed.length === 0")
+        self.command({"type": "seek", "time_s": time_s})
+        there = f"it.time_s > {time_s} - 0.08 && it.time_s < {time_s} + 0.01"
+        self.until_server("/api/status", f"it.state === 'paused' && {there}")
 
     @property
     def state(self) -> str:
@@ -119,6 +151,23 @@ class Dashboard:
         read = "name => (window.__viserSceneTree?.getState()[name]?.message?.props?.points?.length ?? 0)"
         return int(self.scene.evaluate(read, name)) // 3
 
+    def settled_places(self, name: str) -> list[tuple[float, float]]:
+        """The same once the camera has come to rest."""
+        before: list[tuple[float, float]] = []
+
+        def rest() -> bool:
+            nonlocal before
+            earlier, before = before, self.places_in_scene(name)
+            return len(before) == len(earlier) > 0 and all(
+                abs(a - b) < 0.5
+                for one, other in zip(before, earlier, strict=True)
+                for a, b in zip(one, other, strict=True)
+            )
+
+        self.page.wait_for_timeout(300)  # the camera sets out
+        self.eventually(lambda: rest() and rest() and rest(), lambda: before)
+        return before
+
     def places_in_scene(self, name: str) -> list[tuple[float, float]]:
         """Where the middles of a node's copies are seen, in pixels of the page; by the number of the copy."""
         frame = self.page.locator("#scene").bounding_box()
@@ -126,6 +175,9 @@ class Dashboard:
         found = self.scene.evaluate(PROJECTED, name)
         return [(frame["x"] + x, frame["y"] + y) for x, y in found]
 
+
+PRESET = """name => fetch('/api/parameters/preset', { method: 'POST', body: JSON.stringify({ name }),
+  headers: { 'Content-Type': 'application/json' } })"""
 
 PROJECTED = """name => {
   const { props } = window.__viserSceneTree.getState()[name].message;

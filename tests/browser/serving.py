@@ -9,8 +9,11 @@ import sys
 import threading
 from collections import deque
 from pathlib import Path
+from typing import Self
 
 ROOT = Path(__file__).resolve().parents[2]
+# Of a machine that is busy.
+_PATIENCE_S = 120
 _START = "import sys; from app.cli import main; sys.exit(main())"
 
 
@@ -46,10 +49,21 @@ class Server:
         assert found is not None
         return int(found.group(1))
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
     def stop(self) -> None:
-        """End it as Ctrl-C does, and wait."""
+        """End it as Ctrl-C does, and wait; once is enough."""
+        if self._process.returncode is not None:
+            return
         self._process.terminate()
-        self._process.wait(timeout=30)
+        try:
+            self._process.wait(timeout=_PATIENCE_S)
+        finally:
+            self._process.kill()
         self._reader.join(timeout=10)
         assert self._process.stdout is not None
         self._process.stdout.close()

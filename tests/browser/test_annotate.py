@@ -19,18 +19,14 @@ from tests.browser.serving import Server
 def annotated(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A server whose annotations no other test sees."""
     folder: Path = tmp_path_factory.mktemp("annotated")
-    running = Server(STEMMAP_FOLDER=str(folder))
-    yield running
-    running.stop()
+    with Server(STEMMAP_FOLDER=str(folder)) as running:
+        yield running
 
 
 @pytest.fixture
 def person(chromium: Browser, annotated: Server) -> Iterator[Dashboard]:
-    for dashboard in opened(chromium, annotated.link):
-        dashboard.pause()
-        dashboard.command({"type": "seek", "time_s": 15.05})
-        there = "it.state === 'paused' && it.time_s > 14.97 && it.time_s < 15.1"
-        dashboard.until_server("/api/status", there)
+    with opened(chromium, annotated.link) as dashboard:
+        dashboard.stand(15.05)
         dashboard.until_server("/api/trees", "it.trees.length > 20")
         # Whatever became of the test before.
         dashboard.page.evaluate(CLEARED)
@@ -77,7 +73,7 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     near = min(found, key=lambda tree: (tree["x"] - 4.0) ** 2 + (tree["y"] - 2.0) ** 2)
     before = person.ask("/api/evaluation")
     page.get_by_role("button", name="Fit").click()
-    page.wait_for_timeout(300)
+    person.drawn()
     canvas.click(position=place_of(person, near["x"], near["y"]))
     page.locator("#annotate-kind").select_option("pole")
     canvas.press("n")
@@ -136,10 +132,13 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     line.click(position={"x": 5, "y": 5})
     canvas.press("Delete")
     person.until_server("/api/annotations", "it.trees.length === 2")
-    while page.locator("#annotate-undo").is_enabled():
+    mine = page.evaluate("() => localStorage.getItem('stemmap.browser')")
+    edits = f"/api/annotations?browser={mine}"
+    for left in range(person.ask(edits)["undo"] - 1, -1, -1):
         page.locator("#annotate-undo").click()
-        page.wait_for_timeout(250)
+        person.until_server(edits, f"it.undo === {left}")
     assert rows(person) == []
+    expect(page.locator("#annotate-undo")).to_be_disabled()
     person.until_server("/api/evaluation", f"it.FA.count === {before['FA']['count']}")
     assert person.errors == []
 
@@ -154,7 +153,7 @@ def test_two_people_see_one_another_and_a_stale_edit_is_refused(
         {"name": "plot.csv", "mimeType": "text/csv", "buffer": b"X,Y,dbh_cm\n1.5,30.5,22\n-4.0,31.0,\n"}
     )
     expect(page.locator("#annotate-hint")).to_contain_text("2 taken from plot.csv")
-    for other in opened(chromium, annotated.link):
+    with opened(chromium, annotated.link) as other:
         other.tab("Annotate")
         theirs = other.page.locator("#annotations tbody tr")
         expect(theirs).to_have_count(2)
@@ -180,10 +179,9 @@ def test_two_people_see_one_another_and_a_stale_edit_is_refused(
 def test_a_shift_click_on_a_stem_in_the_scene_adds_it(person: Dashboard):
     page = person.page
     found = person.ask("/api/trees")["trees"]
-    page.wait_for_timeout(1500)
     box = page.locator("#scene").bounding_box()
     assert box is not None
-    for x, y in person.places_in_scene("/world/trees"):
+    for x, y in person.settled_places("/world/trees"):
         # Not below viser's own panel and notices.
         right, below = box["x"] + box["width"] - 360, box["y"] + box["height"] - 60
         if not (box["x"] + 20 < x < right and 280 < y < below):

@@ -14,9 +14,7 @@ SEEN = """name => {
 
 def test_what_was_gathered_and_where_the_map_errs_are_layers(dashboard: Dashboard):
     page = dashboard.page
-    dashboard.pause()
-    dashboard.command({"type": "seek", "time_s": 22.55})
-    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 22.47 && it.time_s < 22.56")
+    dashboard.stand()
     page.get_by_role("button", name="Layers").click()
     rows = page.locator("#layer-list label:has(input)")
     titles = rows.locator("span:not(.count)").all_inner_texts()

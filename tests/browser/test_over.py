@@ -12,9 +12,7 @@ from tests.browser.dashboard import Dashboard
 
 @pytest.fixture(autouse=True)
 def _standing(dashboard: Dashboard):
-    dashboard.pause()
-    dashboard.command({"type": "seek", "time_s": 22.55})
-    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 22.47 && it.time_s < 22.56")
+    dashboard.stand()
 
 
 def coloured(canvas: Locator) -> int:

@@ -17,8 +17,8 @@ from tests.browser.serving import Server
 def own(chromium: Browser, tmp_path: Path) -> Iterator[Dashboard]:
     """A server with a folder of its own, in which one short run was mapped to its end."""
     server = Server("sim:stand?duration=4", STEMMAP_FOLDER=str(tmp_path))
-    yield from opened(chromium, server.link)
-    server.stop()
+    with server, opened(chromium, server.link) as dashboard:
+        yield dashboard
 
 
 def map_again(dashboard: Dashboard, changes: dict[str, object]) -> None:

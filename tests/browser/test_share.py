@@ -18,7 +18,7 @@ POINTS = (
 
 
 def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server: Server):
-    for dashboard in opened(chromium, server.link):
+    with opened(chromium, server.link) as dashboard:
         page = dashboard.page
         dashboard.until_server("/api/status", "it.scan_index > 5")
         dashboard.pause()
@@ -47,7 +47,7 @@ def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server
 
 
 def looks(chromium: Browser, link: str, scan: int) -> None:
-    for viewer in opened(chromium, link):
+    with opened(chromium, link) as viewer:
         page = viewer.page
         expect(page.locator("#looks-only")).to_be_visible()
         expect(page.locator("#trees tbody tr").first).to_be_visible()

@@ -19,7 +19,7 @@ SPILLS = """() => [...document.querySelectorAll('header *, main *, footer *')].f
 
 @pytest.mark.parametrize("size", [(1440, 900), (1024, 768), (390, 844)])
 def test_nothing_spills_over_the_edge(chromium: Browser, server: Server, size: tuple[int, int]):
-    for dashboard in opened(chromium, server.link, *size):
+    with opened(chromium, server.link, *size) as dashboard:
         dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
         assert dashboard.page.evaluate(SPILLS) == []
         assert dashboard.page.evaluate("document.documentElement.scrollWidth") <= size[0]

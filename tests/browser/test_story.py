@@ -12,9 +12,7 @@ MARKERS = "/world/robot/scan/markers"
 
 @pytest.fixture(autouse=True)
 def _standing(dashboard: Dashboard):
-    dashboard.pause()
-    dashboard.command({"type": "seek", "time_s": 22.55})
-    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 22.47 && it.time_s < 22.56")
+    dashboard.stand()
     dashboard.page.locator("#map").press("Escape")
 
 
@@ -24,12 +22,11 @@ def test_a_click_on_a_cluster_in_the_scene_tells_why_it_is_no_tree(dashboard: Da
     scan = dashboard.ask("/api/status")["scan_index"]
     dashboard.until_server("/api/story/cluster/0", f"it.scan === {scan}")
     page.locator("#map").press("t")  # from above nothing hides anything
-    page.wait_for_timeout(1500)
     box = page.locator("#scene").bounding_box()
     assert box is not None
     panel = page.locator("#panel-story")
     read: dict[str, int] = {}
-    for cluster, (x, y) in enumerate(dashboard.places_in_scene(MARKERS)):
+    for cluster, (x, y) in enumerate(dashboard.settled_places(MARKERS)):
         # Not below viser's own panel and notices.
         if not (
             box["x"] + 20 < x < box["x"] + box["width"] - 360 and 250 < y < box["y"] + box["height"] - 30
@@ -107,7 +104,7 @@ def test_a_cluster_of_the_list_stands_while_the_run_plays_on(dashboard: Dashboar
 def test_a_cluster_is_clicked_on_the_map(dashboard: Dashboard):
     page = dashboard.page
     page.get_by_role("button", name="Fit").click()
-    page.wait_for_timeout(300)
+    dashboard.drawn()
     places = page.evaluate(SQUARES)
     assert places, "no cluster that is no tree is drawn"
     page.locator("#map").click(position={"x": places[0][0], "y": places[0][1]})

@@ -13,12 +13,9 @@ from tests.browser.dashboard import Dashboard
 
 @pytest.fixture(autouse=True)
 def _standing(dashboard: Dashboard):
-    dashboard.pause()
-    dashboard.command({"type": "seek", "time_s": 22.55})
-    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 22.47 && it.time_s < 22.56")
+    dashboard.stand()
     dashboard.tab("Tune")
-    dashboard.page.locator("#tune-set").select_option("forest")
-    dashboard.until_server("/api/parameters", "it.preset === 'forest' && it.changed.length === 0")
+    expect(dashboard.page.locator("#tune-set")).to_have_value("forest")
 
 
 def value(page: Page, name: str):

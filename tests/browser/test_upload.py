@@ -25,7 +25,7 @@ def test_a_dropped_recording_is_opened_and_a_picture_is_refused(chromium: Browse
     run = tmp_path / "north stand.mcap"
     assert main(["simulate", "stand", "--duration", "1", "--out", str(run)]) == 0
     server = Server("sim:stand?duration=4", STEMMAP_FOLDER=str(tmp_path / "kept"))
-    for dashboard in opened(chromium, server.link):
+    with server, opened(chromium, server.link) as dashboard:
         page = dashboard.page
         page.evaluate(DROP, ["holiday.jpg", base64.b64encode(b"\xff\xd8\xff\xe0 a picture").decode()])
         expect(page.locator("#upload [role=alert]")).to_contain_text("holiday.jpg")
@@ -39,4 +39,3 @@ def test_a_dropped_recording_is_opened_and_a_picture_is_refused(chromium: Browse
         )
         page.locator("#source-button").click()
         expect(page.locator("#source-list").get_by_text("north stand.mcap")).to_be_visible()
-    server.stop()
