@@ -26,8 +26,9 @@ from pipeline.export import DETECTION_COLUMNS, RunFiles, csv_text
 from pipeline.geometry import Pose2
 from pipeline.merged_map import MergedMap, merge_maps
 from pipeline.parameters import Parameters
-from pipeline.records import Path
+from pipeline.records import Path, Trees
 from pipeline.relocalisation import Match, Stems, find_constellation
+from pipeline.saved_map import SavedMap
 
 CORRESPONDENCE_COLUMNS = ("tree", "tree_a", "tree_b", "distance_m")
 HYPOTHESES = 3_000_000
@@ -87,7 +88,7 @@ def merge_runs(
         trees = merged.map.trees(chosen)
         path = _path(merged)
         _update(record, saved, path, int(np.count_nonzero(trees.confirmed)), match)
-        table = _correspondence(merged, set(trees.number[trees.confirmed].tolist()), a, b)
+        table = _correspondence(merged, b.map, _shown(trees), _shown(trees_a), _shown(trees_b))
         more = {"correspondence.csv": csv_text(CORRESPONDENCE_COLUMNS, table)}
         files.finish(trees, path, a.start_ns, record, saved.as_bytes(), more)
     except BaseException:
@@ -166,17 +167,24 @@ def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, mat
     )
 
 
-def _correspondence(merged: MergedMap, shown: set[int], a: SavedRun, b: SavedRun) -> list[list[str]]:
-    """Rows of CORRESPONDENCE_COLUMNS of the confirmed trees of the merged map, by number."""
-    rows = {n: [str(n), str(n), "", ""] for n in a.map.tracks.number.tolist() if n in shown}
-    told = zip(b.map.tracks.number.tolist(), merged.number_of.tolist(), merged.distance.tolist(), strict=True)
+def _shown(trees: Trees) -> set[int]:
+    """Numbers of the trees that a map shows and writes."""
+    return set(trees.number[trees.confirmed].tolist())
+
+
+def _correspondence(
+    merged: MergedMap, b: SavedMap, shown: set[int], of_a: set[int], of_b: set[int]
+) -> list[list[str]]:
+    """Rows of CORRESPONDENCE_COLUMNS of the trees that the merged map shows, by number; a run that did not
+    show the tree has no number of it.
+    """
+    rows = {n: [str(n), str(n) if n in of_a else "", "", ""] for n in sorted(shown)}
+    told = zip(b.tracks.number.tolist(), merged.number_of.tolist(), merged.distance.tolist(), strict=True)
     for old, new, distance in told:
-        if new not in shown:
-            continue
-        row = rows.setdefault(new, [str(new), "", "", ""])
-        row[2] = str(old)
-        row[3] = "" if math.isnan(distance) else f"{distance:.3f}"
-    return [rows[n] for n in sorted(rows)]
+        if new in rows and old in of_b:
+            rows[new][2] = str(old)
+            rows[new][3] = "" if math.isnan(distance) or not rows[new][1] else f"{distance:.3f}"
+    return list(rows.values())
 
 
 def _moved_rows(

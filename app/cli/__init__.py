@@ -41,6 +41,9 @@ CODES = (
 )
 
 
+STOPPED = "stopped; no result was written"
+
+
 class _Parser(argparse.ArgumentParser):
     """Says what was wrong in one line, and where the help is."""
 
@@ -60,10 +63,12 @@ def main(arguments: list[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or (words[0] not in COMMANDS and words[0] not in ("-h", "--help", "--version")):
         words.insert(0, "serve")  # `stemmap run.mcap` is what people type first
-    parser = _build_parser(words[0])
+    parser, known = _build_parser(words[0])
     try:
         _look_for_slip(words)
-        parsed = parser.parse_args(words)
+        parsed, unknown = parser.parse_known_args(words)
+        if unknown:
+            _refuse(unknown, parsed.command, known[parsed.command])
         command = importlib.import_module(f"app.cli.{parsed.command}")
         with _ended_kindly():
             return int(command.run(parsed))
@@ -76,10 +81,28 @@ def main(arguments: list[str] | None = None) -> int:
     except MemoryError:
         return _complain("this needs more memory than this machine has", FAILED)
     except KeyboardInterrupt:
-        return _complain("stopped", FAILED)
+        return _complain(STOPPED, FAILED)
+    except SystemError as error:  # a request to stop that came inside of compiled code's loading
+        if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+            raise
+        return _complain(STOPPED, FAILED)
     except BrokenPipeError:  # `stemmap params | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
+
+
+def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -> None:
+    """Say which words a command does not know, and what may have been meant.
+
+    Raises:
+        UsageError: Always.
+    """
+    flags = [flag for action in parser._actions for flag in action.option_strings]
+    near = difflib.get_close_matches(unknown[0].split("=")[0], flags, n=1, cutoff=0.6)
+    raise UsageError(
+        f"stemmap {command} does not know {' '.join(unknown)}",
+        remedy=f"Did you mean {near[0]}?" if near else f"See stemmap {command} --help",
+    )
 
 
 def _look_for_slip(words: list[str]) -> None:
@@ -108,7 +131,8 @@ def _ended_kindly() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _build_parser(wanted: str) -> argparse.ArgumentParser:
+def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser, and that of each command."""
     parser = _Parser(
         prog="stemmap",
         description="Maps trees from a robot's LiDAR as it drives, and shows in the browser why.",
@@ -128,7 +152,7 @@ def _build_parser(wanted: str) -> argparse.ArgumentParser:
         )
         if name == wanted:
             module.configure(subparser)
-    return parser
+    return parser, dict(subparsers.choices)
 
 
 def _complain(error: object, code: int) -> int:

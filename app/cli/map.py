@@ -27,6 +27,7 @@ from pipeline.errors import ParameterError, StemmapError
 if TYPE_CHECKING:
     from app.continuing import Start
 
+NOT_TIMED = "not timed: the first scan loads the compiled code, and there is no other"
 HELP = "map a run without a browser and write its files"
 
 
@@ -158,7 +159,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         except OSError as error:
             raise _cannot_write(error, arguments.out) from None
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
-    times = f"median {outcome.scan_ms:.2f} ms a scan ({stages})"
+    times = f"median {outcome.scan_ms:.2f} ms a scan ({stages})" if outcome.scan_ms else NOT_TIMED
     return _tell(
         [*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses, replaces=replaces
     )

@@ -13,6 +13,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("file", metavar="FILE", type=Path, help="an .mcap; it is not changed")
     parser.add_argument("--out", metavar="MENDED", type=Path, required=True, help="the new .mcap")
+    parser.add_argument("--force", action="store_true", help="overwrite a file that is there already")
     parser.epilog = "Exit code 0: it was whole; 3: something is lost (said on stderr); 1: nothing is whole."
 
 
@@ -24,6 +25,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out.exists() and arguments.file.exists() and arguments.out.samefile(arguments.file):
         raise StemmapError(
             "this is the damaged file itself", where=str(arguments.out), remedy="Name another with --out"
+        )
+    if arguments.out.exists() and not arguments.force:
+        raise StemmapError(
+            "the file is there already", where=str(arguments.out), remedy="Name another, or add --force"
         )
     mended = mend(arguments.file, arguments.out)
     print(f"{arguments.out}: {mended.messages} messages")

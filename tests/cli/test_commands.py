@@ -38,6 +38,23 @@ def stemmap(capsys: pytest.CaptureFixture[str], *words: object) -> Told:
     return Told(code, told.out, told.err)
 
 
+def test_an_option_that_is_mistyped_is_named(capsys):
+    stemmap(capsys, "map", RUN, "--out", "x", "--presset", "forest").refused(
+        2, "stemmap map does not know --presset", "Did you mean --preset?"
+    )
+
+
+def test_a_request_to_stop_that_came_while_kernels_were_loaded_is_one(capsys, monkeypatch):
+    def ended(_arguments):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as stop:
+            raise SystemError("returned a result with an exception set") from stop
+
+    monkeypatch.setattr("app.cli.params.run", ended)
+    stemmap(capsys, "params").refused(1, "stopped")
+
+
 # --- help -----------------------------------------------------------------------------------------
 
 

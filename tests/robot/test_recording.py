@@ -252,6 +252,11 @@ def test_exit_codes_of_mending(drive: Path, tmp_path: Path, capsys):
     assert main(["recover", str(cut), "--out", str(tmp_path / "n.mcap")]) == 1
     assert not (tmp_path / "n.mcap").exists()
     assert main(["recover", str(drive), "--out", str(drive)]) == 1
+    capsys.readouterr()
+    assert main(["recover", str(drive), "--out", str(tmp_path / "m.mcap")]) == 1
+    assert "--force" in capsys.readouterr().err
+    assert messages_of(tmp_path / "m.mcap") == kept
+    assert main(["recover", str(drive), "--out", str(tmp_path / "m.mcap"), "--force"]) == 0
 
 
 @pytest.fixture(scope="module")
