@@ -101,7 +101,7 @@ def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -
     near = difflib.get_close_matches(unknown[0].split("=")[0], flags, n=1, cutoff=0.6)
     raise UsageError(
         f"stemmap {command} does not know {' '.join(unknown)}",
-        remedy=f"Did you mean {near[0]}?" if near else f"See stemmap {command} --help",
+        remedy=(f"Did you mean {near[0]}? " if near else "") + f"See stemmap {command} --help",
     )
 
 

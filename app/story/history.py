@@ -41,7 +41,8 @@ class TreeHistory:
         scans = self._rows[: self._count, _SCAN]
         self._count = int(np.searchsorted(scans, frame.index))
         trees = frame.trees
-        seen = np.flatnonzero(trees.last_seen_ns == frame.stamp_ns)
+        # A tree that its column began has a place before any scan detected it.
+        seen = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
         if frame.index % self._spacing:
             seen = seen[trees.observations[seen] <= _ALL_OF_FIRST]
         self._append(

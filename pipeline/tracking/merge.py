@@ -46,7 +46,8 @@ def _first_pair(x: Float, touched: Bool, alive: Bool, radius: float) -> tuple[in
 
 def join(tracks: TrackTable, old: int, young: int) -> None:
     """Add to a tree, by its row, what is known of another row of the same tree, which is left as it is."""
-    if tracks.stamp_ns[old] == tracks.stamp_ns[young]:  # two halves of one trunk in one scan
+    # Two halves of one trunk in one scan; a tree that only its column tells of has no view to take off.
+    if tracks.stamp_ns[old] == tracks.stamp_ns[young] and min(tracks.hits[old], tracks.hits[young]) > 0:
         tracks.hits[old] -= 1
     other, row = tracks.P[young].copy(), np.array([old])
     own = other[None, :2, :2] - tracks.shared[young]

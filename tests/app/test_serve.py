@@ -174,7 +174,7 @@ async def ended(*words: str) -> tuple[int | None, str]:
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (["sim:nope"], 1, "there is no scenario 'nope' (sim:nope)"),
+        (["sim:nope"], 2, "there is no scenario 'nope' (sim:nope)"),
         (["no/such/run.mcap"], 1, "there is no such file or folder (no/such/run.mcap)"),
         (["serve", "--port", "x"], 2, "not a port"),
         (["serve", "--preset", "best"], 2, "no preset 'best'"),

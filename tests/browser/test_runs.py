@@ -72,6 +72,7 @@ def test_runs_are_kept_compared_renamed_deleted_and_played_again(own: Dashboard)
 
     assert own.errors == []
     page.get_by_role("button", name="Replay").click()
-    expect(page.locator("#source-name")).to_have_text("sim:stand?duration=4")
+    expect(page.locator("#source-name")).to_have_text("sim:stand")
+    own.until_server("/api/status", "it.source === 'sim:stand?duration=4'")
     own.until_server("/api/parameters", "it.values['tracking.hits_to_confirm'] === 3")
     own.until_server("/api/runs", "it.runs.length === 3")
