@@ -22,19 +22,20 @@ def own(chromium: Browser, tmp_path: Path) -> Iterator[Dashboard]:
 
 
 def map_again(dashboard: Dashboard, changes: dict[str, object]) -> None:
-    """Change parameters, and map the same run once more to its end."""
+    """Map the same run once more to its end, with other parameters."""
+    dashboard.page.evaluate(
+        "() => fetch('/api/open', { method: 'POST', body: JSON.stringify({ uri: 'sim:stand?duration=4' }),"
+        " headers: { 'Content-Type': 'application/json' } })"
+    )
+    # Not before: the run that stands would be mapped with them too, and its record would say so.
     dashboard.page.evaluate(
         "body => fetch('/api/parameters', { method: 'PATCH', body: JSON.stringify(body),"
         " headers: { 'Content-Type': 'application/json' } })",
         {"changes": changes},
     )
-    dashboard.page.evaluate(
-        "() => fetch('/api/open', { method: 'POST', body: JSON.stringify({ uri: 'sim:stand?duration=4' }),"
-        " headers: { 'Content-Type': 'application/json' } })"
-    )
 
 
-def test_runs_are_kept_compared_renamed_deleted_and_played_again(own: Dashboard):
+def test_runs_are_kept_compared_renamed_deleted_and_played_again(own: Dashboard, tmp_path: Path):
     page = own.page
     own.until_server("/api/status", "it.state === 'finished'")
     own.until_server("/api/runs", "it.runs.length === 1 && it.runs[0].scans === 40")
@@ -71,6 +72,14 @@ def test_runs_are_kept_compared_renamed_deleted_and_played_again(own: Dashboard)
     expect(page.get_by_role("heading", name="<b>north</b> stand")).to_be_visible()
 
     assert own.errors == []
+    folder = tmp_path / "recordings" / "north+south & 50%#1"
+    folder.mkdir(parents=True)
+    for name in ("run.json", "trees.csv"):
+        (folder / name).write_text("")
+    page.reload()
+    page.get_by_role("button", name=folder.name).click()
+    expect(page.locator("#run-detail .empty")).to_contain_text("run.json is damaged")
+    rows.nth(1).get_by_role("button").click()
     page.get_by_role("button", name="Replay").click()
     expect(page.locator("#source-name")).to_have_text("sim:stand")
     own.until_server("/api/status", "it.source === 'sim:stand?duration=4'")

@@ -42,15 +42,17 @@ function fill() {
   markTicked();
 }
 
+// A folder may be called as its owner likes: a+b, north & south.
+const addressOf = ({ key }) => `run=${encodeURIComponent(key)}`;
 const group = (text) => el("tr", { class: "group" }, el("td", { colspan: HEADS.length, text }));
 
 function row(run) {
-  const name = el("td", {}, el("button", { text: run.name, onclick: (event) => { event.stopPropagation(); go(`run=${run.key}`); } }),
+  const name = el("td", {}, el("button", { text: run.name, onclick: (event) => { event.stopPropagation(); go(addressOf(run)); } }),
     el("small", {}, ...(run.id === known.open && run.id !== undefined ? [el("span", { class: "badge", text: "open now" })] : []),
       run.uri && shortSource(run.uri) !== run.name ? shortSource(run.uri) : run.kind ?? ""));
   const texts = run.id === undefined ? [when(run.changed_s), "", "", "", "", ""]
     : [when(run.begun_s), scans(run), figure(run.distance_m), String(run.trees), figure(run.scores?.f1), run.preset];
-  return el("tr", { "data-run": run.key, onclick: () => go(`run=${run.key}`) },
+  return el("tr", { "data-run": run.key, onclick: () => go(addressOf(run)) },
     el("td", { onclick: (event) => event.stopPropagation() }, el("input", { type: "checkbox", "aria-label": `Compare ${run.name}`, checked: ticked.has(run.key), onchange: (event) => tick(run.key, event.target.checked) })),
     name, ...texts.map((text, k) => el("td", { class: HEADS[k + 2][1], text })));
 }
@@ -121,7 +123,7 @@ async function undo() {
     return;
   }
   await load();
-  go(`run=${run.key}`);
+  go(addressOf(run));
 }
 
 byId("runs").tHead.replaceChildren(el("tr", {}, ...HEADS.map(([text, cls]) => el("th", { scope: "col", class: cls, text: text || " " }))));
