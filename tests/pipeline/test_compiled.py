@@ -44,7 +44,12 @@ def call(folder: Path, factor: float, more: float, program: str = CALL) -> list[
     told = subprocess.run(
         [sys.executable, "-c", program],
         cwd=folder,
-        env={"PYTHONPATH": f"{folder}:{ROOT}", "NUMBA_CACHE_DIR": str(folder / "kept")},
+        env={
+            "PYTHONPATH": f"{folder}:{ROOT}",
+            "NUMBA_CACHE_DIR": str(folder / "kept"),
+            # Python itself takes a file of the same second and size for the one of before.
+            "PYTHONDONTWRITEBYTECODE": "1",
+        },
         capture_output=True,
         text=True,
         timeout=120,
