@@ -122,7 +122,8 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
             told = Pose2(stride.x + noise[0], stride.y + noise[1], stride.yaw + noise[2])
         found = _detections(truth, trees_there, random)
         at = slam.process(k, told, found, free)
-        tracker.process(k * 100_000_000, at.T_map_base, at.covariance, found, free, 0.0)
+        stamp_ns = k * 100_000_000
+        tracker.process(stamp_ns, at.T_map_base, at.covariance, found, free, 0.0, relative=at.relative)
         tracker.anchor(*slam.landmarks(), at.T_map_base, parameters.slam.view_range)
         if k >= WARM:
             error = at.T_map_base.as_array() - truth.as_array()
