@@ -157,7 +157,7 @@ class Recovery(Generic[S]):
     ) -> tuple[PoseEstimate, tuple[str, ...]]:
         """A scan of a robot that is lost: the odometry leads, until the stems around are found."""
         slam = mapped.slam
-        estimate = slam.process(index, motion, nothing_found(found), np.zeros_like(free))
+        estimate = slam.process(index, motion, nothing_found(found), NOTHING_FREE)
         at = self._search(index, motion, found, free, parameters, mapped.trees)
         if at is not None:
             slam.place(index, at.T_map_base, at.covariance)

@@ -58,17 +58,16 @@ class RosGraph:
 
     def __init__(self) -> None:
         self._alive: dict[str, Publisher] = {}
-        self.overflowed = False
 
-    def add(self, token: str) -> None:
-        """A token was declared."""
+    def add(self, token: str) -> bool:
+        """A token was declared. Returns whether there was room for it; what is no publisher needs none."""
         publisher = publisher_of(token)
-        if publisher is None:
-            return
+        if publisher is None or token in self._alive:
+            return True
         if len(self._alive) >= MOST_ENDPOINTS:
-            self.overflowed = True
-            return
+            return False
         self._alive[token] = publisher
+        return True
 
     def remove(self, token: str) -> None:
         """A token is gone."""

@@ -14,7 +14,7 @@ from app.robot.address import ZenohAddress
 from app.robot.arrival_times import ArrivalTimes
 from app.robot.choosing import SCAN_TYPES
 from app.robot.inbox import Inbox
-from app.robot.ros_graph import ADMIN, Publisher, RosGraph, data_key
+from app.robot.ros_graph import ADMIN, MOST_ENDPOINTS, Publisher, RosGraph, data_key
 from pipeline.sources.container import Channel, Message, count_loss
 
 #: Largest message that is put together from its parts; a cloud of 2 million points is smaller.
@@ -24,6 +24,7 @@ _ATTACHMENT = struct.Struct("<QQB")
 
 LOST_SCANS = "scans lost on the way from the robot"
 TOO_LARGE = "messages larger than 64 MB"
+TOO_MANY = f"topics that came up when {MOST_ENDPOINTS:,} were there already"
 
 
 def configuration(endpoint: str) -> str:
@@ -165,8 +166,8 @@ class ZenohLink:
             self.version += 1
             if sample.kind == zenoh.SampleKind.DELETE:
                 self._graph.remove(str(sample.key_expr))
-            else:
-                self._graph.add(str(sample.key_expr))
+            elif not self._graph.add(str(sample.key_expr)):
+                count_loss(self.losses, TOO_MANY)
 
     def _take(self, sample: Any, channel: Channel) -> None:  # noqa: ANN401
         payload, attachment = sample.payload, sample.attachment

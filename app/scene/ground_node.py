@@ -53,11 +53,6 @@ class GroundNode:
         """Of its mesh."""
         return self._faces
 
-    @property
-    def area(self) -> float:
-        """Of the known cells [m^2]."""
-        return 0.0 if self._shown is None else len(self._shown.place) * self._shown.cell**2
-
     def show(self, ground: HeightMap | None) -> bool:
         """Show a height map; None keeps the one before. Returns whether it is another one."""
         if ground is None or ground is self._shown:

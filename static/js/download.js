@@ -14,7 +14,7 @@ const cell = (value) => {
   return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 };
 
-export const csvText = (rows) => rows.map((row) => `${row.map(cell).join(",")}\n`).join("");
+const csvText = (rows) => rows.map((row) => `${row.map(cell).join(",")}\n`).join("");
 
 export const saveCsv = (name, rows) => save(name, new Blob([csvText(rows)], { type: "text/csv" }));
 

@@ -30,7 +30,7 @@ export const ellipse = (cx, cy, major, minor, angle, cls) =>
   svg("ellipse", { cx, cy, rx: Math.max(major, 0.4), ry: Math.max(minor, 0.4), transform: `rotate(${(-180 * angle) / Math.PI} ${cx} ${cy})`, class: cls });
 
 // A round length [m] of about a third of what is seen.
-export function roundLength(reach) {
+function roundLength(reach) {
   const power = 10 ** Math.floor(Math.log10(reach));
   return [1, 2, 5].map((k) => k * power).filter((length) => length <= reach).pop() ?? power;
 }

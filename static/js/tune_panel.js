@@ -3,7 +3,7 @@
 import { byId, el, setText } from "./dom.js";
 import { countsBeforeAfter } from "./tune_counts.js";
 import { on, state } from "./state.js";
-import { forget, isChanged, isTuning, redo, refuse, reset, save, savedSets, shown, specOf, takeFile, tuning, undo, use } from "./tune.js";
+import { forget, isChanged, isTuning, redo, refuse, reset, save, savedSets, specOf, takeFile, tuning, undo, use } from "./tune.js";
 import { rowOf } from "./tune_row.js";
 import { openTab } from "./tabs.js";
 
@@ -164,7 +164,6 @@ export function openParameter(name) {
 }
 
 export const openSearch = () => { openTab("tune"); byId("tune-find")?.focus(); };
-export const shownValue = (name) => shown(state.parameters?.values[name], specOf(name));
 
 export function startTunePanel() {
   on("specs", build);

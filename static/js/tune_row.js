@@ -9,12 +9,12 @@ const BENT = 3; // how a slider is bent whose usual values lie near its lower en
 // Sliders are bent where a straight one would have the useful values within a few pixels.
 const power = ({ minimum, maximum, default: usual }) => (minimum >= 0 && usual - minimum < 0.2 * (maximum - minimum) ? BENT : 1);
 
-export function toPlace(spec, value) {
+function toPlace(spec, value) {
   const part = (value - spec.minimum) / (spec.maximum - spec.minimum);
   return Math.round(FINE * Math.min(1, Math.max(0, part)) ** (1 / power(spec)));
 }
 
-export function fromPlace(spec, place) {
+function fromPlace(spec, place) {
   return rounded(spec, spec.minimum + (spec.maximum - spec.minimum) * (place / FINE) ** power(spec));
 }
 

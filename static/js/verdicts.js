@@ -1,6 +1,6 @@
 // Verdicts by colour, letter and reason: never by colour alone.
 
-export const VERDICTS = {
+const VERDICTS = {
   tree: ["T", "tree", "Taken as a stem; it feeds SLAM and the map."],
   pole: ["P", "pole", "A thin straight thing."],
   person: ["H", "person", "A person."],

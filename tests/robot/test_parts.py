@@ -89,6 +89,18 @@ def test_any_text_is_a_token_or_none(text: str):
     assert graph.publishers() == []
 
 
+def test_a_network_with_too_many_topics_is_told_of_and_room_comes_back(monkeypatch):
+    monkeypatch.setattr("app.robot.ros_graph.MOST_ENDPOINTS", 2)
+    token = "@ros2_lv/0/abc/0/{}/MP/%/%/driver/%topic{}/std_msgs::msg::dds_::Empty_/RIHS01_00/::,10:,:,:,,"
+    first, second, third = (token.format(k, k) for k in range(3))
+    graph = RosGraph()
+    assert [graph.add(each) for each in (first, second, first, third)] == [True, True, True, False]
+    assert graph.add("no token of a publisher")
+    graph.remove(first)
+    assert graph.add(third)
+    assert len(graph.publishers()) == 2
+
+
 ODD = st.text(st.sampled_from("%ab0_*$#?~. -é"), min_size=1, max_size=12)
 
 

@@ -71,15 +71,6 @@ class Sightings:
         )
 
 
-def no_landmarks() -> Landmarks:
-    """Columns of no length."""
-    whole, real = np.zeros(0, np.int64), np.zeros(0)
-    return Landmarks(
-        whole, whole, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2, 2)),
-        np.zeros(0, np.int32), real, whole, real,
-    )  # fmt: skip
-
-
 def no_sightings() -> Sightings:
     """Columns of no length."""
     whole = np.zeros(0, np.int64)
