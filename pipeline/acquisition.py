@@ -11,6 +11,8 @@ from pipeline.parameters.stages import Acquisition
 from pipeline.records import Float32, Int32, Step
 
 CHUNK = 512  # points; what is computed of them stays in the nearest cache
+#: What is told nearer than this is the sensor's own housing, or a beam without a return [m].
+HOUSING = 0.1
 Bytes = NDArray[np.uint8]
 
 
@@ -25,24 +27,62 @@ def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[F
         The points, float32, shape (N, 3) [m], and the sensor's place in the level base frame,
         shape (3,) [m]; point plus place is the point in the level base frame.
     """
-    level = parameters.level == "imu" and step.tilt_known
-    R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)
-    sensor_offset = R_level_base @ T_base_lidar.t
+    R_level_lidar, sensor_offset = _turn(step, T_base_lidar, parameters)
     offset_ns = step.scan.offset_ns
-    twist = step.twist
-    if parameters.gyro and step.turn_rate is not None:
-        twist = (twist[0], twist[1], step.turn_rate)
+    twist = driven_with(step, parameters)
     moving = parameters.deskew and offset_ns is not None and any(twist)
     points = _take(
         step.scan.points,
         offset_ns if moving and offset_ns is not None else np.zeros(0, np.int32),
-        R_level_base @ T_base_lidar.R,
+        R_level_lidar,
         sensor_offset,
         np.asarray(twist, dtype=np.float64),
         parameters.range_min,
         parameters.range_max,
     )
     return points, sensor_offset
+
+
+def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Float32:
+    """The points that `acquire` leaves out as nearer than `range_min`, in its frame: of the robot itself,
+    or of what stands close before it. They stay where they were seen: the robot moves with itself.
+
+    Returns:
+        float32, shape (N, 3) [m].
+    """
+    points = step.scan.points
+    rows = _nearer(points, min(HOUSING, parameters.range_min), parameters.range_min)
+    R_level_lidar, _ = _turn(step, T_base_lidar, parameters)
+    near: Float32 = (points[rows] @ R_level_lidar.T).astype(np.float32)
+    return near
+
+
+def _turn(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
+    """The turn from the sensor's axes to level ones, and the sensor's place in the level base frame [m]."""
+    level = parameters.level == "imu" and step.tilt_known
+    R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)
+    return R_level_base @ T_base_lidar.R, R_level_base @ T_base_lidar.t
+
+
+def driven_with(step: Step, parameters: Acquisition) -> tuple[float, float, float]:
+    """Velocity of the base at a scan: forward, left [m/s], turn [rad/s], the turn by the gyroscope where it
+    is asked."""
+    if parameters.gyro and step.turn_rate is not None:
+        return (step.twist[0], step.twist[1], step.turn_rate)
+    return step.twist
+
+
+@compiled
+def _nearer(points: Float32, least: float, below: float) -> Int32:
+    """Rows of the points that lie from `least` to below `below` away."""
+    rows = np.empty(points.shape[0], np.int32)
+    n = 0
+    for i in range(points.shape[0]):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        if least * least <= x * x + y * y + z * z < below * below:
+            rows[n] = i
+            n += 1
+    return rows[:n].copy()
 
 
 @compiled

@@ -16,6 +16,7 @@ from pathlib import Path as FilePath
 import numpy as np
 
 from pipeline.errors import StemmapError
+from pipeline.files import UNFINISHED
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.records import Int, Path, Trees
 
@@ -72,7 +73,7 @@ def write_tree_manager(folder: FilePath, path: Path, trees: Trees, reach: float)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise StemmapError("it is not empty", where=str(folder), remedy="Name a new folder")
         folder.parent.mkdir(parents=True, exist_ok=True)
-        staging = FilePath(tempfile.mkdtemp(prefix=".unfinished-", dir=folder.parent))
+        staging = FilePath(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder.parent))
         try:
             left_out = _write(staging, path, trees, reach)
             staging.chmod(0o755)  # as any other new folder; a temporary one is its owner's alone

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO, Any
 
 from pipeline.errors import StemmapError
+
+if sys.platform != "win32":
+    import fcntl
+
+# Begins the name of a folder in which files are written before all of them are whole.
+UNFINISHED = ".unfinished-"
 
 
 @contextmanager
@@ -37,6 +46,23 @@ def write_beside(path: Path) -> Iterator[Path]:
         raise StemmapError(f"cannot write the file: {error.strerror or error}", where=str(path)) from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def hold(file: IO[Any]) -> None:
+    """Let others see that this process writes to an open file, until it closes it or ends in any way."""
+    if sys.platform != "win32":  # there nobody can take an open file away
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_held(path: Path) -> bool:
+    """Whether a process holds a file (see `hold`)."""
+    if sys.platform != "win32":
+        with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+            try:
+                fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+    return False
 
 
 def _to_disk(path: Path) -> None:

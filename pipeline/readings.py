@@ -15,6 +15,7 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Int = NDArray[np.int64]
 Int32 = NDArray[np.int32]
+UInt16 = NDArray[np.uint16]
 Bool = NDArray[np.bool_]
 
 

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 
+from pipeline.clearance import Clearance as Clearance
+from pipeline.clearance import Zone as Zone
 from pipeline.geometry import Pose2
 from pipeline.health import Health
 from pipeline.readings import Bool as Bool
@@ -28,6 +30,7 @@ from pipeline.readings import Truth as Truth
 from pipeline.readings import TruthPath as TruthPath
 from pipeline.readings import TruthTrees as TruthTrees
 from pipeline.readings import Turn as Turn
+from pipeline.readings import UInt16 as UInt16
 
 # --- what the stages hand on ---------------------------------------------------------------------
 
@@ -111,6 +114,10 @@ class Verdict(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
+#: What columns are voted to be, in the order of their shares (see Columns).
+CLASSES = (Verdict.TREE, Verdict.POLE, Verdict.PERSON, Verdict.BUSH, Verdict.WALL, Verdict.OTHER)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Clusters:
     """The clusters of one scan as columns of length K; positions in the level sensor frame.
@@ -127,6 +134,7 @@ class Clusters:
         arc: Visible part of the circle [rad].
         extent: shape (K, 3) [m], size of the bounding box along the ray, across it and up.
         hidden: Whether something nearer hides an edge of the cluster.
+        cut: Whether it goes on where nobody looked (see `pipeline.shape.border`).
         verdict: int32, see Verdict.
     """
 
@@ -142,6 +150,7 @@ class Clusters:
     arc: Float
     extent: Float
     hidden: Bool
+    cut: Bool
     verdict: Int32
 
 
@@ -216,6 +225,7 @@ class Columns:
         axis: shape (K, 5): x, y at 1.3 m [m], shift of x and y per metre of height, strength.
         viewed: How high above the ground any scan looked there [m].
         present, absent: In how many scans something, or nothing, stood there in free view.
+        met, passed: int32, shape (K, slices of height): rays that ended at it, or passed its axis.
         figures: shape (K, figures): what it is judged by, see `pipeline.gathering.features.NAMES`.
         share: shape (K, 6): votes for tree, pole, person, bush, wall, other; verdict: int32, see Verdict.
     """
@@ -225,6 +235,8 @@ class Columns:
     viewed: Float
     present: Float
     absent: Float
+    met: Int32
+    passed: Int32
     figures: Float
     share: Float
     verdict: Int32
@@ -315,6 +327,7 @@ class Frame:
         ground: The height map, made anew every some scans; None where no ground is looked for, or where it
             is the same as in the picture before.
         base_z: Height of the base in the height map [m].
+        clearance: Of the way that the robot drives; None where nobody looks for obstacles.
     """
 
     index: int
@@ -333,6 +346,7 @@ class Frame:
     columns: Columns | None = None
     ground: HeightMap | None = None
     base_z: float = 0.0
+    clearance: Clearance | None = None
 
     @property
     def health(self) -> Health:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from app.robot.address import ROOT
 from app.robot.ros_graph import Publisher
 from pipeline.errors import SourceError
 from pipeline.sources.container import Channel
-from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, TRANSFORMS, VELODYNE_SCAN
+from pipeline.sources.rostypes import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, TRANSFORMS, VELODYNE_SCAN
+from pipeline.sources.topics import TYPES_BY_ROLE
 
-SCAN_TYPES = (POINT_CLOUD, VELODYNE_SCAN)
+SCAN_TYPES = TYPES_BY_ROLE["scan"]
 #: What we publish ourselves is nobody's LiDAR and nobody's odometry.
 OWN = "stemmap"
 _DERIVED = ("camera", "depth", "image", "map", "ground", "cluster", "filtered", "voxel")
@@ -36,7 +38,7 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
 
     Args:
         publishers: Alive now.
-        robot: Namespace that is wanted, "" for the first one by name that sends scans.
+        robot: Namespace that is wanted, ROOT for none, "" for the first one by name that sends scans.
         topics: Topic by role where the user named it.
         where: The address, for errors.
 
@@ -49,16 +51,18 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
     there = [p for p in publishers if OWN not in p.topic.split("/")[:-1]]
     named = topics.get("scan")
     scans = [p for p in there if p.msgtype in SCAN_TYPES]
-    fitting = [p for p in scans if (not robot or p.robot == robot) and (named is None or p.topic == named)]
+    wanted = robot.strip(ROOT)
+    fitting = [p for p in scans if (not robot or p.robot == wanted) and (named is None or p.topic == named)]
     if not fitting:
         _refuse_wrong_type(there, topics, "scan", SCAN_TYPES, where)
         return None
-    scan = min(fitting, key=lambda p: (_derived(p), p.msgtype == VELODYNE_SCAN, p.robot, p.topic))
+    scan = min(fitting, key=_scan_rank)
     mine = [p for p in there if p.robot in (scan.robot, "")]
     odometry = _of_role(mine, topics, "odometry", ODOMETRY, _odometry_rank, where)
     imu = _of_role(mine, topics, "imu", IMU, _imu_rank, where)
+    gnss = _of_role(mine, topics, "gnss", NAV_SAT_FIX, lambda p: (p.topic,), where)
     transforms = sorted({p.topic: p for p in mine if p.msgtype == TRANSFORMS}.values(), key=lambda p: p.topic)
-    chosen = [p for p in (scan, odometry, imu, *transforms) if p is not None]
+    chosen = [p for p in (scan, odometry, imu, gnss, *transforms) if p is not None]
     channels = tuple(Channel(k, p.topic, p.msgtype, "cdr", "", "", 0) for k, p in enumerate(chosen, 1))
     return Choice(scan.robot, channels, tuple(_warnings(scans, scan, robot, named)))
 
@@ -94,6 +98,12 @@ def _refuse_wrong_type(
 def _derived(publisher: Publisher) -> bool:
     """Whether the name says that a cloud is no raw sweep of a LiDAR."""
     return any(word in publisher.topic.lower() for word in _DERIVED)
+
+
+def _scan_rank(publisher: Publisher) -> tuple[object, ...]:
+    """A laser that sees in one plane is the robot's bumper where there is a LiDAR too."""
+    kind = publisher.msgtype
+    return kind == LASER_SCAN, _derived(publisher), kind == VELODYNE_SCAN, publisher.robot, publisher.topic
 
 
 def _odometry_rank(publisher: Publisher) -> tuple[object, ...]:

@@ -75,7 +75,7 @@ class Recording:
         """What came of a scan."""
         if self._writer is None:
             return
-        found = outputs.pose_messages(frame)
+        found = outputs.scan_messages(frame)
         if self._clock() >= self._map_at + _MAP_PAUSE_S:
             self._map_at = self._clock()
             found |= outputs.map_messages(frame, path)
@@ -123,7 +123,7 @@ class RawFile:
     """A new file without a buffer of its own: what was written is with the system when `write` returns."""
 
     def __init__(self, path: FilePath) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         self._length = 0
 
     def write(self, data: bytes) -> int:

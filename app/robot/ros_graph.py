@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 ADMIN = "@ros2_lv"
 PUBLISHER = "MP"
-_TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)::msg::dds_::([A-Za-z][A-Za-z0-9_]*)_")
+TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)::msg::dds_::([A-Za-z][A-Za-z0-9_]*)_")
 #: What cannot be said as a key of Zenoh is no name of ROS: empty parts, wildcards.
-_NAME = re.compile(r"(?:/[A-Za-z0-9_.~-]+)+")
+NAME = re.compile(r"(?:/[A-Za-z0-9_.~-]+)+")
 #: A network that says more of itself than this is not a robot's.
 MOST_ENDPOINTS = 5000
 _LONGEST = 1000
@@ -39,10 +39,10 @@ def publisher_of(token: str) -> Publisher | None:
     parts = token.split("/")
     if len(token) > _LONGEST or len(parts) != 13 or parts[0] != ADMIN or parts[5] != PUBLISHER:
         return None
-    msgtype = _TYPE.fullmatch(parts[10])
+    msgtype = TYPE.fullmatch(parts[10])
     topic = parts[9].replace("%", "/")
     namespace = parts[7].replace("%", "/")
-    if msgtype is None or not _NAME.fullmatch(topic) or not (namespace == "/" or _NAME.fullmatch(namespace)):
+    if msgtype is None or not NAME.fullmatch(topic) or not (namespace == "/" or NAME.fullmatch(namespace)):
         return None
     return Publisher(namespace.strip("/"), topic, f"{msgtype[1]}/msg/{msgtype[2]}")
 

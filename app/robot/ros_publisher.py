@@ -51,7 +51,7 @@ class RosPublisher:
 
     def add(self, frame: Frame, path: Path) -> None:
         """Publish what a scan gave."""
-        messages = outputs.pose_messages(frame)
+        messages = outputs.scan_messages(frame)
         now = time.monotonic()
         if now >= self._map_at + _MAP_PAUSE_S:
             self._map_at = now

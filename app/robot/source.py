@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
-from app.robot.address import VelodyneAddress, ZenohAddress, parse_address
+from app.robot.address import ALL_ROBOTS, DdsAddress, VelodyneAddress, ZenohAddress, parse_address
 from app.robot.choosing import SCAN_TYPES, Choice, choose
+from app.robot.dds_link import DdsLink
 from app.robot.inbox import Inbox
 from app.robot.recording import Recording
 from app.robot.ros_graph import Publisher
@@ -23,7 +24,7 @@ from pipeline.sources.arrivals import ArrivalReader
 from pipeline.sources.base import SourceDescription, SourceOptions
 from pipeline.sources.container import Channel
 
-KIND, VELODYNE_KIND = "ROS 2 over Zenoh", "Velodyne sensor"
+KIND, VELODYNE_KIND, DDS_KIND = "ROS 2 over Zenoh", "Velodyne sensor", "ROS 2 over DDS"
 #: A robot's nodes come up one after another: so long after its LiDAR its topics are counted.
 _SETTLE_S = 1.0
 _POLL_S = 0.005
@@ -65,7 +66,7 @@ class LiveSource:
 
     def __init__(
         self,
-        address: ZenohAddress | VelodyneAddress,
+        address: ZenohAddress | VelodyneAddress | DdsAddress,
         options: SourceOptions,
         make_link: Callable[[Any, Inbox], Link] = ZenohLink,
         kind: str = KIND,
@@ -152,6 +153,10 @@ class LiveSource:
     def robots(self) -> list[str]:
         """The namespaces of all robots that publish scans now."""
         return self._link.robots()
+
+    def publishers(self) -> list[Publisher]:
+        """All topics that are published where it is heard, each once."""
+        return self._link.publishers()
 
     @property
     def scans_waiting(self) -> int:
@@ -301,4 +306,18 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
     address, chosen = parse_address(uri), options or SourceOptions()
     if isinstance(address, VelodyneAddress):
         return LiveSource(address, chosen, VelodyneLink, VELODYNE_KIND)
+    if isinstance(address, DdsAddress):
+        return LiveSource(address, chosen, DdsLink, DDS_KIND)
+    if address.mapped_there:
+        raise SourceError(
+            "a map that a robot makes is watched, not made again",
+            where=uri,
+            remedy="Use `stemmap serve`, or leave out mapped=robot",
+        )
+    if address.robot == ALL_ROBOTS:
+        raise SourceError(
+            "one robot at a time is mapped",
+            where=uri,
+            remedy="Name it, or show all of them with `stemmap serve`",
+        )
     return LiveSource(address, chosen)

@@ -7,10 +7,10 @@ import json
 import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from app.robot.address import ZenohAddress
+from app.robot.address import ROOT, ZenohAddress
 from app.robot.arrival_times import ArrivalTimes
 from app.robot.choosing import SCAN_TYPES
 from app.robot.inbox import Inbox
@@ -27,8 +27,20 @@ TOO_LARGE = "messages larger than 64 MB"
 TOO_MANY = f"topics that came up when {MOST_ENDPOINTS:,} were there already"
 
 
-def configuration(endpoint: str) -> str:
-    """The session's configuration as JSON: a client of one router that listens and scouts nowhere."""
+#: What Zenoh calls the files of certificates.
+_TLS = {"ca": "root_ca_certificate", "cert": "connect_certificate", "key": "connect_private_key"}
+
+
+def configuration(endpoint: str, files: Mapping[str, str] | None = None) -> str:
+    """The session's configuration as JSON: a client of one router that listens and scouts nowhere.
+
+    Args:
+        endpoint: Of the router.
+        files: Of certificates, by what they are, see `ZenohAddress`.
+    """
+    tls: dict[str, Any] = {_TLS[name]: path for name, path in (files or {}).items()}
+    if "connect_certificate" in tls:
+        tls["enable_mtls"] = True
     return json.dumps(
         {
             "mode": "client",
@@ -37,7 +49,7 @@ def configuration(endpoint: str) -> str:
             "timestamping": {"enabled": True},  # what is latched must have a time
             "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
             "transport": {
-                "link": {"rx": {"max_message_size": MESSAGE_LIMIT}},
+                "link": {"rx": {"max_message_size": MESSAGE_LIMIT}, **({"tls": tls} if tls else {})},
                 "shared_memory": {"enabled": False},
             },
         }
@@ -85,7 +97,8 @@ class ZenohLink:
         """Why there is nothing, in words."""
         if self.robots() and not self._address.robot and not self._address.topics:
             return "a robot is there, its topics are counted"
-        wanted = f"robot {self._address.robot}" if self._address.robot else "a robot"
+        robot = self._address.robot
+        wanted = "a robot without a namespace" if robot == ROOT else f"robot {robot}" if robot else "a robot"
         others = [robot or "(no namespace)" for robot in self.robots()]
         there = f" (there are: {', '.join(others[:10])})" if others else ""
         return f"no scans of {wanted} are announced in ROS domain {self._address.domain}{there}"
@@ -140,7 +153,8 @@ class ZenohLink:
 
         while not self._closing.is_set():
             try:
-                session: Any = zenoh.open(zenoh.Config.from_json5(configuration(self._address.endpoint)))
+                config = configuration(self._address.endpoint, self._address.files)
+                session: Any = zenoh.open(zenoh.Config.from_json5(config))
             except Exception as error:  # zenoh has one class for all, and does not promise it
                 self.problem = f"no connection to {self._address.endpoint}: {_short(error)}"
                 self._closing.wait(_RETRY_S)

@@ -42,6 +42,11 @@ def count(default: int, title: str, unit: str, low: int, high: int, doc: str) ->
     )
 
 
+def name(default: str, title: str, pattern: str, doc: str) -> Any:  # noqa: ANN401
+    """A word that names something; what names look like is a regular expression."""
+    return Field(default=default, title=title, description=doc, pattern=pattern)
+
+
 def choice(default: str | bool, title: str, doc: str) -> Any:  # noqa: ANN401
     """One of the words of a Literal, or a switch."""
     return Field(default=default, title=title, description=doc)

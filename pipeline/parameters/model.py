@@ -29,6 +29,7 @@ class Parameters(BaseModel):
     relocalisation: stages.Relocalisation = Field(default_factory=stages.Relocalisation)
     gathering: stages.Gathering = Field(default_factory=stages.Gathering)
     tracking: stages.Tracking = Field(default_factory=stages.Tracking)
+    obstacles: stages.Obstacles = Field(default_factory=stages.Obstacles)
     evaluation: stages.Evaluation = Field(default_factory=stages.Evaluation)
 
     def replace(self, changes: dict[str, Any]) -> Parameters:
@@ -100,7 +101,7 @@ class FieldSpec:
         name: Dotted, e.g. "clustering.eps".
         stage: The stage's title.
         title, unit, doc: For people.
-        kind: "float", "int", "bool" or "choice".
+        kind: "float", "int", "bool", "choice" or "name".
         minimum, maximum, step: Of numbers, else None.
         choices: Of a choice, else empty.
         default: Of the preset `forest`.
@@ -111,7 +112,7 @@ class FieldSpec:
     title: str
     unit: str
     doc: str
-    kind: Literal["float", "int", "bool", "choice"]
+    kind: Literal["float", "int", "bool", "choice", "name"]
     minimum: float | None
     maximum: float | None
     step: float | None
@@ -134,7 +135,7 @@ def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     bounds = {type(m).__name__: m for m in field.metadata}
     minimum, maximum = bounds.get("Ge"), bounds.get("Le")
-    kind: Literal["float", "int", "bool", "choice"]
+    kind: Literal["float", "int", "bool", "choice", "name"]
     choices: tuple[str, ...] = ()
     if get_origin(field.annotation) is Literal:
         kind, choices = "choice", get_args(field.annotation)
@@ -142,6 +143,8 @@ def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
         kind = "bool"
     elif field.annotation is int:
         kind = "int"
+    elif field.annotation is str:
+        kind = "name"
     else:
         kind = "float"
     step = extra.get("step")

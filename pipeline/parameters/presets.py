@@ -27,6 +27,7 @@ _PAPER: dict[str, object] = {
     "clustering.stem_area": 0.0,
     "shape.plane": 2,
     "shape.centre": "centroid",
+    "detection.whole": False,
     "detection.e_min": 1.0,
     "detection.e_max": 20.0,
     "detection.cylindrical_stddev_thresh": 0.1,
@@ -64,6 +65,8 @@ _LASER2D: dict[str, object] = {
     "clustering.method": "range_jump",
     "clustering.eps": 1.0,
     "clustering.min_points": 1,
+    # One ring meets no ground: where returns end says little of where the laser looks.
+    "detection.whole": False,
     "detection.e_max": 1000.0,
     "detection.cylindrical_stddev_thresh": 0.3,
     "detection.radius_min": 0.0,
@@ -84,6 +87,10 @@ _LASER2D: dict[str, object] = {
     "relocalisation.method": "none",
     "relocalisation.slack": 0.3,
     "gathering.method": "none",
+    # The laser looks level, so nothing says how high a return stands.
+    "obstacles.height_min": -10.0,
+    "obstacles.height_max": 10.0,
+    "obstacles.width": 2.0,
     "tracking.dbh_arc_min": 0.0,
     "tracking.distance_max": 3.0,
     "tracking.proximity_radius": 1.5,

@@ -22,11 +22,16 @@ def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
             raise ParameterError(f"{text!r} is not stage.name=value", remedy="E.g. --set clustering.eps=0.3")
-        changes[name] = _parsed(specs[name], value) if name in specs else value
+        changes[name] = parsed(specs[name], value) if name in specs else value
     return parameters.replace(changes)
 
 
-def _parsed(spec: FieldSpec, text: str) -> Value:
+def parsed(spec: FieldSpec, text: str) -> Value:
+    """A value of a parameter from the command line; its bounds are looked at with the whole set.
+
+    Raises:
+        ParameterError: It is to be a number and is none.
+    """
     try:
         if spec.kind == "int":
             return int(text)
@@ -103,6 +108,8 @@ def markdown_table(presets: dict[str, Parameters]) -> str:
 
 
 def _bounds(spec: FieldSpec) -> str:
+    if spec.kind == "name":
+        return "a name"
     if spec.minimum is None or spec.maximum is None:
         return ", ".join(spec.choices) or "true, false"
     return f"{spec.minimum:g} to {spec.maximum:g}"

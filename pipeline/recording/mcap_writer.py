@@ -14,6 +14,7 @@ from pipeline.recording import messages
 from pipeline.recording.quality_of_service import BAG_METADATA, offered_qos_profiles
 from pipeline.recording.truth_json import MEDIA_TYPE, NAME, truth_json
 from pipeline.records import Imu, Odometry, Record, Scan, Sensor, Truth
+from pipeline.sources.camera import Camera, Picture
 
 CHUNK_SIZE = 1 << 20
 TOPICS = {
@@ -24,15 +25,18 @@ TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
 }
 _LATCHED = "/tf_static"
+CAMERA_INFO = "/camera/camera_info"
+_PICTURE, _INFO = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 
 
 def write_recording(
     path: Path,
-    records: Iterable[Record],
+    records: Iterable[Record | Picture],
     *,
     sensor: Sensor,
     T_base_lidar: Pose3,
     truth: Truth | None = None,
+    camera: Camera | None = None,
 ) -> int:
     """Write a run; the file appears when it is whole.
 
@@ -45,6 +49,7 @@ def write_recording(
         sensor: Goes into the attachment with the truth.
         T_base_lidar: Where the LiDAR stands on the robot.
         truth: What is known for certain, attached as `stemmap_truth.json`.
+        camera: That takes the pictures among the records, where there are some.
 
     Returns:
         Number of messages.
@@ -53,7 +58,7 @@ def write_recording(
         StemmapError: A time that ROS cannot hold, or the disk refuses.
     """
     with write_beside(path) as partial, partial.open("wb") as stream:
-        run = _Run(stream, truth_json(sensor, truth), T_base_lidar)
+        run = _Run(stream, truth_json(sensor, truth), T_base_lidar, camera)
         for record in records:
             run.add(record)
         run.finish()
@@ -63,37 +68,47 @@ def write_recording(
 class _Run:
     """One MCAP while it is written."""
 
-    def __init__(self, stream: BinaryIO, truth: bytes, T_base_lidar: Pose3) -> None:
+    def __init__(self, stream: BinaryIO, truth: bytes, T_base_lidar: Pose3, camera: Camera | None) -> None:
         self.count = 0
         self._T_base_lidar: Pose3 | None = T_base_lidar
+        self._camera = camera
+        topics = TOPICS if camera is None else {**TOPICS, camera.topic: _PICTURE, CAMERA_INFO: _INFO}
         self._writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.LZ4)
         # The library would write its own version, and the bytes would change with every release of it.
         self._writer.start(profile="ros2", library="stemmap")
         # At the front, so that a file that is cut short still has it.
         self._writer.add_attachment(0, 0, NAME, MEDIA_TYPE, truth)
         self._writer.add_metadata(*BAG_METADATA)
-        schemas = {name: self._register(name) for name in dict.fromkeys(TOPICS.values())}
+        schemas = {name: self._register(name) for name in dict.fromkeys(topics.values())}
         self._channels = {
             topic: self._writer.register_channel(
                 topic, "cdr", schemas[name], {"offered_qos_profiles": offered_qos_profiles(topic == _LATCHED)}
             )
-            for topic, name in TOPICS.items()
+            for topic, name in topics.items()
         }
-        self._sequence = dict.fromkeys(TOPICS, 0)
+        self._sequence = dict.fromkeys(topics, 0)
 
-    def add(self, record: Record) -> None:
+    def add(self, record: Record | Picture) -> None:
         """Write one record, before the first the mounting of the LiDAR."""
         stamp = record.stamp_ns
         if self._T_base_lidar is not None:
             mounting = messages.transform(stamp, messages.BASE, messages.LIDAR, self._T_base_lidar)
             self._write(_LATCHED, stamp, mounting)
             self._T_base_lidar = None
+            if self._camera is not None:
+                c = self._camera
+                placed = messages.transform(stamp, messages.BASE, messages.CAMERA, c.T_base_camera)
+                self._write(_LATCHED, stamp, placed)
         if isinstance(record, Scan):
             self._write("/velodyne_points", stamp, messages.point_cloud(record))
         elif isinstance(record, Odometry):
             self._write("/odom", stamp, messages.odometry(record))
             moved = messages.transform(stamp, messages.ODOM, messages.BASE, record.T_odom_base)
             self._write("/tf", stamp, moved)
+        elif isinstance(record, Picture) and self._camera is not None:
+            c = self._camera
+            self._write(CAMERA_INFO, stamp, messages.camera_info(stamp, c.width, c.height, c.K))
+            self._write(c.topic, stamp, messages.compressed_image(stamp, record.data))
         elif isinstance(record, Imu):
             self._write("/imu/data", stamp, messages.imu(record))
 

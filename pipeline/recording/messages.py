@@ -12,7 +12,7 @@ from pipeline.errors import StemmapError
 from pipeline.geometry import Pose3
 from pipeline.records import Imu, Odometry, Scan
 
-ODOM, BASE, LIDAR = "odom", "base_link", "velodyne"
+ODOM, BASE, LIDAR, CAMERA = "odom", "base_link", "velodyne", "camera"
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _TYPES = _STORE.types
@@ -102,6 +102,34 @@ def imu(record: Imu) -> Message:
         angular_velocity_covariance=np.zeros(9),
         linear_acceleration=_vector(record.linear_acceleration),
         linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def compressed_image(stamp_ns: int, data: bytes) -> Message:
+    """sensor_msgs/CompressedImage of a JPEG."""
+    pixels = np.frombuffer(data, np.uint8)
+    return _TYPES["sensor_msgs/msg/CompressedImage"](
+        header=_header(stamp_ns, CAMERA), format="jpeg", data=pixels
+    )
+
+
+def camera_info(stamp_ns: int, width: int, height: int, K: NDArray[np.float64]) -> Message:
+    """sensor_msgs/CameraInfo of a pinhole camera without distortion."""
+    region = _TYPES["sensor_msgs/msg/RegionOfInterest"](
+        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    return _TYPES["sensor_msgs/msg/CameraInfo"](
+        header=_header(stamp_ns, CAMERA),
+        height=height,
+        width=width,
+        distortion_model="plumb_bob",
+        d=np.zeros(5),
+        k=K.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.hstack([K, np.zeros((3, 1))]).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=region,
     )
 
 

@@ -1,6 +1,7 @@
-"""Our results as standard ROS 2 messages: pose, path, and the tree map as markers and as detections.
+"""Our results as standard ROS 2 messages: pose, path, the tree map as markers and as detections, and how far
+the way is free.
 
-All are in the frame `map`, whose origin is the first pose of the run.
+All but the last are in the frame `map`, whose origin is the first pose of the run.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from pipeline.clearance import Clearance, Zone
 from pipeline.geometry import Pose2
 from pipeline.records import Frame, Path, Trees
 
@@ -22,6 +24,7 @@ MOST_POSES = 1000
 STEM_HEIGHT, STEM_WIDTH = 1.3, 0.2
 
 POSE, ODOMETRY, PATH, TREES, DETECTIONS = "pose", "odometry", "path", "trees", "detections"
+CLEARANCE, ZONE = "clearance", "zone"
 #: Type by topic, below `/stemmap/`.
 TYPES = {
     POSE: "geometry_msgs/msg/PoseStamped",
@@ -29,6 +32,8 @@ TYPES = {
     PATH: "nav_msgs/msg/Path",
     TREES: "visualization_msgs/msg/MarkerArray",
     DETECTIONS: "vision_msgs/msg/Detection3DArray",
+    CLEARANCE: "sensor_msgs/msg/Range",
+    ZONE: "std_msgs/msg/UInt8",
 }
 #: Said anew for who comes late; the others only as they change.
 LATCHED = (PATH, TREES, DETECTIONS)
@@ -45,6 +50,7 @@ _VISION = {
     "vision_msgs/msg/Detection3DArray": ("std_msgs/Header header\nvision_msgs/Detection3D[] detections\n"),
 }
 _SECOND = 1_000_000_000
+_INFRARED = 1
 _CYLINDER, _TEXT, _ADD, _DELETE_ALL = 3, 9, 0, 3
 _GREEN, _WHITE = (0.0, 0.62, 0.45, 0.9), (1.0, 1.0, 1.0, 1.0)
 
@@ -66,6 +72,33 @@ def definition(topic: str) -> str:
 def type_hash(topic: str) -> str:
     """The hash of a topic's type (REP 2016) by which ROS 2 nodes find one another."""
     return str(store().hash_rihs01(TYPES[topic]))
+
+
+def scan_messages(frame: Frame) -> dict[str, bytes]:
+    """What every scan tells anew by topic, in CDR: the pose, and how far the way is free."""
+    return pose_messages(frame) | way_messages(frame.clearance, frame.stamp_ns)
+
+
+def way_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, bytes]:
+    """How far the way is free by topic, in CDR; nothing where nobody looks for obstacles.
+
+    By REP 117 a range is infinite where nothing is in the way; it is not a number where the sensor does not
+    look there.
+    """
+    if clearance is None:
+        return {}
+    seen = clearance.zone is not Zone.UNKNOWN
+    way = _make(
+        "sensor_msgs/Range",
+        header=_header(stamp_ns, BASE),
+        radiation_type=_INFRARED,
+        field_of_view=0.0,
+        min_range=0.0,
+        max_range=clearance.within,
+        range=clearance.ahead if seen else float("nan"),
+        variance=0.0,
+    )
+    return {CLEARANCE: _cdr(way), ZONE: _cdr(_make("std_msgs/UInt8", data=int(clearance.zone)))}
 
 
 def pose_messages(frame: Frame) -> dict[str, bytes]:
@@ -201,10 +234,10 @@ def _cdr(message: Any) -> bytes:  # noqa: ANN401
     return bytes(store().serialize_cdr(message, message.__msgtype__))
 
 
-def _header(stamp_ns: int) -> Any:  # noqa: ANN401
+def _header(stamp_ns: int, frame_id: str = MAP) -> Any:  # noqa: ANN401
     seconds, rest = divmod(max(stamp_ns, 0), _SECOND)
     stamp = _make("builtin_interfaces/Time", sec=min(seconds, 2**31 - 1), nanosec=rest)
-    return _make("std_msgs/Header", stamp=stamp, frame_id=MAP)
+    return _make("std_msgs/Header", stamp=stamp, frame_id=frame_id)
 
 
 def _pose(T: Pose2, z: float = 0.0) -> Any:  # noqa: ANN401

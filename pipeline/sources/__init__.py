@@ -12,7 +12,7 @@ from pipeline.sources.formats import READABLE, Opener, expected_format, file_for
 __all__ = ["Source", "SourceDescription", "SourceOptions", "open_source"]
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+]+):")
-_LIVE = ("udp", "tcp", "ros2", "dds")
+_LIVE = ("udp", "tcp", "ros2")
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> Source:
@@ -49,7 +49,7 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
         return open_simulated(uri, options)
     if scheme == "file":
         return open_source(uri[len("file:") :].removeprefix("//"), options)
-    if scheme in ("zenoh", "velodyne"):
+    if scheme in ("zenoh", "velodyne", "dds"):
         raise SourceError("a live robot cannot be read as a file", where=uri, remedy="Watch it or map it.")
     if scheme in _LIVE:
         raise SourceError(

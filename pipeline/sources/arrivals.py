@@ -14,9 +14,9 @@ from pipeline.records import Notice, Record
 from pipeline.sources.base import SourceDescription, SourceOptions
 from pipeline.sources.container import Channel, Message
 from pipeline.sources.ros import RosSource
-from pipeline.sources.rostypes import POINT_CLOUD, VELODYNE_SCAN
 from pipeline.sources.stamps import SECOND_NS
 from pipeline.sources.stepping_clock import SteppingClock
+from pipeline.sources.topics import TYPES_BY_ROLE
 
 #: So long after the first scan, or after so many, it is clear which topics speak and where the LiDAR stands.
 OPENING_NS = SECOND_NS
@@ -77,7 +77,7 @@ class ArrivalReader:
 
     def __init__(self, uri: str, kind: str, channels: Sequence[Channel], options: SourceOptions) -> None:
         self._uri, self._kind, self._channels, self._options = uri, kind, channels, options
-        self._scans = {c.number for c in channels if c.msgtype in (POINT_CLOUD, VELODYNE_SCAN)}
+        self._scans = {c.number for c in channels if c.msgtype in TYPES_BY_ROLE["scan"]}
         self._fixed = {c.number for c in channels if c.topic.endswith("tf_static")}
         self._opening: list[Message] = []
         self._first_ns: int | None = None
@@ -135,7 +135,7 @@ class ArrivalReader:
 
         heard = _Heard(self._kind, self._channels, self._opening)
         try:
-            source = RosSource(self._uri, heard, [], self._options, make_clock)
+            source = RosSource(self._uri, heard, [], self._options, make_clock, live=True)
         except SourceError:
             self._failures += 1
             if self._failures >= _TRIES:
@@ -155,8 +155,10 @@ class ArrivalReader:
         assert self._source is not None  # noqa: S101 - the two callers have looked
         assert self._clock is not None  # noqa: S101 - set with it
         records = list(self._source.records_of(message, self.losses, self.from_ns))
-        if self._clock.notices:
+        told = [*self._clock.notices, *self._source.notices]
+        if told:
             stamp_ns = records[0].stamp_ns if records else 0
-            records = [*(Notice(stamp_ns, text) for text in self._clock.notices), *records]
+            records = [*(Notice(stamp_ns, text) for text in told), *records]
             self._clock.notices.clear()
+            self._source.notices.clear()
         return records

@@ -17,8 +17,9 @@ class RecordedTopic:
     Attributes:
         name, type: e.g. "/velodyne_points" and "sensor_msgs/msg/PointCloud2".
         messages: How many.
-        read_as: What it is read as ("scan", "odometry", "imu", "transforms"), "" when it is not read.
+        read_as: What it is read as ("scan", "odometry", "imu", "gnss", "transforms"), "" when it is not read.
         fits: The role that it could be given with `--topic`, "" when none.
+        why_not: Why it is not read, "" when it is.
     """
 
     name: str
@@ -26,6 +27,7 @@ class RecordedTopic:
     messages: int
     read_as: str
     fits: str
+    why_not: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,7 @@ class SourceDescription:
         warnings: What a person should know, e.g. that there is no odometry.
         in_order_of_arrival: Whether records come as they came to a live run, not sorted by their time.
         revisions: The parameters that a recorded run was mapped with, in the order of their scans.
+        gnss: How GNSS fixes are used, in words, "" when none are.
     """
 
     uri: str
@@ -78,6 +81,7 @@ class SourceDescription:
     warnings: tuple[str, ...] = ()
     in_order_of_arrival: bool = False
     revisions: tuple[Revision, ...] = ()
+    gnss: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +89,7 @@ class SourceOptions:
     """What the user may say about a source.
 
     Attributes:
-        topics: Chosen topic by role ("scan", "odometry", "imu"); empty means found by type.
+        topics: Chosen topic by role ("scan", "odometry", "imu", "gnss"); empty means found by type.
         T_base_lidar: Mounting of the LiDAR; None means what the source says, else identity.
         seed: Of simulated runs.
     """

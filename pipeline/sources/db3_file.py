@@ -37,7 +37,7 @@ class Db3File:
             self._refuse_views()
             self._row, self._topic, self._stamp = self._read_index()
             self.channels = self._read_channels()
-        except (sqlite3.Error, OverflowError, UnicodeDecodeError, ValueError) as error:
+        except (sqlite3.Error, OverflowError, UnicodeDecodeError, ValueError, TypeError) as error:
             self.close()
             raise damaged(f"the database cannot be read: {error}", path) from error
         except BaseException:

@@ -72,6 +72,12 @@ def _pcd(uri: str, path: Path, options: SourceOptions) -> Source:
     return open_pcd(uri, path, options)
 
 
+def _scan_tables(uri: str, folder: Path, options: SourceOptions) -> Source:
+    from pipeline.sources.table_scans import open_table_scans
+
+    return open_table_scans(uri, folder, options)
+
+
 def _cloud(uri: str, path: Path, options: SourceOptions) -> Source:
     from pipeline.sources.simulated import drive_through
 
@@ -114,13 +120,16 @@ FILES = (
     Format("Victoria Park .zip (LASER.txt, DRS.txt)", (b"PK\x03\x04",), (".zip",), _victoria),
     Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _pcd),
     Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud),
+    Format("whole cloud .e57", (b"ASTM-E57",), (".e57",), _cloud),
+    Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), _cloud),
+    Format("whole cloud .npy or .npz", (b"\x93NUMPY",), (".npy", ".npz"), _cloud),
     Format("KITTI .bin", (), (".bin",), _kitti),
 )
 
 READABLE = ", ".join(
     [kind.words for kind in FILES]
     + [
-        "a folder of .bin or .pcd scans",
+        "a folder of .bin, .pcd, .ply, .npy, .npz, .las or .laz scans",
         "a rosbag2 folder",
         "a folder of TreeManagerState_<i>.csv with trajectory.txt",
         "sim:stand and the other sim: scenarios",
@@ -130,6 +139,8 @@ READABLE = ", ".join(
 
 def file_format(path: Path, head: bytes) -> Format | None:
     """The format of a file by its first bytes, or by its name where the contents have no mark."""
+    if path.suffix.lower() == ".npz":  # a .zip by its contents
+        return expected_format(path)
     for kind in FILES:
         if any(head.startswith(mark) for mark in kind.magic):
             return kind
@@ -153,4 +164,6 @@ def folder_opener(folder: Path) -> Opener | None:
     inside = folder / "velodyne"
     if ".bin" in suffixes or (inside.is_dir() and any(inside.glob("*.bin"))):
         return _kitti
-    return _pcd if ".pcd" in suffixes else None
+    if ".pcd" in suffixes:
+        return _pcd
+    return _scan_tables if suffixes & {".ply", ".npy", ".npz", ".las", ".laz"} else None

@@ -16,7 +16,8 @@ from pipeline.sources.base import Revision, SourceDescription, SourceOptions
 from pipeline.sources.container import Channel, count_loss
 from pipeline.sources.digest import digest_of
 from pipeline.sources.mcap_file import McapFile, open_mcap
-from pipeline.sources.rostypes import POINT_CLOUD, VELODYNE_SCAN, standard_types
+from pipeline.sources.rostypes import standard_types
+from pipeline.sources.topics import TYPES_BY_ROLE
 
 NAME, PARAMETERS, VERSION = "stemmap_live.json", "/stemmap/parameters", 1
 KIND = "recording of a live run"
@@ -158,7 +159,7 @@ def _channels(container: McapFile, told: Told, where: str) -> list[Channel]:
     if missing:
         raise SourceError(f"the recording lacks the topic {missing[0][:100]}", where=where)
     channels = [by_topic[topic] for topic in told.topics]
-    if channels[0].msgtype not in (POINT_CLOUD, VELODYNE_SCAN):
+    if channels[0].msgtype not in TYPES_BY_ROLE["scan"]:
         raise SourceError("the recording's first topic is of no scans", where=where)
     # The live run had no definitions but the standard ones.
     return [replace(channel, definition="", definition_format="", count=0) for channel in channels]

@@ -27,6 +27,38 @@ def parse_numbers(text: bytes | memoryview, limit: int | None = None) -> Float:
     return numbers[: _parse(buffer, numbers, _POWERS)]
 
 
+def rows_of(text: bytes | memoryview, width: int, limit: int) -> tuple[int, int]:
+    """How many lines of `width` words a text begins with, empty ones aside, and the words of the line after.
+
+    Args:
+        text: ASCII; width: of a row; limit: count at most so many rows.
+
+    Returns:
+        The rows, and how many words stand in the first line that is none; 0 where there is no such line.
+    """
+    rows, words = _rows(np.frombuffer(text, dtype=np.uint8), width, limit)
+    return int(rows), int(words)
+
+
+@compiled
+def _rows(buffer: NDArray[np.uint8], width: int, limit: int) -> tuple[int, int]:
+    rows, words, at, size = 0, 0, 0, len(buffer)
+    before = True  # whether a gap stands before this letter
+    while at <= size and rows < limit:
+        if at == size or buffer[at] == 10:
+            if words != 0 and words != width:
+                return rows, words
+            rows += words != 0
+            words = 0
+            before = True
+        else:
+            gap = _is_gap(buffer[at])
+            words += before and not gap
+            before = gap
+        at += 1
+    return rows, 0
+
+
 @compiled
 def _is_gap(letter: int) -> bool:
     return letter == 32 or letter == 44 or 9 <= letter <= 13

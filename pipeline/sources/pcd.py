@@ -11,6 +11,7 @@ from pipeline.sources.base import SourceOptions
 from pipeline.sources.cleaning import clean_scan
 from pipeline.sources.pcd_file import read_pcd
 from pipeline.sources.point_fields import REFLECTANCE, RING, TIME, first_of, is_ring, point_offsets
+from pipeline.sources.point_files import Columns
 from pipeline.sources.scan_folder import ScanFolder, ScanFormat
 from pipeline.sources.sensing import sensor_of
 
@@ -32,7 +33,11 @@ def load_pcd(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
         ScanFileError: See `read_pcd`.
         OSError: It cannot be read.
     """
-    columns = read_pcd(path, losses)
+    return scan_of(read_pcd(path, losses), stamp_ns)
+
+
+def scan_of(columns: Columns, stamp_ns: int) -> Scan:
+    """A scan of the columns of a table; x, y and z [m] are among them."""
     kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
     with np.errstate(invalid="ignore", over="ignore"):
         points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)

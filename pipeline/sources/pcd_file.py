@@ -56,7 +56,7 @@ class PcdHeader:
         return sum(int(code[2]) * count for code, count in zip(self.types, self.counts, strict=True))
 
 
-def read_pcd(path: Path, losses: dict[str, int]) -> Columns:
+def read_pcd(path: Path, losses: dict[str, int], *, most_points: int = POINT_LIMIT) -> Columns:
     """Read the fields that have one value a point, each of shape (N,).
 
     A file that ends early gives the points that are whole, and a loss is counted.
@@ -68,7 +68,7 @@ def read_pcd(path: Path, losses: dict[str, int]) -> Columns:
     if path.stat().st_size > FILE_LIMIT:
         raise ScanFileError("the file is too large for one scan")
     content = path.read_bytes()
-    header = parse_header(content)
+    header = parse_header(content, most_points=most_points)
     body = memoryview(content)[header.length :]
     if header.data == "ascii":
         columns = _ascii(header, body)
@@ -82,8 +82,13 @@ def read_pcd(path: Path, losses: dict[str, int]) -> Columns:
     return columns
 
 
-def parse_header(content: bytes) -> PcdHeader:
+def parse_header(content: bytes, *, most_points: int = POINT_LIMIT) -> PcdHeader:
     """Read and check the header.
+
+    Args:
+        content: The beginning of the file.
+        most_points: More are refused, and so is what takes more than FILE_LIMIT bytes, where the points
+            are read at once: a scan, or data that is not binary.
 
     Raises:
         ScanFileError: It is no header of a PCD file or contradicts itself.
@@ -99,12 +104,12 @@ def parse_header(content: bytes) -> PcdHeader:
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
     try:
-        return _checked(entries, at)
+        return _checked(entries, at, most_points)
     except (KeyError, IndexError, ValueError) as error:
         raise ScanFileError(f"its header is damaged at {error}") from error
 
 
-def _checked(entries: dict[str, list[str]], length: int) -> PcdHeader:
+def _checked(entries: dict[str, list[str]], length: int, most_points: int) -> PcdHeader:
     names = tuple(entries["FIELDS"])
     sizes = [_whole(word) for word in entries["SIZE"]]
     counts = tuple(_whole(word) for word in entries.get("COUNT", ["1"] * len(names)))
@@ -116,9 +121,11 @@ def _checked(entries: dict[str, list[str]], length: int) -> PcdHeader:
     if points != width * height:
         raise ScanFileError(f"its header promises {points} points and {width} x {height}")
     header = PcdHeader(names, types, counts, points, entries["DATA"][0].lower(), length)
-    if points > POINT_LIMIT or header.step > _STEP_LIMIT or points * header.step > FILE_LIMIT:
+    in_parts = most_points > POINT_LIMIT and header.data == "binary"
+    limit = most_points * header.step if in_parts else FILE_LIMIT
+    if points > most_points or header.step > _STEP_LIMIT or points * header.step > limit:
         raise ScanFileError(
-            f"its header promises {points} points of {header.step} bytes, too many for one scan"
+            f"its header promises {points} points of {header.step} bytes, too many to be read"
         )
     if header.data not in ("ascii", "binary", "binary_compressed"):
         raise ScanFileError(f"its data is of the unknown kind {header.data[:20]!r}")
@@ -160,7 +167,8 @@ def _converted(numbers: NDArray[np.float64], code: str) -> NDArray[np.generic]:
     ).astype(code)
 
 
-def _binary(header: PcdHeader, body: memoryview) -> Columns:
+def record_type(header: PcdHeader) -> np.dtype[np.void]:
+    """One point of binary data: the fields that have one value."""
     names, formats, offsets, at = [], [], [], 0
     for name, code, count in zip(header.names, header.types, header.counts, strict=True):
         if count == 1 and name not in names:
@@ -168,9 +176,12 @@ def _binary(header: PcdHeader, body: memoryview) -> Columns:
             formats.append(code)
             offsets.append(at)
         at += int(code[2]) * count
-    dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": header.step})
-    table = np.frombuffer(body, dtype=dtype, count=min(header.points, len(body) // header.step))
-    return {name: table[name] for name in names}
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": header.step})
+
+
+def _binary(header: PcdHeader, body: memoryview) -> Columns:
+    table = np.frombuffer(body, record_type(header), count=min(header.points, len(body) // header.step))
+    return {name: table[name] for name in table.dtype.names or ()}
 
 
 def _compressed(header: PcdHeader, body: memoryview) -> Columns:

@@ -14,6 +14,7 @@ TEXT_LIMIT = 64 << 20
 #: The usual turn between a camera's axes (x right, y down, z forward) and a LiDAR's.
 R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _STILL = 0.05
+TUM_COLUMNS = 8
 
 
 class TextError(Exception):
@@ -45,6 +46,57 @@ def read_poses(path: Path) -> list[Pose3]:
         return poses
     T_lidar_camera = T_camera_lidar.inverse()
     return [T_lidar_camera @ pose @ T_camera_lidar for pose in poses]
+
+
+def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
+    """Poses of the LiDAR with their times [ns] (TUM: t x y z qx qy qz qw), or one a scan (KITTI, times None).
+
+    Raises:
+        TextError: It has neither form.
+        OSError: It cannot be read.
+    """
+    if _columns(path) != TUM_COLUMNS:
+        return None, read_poses(path)
+    rows = read_table(path, TUM_COLUMNS)
+    times = exact_ns(path)
+    if np.any(np.diff(times) <= 0):
+        raise TextError("its times do not ascend")
+    try:
+        return times, [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in rows]
+    except ValueError as error:
+        raise TextError("it has a quaternion of no length") from error
+
+
+def exact_ns(path: Path) -> Int:
+    """The first column, seconds in decimals, in whole nanoseconds: a float has not the digits for it."""
+    words = [line.split()[0] for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
+    try:
+        return np.array([seconds_ns(word) for word in words], dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise TextError("its times are no seconds") from error
+
+
+def seconds_ns(text: str) -> int:
+    """Seconds in decimals as nanoseconds, to the last digit.
+
+    Raises:
+        ValueError: It is no number, or beyond what nanoseconds can tell.
+    """
+    whole, dot, fraction = text.partition(".")
+    plain = whole.isascii() and whole.isdigit() and (not dot or (fraction.isascii() and fraction.isdigit()))
+    nanoseconds = (
+        int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0") or "0")
+        if plain and len(whole) < 12
+        else round(float(text) * 1e9)
+    )
+    if abs(nanoseconds) >= 1 << 62:
+        raise ValueError("too far away in time")
+    return nanoseconds
+
+
+def _columns(path: Path) -> int:
+    lines = (line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#"))
+    return len(next(lines, []))
 
 
 def read_times(path: Path) -> Int:

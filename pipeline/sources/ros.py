@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -15,12 +15,15 @@ from pipeline.geometry import Pose3
 from pipeline.records import Odometry, Record, Scan, Sensor, Truth
 from pipeline.sources import ros_messages
 from pipeline.sources.base import SourceDescription, SourceOptions
+from pipeline.sources.camera import SAME_TIME_NS, Camera, Picture, find_camera, picture_of
 from pipeline.sources.container import Channel, Container, Message, count_loss
 from pipeline.sources.digest import digest_of
+from pipeline.sources.first_stretch import align_fixes
+from pipeline.sources.live_stretch import LiveStretch
 from pipeline.sources.mounting import Mounting
 from pipeline.sources.ordering import WINDOW_NS, Stamped, by_stamp
 from pipeline.sources.ros_records import RecordDecoder
-from pipeline.sources.rostypes import MessageDecoder
+from pipeline.sources.rostypes import LASER_SCAN, MessageDecoder
 from pipeline.sources.sensing import rings_descend, sensor_of
 from pipeline.sources.stamps import Clock, header_stamp
 from pipeline.sources.topics import Topic, choose_topics
@@ -31,6 +34,8 @@ from pipeline.sources.velodyne import SENSORS
 
 #: How many scans may be unreadable at the start before the recording is refused.
 _TRIES = 20
+#: A picture may be written so long before a scan of its time is stamped, and so long after.
+_CAMERA_EARLY_NS, _CAMERA_LATE_NS = 300_000_000, 1_000_000_000
 
 
 class RosSource:
@@ -42,6 +47,10 @@ class RosSource:
         paths: Its files, for the digest.
         options: Topics and mounting, where the user knows better.
         make_clock: From stamp minus time of writing of each topic's first message.
+        live: Whether `records_of` will be given more than the container holds.
+
+    Attributes:
+        notices: What a person should know of the messages of `records_of`; who tells of it empties the list.
 
     Raises:
         SourceError: It holds no scans, or none of the first ones can be read.
@@ -54,11 +63,13 @@ class RosSource:
         paths: list[Path],
         options: SourceOptions,
         make_clock: Callable[[list[int | None]], Clock] = Clock,
+        *,
+        live: bool = False,
     ) -> None:
         self._uri, self._container = uri, container
         channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
         decoder = MessageDecoder(channels.values())
-        self._channels = channels
+        self._channels, self._decoder = channels, decoder
         self._topics = choose_topics(channels.values(), options.topics, uri)
         self._mounting = Mounting(container, decoder)
         self._mounting.read(self._topics.fixed, self._topics.moving)
@@ -68,12 +79,18 @@ class RosSource:
         self._clock = make_clock([self._clock_offset(topic) for topic in named])
         self._moving = self._moving_numbers()
         self._wanted = self._moving.union(*(topic.numbers for topic in named))
+        fixes = frozenset[int]() if self._topics.gnss is None else self._topics.gnss.numbers
         self._truth, sensor = self._read_truth()
         first, frame, product = self._first_scan()
         sensor = sensor or SENSORS.get(product) or sensor_of(first)
         self._top_ring = sensor.rings - 1 if rings_descend(first) else None
         self._description = self._describe(first, frame, sensor, decoder.refused, options)
         self._description = replace(self._description, digest=digest_of(paths))
+        self.notices: list[str] = []
+        self._fixes = fixes
+        self._stretch = self._live_stretch() if live else None
+        if fixes and not live:
+            self._use_fixes(fixes)
 
     @property
     def description(self) -> SourceDescription:
@@ -100,8 +117,9 @@ class RosSource:
     ) -> Iterator[Record]:
         """The records that one message gives, whenever it came, unless they lie before a time; what cannot be
         used is counted."""
-        if message.channel in self._wanted:
+        if message.channel in self._wanted or (self._stretch is not None and message.channel in self._fixes):
             for stamped in self._times_of(message, losses):
+                self._lay_over(stamped)
                 if from_ns is None or stamped.stamp_ns >= from_ns:
                     yield from self._decoded(stamped, losses)
 
@@ -112,6 +130,55 @@ class RosSource:
     def truth(self) -> Truth | None:
         """The truth that a simulated recording carries."""
         return self._truth
+
+    def camera(self) -> tuple[Camera | None, str]:
+        """The camera beside the LiDAR; None and why where there is none that tells where things stand."""
+        topic = self._topics.camera
+        if topic is None:
+            return None, ""
+        return find_camera(
+            self._container, self._decoder, self._mounting.tree, self._records.base, topic.numbers
+        )
+
+    def picture_stamps(self) -> list[int]:
+        """When the camera took a picture, ascending [ns]."""
+        topic = self._topics.camera
+        numbers = frozenset[int]() if topic is None else topic.numbers
+        found = [
+            arrival.stamp_ns
+            for message in (self._container.messages(numbers, None, {}) if numbers else ())
+            for arrival in self._stamped(replace(message, payload=plain_message(message.payload)), {})
+        ]
+        return sorted(found)
+
+    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
+        """The pictures that were taken at some of `picture_stamps`, each once."""
+        topic, left = self._topics.camera, set(wanted_ns)
+        for message in self._container.messages(topic.numbers, None, {}) if topic and left else ():
+            plain = replace(message, payload=plain_message(message.payload))
+            for arrival in self._stamped(plain, {}):
+                if arrival.stamp_ns in left:
+                    left.discard(arrival.stamp_ns)
+                    picture = picture_of(plain, self._channels, self._decoder, arrival.stamp_ns)
+                    if picture is not None:
+                        yield picture
+
+    def picture_near(self, stamp_ns: int) -> Picture | None:
+        """The picture that was taken nearest to a time, None where that is too far from it."""
+        topic = self._topics.camera
+        if topic is None:
+            return None
+        log_ns = stamp_ns - self._clock.offset_ns
+        best: tuple[int, int, Message] | None = None
+        for message in self._container.messages(topic.numbers, log_ns - _CAMERA_EARLY_NS, {}):
+            if message.log_ns > log_ns + _CAMERA_LATE_NS:
+                break
+            plain = replace(message, payload=plain_message(message.payload))
+            for arrival in self._stamped(plain, {}):
+                off_ns = abs(arrival.stamp_ns - stamp_ns)
+                if off_ns <= SAME_TIME_NS and (best is None or off_ns < best[0]):
+                    best = off_ns, arrival.stamp_ns, plain
+        return None if best is None else picture_of(best[2], self._channels, self._decoder, best[1])
 
     def close(self) -> None:
         """Close the recording."""
@@ -216,6 +283,47 @@ class RosSource:
         content = self._container.attachment(ATTACHMENT, SIZE_LIMIT)
         return (None, None) if content is None else read_truth(content, self._uri)
 
+    def _use_fixes(self, fixes: frozenset[int]) -> None:
+        """Find how GNSS fixes lie in the map; from then on they are read, or it is said why not."""
+        odometry = self._moving if self._topics.odometry is None else self._topics.odometry.numbers
+        known = self._description
+        found, why = align_fixes(
+            self._container, self._records, self._times_of, fixes, odometry, known.start_ns or 0
+        )
+        if found is None:
+            told = f"GNSS fixes are not used: {why}"
+            self._description = replace(known, warnings=(*known.warnings, told))
+            return
+        self._records.alignment = found
+        self._wanted = self._wanted | fixes
+        self._description = replace(known, gnss=found.words)
+
+    def _live_stretch(self) -> LiveStretch | None:
+        """What lays fixes over the way while it is driven; None where there is nothing to lay."""
+        known = self._description
+        if not self._fixes:
+            return None
+        if not known.has_odometry:
+            why = "GNSS fixes are not used: without odometry nobody tells the direction of north"
+            self._description = replace(known, warnings=(*known.warnings, why))
+            return None
+        told = "fixes count when the robot drove far enough to tell the direction of north"
+        self._description = replace(known, gnss=told)
+        return LiveStretch(self._records, self._fixes, known.start_ns or 0)
+
+    def _lay_over(self, stamped: Stamped[Message | Odometry]) -> None:
+        if self._stretch is None:
+            return
+        found = self._stretch.add(stamped)
+        if found is not None:
+            self._records.alignment = found
+            self._wanted = self._wanted | self._fixes
+            self.notices.append(f"GNSS: {found.words}")
+            self._stretch = None
+        elif self._stretch.refused:
+            self.notices.append(f"GNSS fixes are not used: {self._stretch.refused}")
+            self._stretch = None
+
     def _said_base(self) -> str:
         """The base frame as the odometry topic names it, "" when it does not."""
         topic = self._topics.odometry
@@ -256,6 +364,7 @@ class RosSource:
             start_ns=first.stamp_ns,
             end_ns=self._last_stamp(),
             digest="",
+            preset="laser2d" if self._topics.scan.msgtype == LASER_SCAN else "forest",
             topics=self._topics.recorded(),
             warnings=tuple(warnings),
         )

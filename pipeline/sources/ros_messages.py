@@ -64,6 +64,61 @@ class PointCloud2(Stamped, Protocol):
     data: NDArray[np.uint8]
 
 
+class LaserScan(Stamped, Protocol):
+    """sensor_msgs/LaserScan."""
+
+    angle_min: float
+    angle_increment: float
+    time_increment: float
+    range_min: float
+    range_max: float
+    ranges: NDArray[np.float32]
+    intensities: NDArray[np.float32]
+
+
+class NavSatStatus(Protocol):
+    """sensor_msgs/NavSatStatus."""
+
+    status: int
+
+
+class NavSatFix(Stamped, Protocol):
+    """sensor_msgs/NavSatFix."""
+
+    status: NavSatStatus
+    latitude: float
+    longitude: float
+    altitude: float
+    position_covariance: NDArray[np.float64]
+    position_covariance_type: int
+
+
+class CameraInfo(Stamped, Protocol):
+    """sensor_msgs/CameraInfo; the matrix is `k` in ROS 2 and `K` in ROS 1."""
+
+    width: int
+    height: int
+    k: NDArray[np.float64]
+    K: NDArray[np.float64]
+
+
+class CompressedImage(Stamped, Protocol):
+    """sensor_msgs/CompressedImage."""
+
+    format: str
+    data: NDArray[np.uint8]
+
+
+class Image(Stamped, Protocol):
+    """sensor_msgs/Image."""
+
+    height: int
+    width: int
+    encoding: str
+    step: int
+    data: NDArray[np.uint8]
+
+
 class Packet(Protocol):
     """velodyne_msgs/VelodynePacket."""
 

@@ -11,11 +11,15 @@ from pipeline.geometry import Pose3
 from pipeline.records import Imu, Odometry, Record, Scan
 from pipeline.sources import ros_messages
 from pipeline.sources.container import Channel, Message, count_loss
+from pipeline.sources.gnss import Alignment, Fix
+from pipeline.sources.laser_scan import decode_laser_scan
 from pipeline.sources.pointcloud2 import decode_cloud
-from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, MessageDecoder
+from pipeline.sources.rostypes import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, MessageDecoder
 from pipeline.sources.stamps import SECOND_NS
 from pipeline.sources.transforms import TransformTree, frame_name, pose_of
 from pipeline.sources.velodyne import PacketDecoder, is_data_packet
+
+_NAMES = {ODOMETRY: "odometry messages", IMU: "IMU messages", NAV_SAT_FIX: "GNSS messages"}
 
 
 class RecordDecoder:
@@ -28,12 +32,14 @@ class RecordDecoder:
 
     Attributes:
         base: Name of the base frame, "" when there is none.
+        alignment: How GNSS fixes lie in the map, None when that is not known: they are not used then.
     """
 
     def __init__(self, channels: Mapping[int, Channel], decoder: MessageDecoder, tree: TransformTree) -> None:
         self._channels, self._decoder, self._tree = channels, decoder, tree
         self._packets = PacketDecoder()
         self.base = ""
+        self.alignment: Alignment | None = None
 
     def record(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
         """Decode a message; None when it cannot be used, which is counted in `losses`."""
@@ -45,9 +51,11 @@ class RecordDecoder:
                     return self._odometry(message, stamp_ns)
                 if channel.msgtype == IMU:
                     return self._imu(message, stamp_ns)
+                if channel.msgtype == NAV_SAT_FIX:
+                    return self._measured(message, stamp_ns, losses)
                 scan = self.scan(message, stamp_ns, losses)[0]
         except Exception:  # the one place that catches what the generated decoders of rosbags raise
-            named = {ODOMETRY: "odometry messages", IMU: "IMU messages"}.get(channel.msgtype, "scans")
+            named = _NAMES.get(channel.msgtype, "scans")
             count_loss(losses, f"{named} that cannot be read")
             return None
         if len(scan.points):
@@ -61,7 +69,11 @@ class RecordDecoder:
         Raises:
             Exception: Of many kinds, when the message is damaged.
         """
-        if self._channels[message.channel].msgtype == POINT_CLOUD:
+        msgtype = self._channels[message.channel].msgtype
+        if msgtype == LASER_SCAN:
+            laser = cast(ros_messages.LaserScan, self.message(message))
+            return decode_laser_scan(laser, stamp_ns), frame_name(laser.header.frame_id), 0
+        if msgtype == POINT_CLOUD:
             cloud = cast(ros_messages.PointCloud2, self.message(message))
             return decode_cloud(cloud, stamp_ns), frame_name(cloud.header.frame_id), 0
         decoded = cast(ros_messages.VelodyneScan, self.message(message))
@@ -80,6 +92,33 @@ class RecordDecoder:
             Exception: Of many kinds, when it is damaged.
         """
         return self._decoder.decode(self._channels[message.channel], message.payload)
+
+    def fix(self, message: Message, stamp_ns: int) -> tuple[Fix | None, str]:
+        """A GNSS fix, None where the receiver had none; and the frame of its antenna.
+
+        Raises:
+            Exception: Of many kinds, when the message is damaged.
+        """
+        decoded = cast(ros_messages.NavSatFix, self.message(message))
+        frame = frame_name(decoded.header.frame_id)
+        if decoded.status.status < 0:
+            return None, frame
+        covariance = [float(number) for number in decoded.position_covariance]
+        kind = int(decoded.position_covariance_type)
+        return Fix.of(stamp_ns, float(decoded.latitude), float(decoded.longitude), covariance, kind), frame
+
+    def place_of(self, frame: str) -> Pose3 | None:
+        """Where a frame stands on the robot, None when no fixed transform says it."""
+        return self._tree.find(self.base, frame)
+
+    def _measured(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
+        if self.alignment is None:
+            return None
+        fix, _ = self.fix(message, stamp_ns)
+        if fix is None:
+            count_loss(losses, "GNSS messages without a fix")
+            return None
+        return self.alignment.measured(fix)
 
     def _odometry(self, message: Message, stamp_ns: int) -> Odometry:
         pose = cast(ros_messages.Odometry, self.message(message)).pose.pose

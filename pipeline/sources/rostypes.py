@@ -21,9 +21,26 @@ POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 VELODYNE_SCAN = "velodyne_msgs/msg/VelodyneScan"
 ODOMETRY = "nav_msgs/msg/Odometry"
 IMU = "sensor_msgs/msg/Imu"
+LASER_SCAN = "sensor_msgs/msg/LaserScan"
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 ROS1_TRANSFORMS = "tf/msg/tfMessage"
-READ_TYPES = (POINT_CLOUD, VELODYNE_SCAN, ODOMETRY, IMU, TRANSFORMS, ROS1_TRANSFORMS)
+READ_TYPES = (
+    POINT_CLOUD,
+    VELODYNE_SCAN,
+    LASER_SCAN,
+    ODOMETRY,
+    IMU,
+    NAV_SAT_FIX,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    CAMERA_INFO,
+    TRANSFORMS,
+    ROS1_TRANSFORMS,
+)
 
 _EXTRA = {
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",

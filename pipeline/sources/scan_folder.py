@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,14 @@ from pipeline.records import Int, Odometry, Record, Scan, Sensor, Truth
 from pipeline.sources.base import SourceDescription, SourceOptions
 from pipeline.sources.container import count_loss
 from pipeline.sources.digest import digest_of
-from pipeline.sources.poses_file import TextError, read_poses, read_times
+from pipeline.sources.pose_table import pose_at
+from pipeline.sources.poses_file import TextError, read_any_poses, read_times, seconds_ns
 
 #: Scans of a folder without times are taken to follow each other at 10 Hz.
 STEP_NS = 100_000_000
+#: Names that poses beside scans usually have.
+POSES = ("poses.txt", "poses.tum", "trajectory.txt", "trajectory.tum", "groundtruth.txt")
+_TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[0-9]{19})", re.ASCII)
 #: How many files may be unreadable at the start before the folder is refused.
 _TRIES = 20
 
@@ -50,9 +55,11 @@ class ScanFormat:
 class ScanFolder:
     """Scan files in the order of the numbers in their names.
 
-    `poses.txt` (odometry) and `times.txt` or `timestamps.txt` are taken from the folder or its
-    parent. The number in a file's name is its row in them, or else its place in the folder when
-    they have as many rows as there are files; if neither fits they are left aside with a warning.
+    Poses (odometry; `poses.txt` and the other names of POSES, in KITTI's form or TUM's) and `times.txt` or
+    `timestamps.txt` are taken from the folder or its parent. The number in a file's name is its row in
+    them, or else its place in the folder when they have as many rows as there are files; if neither fits
+    they are left aside with a warning. Without a file of times a name that is a time (1645000000.25.pcd)
+    tells it, or else TUM's rows. TUM's rows belong to the scans by their times where both have some.
 
     Args:
         uri: As the user wrote it.
@@ -74,10 +81,12 @@ class ScanFolder:
         if not self._files:
             raise SourceError(f"the folder has no {form.suffix} files", where=uri)
         numbers = np.array([_number(file) for file in self._files], dtype=np.int64)
-        if len(np.unique(numbers)) < len(numbers) or (numbers < 0).any():
+        by_time = all(_TIME_NAME.fullmatch(file.stem) for file in self._files)
+        if by_time or len(np.unique(numbers)) < len(numbers) or (numbers < 0).any():
             numbers = np.arange(len(numbers), dtype=np.int64)
         folder = self._files[0].parent
         places = [] if path.is_file() else [folder, folder.parent]
+        self._timed = False
         self._stamp = self._read_stamps(places, numbers)
         self._T_base_lidar = options.T_base_lidar or Pose3.identity()
         self._poses = self._read_poses(places, numbers)
@@ -112,8 +121,9 @@ class ScanFolder:
         begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
         for index in range(begin, len(self._files)):
             stamp_ns = int(self._stamp[index])
-            if self._poses is not None:
-                yield Odometry(stamp_ns, self._poses[index] @ self._T_base_lidar.inverse())
+            pose = None if self._poses is None else self._poses[index]
+            if pose is not None:
+                yield Odometry(stamp_ns, pose @ self._T_base_lidar.inverse())
             try:
                 scan = self._form.load(self._files[index], stamp_ns, losses)
             except (ScanFileError, OSError):
@@ -157,23 +167,43 @@ class ScanFolder:
                 rows = self._rows(name, len(times), numbers)
                 if rows is not None:
                     self._texts.append(place / name)
+                    self._timed = True
                     return times[rows]
-        return numbers * STEP_NS
+        named = _times_in_names(self._files)
+        self._timed = named is not None
+        return numbers * STEP_NS if named is None else named
 
-    def _read_poses(self, places: list[Path], numbers: Int) -> list[Pose3] | None:
-        for place in places:
+    def _read_poses(self, places: list[Path], numbers: Int) -> list[Pose3 | None] | None:
+        for path in [place / name for place in places for name in POSES]:
             try:
-                poses = read_poses(place / "poses.txt")
+                times, poses = read_any_poses(path)
             except FileNotFoundError:
                 continue
             except (TextError, OSError) as error:
-                self._warnings.append(f"poses.txt is not used: {error}")
+                self._warnings.append(f"{path.name} is not used: {error}")
                 continue
-            rows = self._rows("poses.txt", len(poses), numbers)
-            if rows is not None:
-                self._texts.append(place / "poses.txt")
-                return [poses[row] for row in rows.tolist()]
+            found = self._fitting(path.name, times, poses, numbers)
+            if found is not None:
+                self._texts.append(path)
+                return found
         return None
+
+    def _fitting(
+        self, name: str, times: Int | None, poses: list[Pose3], numbers: Int
+    ) -> list[Pose3 | None] | None:
+        """The pose of each scan, None where a file's rows do not belong to the scans."""
+        if times is not None and self._timed:
+            found = [pose_at(times, poses, int(stamp_ns)) for stamp_ns in self._stamp]
+            if any(pose is not None for pose in found):
+                return found
+            self._warnings.append(f"{name} is not used: its times are not those of the scans")
+            return None
+        rows = self._rows(name, len(poses), numbers)
+        if rows is None:
+            return None
+        if times is not None:
+            self._stamp = times[rows]
+        return [poses[row] for row in rows.tolist()]
 
     def _rows(self, name: str, count: int, numbers: Int) -> Int | None:
         """The row of each file in a text file with `count` rows, None when they do not fit."""
@@ -194,7 +224,27 @@ def _scan_files(path: Path, suffix: str) -> list[Path]:
     if not any(file.suffix.lower() == suffix for file in path.iterdir()) and (path / "velodyne").is_dir():
         folder = path / "velodyne"
     files = (file for file in folder.iterdir() if file.suffix.lower() == suffix and file.is_file())
-    return sorted(files, key=lambda file: (_number(file), file.name))
+    found = sorted(files, key=lambda file: (_number(file), file.name))
+    if all(_TIME_NAME.fullmatch(file.stem) for file in found):  # their last digits alone say nothing
+        found.sort(key=lambda file: (_name_ns(file.stem), file.name))
+    return found
+
+
+def _times_in_names(files: list[Path]) -> Int | None:
+    """The times that files are named by [ns], None where they are named otherwise."""
+    if not all(_TIME_NAME.fullmatch(file.stem) for file in files):
+        return None
+    stamps = [_name_ns(file.stem) for file in files]
+    return np.array(stamps, dtype=np.int64) if np.all(np.diff(stamps) > 0) else None
+
+
+def _name_ns(stem: str) -> int:
+    """A name that is a time, in seconds with decimals, microseconds or nanoseconds since 1970 [ns]."""
+    match = _TIME_NAME.fullmatch(stem)
+    word = match.group(1) if match else "0"
+    if "." in word or "_" in word:
+        return seconds_ns(word.replace("_", "."))
+    return int(word) * (1000 if len(word) == 16 else 1)
 
 
 def _number(file: Path) -> int:

@@ -25,7 +25,13 @@ def sensor_of(scan: Scan) -> Sensor:
     steps = np.abs(np.diff(elevation[np.isfinite(elevation)]))
     ring_step = float(np.median(steps)) if len(steps) else 0.0
     azimuth_step = _azimuth_step(scan)
-    name = {16: "16-ring LiDAR", 32: "32-ring LiDAR", 64: "64-ring LiDAR", 128: "128-ring LiDAR"}
+    name = {
+        1: "planar laser",
+        16: "16-ring LiDAR",
+        32: "32-ring LiDAR",
+        64: "64-ring LiDAR",
+        128: "128-ring LiDAR",
+    }
     return Sensor(
         name.get(rings, "LiDAR"), rings, ring_step, azimuth_step or Sensor().azimuth_step, range_sigma=0.03
     )

@@ -8,9 +8,28 @@ from dataclasses import dataclass
 from pipeline.errors import SourceError
 from pipeline.sources.base import RecordedTopic
 from pipeline.sources.container import Channel
-from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, ROS1_TRANSFORMS, TRANSFORMS, VELODYNE_SCAN
+from pipeline.sources.rostypes import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    IMU,
+    LASER_SCAN,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    POINT_CLOUD,
+    ROS1_TRANSFORMS,
+    TRANSFORMS,
+    VELODYNE_SCAN,
+)
 
-TYPES_BY_ROLE = {"scan": (POINT_CLOUD, VELODYNE_SCAN), "odometry": (ODOMETRY,), "imu": (IMU,)}
+TYPES_BY_ROLE = {
+    "scan": (POINT_CLOUD, VELODYNE_SCAN, LASER_SCAN),
+    "odometry": (ODOMETRY,),
+    "imu": (IMU,),
+    "gnss": (NAV_SAT_FIX,),
+    "camera": (COMPRESSED_IMAGE, IMAGE),
+}
+ROLES = "scan, odometry, imu, gnss or camera"
 _READABLE = ("cdr", "ros1")
 
 
@@ -37,6 +56,8 @@ class Topics:
     scan: Topic
     odometry: Topic | None
     imu: Topic | None
+    gnss: Topic | None
+    camera: Topic | None
     fixed: tuple[Topic, ...]
     moving: tuple[Topic, ...]
     every: tuple[Topic, ...]
@@ -44,10 +65,25 @@ class Topics:
     def recorded(self) -> tuple[RecordedTopic, ...]:
         """All topics for people, each with what it is read as."""
         reading: dict[Topic, str] = dict.fromkeys((*self.fixed, *self.moving), "transforms")
-        chosen = {"scan": self.scan, "odometry": self.odometry, "imu": self.imu}
+        infos = [topic for topic in self.every if topic.msgtype == CAMERA_INFO]
+        reading.update(dict.fromkeys(infos if self.camera else [], "camera"))
+        chosen = {
+            "scan": self.scan,
+            "odometry": self.odometry,
+            "imu": self.imu,
+            "gnss": self.gnss,
+            "camera": self.camera,
+        }
         reading.update({topic: role for role, topic in chosen.items() if topic is not None})
         return tuple(
-            RecordedTopic(topic.name, topic.msgtype, topic.count, reading.get(topic, ""), _role_of(topic))
+            RecordedTopic(
+                topic.name,
+                topic.msgtype,
+                topic.count,
+                reading.get(topic, ""),
+                _role_of(topic),
+                "" if topic in reading else _why_not(topic, chosen.get(_role_of(topic))),
+            )
             for topic in self.every
         )
 
@@ -67,9 +103,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
     topics = _group(channels)
     unknown = sorted(wanted.keys() - TYPES_BY_ROLE.keys())
     if unknown:
-        raise SourceError(
-            f"there is no role {unknown[0]!r} for a topic", where=where, remedy="Use scan, odometry or imu."
-        )
+        raise SourceError(f"there is no role {unknown[0]!r} for a topic", where=where, remedy=f"Use {ROLES}.")
     chosen = {role: _choose(topics, role, wanted.get(role), where) for role in TYPES_BY_ROLE}
     scan = chosen["scan"]
     if scan is None:
@@ -82,11 +116,33 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
     transforms = [topic for topic in topics if topic.msgtype in (TRANSFORMS, ROS1_TRANSFORMS)]
     fixed = tuple(topic for topic in transforms if topic.name.endswith("tf_static"))
     moving = tuple(topic for topic in transforms if not topic.name.endswith("tf_static"))
-    return Topics(scan, chosen["odometry"], chosen["imu"], fixed, moving, tuple(topics))
+    return Topics(
+        scan,
+        chosen["odometry"],
+        chosen["imu"],
+        chosen["gnss"],
+        chosen["camera"],
+        fixed,
+        moving,
+        tuple(topics),
+    )
 
 
 def _role_of(topic: Topic) -> str:
     return next((role for role, types in TYPES_BY_ROLE.items() if topic.msgtype in types), "")
+
+
+def _why_not(topic: Topic, chosen: Topic | None) -> str:
+    """Why a topic is not read, for people."""
+    if chosen is None:
+        return "no message in it" if _role_of(topic) else "nothing is made of this type"
+    if topic.count == 0:
+        return "no message in it"
+    if chosen.msgtype != LASER_SCAN and topic.msgtype == LASER_SCAN:
+        return f"{chosen.name} sees in space"
+    if topic.count == chosen.count:
+        return f"{chosen.name} has as many messages, and is taken"
+    return f"{chosen.name} has more messages" if chosen.count > topic.count else f"{chosen.name} was named"
 
 
 def _group(channels: Iterable[Channel]) -> list[Topic]:
@@ -114,7 +170,12 @@ def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Top
         )
     filled = [topic for topic in fitting if topic.count > 0] or (fitting if name is not None else [])
     # Of equally many messages the decoded cloud is preferred to the raw packets it was made of.
-    return max(filled, key=lambda topic: (topic.count, -types.index(topic.msgtype)), default=None)
+    # A laser that sees in one plane is the robot's bumper where there is a LiDAR too.
+    return max(
+        filled,
+        key=lambda topic: (topic.msgtype != LASER_SCAN, topic.count, -types.index(topic.msgtype)),
+        default=None,
+    )
 
 
 def _listing(topics: list[Topic]) -> str:

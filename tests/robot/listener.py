@@ -22,6 +22,8 @@ _DEFINED = {
     "odometry": "nav_msgs/msg/Odometry",
     "path": "nav_msgs/msg/Path",
     "trees": "visualization_msgs/msg/MarkerArray",
+    "clearance": "sensor_msgs/msg/Range",
+    "zone": "std_msgs/msg/UInt8",
 }
 
 
@@ -73,6 +75,8 @@ def main(port: int, robot: str) -> None:
         "child": heard["odometry"].child_frame_id,
         "markers": len(heard["trees"].markers),
         "poses": len(heard["path"].poses),
+        "ahead": round(float(heard["clearance"].range), 3),
+        "zone": int(heard["zone"].data),
     }
     print(json.dumps(told), flush=True)
     sys.stdin.read()

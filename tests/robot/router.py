@@ -1,4 +1,4 @@
-"""A Zenoh router on this machine, as a robot has one: `python -m tests.robot.router PORT`."""
+"""A Zenoh router on this machine, as a robot has one: `python -m tests.robot.router PORT [OTHER_PORT]`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import threading
 import zenoh
 
 
-def main(port: str) -> None:
-    """Route until stdin ends."""
+def main(port: str, other: str = "") -> None:
+    """Route until stdin ends; with another router, pass all on to it and from it."""
     settings = {
         "mode": "router",
         "listen": {"endpoints": [f"tcp/127.0.0.1:{port}"]},
+        "connect": {"endpoints": [f"tcp/127.0.0.1:{other}"] if other else []},
         "scouting": {"multicast": {"enabled": False}},
     }
     with zenoh.open(zenoh.Config.from_json5(json.dumps(settings))):
@@ -23,4 +24,4 @@ def main(port: str) -> None:
 
 if __name__ == "__main__":
     threading.current_thread().name = "router"
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SourceError
-from pipeline.records import Notice, Odometry, Record, Scan
+from pipeline.records import Notice, Odometry, PoseMeasurement, Record, Scan
 from pipeline.sources import SourceOptions, open_source
 from pipeline.sources.arrivals import OPENING_LIMIT, ArrivalReader
 from pipeline.sources.container import Channel, Message
@@ -21,6 +21,8 @@ from pipeline.sources.mcap_file import McapFile
 from pipeline.sources.rostypes import ODOMETRY, POINT_CLOUD
 from pipeline.sources.stepping_clock import SteppingClock
 from tests.robot.conftest import SCANS
+from tests.sources.recordings import START_NS, STEP_NS, write_recording
+from tests.sources.test_more_ros import straight
 
 SECOND = 1_000_000_000
 SCAN, WHEELS = 1, 2
@@ -46,6 +48,39 @@ def test_a_row_of_messages_gives_the_records_of_its_file(drive: Path):
         assert ours == theirs
         assert len(ours) == SCANS
         assert not any(isinstance(record, Notice) for record in records)
+
+
+def test_a_planar_laser_and_fixes_count_live_too(tmp_path: Path):
+    drive = write_recording("mcap", tmp_path, lambda author, write: straight(author, write, metres=120.0))
+    with closing(McapFile(next(drive.rglob("*.mcap")))) as container:
+        numbers = [channel.number for channel in container.channels]
+        messages = list(container.messages(numbers, None, {}))
+        reader, records = read(container.channels, iter(messages))
+        again = ArrivalReader("here", "live", container.channels, SourceOptions())
+        again.from_ns = messages[-1].log_ns - SECOND
+        late = [record for message in messages for record in again.add(message)]
+    assert reader.description is not None
+    assert reader.description.preset == "laser2d"
+    assert "drove far enough" in reader.description.gnss
+    assert sum(isinstance(record, Scan) for record in records) == 60
+    assert [n.text for n in records if isinstance(n, Notice) and "north is known" in n.text]
+    measured = [record for record in records if isinstance(record, PoseMeasurement)]
+    assert len(measured) >= 2
+    for pose in measured:
+        ahead = 120.0 * (pose.stamp_ns - START_NS) / STEP_NS / 59
+        np.testing.assert_allclose([pose.T_map_base.x, pose.T_map_base.y], [ahead, 0.0], atol=1.0)
+    # Going on from a later time gives the very same poses.
+    told = [repr(record) for record in late if isinstance(record, PoseMeasurement)]
+    assert told
+    assert told == [repr(pose) for pose in measured][-len(told) :]
+
+
+def test_fixes_beside_a_robot_that_stands_tell_nothing(tmp_path: Path):
+    drive = write_recording("mcap", tmp_path, lambda author, write: straight(author, write, metres=3.0))
+    with closing(McapFile(next(drive.rglob("*.mcap")))) as container:
+        numbers = [channel.number for channel in container.channels]
+        _, records = read(container.channels, container.messages(numbers, None, {}))
+    assert not any(isinstance(record, PoseMeasurement) for record in records)
 
 
 def test_nothing_is_known_before_a_scan_and_memory_is_bounded(drive: Path):

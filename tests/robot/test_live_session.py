@@ -65,7 +65,7 @@ class Stage:
         self.commands: queue.Queue[ToWorker | None] = queue.Queue()
         self.links: list[FakeLink] = []
         self.session = Session(
-            open_source=lambda uri, _seed: LiveSource(parse_address(uri), SourceOptions(), self._link),
+            open_source=lambda uri, _options: LiveSource(parse_address(uri), SourceOptions(), self._link),
             make_mapper=lambda _source, p, seed, watch: FakeMapper(p, seed, watch),
             make_synchroniser=lambda _odometry: steps,
             parameters=Parameters(),

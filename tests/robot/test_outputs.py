@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from pipeline.clearance import Clearance, Zone
 from pipeline.geometry import Pose2
 from pipeline.recording import outputs
 from tests.app.fakes import START_NS, frame, path, trees
@@ -77,3 +78,21 @@ def test_the_hash_of_a_type_is_that_of_ros():
     known = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
     assert outputs.store().hash_rihs01("std_msgs/msg/String") == known
     assert len({outputs.type_hash(topic) for topic in outputs.TYPES}) == len(outputs.TYPES)
+
+
+@pytest.mark.parametrize(
+    ("clearance", "told"),
+    [
+        (Clearance(Zone.STOP, 0.5, within=3.0), 0.5),
+        (Clearance(Zone.CLEAR, within=3.0), np.inf),
+        (Clearance(Zone.UNKNOWN, 0.5, within=3.0), np.nan),
+    ],
+)
+def test_how_far_the_way_is_free_arrives(clearance: Clearance, told: float):
+    found = outputs.scan_messages(replace(frame(0, START_NS), clearance=clearance))
+    way = decoded(outputs.CLEARANCE, found[outputs.CLEARANCE])
+    assert (way.header.frame_id, way.max_range) == ("base_link", 3.0)
+    np.testing.assert_equal(float(way.range), told)
+    assert decoded(outputs.ZONE, found[outputs.ZONE]).data == int(clearance.zone)
+    silent = outputs.scan_messages(replace(frame(0, START_NS), clearance=None))
+    assert silent.keys() == {outputs.POSE, outputs.ODOMETRY}

@@ -15,7 +15,7 @@ from app.robot.ros_graph import Publisher, RosGraph, data_key, publisher_of
 from app.robot.zenoh_link import ZenohLink
 from pipeline.errors import SourceError
 from pipeline.sources.container import Message
-from pipeline.sources.rostypes import IMU, ODOMETRY, POINT_CLOUD, TRANSFORMS
+from pipeline.sources.rostypes import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, TRANSFORMS
 
 NAMES = st.from_regex(r"\A[a-z][a-z0-9_]{0,8}\Z")
 
@@ -180,6 +180,16 @@ def test_a_robot_is_read_with_its_own_odometry():
     assert first.robot == "blue"
     assert any("red" in warning for warning in first.warnings)
     assert choose(both, "green", {}, "here") is None
+
+
+def test_a_planar_laser_is_read_where_there_is_no_lidar_and_fixes_beside():
+    alone = there(("", "/bumper", LASER_SCAN), ("", "/gps/fix", NAV_SAT_FIX), ("", "/odom", ODOMETRY))
+    found = choose(alone, "", {}, "here")
+    assert found is not None
+    assert [channel.topic for channel in found.channels] == ["/bumper", "/odom", "/gps/fix"]
+    both = choose([*alone, *there(("", "/camera/points", POINT_CLOUD))], "", {}, "here")
+    assert both is not None
+    assert both.channels[0].topic == "/camera/points"
 
 
 def test_a_topic_of_another_type_is_refused():

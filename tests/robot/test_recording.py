@@ -127,7 +127,9 @@ def map_files(source: Source, out: Path, **plan: Any) -> dict[str, bytes]:
     return {name: (out / name).read_bytes() for name in MAP_FILES}
 
 
-def test_the_replay_gives_the_map_of_the_live_run_byte_for_byte(stand: Path, tmp_path: Path):
+def test_the_replay_gives_the_map_of_the_live_run_byte_for_byte(
+    stand: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+):
     recording = Recording(tmp_path / "live.mcap")
     heard = Heard(stand, recording)
     played = Played(heard)
@@ -145,7 +147,10 @@ def test_the_replay_gives_the_map_of_the_live_run_byte_for_byte(stand: Path, tmp
         again = map_files(replay, tmp_path / "b", parameters=parameters)
         assert again == live
         assert map_files(replay, tmp_path / "c") != live, "with other parameters it is another map"
-    assert main(["map", str(recording.path), "--out", str(tmp_path / "d")]) == 0
+    code = main(["map", str(recording.path), "--out", str(tmp_path / "d")])
+    told = capfd.readouterr().err
+    assert code == 3, told  # what came late was left out, and is counted
+    assert "left out: IMU readings that were not later than the one before" in told
     assert {name: (tmp_path / "d" / name).read_bytes() for name in MAP_FILES} == live
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from app.robot.source import LiveSource, open_live
 from app.robot.zenoh_link import LOST_SCANS
+from pipeline.clearance import Clearance, Zone
 from pipeline.recording import outputs
 from pipeline.records import Odometry, Record, Scan
 from tests.app.fakes import START_NS, frame, path, trees
@@ -80,6 +81,7 @@ def test_a_router_that_is_not_there_is_named_and_tried_again():
 
 def test_others_hear_the_pose_and_the_trees(router: int, robots: Callable[[str], Robot]):
     robot = robots("red")
+    near = Clearance(Zone.SLOW, 1.75, 0.0, 2.15, 0.0, within=3.0)
     with closing(open_live(f"zenoh:tcp/127.0.0.1:{router}")) as source:
         source.use(None, publish=True)
         until(lambda: subscribed(source))
@@ -89,7 +91,7 @@ def test_others_hear_the_pose_and_the_trees(router: int, robots: Callable[[str],
 
         def say() -> None:
             while not stop.wait(0.05):
-                source.mapped(replace(frame(0, START_NS), trees=trees(4)), path([0.0, 1.0]))
+                source.mapped(replace(frame(0, START_NS), trees=trees(4), clearance=near), path([0.0, 1.0]))
 
         saying = threading.Thread(target=say)
         saying.start()
@@ -100,6 +102,7 @@ def test_others_hear_the_pose_and_the_trees(router: int, robots: Callable[[str],
         assert told["topics"] == [f"/red/stemmap/{name}" for name in sorted(outputs.TYPES)]
         assert (told["pose_frame"], told["child"]) == ("map", "base_link")
         assert (told["markers"], told["poses"]) == (1 + 2 * 3, 2)
+        assert (told["ahead"], told["zone"]) == (1.75, int(Zone.SLOW))
         robot.send()
         until(source.listen)
         assert not any("stemmap" in topic.name for topic in source.description.topics)

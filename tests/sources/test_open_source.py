@@ -10,9 +10,9 @@ from pipeline.errors import SourceError
 from pipeline.sources import open_source
 
 
-@pytest.mark.parametrize("uri", ["dds:robot", "udp://0.0.0.0:2368"])
+@pytest.mark.parametrize("uri", ["ros2:robot", "udp://0.0.0.0:2368"])
 def test_live_input_is_refused_with_a_remedy(uri: str):
-    with pytest.raises(SourceError, match=r"does not read (dds|udp): live.*over Zenoh"):
+    with pytest.raises(SourceError, match=r"does not read (ros2|udp): live.*over Zenoh"):
         open_source(uri)
 
 

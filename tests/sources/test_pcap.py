@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from pipeline.errors import SourceError
 from pipeline.records import Scan
 from pipeline.sources.pcd_file import read_pcd
-from pipeline.sources.velodyne import is_data_packet
+from pipeline.sources.velodyne import SENSORS, is_data_packet
 from tests.sources.conftest import Opened
 
 
@@ -142,3 +142,21 @@ def test_garbage_of_the_right_length_is_no_data_packet(real: Path):
     assert not is_data_packet(bytes(1206))
     assert not is_data_packet(packet[:2] + b"\xff\xff" + packet[4:])
     assert not is_data_packet(packet[:-1] + b"\x00")
+
+
+@pytest.mark.parametrize("product", sorted(SENSORS))
+def test_every_model_that_names_itself_is_read_as_that_model(
+    product: int, real: Path, tmp_path: Path, opened: Opened
+):
+    """No capture of the others is at hand: the real packets with another model's number in them."""
+    named = [(s, f, frame[:-1] + bytes([product])) for s, f, frame in frames(real.read_bytes())]
+    path = tmp_path / "other.pcap"
+    path.write_bytes(capture_of(named))
+    source = opened(path)
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    assert source.description.sensor == SENSORS[product]
+    assert scans
+    for scan in scans:
+        assert np.isfinite(scan.points).all()
+        assert scan.ring is not None
+        assert 0 <= scan.ring.min() <= scan.ring.max() < SENSORS[product].rings

@@ -13,9 +13,10 @@ from pipeline.errors import SourceError
 from pipeline.geometry import Pose3
 from pipeline.records import Imu, Odometry, Record, Scan
 from pipeline.sources import SourceOptions
+from tests.benchmarks.mutating import read_all
 from tests.sources.conftest import Opened
 from tests.sources.recordings import SCANS, START_NS, STEP_NS, drive, points_of, write_recording
-from tests.sources.test_bad_input import mutations, read_all
+from tests.sources.test_bad_input import mutations
 
 KINDS = ["bag", "db3", "mcap"]
 
@@ -137,8 +138,10 @@ def test_topics_can_be_chosen_and_wrong_choices_are_told(opened: Opened, tmp_pat
         opened(path, SourceOptions(topics={"scan": "/none"}))
     with pytest.raises(SourceError, match="not of the type"):
         opened(path, SourceOptions(topics={"scan": "/odom"}))
-    with pytest.raises(SourceError, match="no role"):
+    with pytest.raises(SourceError, match="not of the type sensor_msgs/msg/CompressedImage"):
         opened(path, SourceOptions(topics={"camera": "/other"}))
+    with pytest.raises(SourceError, match="no role"):
+        opened(path, SourceOptions(topics={"radar": "/other"}))
 
 
 def test_the_mounting_that_the_user_gives_wins(opened: Opened, tmp_path: Path):

@@ -1,4 +1,4 @@
-"""Whole clouds of plots: LAS, LAZ and others, read part by part."""
+"""Whole clouds of plots, read part by part: LAS, LAZ, E57, PLY, NumPy's arrays, PCD."""
 
 from __future__ import annotations
 
@@ -6,19 +6,24 @@ from pathlib import Path
 
 from pipeline.errors import SourceError
 from pipeline.plot.cloud import Cloud
-from pipeline.sources.clouds.las import MAGIC
 
-SUFFIXES = (".las", ".laz")
+LAS, E57 = b"LASF", b"ASTM-E57"
+#: Whole clouds unless somebody says otherwise; one .pcd file is a scan unless somebody says otherwise.
+SUFFIXES = (".las", ".laz", ".ply", ".npy", ".npz", ".e57")
+READABLE = "LAS, LAZ, PLY, E57, .npy, .npz and PCD"
 
 
 def is_cloud(uri: str) -> bool:
-    """Whether it names a file that holds a whole cloud, by its first bytes or its name."""
+    """Whether it names a file that is taken for a whole cloud, by its first bytes or its name."""
+    from pipeline.sources.point_files import MAGIC
+
     path = Path(uri).expanduser()
     try:
         with path.open("rb") as file:
-            return file.read(4) == MAGIC or path.suffix.lower() in SUFFIXES
-    except (OSError, ValueError):
+            head = file.read(16)
+    except (OSError, ValueError, RuntimeError):
         return False
+    return head.startswith((LAS, E57, *MAGIC[".ply"], *MAGIC[".npy"])) or path.suffix.lower() in SUFFIXES
 
 
 def open_cloud(uri: str) -> Cloud:
@@ -28,9 +33,18 @@ def open_cloud(uri: str) -> Cloud:
         SourceError: It is not there, of a kind that cannot be read, or damaged.
     """
     from pipeline.sources.clouds.las import LasCloud
+    from pipeline.sources.clouds.table_cloud import TableCloud
 
     try:
-        return LasCloud(uri, Path(uri).expanduser())
+        path = Path(uri).expanduser()
+        with path.open("rb") as file:
+            head = file.read(8)
+        if head == E57 or path.suffix.lower() == ".e57":
+            from pipeline.sources.clouds.e57 import E57Cloud
+
+            return E57Cloud(uri, path)
+        is_las = head.startswith(LAS) or path.suffix.lower() in (".las", ".laz")
+        return LasCloud(uri, path) if is_las else TableCloud(uri, path)
     except MemoryError:
         raise SourceError("it is too large for the memory of this machine", where=uri) from None
     except (OSError, ValueError, RuntimeError) as error:  # a path with a zero byte, a home of nobody

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
@@ -16,16 +17,15 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.plot.cloud import CloudDescription
 from pipeline.records import Float32
+from pipeline.sources.clouds.placing import is_place, offset_for
 from pipeline.sources.digest import digest_of
 
 if TYPE_CHECKING:
     import laspy
 
-MAGIC = b"LASF"
 PART = 1 << 19  # points
 MOST_POINTS = 2_000_000_000
 RECORD_LIMIT = 1024  # bytes of a point
-COORDINATE_LIMIT = 1e8  # m
 _COMPRESSED = 0xC0
 _REMEDY = "Copy the file again, or export it again"
 
@@ -44,26 +44,25 @@ class LasCloud:
         points, self._there, compressed, version = _check(path, uri)
         crs = ""
         try:
-            with _open(path) as reader:
+            with _without_panic(), _open(path) as reader:
                 header = reader.header
                 self._scales, self._offsets = header.scales.copy(), header.offsets.copy()
                 crs = _crs_of(header)
                 low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
                 attributes = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
-                middle = self._xyz(reader.read_points(min(1000, self._there))).mean(axis=0)
+                with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+                    middle = self._xyz(reader.read_points(min(1000, self._there))).mean(axis=0)
         except SourceError:
             raise
         except _all_that_damage_raises() as error:
             raise SourceError(f"the LAS file is damaged: {error}", where=uri, remedy=_REMEDY) from None
-        if not np.isfinite(middle).all() or np.abs(middle).max() > COORDINATE_LIMIT:
+        if not is_place(middle[None]).all():
             raise SourceError("the coordinates of the cloud are no coordinates", where=uri, remedy=_REMEDY)
-        # In whole hundreds near the points: nothing is lost, and who reads the files can add it.
-        offset = np.where(np.abs(middle) < 1000.0, 0.0, np.round(middle / 100.0) * 100.0)
         self.description = CloudDescription(
             uri=uri,
             kind=f"LAS {version}" + (" compressed" if compressed else ""),
             points=points,
-            offset=offset,
+            offset=offset_for(middle),
             crs=crs,
             digest=digest_of([path]),
             low=low,
@@ -76,13 +75,13 @@ class LasCloud:
         self.losses = {}
         read = 0
         try:
-            with _open(self._path) as reader:
+            with _without_panic(), _open(self._path) as reader:
                 while read < self._there:
                     chunk = reader.read_points(min(PART, self._there - read))
                     if len(chunk) == 0:
                         break
                     xyz = self._xyz(chunk) - self.description.offset
-                    good = np.isfinite(xyz).all(axis=1) & (np.abs(xyz) < COORDINATE_LIMIT).all(axis=1)
+                    good = is_place(xyz)
                     withheld = np.asarray(chunk.withheld).astype(np.bool_)
                     self._lose("points without coordinates", int(np.count_nonzero(~good)))
                     self._lose("points that the file withholds", int(np.count_nonzero(good & withheld)))
@@ -105,6 +104,17 @@ class LasCloud:
     def _lose(self, reason: str, n: int) -> None:
         if n > 0:
             self.losses[reason] = self.losses.get(reason, 0) + n
+
+
+@contextmanager
+def _without_panic() -> Iterator[None]:
+    """What makes the decoder panic is damage as any other; its own exception is none that is caught."""
+    try:
+        yield
+    except BaseException as error:
+        if type(error).__name__ == "PanicException":
+            raise ValueError(str(error)) from None
+        raise
 
 
 def _open(path: Path) -> laspy.LasReader:
@@ -144,7 +154,7 @@ def _check(path: Path, uri: str) -> tuple[int, int, bool, str]:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(375)
-        if len(head) < 227 or head[:4] != MAGIC:
+        if len(head) < 227 or head[:4] != b"LASF":
             raise SourceError("the contents are not those of a LAS file", where=uri, remedy=_REMEDY)
         version = f"{head[24]}.{head[25]}"
         header_size, first, records = struct.unpack_from("<HII", head, 94)

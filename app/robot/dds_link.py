@@ -1,0 +1,259 @@
+"""ROS 2 over plain DDS, by CycloneDDS (an extra): topics by discovery, messages as they came, in CDR."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from app.robot.address import DdsAddress
+from app.robot.arrival_times import ArrivalTimes
+from app.robot.choosing import SCAN_TYPES
+from app.robot.dds_discovery import DdsGraph, Offer
+from app.robot.dds_types import idl_type
+from app.robot.inbox import Inbox
+from app.robot.ros_graph import Publisher
+from app.robot.zenoh_link import LOST_SCANS, MESSAGE_LIMIT
+from pipeline.sources.container import Channel, Message, count_loss
+
+_RETRY_S = 1.0
+_WAIT_NS = 50_000_000
+#: So many samples wait in CycloneDDS while Python is busy: two seconds of scans, of the rest far more.
+_SCAN_DEPTH, _DEPTH = 20, 5000
+OVERRUN = "times that more messages came at once than CycloneDDS keeps"
+OWN_CONFIGURATION = "CYCLONEDDS_URI"
+
+
+def configuration(address: DdsAddress) -> str:
+    """CycloneDDS's configuration: one interface, this machine's own unless another was named."""
+    named = address.interface or "127.0.0.1"
+    by = "address" if named[0].isdigit() else "name"
+    peers = address.peers or (() if address.interface else ("127.0.0.1",))
+    known = "".join(f'<Peer address="{peer}"/>' for peer in peers)
+    return (
+        '<CycloneDDS><Domain Id="any">'
+        f'<General><Interfaces><NetworkInterface {by}="{named}"/></Interfaces></General>'
+        "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f"<MaxAutoParticipantIndex>30</MaxAutoParticipantIndex><Peers>{known}</Peers></Discovery>"
+        "<Internal>"
+        f"<MaxSampleSize>{MESSAGE_LIMIT} B</MaxSampleSize>"
+        '<SocketReceiveBufferSize min="default" max="8MB"/>'
+        "</Internal></Domain></CycloneDDS>"
+    )
+
+
+class DdsLink:
+    """Takes part in a DDS domain, in a thread of its own; tried again until it works.
+
+    Args:
+        address: Of the domain.
+        inbox: For what comes.
+
+    Attributes:
+        problem, losses, scans, version: As of `ZenohLink`.
+    """
+
+    session = None
+
+    def __init__(self, address: DdsAddress, inbox: Inbox) -> None:
+        self.problem = "not connected yet"
+        self.losses: dict[str, int] = {}
+        self.scans = self.version = 0
+        self._address, self._inbox = address, inbox
+        self._graph = DdsGraph(address.robot)
+        self._times = ArrivalTimes()
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._heard_s: float | None = None
+        self._channels: Sequence[Channel] = ()
+        self._thread = threading.Thread(target=self._listen, name="dds", daemon=True)
+        self._thread.start()
+
+    @property
+    def place(self) -> str:
+        """Where it listens, in words."""
+        return f"in DDS domain {self._address.domain} on {self._address.interface or 'this machine'}"
+
+    @property
+    def nothing(self) -> str:
+        """Why there is nothing, in words."""
+        wanted = f" below /{self._address.robot}" if self._address.robot else ""
+        others = sorted({p.topic for p in self.publishers()})[:10]
+        there = f" (there are: {', '.join(others)})" if others else ""
+        elsewhere = "" if self._address.interface else "; interface=ADDRESS listens on a network"
+        return f"no scans{wanted} are announced{there}{elsewhere}"
+
+    @property
+    def silence_s(self) -> float | None:
+        """Seconds since the last scan came, None before the first."""
+        return None if self._heard_s is None else time.monotonic() - self._heard_s
+
+    def publishers(self) -> list[Publisher]:
+        """All topics that somebody writes now."""
+        with self._lock:
+            return self._graph.publishers()
+
+    def robots(self) -> list[str]:
+        """The robot, while it sends scans: DDS names topics, not robots."""
+        return sorted({p.robot for p in self.publishers() if p.msgtype in SCAN_TYPES})
+
+    def subscribe(self, channels: Sequence[Channel]) -> None:
+        """Listen to these topics from now on."""
+        self._channels = tuple(channels)
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._closing.set()
+        self._thread.join(timeout=5.0)
+
+    def _listen(self) -> None:
+        while not self._closing.is_set():
+            try:
+                self._take_part()
+            except Exception as error:  # whatever CycloneDDS says of networks, interfaces and itself
+                self.problem = f"cannot take part in DDS domain {self._address.domain}: {_short(error)}"
+                self._closing.wait(_RETRY_S)
+
+    def _take_part(self) -> None:
+        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+        from cyclonedds.core import WaitSet
+        from cyclonedds.domain import Domain, DomainParticipant
+
+        number = self._address.domain
+        own = not self._address.interface and os.environ.get(OWN_CONFIGURATION)
+        domain = None if own else Domain(number, configuration(self._address))
+        participant = DomainParticipant(number)
+        announced = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
+        waiting = WaitSet(participant)
+        readers: dict[int, _Reader] = {}
+        with self._lock:  # what was announced to an earlier participant may be long gone
+            self._graph = DdsGraph(self._address.robot)
+            self.version += 1
+        self.problem = ""
+        while not self._closing.is_set():
+            self._note(announced)
+            self._adjust(participant, waiting, readers)
+            waiting.wait(_WAIT_NS)
+            for reader in readers.values():
+                self._take(reader)
+        readers.clear()
+        del waiting, announced, participant, domain  # in this order; that leaves the network
+
+    def _note(self, announced: Any) -> None:  # noqa: ANN401
+        """What was announced and withdrawn since."""
+        from cyclonedds.core import InstanceState
+
+        for found in announced.take(100):
+            alive = found.sample_info.instance_state == InstanceState.Alive
+            with self._lock:
+                if alive:
+                    changed = self._graph.add(str(found.key), _offer(found), self.losses)
+                else:
+                    changed = self._graph.remove(str(found.key))
+                self.version += changed
+
+    def _adjust(self, participant: Any, waiting: Any, readers: dict[int, _Reader]) -> None:  # noqa: ANN401
+        """A reader a channel, that asks for no more than all writers of its topic offer."""
+        for channel in self._channels:
+            with self._lock:
+                asked = self._graph.common(channel.topic, channel.msgtype)
+            known = readers.get(channel.number)
+            if asked is None or (known is not None and known.asked == asked):
+                continue
+            if known is not None:
+                waiting.detach(known.ready)
+            readers[channel.number] = _Reader(participant, channel, asked, self._note_lost)
+            waiting.attach(readers[channel.number].ready)
+
+    def _note_lost(self, channel: Channel, number: int) -> None:
+        if channel.msgtype in SCAN_TYPES:
+            with self._lock:
+                count_loss(self.losses, LOST_SCANS, number)
+
+    def _take(self, reader: _Reader) -> None:
+        payloads = reader.take()
+        is_scan = reader.channel.msgtype in SCAN_TYPES
+        with self._lock:
+            if len(payloads) >= reader.depth:
+                count_loss(self.losses, OVERRUN)
+            if payloads and is_scan:
+                self._heard_s = time.monotonic()
+                self.scans += len(payloads)
+        for payload in payloads:
+            self._inbox.put(Message(reader.channel.number, self._times.next_ns(), payload), is_scan=is_scan)
+
+
+def _offer(found: Any) -> Offer | None:  # noqa: ANN401
+    """An announced writer of cyclonedds in our words."""
+    from cyclonedds.core import Policy
+
+    reliable = isinstance(found.qos[Policy.Reliability], Policy.Reliability.Reliable)
+    latched = found.qos[Policy.Durability] in (Policy.Durability.TransientLocal, Policy.Durability.Persistent)
+    return Offer.of(found.topic_name or "", found.type_name or "", reliable=reliable, latched=latched)
+
+
+class _Sample:
+    """Stands in for a message's class: the bytes stay as they came."""
+
+    def __init__(self, payload: bytes) -> None:
+        self.payload = payload
+        self.sample_info: Any = None
+
+    @classmethod
+    def deserialize(cls, payload: bytes) -> _Sample:
+        return cls(payload)
+
+    @classmethod
+    def deserialize_key(cls, payload: bytes) -> _Sample:
+        del payload
+        return cls(b"")
+
+
+class _Reader:
+    """A DataReader of one channel. Asks for a topic's past where its writers keep it (as /tf_static)."""
+
+    def __init__(self, participant: Any, channel: Channel, asked: Offer, lost: Any) -> None:  # noqa: ANN401
+        from cyclonedds.core import (
+            InstanceState,
+            Listener,
+            Policy,
+            Qos,
+            ReadCondition,
+            SampleState,
+            ViewState,
+        )
+        from cyclonedds.sub import DataReader
+        from cyclonedds.topic import Topic
+        from cyclonedds.util import duration
+
+        self.channel, self.asked = channel, asked
+        self.depth = _SCAN_DEPTH if channel.msgtype in SCAN_TYPES else _DEPTH
+        policies = [
+            Policy.Reliability.Reliable(duration(milliseconds=100))
+            if asked.reliable
+            else Policy.Reliability.BestEffort,
+            Policy.Durability.TransientLocal if asked.latched else Policy.Durability.Volatile,
+            Policy.History.KeepLast(self.depth),
+            Policy.TypeConsistency.AllowTypeCoercion(),
+        ]
+        topic: Any = Topic(participant, f"rt{channel.topic}", idl_type(channel.msgtype))
+        topic.data_type = _Sample
+
+        def on_lost(reader: Any, status: Any) -> None:  # noqa: ANN401
+            del reader
+            lost(channel, int(status.total_count_change))
+
+        listener = Listener(on_sample_lost=on_lost)
+        self._reader: Any = DataReader(participant, topic, Qos(*policies), listener)
+        self.ready = ReadCondition(self._reader, SampleState.Any | ViewState.Any | InstanceState.Any)
+
+    def take(self) -> list[bytes]:
+        """What came since, each in CDR."""
+        found = self._reader.take(self.depth)
+        return [sample.payload for sample in found if isinstance(sample, _Sample)]
+
+
+def _short(error: Exception) -> str:
+    return str(error).partition("\n")[0][:200] or type(error).__name__
