@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pipeline.parameters import Parameters
 from pipeline.records import Bool, Columns, Int, Verdict
 from pipeline.saved_map import SavedMap
 from pipeline.slam import SlamState
+from pipeline.slam.frame import FrameMemory, carried
 from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.maps import MapColumns, shared_map
 from pipeline.tracking.merge import join
@@ -81,10 +82,13 @@ def merge_maps(
         tracks=tracks,
         next_number=a.next_number + int(np.count_nonzero(fresh)),
         odometry=None,
+        search=None,  # a robot that was lost at the end of a stands at the end of b now
         stamp_ns=np.concatenate([a.stamp_ns, b.stamp_ns + stamp_shift_ns]),
         sigma_xy=np.concatenate(
             [a.sigma_xy, np.hypot(b.sigma_xy, np.sqrt(np.trace(covariance[:2, :2]) / 2))]
         ),
+        motion=np.concatenate([a.motion, b.motion]),
+        placed=len(a.stamp_ns) + b.placed,
     )
     return MergedMap(merged, number_of, distance)
 
@@ -142,9 +146,31 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
     )
     return replace(
         a.placed(np.tile(path[-1], (P, 1))),
+        frame=_frame(a, b, T, covariance),
         maps=shared_map(P, landmarks),
         detections=a.detections + b.detections,
         genealogy=Genealogy.of_path(path, P),
+    )
+
+
+def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemory:
+    """The marks of both, those of b as well known as its own frame allows and T besides."""
+    own, other = a.frame.forgotten(), b.frame
+    if not len(other.serial):
+        return own
+    pose = np.column_stack([T.apply(other.pose[:, :2]), wrap_angle(other.pose[:, 2] + T.yaw)])
+    C = np.eye(3)
+    C[:2, :2] = T.rotation()
+    moved = C @ other.covariance @ C.T
+    for k, (x, y, _) in enumerate(pose):
+        moved[k] += carried(covariance, x - T.x, y - T.y)
+    return replace(
+        own,
+        serial=np.concatenate([own.serial, other.serial + a.detections]),
+        scan=np.concatenate([own.scan, other.scan + len(a.genealogy)]),
+        pose=np.concatenate([own.pose, pose]),
+        covariance=np.concatenate([own.covariance, moved]),
+        at=pose[-1],
     )
 
 
@@ -166,7 +192,7 @@ def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
     axis[:, :2] = T.apply(b.axis[:, :2])
     axis[:, 2:4] = b.axis[:, 2:4] @ T.rotation().T
     new = _apart(axis[:, :2], a.axis[:, :2])
-    names = ("viewed", "present", "absent", "figures", "share", "verdict")
+    names = [f.name for f in fields(Columns) if f.name not in ("tile", "axis")]
     joined = {name: np.concatenate([getattr(a, name), getattr(b, name)[new]]) for name in names}
     tile = np.floor(axis[new, :2] / TILE).astype(np.int64)
     return Columns(tile=np.concatenate([a.tile, tile]), axis=np.concatenate([a.axis, axis[new]]), **joined)

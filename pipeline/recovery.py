@@ -10,12 +10,13 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from pipeline import loops
 from pipeline.geometry import Float, Pose2
 from pipeline.parameters import Parameters
-from pipeline.records import Detections, PoseEstimate, Trees, nothing_found
+from pipeline.records import Detections, Int, PoseEstimate, Trees, nothing_found
 from pipeline.relocalisation import Stems, find_constellation
 from pipeline.relocalisation.stems import worst_sigma
-from pipeline.slam import BackEnd, FastSlam, Motion, SlamState
+from pipeline.slam import BackEnd, FastSlam, Loop, Motion, SlamState
 from pipeline.visibility import BINS
 
 S = TypeVar("S")
@@ -31,6 +32,7 @@ ASTRAY = (
     "the robot is lost: what was mapped since the known trees were last seen is taken back, and the map is "
     "searched for the stems around"
 )
+BENT = "the path drifted since then: it is bent, and what was mapped from it with it"
 NOT_FOUND = "the stems around were not found in the map; it goes on where the odometry leads"
 
 
@@ -43,12 +45,14 @@ class RecoveryState(Generic[S]):
         motions: Number and motion of every scan since the older one.
         local: The small map of a search; None while the robot knows where it is.
         driven: Since the search began [m].
+        since: Scan; those since then mapped nothing.
     """
 
     kept: tuple[S, ...] = ()
     motions: tuple[tuple[int, Motion], ...] = ()
     local: SlamState | None = None
     driven: float = 0.0
+    since: int = 0
 
     def copy(self) -> RecoveryState[S]:
         """Independent of a search that goes on."""
@@ -57,11 +61,12 @@ class RecoveryState(Generic[S]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Where the robot is in the map, with the covariance of x, y [m], yaw [rad], and how many stems agree."""
+    """Where the robot is in the map, with the covariance of x, y [m], yaw [rad], and the numbers of the trees
+    that agree, int64, shape (K,)."""
 
     T_map_base: Pose2
     covariance: Float
-    stems: int
+    numbers: Int
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +78,18 @@ class Mapped(Generic[S]):
         state: Gives all its state without that of its recovery.
         take_back: Leaves its map as it was in a state.
         trees: Gives the trees of its map.
+        run: Gives what is known of the run, with a pose.
+        bend: Closes a loop: path and map are bent.
+        place: Puts the base where it was found, with the covariance of that.
     """
 
     slam: BackEnd
     state: Callable[[], S]
     take_back: Callable[[S], None]
     trees: Callable[[], Trees]
+    run: Callable[[PoseEstimate], loops.Mapped]
+    bend: Callable[[Loop], None]
+    place: Callable[[Pose2, Float], None]
 
 
 class Recovery(Generic[S]):
@@ -143,7 +154,7 @@ class Recovery(Generic[S]):
             estimate = slam.process(index, motion, nothing_found(found), NOTHING_FREE)
         slam.state = replace(slam.state, recent=recent)
         local = SlamState.at_origin(min(PARTICLES, parameters.slam.particles))
-        self.state = RecoveryState(local=local)
+        self.state = RecoveryState(local=local, since=s.motions[0][0])
         return replace(estimate, health=slam.lost(estimate))
 
     def _follow(
@@ -160,14 +171,25 @@ class Recovery(Generic[S]):
         estimate = slam.process(index, motion, nothing_found(found), NOTHING_FREE)
         at = self._search(index, motion, found, free, parameters, mapped.trees)
         if at is not None:
-            slam.place(index, at.T_map_base, at.covariance)
+            told: tuple[str, ...] = (f"found again in the map by {len(at.numbers)} stems that agree",)
+            loop = self._loop(at, estimate, mapped)
+            if loop is None:
+                mapped.place(at.T_map_base, at.covariance)
+            else:
+                mapped.bend(loop)
+                told = (*told, BENT)
             self._end()
-            return slam.estimate(estimate), (f"found again in the map by {at.stems} stems that agree",)
+            return slam.estimate(estimate), told
         if self.state.driven > FARTHEST:
             slam.give_up()
             self._end()
             return estimate, (NOT_FOUND,)
         return estimate, ()
+
+    def _loop(self, at: Found, estimate: PoseEstimate, mapped: Mapped[S]) -> Loop | None:
+        """The loop that the robot has driven, where it was not carried."""
+        last, run = self.state.since - 1, mapped.run(estimate)
+        return loops.loop_to(run, at.numbers, at.T_map_base, at.covariance, last, estimate.covariance)
 
     def _search(
         self,
@@ -189,15 +211,22 @@ class Recovery(Generic[S]):
         self.state = replace(s, local=slam.state, driven=driven)
         if index % EVERY:
             return None
+        known = trees()
         match = find_constellation(
             _stems(slam, parameters),
-            Stems.of_trees(trees()),
+            Stems.of_trees(known),
             parameters.relocalisation,
             hypotheses=HYPOTHESES,
         )
         if match.pose is None:
             return None
-        return Found(*_through(match.pose, match.covariance, estimate), len(match.local))
+        numbers = known.number[known.confirmed][match.reference]
+        own = loops.nearby(estimate)
+        return Found(*loops.through(match.pose, match.covariance, estimate.T_map_base, own), numbers)
+
+    def forget(self) -> None:
+        """Take nothing back to before now: the map was bent since."""
+        self._end()
 
     def _end(self) -> None:
         """The robot is mapped again."""
@@ -210,13 +239,3 @@ def _stems(slam: FastSlam, parameters: Parameters) -> Stems:
     known = landmarks.hits >= parameters.slam.hits_to_weigh
     unknown = np.full(int(np.count_nonzero(known)), np.nan)
     return Stems(landmarks.mean[known], worst_sigma(landmarks.covariance[known]), unknown, unknown)
-
-
-def _through(T_map_local: Pose2, covariance: Float, estimate: PoseEstimate) -> tuple[Pose2, Float]:
-    """The pose of the base in the map, and its covariance from those of the match and the small map."""
-    C = np.eye(3)
-    C[:2, :2] = T_map_local.rotation()
-    T_map_base = T_map_local @ estimate.T_map_base
-    J = np.eye(3)
-    J[0, 2], J[1, 2] = T_map_local.y - T_map_base.y, T_map_base.x - T_map_local.x
-    return T_map_base, J @ covariance @ J.T + C @ estimate.covariance @ C.T

@@ -1,7 +1,7 @@
 """A map as it is saved: all that the mapper knows, so that it goes on from there to the same bytes.
 
-What is kept to take back wrong scans, and a search that goes on, are left out: a robot that is carried away
-shortly after a run goes on takes back no scan from before, and one that was lost is searched for anew.
+What is kept to take back wrong scans is left out: a robot that is carried away shortly after a run goes on
+takes back no scan from before. A search that goes on keeps nothing more, and is saved.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pipeline.height_map import PackedHeightMap
 from pipeline.mapper import Mapper, MapperState
 from pipeline.parameters import Parameters
 from pipeline.records import Columns, Int, Trees
+from pipeline.recovery import RecoveryState
 from pipeline.slam import GraphState, SlamState
 from pipeline.slam.frame import FrameMemory
 from pipeline.slam.genealogy import BLOCK
@@ -25,8 +26,17 @@ from pipeline.tracking.table import TrackTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """Of a robot that is lost: see RecoveryState."""
+
+    local: SlamState
+    driven: float
+    since: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SavedMap:
-    """See MapperState; `stamp_ns` and `sigma_xy` are those of the path, one a scan."""
+    """See MapperState; `stamp_ns`, `sigma_xy` and `motion` are those of the path, one a scan."""
 
     slam: SlamState
     memory: PackedMemory
@@ -37,11 +47,15 @@ class SavedMap:
     odometry: Pose2 | None
     stamp_ns: Int
     sigma_xy: Float
+    motion: Float
+    placed: int
+    search: Search | None = None
 
     @classmethod
     def of(cls, mapper: Mapper) -> SavedMap:
         """What a mapper knows now; a pose graph is saved as the particles that would go on from it."""
-        state, path, slam = mapper.snapshot(), mapper.path, mapper.snapshot().slam
+        state, path = mapper.snapshot(), mapper.path
+        slam, lost = state.slam, state.recovery
         if isinstance(slam, GraphState):
             slam = slam.as_particles(mapper.parameters.slam.particles, seed=0)
         return cls(
@@ -54,6 +68,9 @@ class SavedMap:
             state.odometry,
             path.stamp_ns,
             path.sigma_xy,
+            mapper.motion,
+            state.placed,
+            None if lost.local is None else Search(lost.local, lost.driven, lost.since),
         )
 
     def state(self) -> MapperState:
@@ -66,9 +83,11 @@ class SavedMap:
         n = len(self.slam.genealogy)
         if not self.stamp_ns.shape == self.sigma_xy.shape == (n,) or np.any(np.diff(self.stamp_ns) <= 0):
             raise ValueError("the stamps are not those of the path")
+        if self.motion.shape != (n, 3) or not 0 <= self.placed <= n:
+            raise ValueError("the odometry is not that of the path")
         _check_rows(self.tracks, TrackTable.empty())
         _check_rows(self.columns, no_columns())
-        _check_finite(self.tracks.x, self.tracks.P, self.tracks.shared, self.columns.axis)
+        _check_finite(self.tracks.x, self.tracks.P, self.tracks.shared, self.columns.axis, self.motion)
         if (
             len(self.tracks)
             and not 0 < self.tracks.number.min() <= self.tracks.number.max() < self.next_number
@@ -76,8 +95,18 @@ class SavedMap:
             raise ValueError("the numbers of the trees are out of order")
         gathering = GatheringState(self.memory.checked(), (), self.columns)
         return MapperState(
-            self.slam, gathering, self.ground.unpacked(), self.tracks, self.next_number, self.odometry, n
-        )
+            self.slam, gathering, self.ground.unpacked(), self.tracks, self.next_number, self.odometry, n,
+            self.placed, self._recovery(n),
+        )  # fmt: skip
+
+    def _recovery(self, scans: int) -> RecoveryState[MapperState]:
+        if self.search is None:
+            return RecoveryState()
+        local, driven, since = self.search.local, self.search.driven, self.search.since
+        _check_slam(local)
+        if not (np.isfinite(driven) and driven >= 0.0 and 0 <= since <= scans):
+            raise ValueError("the search does not fit the path")
+        return RecoveryState(local=local, driven=driven, since=since)
 
     def trees(self, parameters: Parameters) -> Trees:
         """The trees of the map, by these parameters."""
@@ -108,17 +137,19 @@ def _check_slam(slam: SlamState) -> None:
         raise ValueError("the path has other columns")
     if past.founders is not None and any(len(f) != P or not _within(f, 1 << 20) for f in past.founders):
         raise ValueError("the particles have other founders")
-    _check_frame(slam.frame)
+    _check_frame(slam.frame, len(past))
 
 
-def _check_frame(frame: FrameMemory) -> None:
+def _check_frame(frame: FrameMemory, scans: int) -> None:
     marks, template = len(frame.serial), FrameMemory()
     for f in fields(FrameMemory):
         column, wanted = getattr(frame, f.name), getattr(template, f.name)
         if column.shape != ((marks, *wanted.shape[1:]) if len(wanted) == 0 else wanted.shape):
             raise ValueError(f"{f.name} of the frame has another shape")
-    if np.any(np.diff(frame.serial) < 0):
+    if np.any(np.diff(frame.serial) < 0) or np.any(np.diff(frame.scan) < 0):
         raise ValueError("the marks of the frame are out of order")
+    if marks and not 0 <= frame.scan[0] <= frame.scan[-1] < scans:
+        raise ValueError("the marks of the frame are of no scan")
     _check_finite(frame.pose, frame.covariance, frame.hidden, frame.at)
 
 

@@ -8,6 +8,7 @@ from pipeline.compiled import compiled
 from pipeline.gathering.columns import ARC, HIGH
 from pipeline.gathering.memory import SLICE, SLICES
 from pipeline.geometry import Float
+from pipeline.records import Int32
 
 # Bands of height above the ground, as slices: first, one past the last.
 BANDS = np.array([[1, 4], [4, 7], [7, 11], [11, 16], [16, 30]])
@@ -47,14 +48,30 @@ NAMES = tuple(
     ]
     + [f"alone beyond 0.45 m {band} m" for band in _BAND_WORDS[:4]]
     + [f"alone within 0.45 m {band} m" for band in _BAND_WORDS[:4]]
+    + [f"opaque {band} m" for band in _BAND_WORDS]
+    + [
+        "free above what is clean",
+        "free above the highest return",
+        "rays up to",
+        "nothing above what is clean",
+    ]
 )
 COUNT = len(NAMES)
+# The figures from RAYS on are what rays tell.
+LAST, RAYS = NAMES.index("clean to"), NAMES.index("opaque 0.2-0.8 m")
 UNSEEN = -1.0  # of a figure of a band that no return tells anything of
 
 
 @compiled
 def features(
-    axis: Float, profiles: Float, viewed: Float, present: Float, absent: Float, figures: Float
+    axis: Float,
+    profiles: Float,
+    viewed: Float,
+    present: Float,
+    absent: Float,
+    met: Int32,
+    passed: Int32,
+    figures: Float,
 ) -> None:
     """The features of columns, into `figures`, shape (K, COUNT), in the order of NAMES.
 
@@ -63,10 +80,12 @@ def features(
         profiles: shape (K, SLICES, PROFILE).
         viewed: How high above the ground any scan looked there, shape (K,) [m].
         present, absent: In how many scans something, or nothing, stood there in free view, shape (K,).
+        met, passed: Rays that ended at it or passed its axis, shape (K, SLICES).
         figures: Is filled.
     """
     for c in range(axis.shape[0]):
         _features(axis[c], profiles[c], viewed[c], present[c], absent[c], figures[c])
+        _rays(profiles[c], met[c], passed[c], int(figures[c, LAST] / SLICE + 0.5), figures[c, RAYS:])
 
 
 @compiled
@@ -111,6 +130,36 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
     out[k + 25] = rows[1:HIGH, 3].sum()
     for b in range(4):
         _nearer(rows, BANDS[b, 0], BANDS[b, 1], out[k + 26 + b : k + 31 + b : 4])
+
+
+@compiled
+def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None:
+    """Of each band the part of the rays that ended at the column; then how much was seen to be free above
+    the clean slices before the next return, and above the highest return; up to where rays tell something;
+    and how far above the clean slices the next return lies, as far as that. All in metres."""
+    n = BANDS.shape[0]
+    for b in range(n):
+        ended, went = 0.0, 0.0
+        for s in range(BANDS[b, 0], BANDS[b, 1]):
+            ended += met[s]
+            went += passed[s]
+        out[b] = ended / (ended + went) if ended + went > 0.0 else UNSEEN
+    free, above, told, top = 0, 0, 0, 0
+    gap = -1
+    for s in range(1, SLICES):
+        if rows[s, 0] > 0.0:
+            top, above = s, 0
+            if s > last and gap < 0:
+                gap = s - last - 1
+        elif passed[s] > 0:
+            above += 1
+            free += s > last and gap < 0
+        if met[s] + passed[s] > 0:
+            told = s
+    out[n] = free * SLICE
+    out[n + 1] = above * SLICE
+    out[n + 2] = told * SLICE
+    out[n + 3] = (gap if gap >= 0 else max(told - top, 0)) * SLICE
 
 
 @compiled

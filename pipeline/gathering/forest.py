@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -14,11 +15,11 @@ from pipeline.compiled import compiled
 from pipeline.errors import StemmapError
 from pipeline.gathering.features import NAMES
 from pipeline.geometry import Float
-from pipeline.records import Int32, Verdict
+from pipeline.records import CLASSES as CLASSES
+from pipeline.records import Int32
 
-# The kinds that are told apart, in the order of the JSON's shares.
-CLASSES = (Verdict.TREE, Verdict.POLE, Verdict.PERSON, Verdict.BUSH, Verdict.WALL, Verdict.OTHER)
 ALL_AROUND, ONE_WAY = "all around", "one way"
+PACKAGE = "package"  # the name of the trees that come with the package
 FILE = Path(__file__).with_name("forest.json")
 _MOST_BYTES = 4_000_000
 _MOST_NODES = 100_000
@@ -45,6 +46,21 @@ class Forest:
     share: Float
 
 
+# By a name, as the parameter `gathering.forest` gives it, and whether the sensor sees all around.
+ForestOf = Callable[[str, bool], Forest]
+
+
+def package_alone(name: str, all_around: bool) -> Forest:
+    """The forest of the package; it knows no other.
+
+    Raises:
+        StemmapError: Another one is asked for.
+    """
+    if name != PACKAGE:
+        raise StemmapError(f"the decision trees {name} are not known here")
+    return standard_forest(all_around)
+
+
 @cache
 def standard_forest(all_around: bool) -> Forest:
     """The forest that comes with the package for sensors that see all around, or for those that look one
@@ -58,13 +74,23 @@ def read_forest(path: Path, kind: str) -> Forest:
     Raises:
         StemmapError: The file is too large, is no such JSON, or asks for figures that do not exist.
     """
+    return read_forests(path, kind)[1][0]
+
+
+def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]:
+    """What a file of decision trees holds, and the forests for some kinds of sensors.
+
+    Raises:
+        StemmapError: As `read_forest`.
+    """
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ValueError("it is too large")
-        return forest_of(json.loads(path.read_text(encoding="utf-8")), kind)
+        data = json.loads(path.read_text(encoding="utf-8"))
+        return data, [forest_of(data, kind) for kind in kinds]
     except OSError as error:
         raise _damaged(path, str(error.strerror)) from None
-    except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
         raise _damaged(path, str(error)) from None
 
 

@@ -6,13 +6,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.bend import Bend
 from pipeline.compiled import compiled
+from pipeline.gathering.bending import bent, bent_columns
 from pipeline.gathering.columns import MARGIN, PROFILE, examine
-from pipeline.gathering.features import COUNT, NAMES, features
-from pipeline.gathering.forest import CLASSES, Forest, standard_forest, vote
+from pipeline.gathering.features import COUNT, features
+from pipeline.gathering.forest import CLASSES, ForestOf, package_alone, vote
+from pipeline.gathering.judged import judged
 from pipeline.gathering.memory import SLICE, SLICES, TILE, Memory
 from pipeline.gathering.packed import PackedMemory
-from pipeline.gathering.sight import View, look
+from pipeline.gathering.sight import View, look, look_through
 from pipeline.geometry import Float
 from pipeline.parameters.stages import Gathering as GatheringParameters
 from pipeline.records import Bool, Columns, Float32, Int, Verdict
@@ -20,8 +23,6 @@ from pipeline.records import Bool, Columns, Float32, Int, Verdict
 GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
 SAME = 0.35  # m; a column found again so near is the one of before
 FOLD = 25  # scans after which a snapshot no longer repeats them one by one; as many are kept
-VOXELS, LEAST_VOXELS = NAMES.index("voxels to 3 m"), 6.0
-GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,18 +49,32 @@ class Gathering:
     Args:
         parameters: Of this stage.
         all_around: Whether the sensor sees all around, or one way.
-        forest: Votes on the columns; None takes the one that comes with the package.
+        forests: Where the forest that votes on the columns is found.
+
+    Raises:
+        StemmapError: There is no such forest.
     """
 
     def __init__(
-        self, parameters: GatheringParameters, *, all_around: bool, forest: Forest | None = None
+        self, parameters: GatheringParameters, *, all_around: bool, forests: ForestOf = package_alone
     ) -> None:
+        self._all_around, self._forests = all_around, forests
         self.parameters = parameters
-        self._forest = forest or standard_forest(all_around)
         self.memory = Memory.empty(1 << parameters.voxels_log2)
         self.columns = no_columns()
         self._base = PackedMemory.of(self.memory)
         self._since: list[tuple[Float32, int, int]] = []
+
+    @property
+    def parameters(self) -> GatheringParameters:
+        """In force; new ones act from the next scan that is taken on."""
+        return self._parameters
+
+    @parameters.setter
+    def parameters(self, parameters: GatheringParameters) -> None:
+        self._forest = self._forests(parameters.forest, self._all_around)
+        self._parameters = parameters
+        self._vote_again = True
 
     def add(self, points: Float32, height: Float32, scan: int, view: View) -> None:
         """Take one scan.
@@ -77,8 +92,11 @@ class Gathering:
         first = len(c.verdict) - len(profiles)
         seen = (view.clear_range, view.steepest, view.sensor_offset, view.terrain)
         look(c.axis, c.viewed, c.present, c.absent, pose, *seen, p.range_max)
-        new = (c.viewed[first:], c.present[first:], c.absent[first:], c.figures[first:])
-        features(c.axis[first:], profiles, *new)
+        through = (view.depth, view.sensor_offset, view.terrain)
+        look_through(c.axis, c.met, c.passed, pose, *through, p.range_max)
+        new = slice(first, None)
+        scans, rays = (c.viewed[new], c.present[new], c.absent[new]), (c.met[new], c.passed[new])
+        features(c.axis[new], profiles, *scans, *rays, c.figures[new])
         self._judge(first)
 
     def snapshot(self) -> GatheringState:
@@ -90,6 +108,13 @@ class Gathering:
         self._base, self._since = state.base, list(state.since)
         self.memory = state.folded()
         self.columns = state.columns
+        self._vote_again = True  # another forest may have voted then
+
+    def bend(self, bend: Bend) -> None:
+        """Move what is known with a path that was bent."""
+        self.columns = bent_columns(self.columns, self.memory, bend)
+        self.memory = bent(self.memory, bend)
+        self.settle()
 
     @property
     def is_unsettled(self) -> bool:
@@ -121,37 +146,27 @@ class Gathering:
             profiles.append(around)
         fresh = _rows(np.concatenate(axes), np.concatenate(homes))
         n = len(axes[0])
-        for name in ("viewed", "present", "absent", "figures", "share", "verdict"):
+        for name in ("viewed", "present", "absent", "met", "passed", "figures", "share", "verdict"):
             getattr(fresh, name)[:n] = getattr(old, name)[kept]
-        known = (old.axis, old.viewed, old.present, old.absent)
-        _inherit(*known, fresh.axis, fresh.viewed, fresh.present, fresh.absent, n)
+        nearest = _nearest_before(old.axis, fresh.axis, n)
+        again = np.flatnonzero(nearest >= 0)
+        for name in ("viewed", "present", "absent", "met", "passed"):
+            getattr(fresh, name)[n + again] = getattr(old, name)[nearest[again]]
         self.columns = fresh
         return np.concatenate(profiles)
 
     def _judge(self, first: int) -> None:
         """Give the columns from a row on their verdict; who walked away is told at any time."""
         c = self.columns
+        if self._vote_again:
+            first, self._vote_again = 0, False
         c.share[first:] = vote(c.figures[first:], self._forest)
-        kind = np.array(CLASSES, np.int32)
-        verdict = kind[c.share.argmax(axis=1)] if len(c.share) else np.zeros(0, np.int32)
-        tree = c.share[:, 0] >= self.parameters.tree_share
-        verdict[~tree & (verdict == Verdict.TREE)] = Verdict.OTHER
-        verdict[tree] = Verdict.TREE
-        verdict[_too_few(c.figures)] = Verdict.TOO_FEW_POINTS
-        gone = (c.absent >= GONE_SCANS) & (c.absent > GONE * (c.present + c.absent))
-        verdict[gone] = Verdict.MOVING
-        self.columns = replace(c, verdict=verdict.astype(np.int32))
+        self.columns = replace(c, verdict=judged(c).verdict(self.parameters.tree_share))
 
 
 def no_columns() -> Columns:
     """A table of columns without rows."""
     return _rows(np.zeros((0, 5)), np.zeros((0, 2), np.int64))
-
-
-def _too_few(figures: Float) -> Bool:
-    """Columns of so few voxels that chance can pile them up."""
-    few: Bool = figures[:, VOXELS] < LEAST_VOXELS
-    return few
 
 
 def _rows(axis: Float, tile: Int) -> Columns:
@@ -163,6 +178,8 @@ def _rows(axis: Float, tile: Int) -> Columns:
         viewed=zero,
         present=zero.copy(),
         absent=zero.copy(),
+        met=np.zeros((n, SLICES), np.int32),
+        passed=np.zeros((n, SLICES), np.int32),
         figures=np.zeros((n, COUNT)),
         share=np.zeros((n, len(CLASSES))),
         verdict=np.full(n, Verdict.OTHER, np.int32),
@@ -190,22 +207,14 @@ def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_
 
 
 @compiled
-def _inherit(
-    old_axis: Float,
-    old_viewed: Float,
-    old_present: Float,
-    old_absent: Float,
-    axis: Float,
-    viewed: Float,
-    present: Float,
-    absent: Float,
-    first: int,
-) -> None:
-    """Give each new column what was known of its place."""
+def _nearest_before(old: Float, axis: Float, first: int) -> Int:
+    """For each column from a row on the nearest one of before within SAME, -1 where there is none."""
+    nearest = np.full(axis.shape[0] - first, -1, np.int64)
     for k in range(first, axis.shape[0]):
         best = SAME * SAME
-        for o in range(old_axis.shape[0]):
-            dx, dy = axis[k, 0] - old_axis[o, 0], axis[k, 1] - old_axis[o, 1]
+        for o in range(old.shape[0]):
+            dx, dy = axis[k, 0] - old[o, 0], axis[k, 1] - old[o, 1]
             if dx * dx + dy * dy < best:
                 best = dx * dx + dy * dy
-                viewed[k], present[k], absent[k] = old_viewed[o], old_present[o], old_absent[o]
+                nearest[k - first] = o
+    return nearest

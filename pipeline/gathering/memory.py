@@ -160,6 +160,21 @@ class Memory:
         return fresh
 
 
+def keys_of(mean: Float32) -> Int:
+    """The cells of places, shape (N, 3); -1 where there is none."""
+    place = mean.astype(np.float64)
+    cell = np.floor(place / np.array([SIDE, SIDE, SLICE]))
+    inside = (cell[:, 2] >= 0) & (cell[:, 2] < SLICES) & np.all(np.abs(place[:, :2]) < _FARTHEST, axis=1)
+    ix, iy, h = np.where(inside[:, None], cell, 0.0).astype(np.int64).T
+    return np.where(inside, (ix + _OFFSET << 36) | (iy + _OFFSET << 5) | h, -1)
+
+
+def tiles_of(keys: Int) -> Int:
+    """The tiles of cells, shape (N,)."""
+    ix, iy = keys >> 36, (keys >> 5) & ((1 << 31) - 1)
+    return (ix // TILE_CELLS) << 31 | (iy // TILE_CELLS)
+
+
 @compiled
 def _first_place(key: int | np.int64, mask: int) -> int:
     # The upper bits of the product are well mixed, 26 of them enough for any table that is allowed.

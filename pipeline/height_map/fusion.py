@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
+from pipeline.height_map.bending import bent
 from pipeline.height_map.cells import CELL, COLUMNS, MEAN, SIDE, VARIANCE, VIEWS, WEIGHT, fuse, look
 from pipeline.records import Float32, HeightMap
 from pipeline.terrain import Terrain, ground_at
@@ -85,6 +87,11 @@ class HeightMapper:
         scans = old.scans + 1
         due = scans <= 2 or scans % (RENEW + len(tiles) // TILES_A_SCAN) == 0
         self.state = HeightMapState(tiles, z, scans, _record(tiles) if due else old.record)
+
+    def bend(self, bend: Bend) -> None:
+        """Move what is known with a path that was bent."""
+        tiles = bent(self.state.tiles, bend)
+        self.state = replace(self.state, tiles=tiles, record=_record(tiles))
 
     def record(self) -> HeightMap:
         """The whole map as it is now."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
 from pipeline.health import Health
 from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, PoseEstimate
 from pipeline.slam.fastslam import FastSlam
+from pipeline.slam.loop import Loop
 from pipeline.slam.motion import Motion
 from pipeline.slam.pose_graph import GraphSlam, GraphState
 from pipeline.slam.state import SlamState
@@ -65,6 +67,10 @@ class BackEnd:
         """See FastSlam.place."""
         self._slam.place(index, T_map_base, covariance)
 
+    def close(self, index: int, loop: Loop) -> Bend:
+        """See FastSlam.close."""
+        return self._slam.close(index, loop)
+
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
         """After `place`: the pose, with the health of an estimate before it."""
         return self._slam.estimate(before)
@@ -80,6 +86,10 @@ class BackEnd:
     def path(self) -> Float:
         """x, y [m], yaw [rad] at every scan, shape (N, 3)."""
         return self._slam.path()
+
+    def begun_since(self, scan: int) -> tuple[Float, Float]:
+        """See FastSlam.begun_since."""
+        return self._slam.begun_since(scan)
 
     def landmarks(self) -> tuple[Float, Float]:
         """Positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Bool, Int32
 
@@ -35,25 +35,25 @@ def cells_for(landmarks: int) -> Cells:
     )
 
 
-@compiled
+@compiled_borrowing
 def per_metre(radius: float) -> float:
     """Cells a metre for searches of this radius [m]: four of them hold all within it of a place."""
     return 0.5 / (WIDER * radius)
 
 
-@compiled
+@compiled_within
 def cell_of(u: int, v: int) -> int:
     """The number of a cell in a row and a column of the plane."""
     return (u & (SIDE - 1)) * SIDE + (v & (SIDE - 1))
 
 
-@compiled
+@compiled_within
 def first_of_four(x: float, y: float, scale: float) -> tuple[int, int]:
     """Row and column of the first of the two by two cells that hold all within the radius of a place."""
     return int(np.floor(scale * x - 0.5)), int(np.floor(scale * y - 0.5))
 
 
-@compiled
+@compiled_within
 def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
     """Put the first rows of `mean`, shape (L, 2) [m], into empty cells, `scale` of them a metre."""
     for j in range(known - 1, -1, -1):
@@ -63,14 +63,14 @@ def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
         cells.head[at] = j
 
 
-@compiled
+@compiled_within
 def clear(cells: Cells, known: int) -> None:
     """Empty the cells again, of so many landmarks."""
     for j in range(known):
         cells.head[cells.cell[j]] = -1
 
 
-@compiled
+@compiled_within
 def holds_unseen(
     cells: Cells, mean: Float, seen: Bool, x: float, y: float, radius2: float, scale: float
 ) -> bool:

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2, wrap_angle
 from pipeline.health import Health
 from pipeline.parameters.stages import Slam
@@ -21,9 +22,11 @@ from pipeline.slam import slip
 from pipeline.slam.draws import draws
 from pipeline.slam.frame import FrameMemory
 from pipeline.slam.gaussian import rows_of
+from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.health import Recent, ScanTold, is_astray, judged, remembered, scan_of
-from pipeline.slam.maps import take_ancestors
-from pipeline.slam.motion import Motion, accumulated
+from pipeline.slam.loop import Loop, bent_landmarks, bent_path
+from pipeline.slam.maps import shared_map, take_ancestors
+from pipeline.slam.motion import Motion, accumulated, noise_of
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.scan import against_slip, estimated, use_scan
 from pipeline.slam.state import SlamState
@@ -68,7 +71,8 @@ class FastSlam:
         estimate, frame = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
         if used and len(detections.cluster):
             serial = state.detections - len(detections.cluster)
-            frame = frame.marked(serial, estimate.T_map_base.as_array(), estimate.covariance)
+            at = estimate.T_map_base.as_array()
+            frame = frame.marked(serial, len(state.genealogy), at, estimate.covariance)
         if used and estimate.n_eff < p.resample_below * p.particles:
             ancestors = low_variance_ancestors(weights, offset)
             take_ancestors(ancestors, state.pose, state.maps)
@@ -93,6 +97,28 @@ class FastSlam:
         pose = T_map_base.as_array() + noise @ (axes * np.sqrt(np.maximum(values, 0.0))).T
         pose[:, 2] = wrap_angle(pose[:, 2])
         self.state = self.state.placed(pose)
+
+    def close(self, index: int, loop: Loop) -> Bend:
+        """Close a loop that ends at the newest scan: the path since it began is bent, the landmarks with it,
+        and all particles go on from where the loop ends, with the map and the past of the best one.
+
+        Args:
+            index: Number of the scan, for the draws; loop: what was found.
+        """
+        path = self.path()
+        bend = Bend(path, bent_path(path, loop, noise_of(self.parameters)), loop.first, loop.last)
+        before = self.state
+        known = before.map_of(before.best)
+        landmarks = bent_landmarks(known, before.frame.scan_of(known.birth), bend)
+        self.place(index, loop.T_map_base, loop.covariance)
+        particles = len(self.state.pose)
+        self.state = replace(
+            self.state,
+            maps=shared_map(particles, landmarks),
+            genealogy=Genealogy.of_path(bend.after, particles),
+            frame=self.state.frame.bent(bend, loop.covariance),
+        )
+        return bend
 
     @property
     def is_astray(self) -> bool:
@@ -123,6 +149,14 @@ class FastSlam:
         shape (L, 3) [m^2]."""
         landmarks = self.state.map_of(self.state.best)
         return landmarks.mean, landmarks.covariance
+
+    def begun_since(self, scan: int) -> tuple[Float, Float]:
+        """The well known landmarks of the best particle that were begun at a scan or later: positions, shape
+        (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]; they fit the end of its path."""
+        known = self.state.map_of(self.state.best)
+        young = self.state.frame.scan_of(known.birth) >= scan
+        rows = young & (known.hits >= self.parameters.hits_to_weigh)
+        return known.mean[rows], known.covariance[rows]
 
     def _moved(self, state: SlamState, motion: Motion) -> SlamState:
         moved = accumulated(
@@ -210,7 +244,7 @@ def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[
     pose, mean, spread, n_eff = estimated(state.pose, weights, state.motion, state.motion_covariance)
     landmarks = state.map_of(state.best)
     covariance, frame = state.frame.told(
-        mean, spread, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
+        mean, spread, n_eff, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
     )
     return PoseEstimate(
         T_map_base=Pose2(float(mean[0]), float(mean[1]), float(mean[2])),

@@ -14,12 +14,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pipeline.bend import Bend
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int, Int32
 from pipeline.slam.motion import wrapped
 
 APART = 0.5  # m, or as many radians, between two marks
+NOISE = 4.0  # two sigma of the ratio of two variances of N particles each, times the root of N
 SMALL = 1e-12  # m^2, rad^2; so that a pose without spread has a direction to grow in
 
 
@@ -29,34 +31,45 @@ class FrameMemory:
 
     Attributes:
         serial: int64, shape (M,): landmarks born with this serial number or a later one belong to a mark.
+        scan: int64, shape (M,): the scan there.
         pose: x, y [m], yaw [rad] there, shape (M, 3); covariance: of it, shape (M, 3, 3).
         hidden: Of the error that all particles share, at `at`, shape (3, 3).
         at: Where, shape (3,).
     """
 
     serial: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    scan: Int = field(default_factory=lambda: np.zeros(0, np.int64))
     pose: Float = field(default_factory=lambda: np.zeros((0, 3)))
     covariance: Float = field(default_factory=lambda: np.zeros((0, 3, 3)))
     hidden: Float = field(default_factory=lambda: np.zeros((3, 3)))
     at: Float = field(default_factory=lambda: np.zeros(3))
 
     def told(
-        self, pose: Float, spread: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float
+        self,
+        pose: Float,
+        spread: Float,
+        n_eff: float,
+        mean: Float,
+        birth: Int,
+        hits: Int32,
+        hits_min: int,
+        reach: float,
     ) -> tuple[Float, FrameMemory]:
         """The covariance of a pose in the frame of the map, and the memory after it.
 
         Args:
-            pose: shape (3,); spread: covariance that the particles show, shape (3, 3).
+            pose: shape (3,); spread: covariance that the particles show, shape (3, 3); n_eff: so many they
+                are worth.
             mean, birth, hits: Of the landmarks, shape (L, ...); those nearer than `reach` [m] and seen
                 `hits_min` times are what the pose was found by.
         """
         covariance, hidden = _with_frame(
-            pose, spread, mean, birth, hits, hits_min, reach, self.serial, self.pose, self.covariance,
+            pose, spread, n_eff, mean, birth, hits, hits_min, reach, self.serial, self.pose, self.covariance,
             self.hidden, self.at,
         )  # fmt: skip
         return covariance, replace(self, hidden=hidden, at=pose)
 
-    def marked(self, serial: int, pose: Float, covariance: Float) -> FrameMemory:
+    def marked(self, serial: int, scan: int, pose: Float, covariance: Float) -> FrameMemory:
         """With a mark here if the last one is far enough behind; `serial`: of this scan's first detection."""
         if len(self.serial):
             away = pose - self.pose[-1]
@@ -66,9 +79,34 @@ class FrameMemory:
         return replace(
             self,
             serial=np.append(self.serial, serial),
+            scan=np.append(self.scan, scan),
             pose=np.concatenate([self.pose, pose[None]]),
             covariance=np.concatenate([self.covariance, covariance[None]]),
         )
+
+    def scan_of(self, birth: Int) -> Int:
+        """The scan of the mark that landmarks belong to, shape (L,); 0 where they are older than all."""
+        if not len(self.serial):
+            return np.zeros(len(birth), np.int64)
+        k = np.searchsorted(self.serial, birth, side="right") - 1
+        return np.where(k >= 0, self.scan[np.maximum(k, 0)], 0)
+
+    def bent(self, bend: Bend, covariance: Float) -> FrameMemory:
+        """After a loop was closed: marks move with their scans, and what is known at both ends of a walk is
+        known the better in between (a Brownian bridge, by the share of the marks).
+
+        Args:
+            covariance: Of the pose where the loop was closed, with respect to where it began, (3, 3).
+        """
+        late = np.flatnonzero(self.scan > bend.first)
+        if not len(late):
+            return self
+        pose, sharper = self.pose.copy(), self.covariance.copy()
+        pose[late] = bend.poses(self.pose[late], self.scan[late])
+        base = covariance if late[0] == 0 else covariance + self.covariance[late[0] - 1]
+        share = (np.arange(len(late)) + 1.0) / len(late)
+        sharper[late] += share[:, None, None] * (base - sharper[late])
+        return replace(self, pose=pose, covariance=sharper)
 
     def forgotten(self) -> FrameMemory:
         """Nothing hidden: the particles were put somewhere with the spread that is known."""
@@ -94,6 +132,7 @@ def carried(covariance: Float, dx: float, dy: float) -> Float:
 def _with_frame(
     pose: Float,
     spread: Float,
+    n_eff: float,
     mean: Float,
     birth: Int,
     hits: Int32,
@@ -122,18 +161,28 @@ def _with_frame(
     for m in range(len(serial)):
         if counts[m]:
             least += counts[m] / known * carried(covariance[m], pose[0] - place[m, 0], pose[1] - place[m, 1])
-    both = at_least(spread, least)
+    both = at_least(spread, least, NOISE / np.sqrt(n_eff))
     return both, both - spread
 
 
 @compiled
-def at_least(spread: Float, least: Float) -> Float:
-    """The covariance that is as large as both in every direction, and no larger in their common axes."""
+def at_least(spread: Float, least: Float, noise: float = 0.0) -> Float:
+    """The covariance that is no smaller than `spread` in any direction, and as large as `least` where that is
+    larger by more than `noise`; no larger in their common axes.
+
+    Args:
+        spread, least: shape (3, 3) each, of x, y [m] and heading [rad].
+        noise: Error of the ratio of their variances, both being taken from particles. Of two that are alike
+            but for this the larger one would always be too large, and more so each time that it is kept; so
+            what is larger by less counts for nothing, and what is larger by much, for all that it is
+            (non-negative garrote; Gao 1998).
+    """
     # Two particles far apart spread along a line; what rounding leaves of the rest grows with the distance.
     L = np.linalg.cholesky(spread + SMALL * max(1.0, np.trace(spread)) * np.eye(3))
     L_inv = np.linalg.inv(L)
     values, axes = np.linalg.eigh(L_inv @ least @ L_inv.T)
     B = L @ axes
-    larger = np.maximum(values, 1.0) - 1.0
+    more = np.maximum(values - 1.0, 1e-300)
+    larger = np.maximum(more - noise * noise / more, 0.0)
     grown: Float = spread + (B * larger) @ B.T
     return grown

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.geometry import Float
 
 SMALL_TURN = 0.02  # rad; below it the series of sine and cosine is exact to 1e-10
@@ -27,13 +27,13 @@ class Pose(NamedTuple):
     tt: float
 
 
-@compiled
+@compiled_borrowing
 def pose_of(mu: Float, P: Float) -> Pose:
     """A pose from its mean, shape (3,), and covariance, shape (3, 3)."""
     return Pose(mu[0], mu[1], mu[2], P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
 
 
-@compiled
+@compiled_borrowing
 def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
     """The inverse of `pose_of`, into arrays."""
     mu[0], mu[1], mu[2] = pose.x, pose.y, pose.yaw
@@ -52,7 +52,7 @@ def rows_of(covariance: Float) -> Float:
     return rows
 
 
-@compiled
+@compiled_within
 def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
     """The covariance R[d] (xx, xy, yy) turned by the angle of cosine c and sine s."""
     xx, xy, yy = R[d, 0], R[d, 1], R[d, 2]
@@ -63,7 +63,7 @@ def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
     )
 
 
-@compiled
+@compiled_within
 def expected_spread(
     pose: Pose, c: float, s: float, ax: float, ay: float, R: Float, d: int
 ) -> tuple[float, float, float]:
@@ -82,7 +82,7 @@ def expected_spread(
     )
 
 
-@compiled
+@compiled_within
 def corrected(
     pose: Pose, ax: float, ay: float, S0: float, S1: float, S2: float, y0: float, y1: float
 ) -> Pose:
@@ -107,7 +107,7 @@ def corrected(
     )
 
 
-@compiled
+@compiled_within
 def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
     """Cosine and sine of a yaw from those before it turned by a little."""
     if abs(by) > SMALL_TURN:
@@ -117,7 +117,7 @@ def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
     return c * cos - s * sin, s * cos + c * sin
 
 
-@compiled
+@compiled_within
 def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
     """out[p] = mu + L noise[p] with L L^T = P (Cholesky); a direction without variance gets no noise."""
     l00 = np.sqrt(max(P[0, 0], 0.0))

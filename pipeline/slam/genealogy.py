@@ -8,6 +8,7 @@ one particle are kept of it, so that memory stays bounded.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,19 +67,18 @@ class Genealogy:
             ancestors: Who comes from whom after it, shape (Q,).
             leaf: The best particle after it; its path is taken where the past has to be settled.
         """
-        founders = self._founders_after(len(pose), ancestors)
-        recent = (*self.recent, Generation(pose.astype(np.float32), ancestors))
-        if len(recent) < BLOCK + max(BLOCK, RECENT_POSES // len(pose)):
-            return Genealogy(self.settled, recent, founders)
-        rows = _walk(recent, leaf)[:BLOCK]
-        return Genealogy((*self.settled, rows), recent[BLOCK:], founders)
+        return self.with_scans([(pose, ancestors, leaf)])
 
-    def _founders_after(self, particles: int, ancestors: Int | None) -> tuple[Int, Int]:
-        everyone = np.arange(particles)
-        newer, older = self.founders or (everyone, everyone)
-        if len(self) % FOUNDED == 0:
-            newer, older = everyone, newer
-        return (newer, older) if ancestors is None else (newer[ancestors], older[ancestors])
+    def with_scans(self, scans: Iterable[tuple[Float | Float32, Int | None, int]]) -> Genealogy:
+        """Many scans more, each as `with_scan` takes it: the past is copied once and not for each."""
+        settled, recent, founders = list(self.settled), list(self.recent), self.founders
+        for pose, ancestors, leaf in scans:
+            founders = _founders_after(BLOCK * len(settled) + len(recent), founders, len(pose), ancestors)
+            recent.append(Generation(pose.astype(np.float32), ancestors))
+            if len(recent) >= BLOCK + max(BLOCK, RECENT_POSES // len(pose)):
+                settled.append(_walk(recent, leaf)[:BLOCK])
+                del recent[:BLOCK]
+        return Genealogy(tuple(settled), tuple(recent), founders)
 
     @property
     def distinct_ancestors(self) -> int:
@@ -101,7 +101,17 @@ class Genealogy:
         return np.concatenate([*self.settled, _walk(self.recent, leaf)])
 
 
-def _walk(generations: tuple[Generation, ...], leaf: int) -> Float:
+def _founders_after(
+    scans: int, founders: tuple[Int, Int] | None, particles: int, ancestors: Int | None
+) -> tuple[Int, Int]:
+    """The founders after one scan more, that many before it; see Genealogy."""
+    newer, older = founders or (np.arange(particles),) * 2
+    if scans % FOUNDED == 0:
+        newer, older = np.arange(particles), newer
+    return (newer, older) if ancestors is None else (newer[ancestors], older[ancestors])
+
+
+def _walk(generations: Sequence[Generation], leaf: int) -> Float:
     rows = np.empty((len(generations), 3))
     for i in range(len(generations) - 1, -1, -1):
         ancestors = generations[i].ancestors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,9 +132,9 @@ def _mahalanobis2(shift: Float, covariance: Float) -> float:
 
 def remembered(recent: Recent, scan: ScanTold, driven: float) -> Recent:
     """The fading means after one scan more, `driven` metres after the one before it."""
-    expected = scan.found + scan.missed
+    expected, told = scan.found + scan.missed, math.isfinite(scan.innovation)
     return Recent(
-        innovation=_faded(recent.innovation, scan.innovation, FADING if np.isfinite(scan.innovation) else 0),
+        innovation=_faded(recent.innovation, scan.innovation, FADING if told else 0),
         found=_faded(recent.found, scan.found / max(expected, 1e-9), FADING_FOUND if expected > 0 else 0),
         ambiguous=_faded(
             recent.ambiguous,

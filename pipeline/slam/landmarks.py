@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
 from pipeline.slam.cells import Cells, holds_unseen
@@ -12,7 +12,7 @@ from pipeline.slam.cells import Cells, holds_unseen
 VARIANCE_MIN = 1e-4  # m^2; views of one trunk share an error of about a centimetre
 
 
-@compiled
+@compiled_within
 def kalman_update(
     m: Float, Sigma: Float, j: int, z0: float, z1: float, R0: float, R1: float, R2: float, looks: float
 ) -> None:
@@ -34,7 +34,7 @@ def kalman_update(
     Sigma[j, 2] = max(k10 * R1 + k11 * R2, VARIANCE_MIN, R2 / looks)
 
 
-@compiled
+@compiled_within
 def merge_duplicates(
     mean: Float,
     covariance: Float,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Float32, Int, Int32
 
@@ -238,11 +238,17 @@ def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[
         int32, shape (P, K), ascending, the first of each row valid; int32, shape (P,), how many; and how
         many free rows of the pool all of that may take.
     """
-    particles = pose.shape[0]
     near = np.empty(maps.block.shape, np.int32)
-    length = np.zeros(particles, np.int32)
-    rows = particles * (fresh // ROOM + 2)
-    for p in range(particles):
+    length = np.empty(pose.shape[0], np.int32)
+    shared = _fill_in_reach(maps, pose, reach, near, length)
+    return near, length, pose.shape[0] * (fresh // ROOM + 2) + shared
+
+
+@compiled_borrowing
+def _fill_in_reach(maps: Maps, pose: Float, reach: float, near: Int32, length: Int32) -> int:
+    """Fill what `blocks_in_reach` gives; returns how many of those blocks other particles hold too."""
+    shared = 0
+    for p in range(pose.shape[0]):
         n = 0
         for k in range((maps.places[p] + ROOM - 1) // ROOM):
             b = maps.block[p, k]
@@ -251,19 +257,19 @@ def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[
             if dx * dx + dy * dy <= reach * reach:
                 near[p, n] = k
                 n += 1
-                rows += maps.owners[b] > 1
+                shared += maps.owners[b] > 1
         length[p] = n
-    return near, length, rows
+    return shared
 
 
-@compiled
+@compiled_within
 def widen(maps: Maps, b: int, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
     """Let the bounding box of row b of the pool hold these places too."""
     maps.box[b, 0], maps.box[b, 1] = min(maps.box[b, 0], x_min), min(maps.box[b, 1], y_min)
     maps.box[b, 2], maps.box[b, 3] = max(maps.box[b, 2], x_max), max(maps.box[b, 3], y_max)
 
 
-@compiled
+@compiled_within
 def own_block(maps: Maps, p: int, k: int) -> int:
     """The row of block k of particle p, for it to write in: copied before if others hold it too."""
     b = maps.block[p, k]
@@ -291,7 +297,7 @@ def own_block(maps: Maps, p: int, k: int) -> int:
     return int(n)
 
 
-@compiled
+@compiled_borrowing
 def take_ancestors(ancestors: Int, pose: Float, maps: Maps) -> None:
     """Make each particle its ancestor's twin, in place: their blocks are shared until one of them writes.
 

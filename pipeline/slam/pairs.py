@@ -9,13 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Bool, Int
 from pipeline.slam.cells import Cells, cell_of, first_of_four
 from pipeline.slam.gaussian import Pose, expected_spread
+from pipeline.slam.joint_choice import CHOICES, MOST, Doubts, doubts_for
 
 FEW = 64  # rows
+LIKELY = 6.0  # of -2 log likelihood: a second choice that is less than this behind makes a doubt
 
 
 class Room(NamedTuple):
@@ -27,6 +29,8 @@ class Room(NamedTuple):
         landmark_of: int64, shape (D,), -1 for none.
         turn: int64, shape (D,): the detections in the order in which the last particle took them.
         taken: shape (L,).
+        doubt: shape (D,): which detections have a close choice; claimed: int64, shape (L,): the row of
+            `order` with the likeliest pair of a landmark; doubts: for those that are decided together.
     """
 
     detection: Int
@@ -38,6 +42,9 @@ class Room(NamedTuple):
     landmark_of: Int
     turn: Int
     taken: Bool
+    doubt: Bool
+    claimed: Int
+    doubts: Doubts
 
 
 @compiled
@@ -54,12 +61,17 @@ def room_for(detections: int, landmarks: int) -> Room:
         np.empty(detections, np.int64),
         np.arange(detections),
         np.empty(landmarks, np.bool_),
+        np.empty(detections, np.bool_),
+        np.empty(landmarks, np.int64),
+        doubts_for(),
     )
 
 
-@compiled
+@compiled_within
 def likely_pairs(
     pose: Pose,
+    c: float,
+    s: float,
     centre: Float,
     R: Float,
     mean: Float,
@@ -73,14 +85,13 @@ def likely_pairs(
     """Fill the pairs within the gate, their costs and order, and the best costs of each detection; how many.
 
     Args:
-        pose: Before the scan.
+        pose: Before the scan; c, s: cosine and sine of its yaw.
         centre: shape (D, 2) [m], base frame; R: xx, xy, yy, shape (D, 3).
         mean, covariance: Of the landmarks; cells: which hold them, `scale` a metre.
         gate2: Square of the largest Mahalanobis distance; distance_max: largest distance [m].
         room: Its `turn` has every detection once; the order of the pairs and of the turns is left in it.
     """
     pairs = 0
-    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
     for i in range(centre.shape[0]):
         d = room.turn[i]
         room.landmark_of[d] = -1
@@ -93,28 +104,82 @@ def likely_pairs(
             j = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
             while j >= 0:
                 y0, y1 = mean[j, 0] - wx, mean[j, 1] - wy
-                square = y0 * y0 + y1 * y1
-                S0, S2 = s0 + covariance[j, 0], s2 + covariance[j, 2]
-                S1 = s1 + covariance[j, 1]
+                at, j = j, cells.following[j]
+                if not y0 * y0 + y1 * y1 <= distance_max * distance_max:
+                    continue
+                S0, S2 = s0 + covariance[at, 0], s2 + covariance[at, 2]
+                S1 = s1 + covariance[at, 1]
                 det = S0 * S2 - S1 * S1
                 d2 = (S2 * y0 * y0 - 2.0 * S1 * y0 * y1 + S0 * y1 * y1) / det
-                if square <= distance_max * distance_max and d2 <= gate2:
+                if d2 <= gate2:
                     cost = d2 + np.log(det)
                     room.cost[pairs] = cost
-                    room.detection[pairs], room.landmark[pairs], room.order[pairs] = d, j, pairs
+                    room.detection[pairs], room.landmark[pairs], room.order[pairs] = d, at, pairs
                     if cost < best:
                         best, second = cost, best
                     elif cost < second:
                         second = cost
                     pairs += 1
-                j = cells.following[j]
         room.best[d], room.second[d] = best, second
     _sort(room.cost, room.order, pairs)
     _remember_turns(room, pairs, centre.shape[0])
     return pairs
 
 
-@compiled
+@compiled_within
+def find_doubts(pairs: int, found: int, room: Room) -> int:
+    """Mark the detections with a close choice and free all landmarks of the pairs; returns how many.
+
+    The choice is close where a second landmark is nearly as likely, and where two detections would have one
+    landmark nearly alike.
+    """
+    doubtful = 0
+    for d in range(found):
+        room.doubt[d] = room.second[d] - room.best[d] < LIKELY
+        doubtful += room.doubt[d]
+    for i in range(pairs):
+        room.taken[room.landmark[i]] = False
+    for i in range(pairs):
+        k = room.order[i]
+        d, j = room.detection[k], room.landmark[k]
+        if not room.taken[j]:
+            room.taken[j] = True
+            room.claimed[j] = k
+            continue
+        first = room.claimed[j]
+        if room.cost[k] - room.cost[first] < LIKELY:
+            doubtful += 2 - room.doubt[d] - room.doubt[room.detection[first]]
+            room.doubt[d] = room.doubt[room.detection[first]] = True
+    for i in range(pairs):
+        room.taken[room.landmark[i]] = False
+    return doubtful
+
+
+@compiled_borrowing
+def gather_doubts(pairs: int, room: Room) -> int:
+    """Fill the levels of the search with the surest of the doubtful detections and the free landmarks that
+    each may be of; returns how many levels."""
+    doubts, n = room.doubts, 0
+    for i in range(pairs):
+        k = room.order[i]
+        d, j = room.detection[k], room.landmark[k]
+        if not room.doubt[d] or room.taken[j]:
+            continue
+        level = 0
+        while level < n and doubts.detection[level] != d:
+            level += 1
+        if level == MOST:
+            continue
+        if level == n:
+            doubts.detection[n], doubts.choices[n] = d, 0
+            n += 1
+        if doubts.choices[level] < CHOICES:
+            doubts.landmark[level, doubts.choices[level]] = j
+            doubts.choices[level] += 1
+    return n
+
+
+@compiled_within
 def _sort(cost: Float, order: Int, n: int) -> None:
     """Order the first n rows by cost, equal ones by row: Shell's sort, which needs no memory. Few rows that
     stand nearly in order, as they do after the first particle, want its last pass alone."""
@@ -133,7 +198,7 @@ def _sort(cost: Float, order: Int, n: int) -> None:
         gap //= 2
 
 
-@compiled
+@compiled_within
 def _remember_turns(room: Room, pairs: int, found: int) -> None:
     """Let the next particle, which sees much the same, take the detections as this one sorted them."""
     n = 0

@@ -10,25 +10,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Int, Int32
 from pipeline.slam.cells import Cells
 from pipeline.slam.gaussian import Pose, corrected, expected_spread, keep_pose, pose_of, turned
 from pipeline.slam.health import AMBIGUOUS as DOUBTFUL
 from pipeline.slam.health import FOUND, INNOVATION, MOST_HITS, RECOGNISED
-from pipeline.slam.pairs import Room, likely_pairs
+from pipeline.slam.joint_choice import choose_jointly
+from pipeline.slam.pairs import LIKELY, Room, find_doubts, gather_doubts, likely_pairs
 
-LIKELY = 6.0  # of -2 log likelihood: a second choice that is less than this behind makes a doubt
 
-
-@compiled
+@compiled_within
 def recognise(
     mu: Float,
     P: Float,
     centre: Float,
     R: Float,
-    known: int,
     mean: Float,
     covariance: Float,
     hits: Int32,
@@ -44,12 +42,13 @@ def recognise(
     """Find the landmark of each detection, one to one, correct the pose, and weigh.
 
     Pairs are taken by falling likelihood, first those of detections with one likely landmark; each
-    one is judged with the pose that the pairs before it left.
+    one is judged with the pose that the pairs before it left. Close choices are decided together
+    (see joint_choice).
 
     Args:
         mu, P: The pose before the scan and its covariance; corrected in place.
         centre: shape (D, 2) [m], base frame; R: xx, xy, yy, shape (D, 3).
-        known: So many rows of the next three are landmarks in reach of this particle.
+        mean, covariance, hits: Their first rows are the landmarks in reach of this particle.
         cells: Hold them, `scale` a metre.
         gate: Largest Mahalanobis distance [sigma]; distance_max: largest distance [m].
         hits_to_weigh: Landmarks seen fewer times neither correct nor weigh.
@@ -61,18 +60,28 @@ def recognise(
     """
     gate2 = gate * gate
     pose = pose_of(mu, P)
-    pairs = likely_pairs(pose, centre, R, mean, covariance, cells, scale, gate2, distance_max, room)
-    for j in range(known):
-        room.taken[j] = False
-    log_likelihood, product = 0.0, 1.0
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
-    for doubtful in range(2):
-        for i in range(pairs):
-            k = room.order[i]
-            d, j = room.detection[k], room.landmark[k]
-            doubt = room.second[d] - room.best[d] < LIKELY
-            if room.landmark_of[d] >= 0 or room.taken[j] or doubt != (doubtful == 1):
-                continue
+    pairs = likely_pairs(pose, c, s, centre, R, mean, covariance, cells, scale, gate2, distance_max, room)
+    doubtful = find_doubts(pairs, centre.shape[0], room)
+    log_likelihood, product = 0.0, 1.0
+    for turn in range(3 if doubtful > 0 else 1):  # the sure ones, those decided together, the rest
+        n = pairs
+        if turn == 1:
+            n = gather_doubts(pairs, room)
+            choose_jointly(
+                pose, centre, R, mean, covariance, hits, gate2, hits_to_weigh, room.taken, n, room.doubts
+            )
+        for i in range(n):
+            if turn == 1:
+                d, j = room.doubts.detection[i], room.doubts.best[i]
+                room.doubt[d] = False
+                if j < 0:
+                    continue
+            else:
+                k = room.order[i]
+                d, j = room.detection[k], room.landmark[k]
+                if room.landmark_of[d] >= 0 or room.taken[j] or room.doubt[d] != (turn == 2):
+                    continue
             ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
             S0, S1, S2 = expected_spread(pose, c, s, ax, ay, R, d)
             S0, S1, S2 = S0 + covariance[j, 0], S1 + covariance[j, 1], S2 + covariance[j, 2]
@@ -104,7 +113,7 @@ def recognise(
     return float(log_likelihood) - price
 
 
-@compiled
+@compiled_within
 def _price_of_new(
     pose: Pose,
     centre: Float,
@@ -116,10 +125,11 @@ def _price_of_new(
 ) -> float:
     """What detections of no well known landmark take from the log likelihood: a new tree is as likely as
     one at the gate, else particles that recognise nothing win."""
-    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
-    price = 0.0
+    c, s, price = 0.0, 0.0, 0.0
     for d in range(centre.shape[0]):
         if landmark_of[d] < 0 or hits[landmark_of[d]] < hits_to_weigh:
+            if c == 0.0 and s == 0.0:  # most particles know all that they see, and need neither
+                c, s = np.cos(pose.yaw), np.sin(pose.yaw)
             ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
             S0, S1, S2 = expected_spread(pose, c, s, ax, ay, R, d)
             price += 0.5 * (gate2 + np.log(S0 * S2 - S1 * S1))

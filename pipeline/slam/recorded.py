@@ -86,7 +86,7 @@ def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
         recorded.centre, recorded.covariance, recorded.first, recorded.clear_range,
         rules_of(p), noise_of(p), p.update_distance, p.resample_below,
     )  # fmt: skip
-    genealogy, recent, best = state.genealogy, state.recent, state.best
+    recent, best, scans = state.recent, state.best, []
     found = np.diff(recorded.first)
     for t in range(len(recorded.motion)):
         if told.used[t]:
@@ -94,11 +94,11 @@ def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
             scan = scan_of(told.mean[t], told.odometry[t], int(found[t]))
             recent, best = remembered(before, scan, told.driven[t]), int(told.best[t])
         ancestors = told.ancestors[t] if told.ancestors[t, 0] >= 0 else None
-        genealogy = genealogy.with_scan(told.particles[t], ancestors, best)
+        scans.append((told.particles[t], ancestors, best))
     slam.state = replace(
         state, maps=maps, motion=motion, motion_covariance=motion_covariance, since_update=since_update,
-        detections=state.detections + int(found[told.used].sum()), best=best, genealogy=genealogy,
-        recent=recent, frame=FrameMemory(),
+        detections=state.detections + int(found[told.used].sum()), best=best, recent=recent,
+        genealogy=state.genealogy.with_scans(scans), frame=FrameMemory(),
     )  # fmt: skip
     return Driven(told.pose, told.n_eff)
 

@@ -74,6 +74,7 @@ def use_scan(
     observe(
         pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
         clear_range, reach, first_birth, rules, near, room, told, measured, measured_covariance,
+        np.empty(3), np.zeros((3, 3)),
     )  # fmt: skip
     log_weight -= log_weight.max()
     weights = normalised(log_weight)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.direction import direction_bin
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
@@ -112,7 +112,7 @@ def predict(pose: Float, motion: Float, covariance: Float, noise: Float, use_pro
     return moved
 
 
-@compiled
+@compiled_borrowing
 def observe(
     pose: Float,
     moved: Float,
@@ -134,6 +134,8 @@ def observe(
     told: Float,
     measured: Float,
     measured_covariance: Float,
+    mu: Float,
+    P: Float,
 ) -> None:
     """Update every particle in place.
 
@@ -149,10 +151,10 @@ def observe(
         near, room: Memory for the landmarks in reach and for pairs.
         told: shape (P, TOLD), filled: what each particle tells of the scan (see health).
         measured: x, y, yaw by another source, shape (3,), or of no length; measured_covariance: (3, 3).
+        mu, P: Memory for a pose, shape (3,), and its covariance, shape (3, 3), zeros.
     """
-    mu = np.empty(3)
-    P = np.zeros((3, 3))
     scale = per_metre(rules.distance_max)
+    farthest = _farthest_missed(clear_range, rules.view_range)
     for p in range(pose.shape[0]):
         before_c, before_s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
         x, y, yaw = pose[p, 0], pose[p, 1], pose[p, 2]
@@ -164,7 +166,7 @@ def observe(
         known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, near)
         fill(near.cells, near.mean, known, scale)
         likelihood = recognise(
-            mu, P, centre, R, known, near.mean, near.covariance, near.hits, near.cells, scale,
+            mu, P, centre, R, near.mean, near.covariance, near.hits, near.cells, scale,
             rules.gate, rules.distance_max, rules.hits_to_weigh, room, told, p,
         )  # fmt: skip
         _shift(x, y, yaw, before_c, before_s, motion, mu, told, p)
@@ -172,8 +174,11 @@ def observe(
             draw(mu, P, noise, p, pose)
         else:
             pose[p, 0], pose[p, 1], pose[p, 2] = mu[0], mu[1], mu[2]
-        all_near = _learn(pose, p, maps, near, known, free, room.landmark_of, centre, R, first_birth, rules)
-        missed = _miss(pose, p, near, known, clear_range, rules, told)
+        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+        all_near = _learn(
+            pose, p, c, s, maps, near, known, free, room.landmark_of, centre, R, first_birth, rules
+        )
+        missed = _miss(pose, p, c, s, near, known, clear_range, farthest, rules, told)
         log_weight[p] += rules.weight_power * (likelihood - rules.miss_weight * missed)
         merge_duplicates(
             near.mean, near.covariance, near.hits, near.score, near.birth, known, near.seen,
@@ -183,7 +188,7 @@ def observe(
         _write_back(maps, p, near, all_near)
 
 
-@compiled
+@compiled_within
 def _gather(
     maps: Maps, p: int, near_blocks: Int32, blocks: int, mu: Float, reach: float, near: Near
 ) -> tuple[int, int]:
@@ -216,10 +221,12 @@ def _gather(
     return n, free
 
 
-@compiled
+@compiled_within
 def _learn(
     pose: Float,
     p: int,
+    c: float,
+    s: float,
     maps: Maps,
     near: Near,
     known: int,
@@ -231,8 +238,7 @@ def _learn(
     rules: Rules,
 ) -> int:
     """Sharpen the landmarks of one particle that were seen, marking them, and begin new ones behind them;
-    returns how many rows of `near` there are then."""
-    c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+    returns how many rows of `near` there are then. c, s: cosine and sine of the particle's yaw."""
     n = known
     for d in range(centre.shape[0]):
         z0 = pose[p, 0] + c * centre[d, 0] - s * centre[d, 1]
@@ -258,20 +264,40 @@ def _learn(
     return n
 
 
-@compiled
+@compiled_borrowing
+def _farthest_missed(clear_range: Float, view_range: float) -> float:
+    """Square of the distance beyond which no landmark can be missed in any direction [m^2]."""
+    free = 0.0
+    for k in range(clear_range.shape[0]):
+        if clear_range[k] - BEHIND > free:
+            free = clear_range[k] - BEHIND
+    return min(free * free, view_range * view_range)
+
+
+@compiled_within
 def _miss(
-    pose: Float, p: int, near: Near, known: int, clear_range: Float, rules: Rules, told: Float
+    pose: Float,
+    p: int,
+    c: float,
+    s: float,
+    near: Near,
+    known: int,
+    clear_range: Float,
+    farthest: float,
+    rules: Rules,
+    told: Float,
 ) -> float:
     """Take from the score of landmarks in free view that were not seen; returns how many well known ones
-    there are."""
-    c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+    there are. c, s: cosine and sine of the particle's yaw; farthest: see `_farthest_missed`."""
     missed = 0.0
+    if farthest == 0.0:
+        return missed
     for j in range(known):
         if near.seen[j]:
             continue
         dx, dy = near.mean[j, 0] - pose[p, 0], near.mean[j, 1] - pose[p, 1]
         square = dx * dx + dy * dy
-        if square > rules.view_range * rules.view_range:
+        if square > farthest:
             continue
         free = clear_range[direction_bin(c * dx + s * dy, c * dy - s * dx, clear_range.shape[0])] - BEHIND
         if free > 0.0 and free * free > square:
@@ -283,7 +309,7 @@ def _miss(
     return missed
 
 
-@compiled
+@compiled_within
 def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
     """Keep what changed; a landmark without score leaves its place free."""
     k, b = -1, 0
@@ -314,7 +340,7 @@ def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
         widen(maps, b, x_min, y_min, x_max, y_max)
 
 
-@compiled
+@compiled_within
 def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
     """P = C covariance C^T with the rotation C about z; written out, for the library's product of such
     small matrices costs more than all else here."""
@@ -327,7 +353,7 @@ def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
     P[2, 2] = covariance[2, 2]
 
 
-@compiled
+@compiled_within
 def _shift(
     x: float, y: float, yaw: float, c: float, s: float, motion: Float, mu: Float, told: Float, p: int
 ) -> None:

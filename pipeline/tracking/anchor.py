@@ -87,3 +87,6 @@ def _anchor(
             shared[t, 0, 0], shared[t, 0, 1], shared[t, 1, 0], shared[t, 1, 1] = B[0], B[1], B[1], B[2]
             P[t, 0, 0], P[t, 1, 1] = C[0] + B[0], C[2] + B[2]
             P[t, 0, 1] = P[t, 1, 0] = C[1] + B[1]
+            # What the old place told of the velocity, the landmark's place does not.
+            P[t, :2, 2:] = 0.0
+            P[t, 2:, :2] = 0.0

@@ -21,26 +21,29 @@ def tree_columns(columns: Columns) -> Int:
     return one_each
 
 
-def assign_verdicts(tracks: TrackTable, columns: Columns, trees: Int) -> Int:
+def assign_verdicts(tracks: TrackTable, columns: Columns, trees: Int, due: Bool) -> Int:
     """Give every track the verdict of what stands at its place.
 
     Each tree column makes one track a tree, the one with most hits in reach. A track that no column
-    is near to keeps what it was.
+    is near to keeps what it was; where its column is overdue, nothing upright stands there, and its hits
+    alone make it no tree.
 
     Args:
         tracks: Changed in place.
         columns: All of them; trees: rows of those that are trees, best first.
+        due: shape (T,): which tracks would have a column by now if they were trees.
 
     Returns:
         Places in `trees` of those without a track.
     """
     is_tree = np.zeros(len(columns.verdict), np.bool_)
     is_tree[trees] = True
-    nearest = _nearest(tracks.x[:, :2], columns.axis[:, :2], REACH)
+    nearest = nearest_other(tracks.x[:, :2], columns.axis[:, :2], REACH)
     near = nearest >= 0
     verdict = columns.verdict[nearest[near]].astype(np.int64)
     verdict[verdict == Verdict.TREE] = Verdict.OTHER  # another track is that tree, unless told below
     tracks.verdict[near] = verdict
+    tracks.verdict[~near & due & (tracks.verdict < 0)] = Verdict.OTHER
     track_of = _track_of(columns.axis[trees, :2], tracks.x[:, :2], tracks.hits, REACH)
     found = track_of >= 0
     tracks.verdict[track_of[found]] = Verdict.TREE
@@ -66,7 +69,7 @@ def _apart(place: Float, distance: float) -> Bool:
 
 
 @compiled
-def _nearest(place: Float, other: Float, reach: float) -> Int:
+def nearest_other(place: Float, other: Float, reach: float) -> Int:
     """The nearest other place to each, -1 where none is in reach, shape (N,)."""
     nearest = np.full(place.shape[0], -1, np.int64)
     for a in range(place.shape[0]):

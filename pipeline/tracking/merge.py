@@ -65,6 +65,7 @@ def join(tracks: TrackTable, old: int, young: int) -> None:
         tracks.eccentricities,
         tracks.radius,
         tracks.radius_weight,
+        tracks.radius_reach,
         tracks.radii,
     ):
         column[old] += column[young]

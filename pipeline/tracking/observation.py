@@ -11,7 +11,10 @@ from pipeline.records import Bool, Int, Verdict
 SECTORS = 36  # of 10 degrees around a trunk, kept as bits: which sides were seen
 DBH_OBSERVATIONS = 3  # fewer radii are no diameter yet
 TAPER = 0.005  # of the radius per metre of height; stems of pine and spruce lose 0.3 to 0.7 cm a metre
-SHARED_RADIUS_SIGMA = 0.01  # m; bark and taper, which more scans of one side do not average out
+# What more scans do not average out of a radius: how far the edges of a trunk are known, a fifth of half a
+# beam's width; how far a round trunk and an even taper are none, in m and as a part of the radius.
+EDGE, UNEVEN, OUT_OF_ROUND = 0.0003, 0.0005, 0.01
+NEAREST = 1.0  # m; a trunk nearer than this counts no more
 
 
 @compiled
@@ -29,6 +32,7 @@ def add_observations(
     eccentricities: Int,
     radius_sum: Float,
     radius_weight: Float,
+    radius_reach: Float,
     radii: Int,
     sides: Int,
 ) -> None:
@@ -40,6 +44,10 @@ def add_observations(
         eccentricity, radius, radius_sigma, arc: See `Detections`, shape (D,).
         above_breast: How far above breast height the radius was measured, shape (D,) [m]; NaN where no
             ground was seen: such a radius counts as it is.
+
+    A radius weighs by its variance and by the square of the distance: what a fit does not know of, as the
+    width of a beam, errs in proportion to the distance and the same way in every scan, so that a hundred
+    views from afar must not outvote a few from near by.
     """
     for d in range(rows.shape[0]):
         t = rows[d]
@@ -48,11 +56,13 @@ def add_observations(
             eccentricity_sum[t] += eccentricity[d]
             eccentricities[t] += 1
         if np.isfinite(radius[d]):
-            weight = 1.0 / (radius_sigma[d] * radius_sigma[d])
+            reach = max(np.hypot(pose[0] - place[d, 0], pose[1] - place[d, 1]), NEAREST)
+            weight = 1.0 / (radius_sigma[d] * reach) ** 2
             # A band of heights sees the thicker foot of a near tree, and its mean lies below breast height.
             lost = TAPER * above_breast[d] if np.isfinite(above_breast[d]) else 0.0
             radius_sum[t] += weight * (radius[d] + lost)
             radius_weight[t] += weight
+            radius_reach[t] += weight * reach
             radii[t] += 1
         bearing = np.arctan2(pose[1] - place[d, 1], pose[0] - place[d, 0])
         sides[t] |= seen_sides(bearing, arc[d])
@@ -81,6 +91,7 @@ def table_figures(
     radii: Int,
     radius: Float,
     radius_weight: Float,
+    radius_reach: Float,
     eccentricity: Float,
     eccentricities: Int,
     verdict: Int,
@@ -100,8 +111,10 @@ def table_figures(
             seen += 1
         coverage[t] = seen * (2.0 * np.pi / SECTORS)
         if radii[t] >= DBH_OBSERVATIONS and coverage[t] >= dbh_arc_min - 1e-9:
-            dbh[t] = 2.0 * radius[t] / radius_weight[t]
-            dbh_sigma[t] = 2.0 * np.sqrt(1.0 / radius_weight[t] + SHARED_RADIUS_SIGMA**2)
+            mean_radius, reach = radius[t] / radius_weight[t], radius_reach[t] / radius_weight[t]
+            shared = (EDGE * reach + UNEVEN) ** 2 + (OUT_OF_ROUND * mean_radius) ** 2
+            dbh[t] = 2.0 * mean_radius
+            dbh_sigma[t] = 2.0 * np.sqrt(1.0 / (radius_weight[t] * reach * reach) + shared)
         if eccentricities[t] > 0:
             mean[t] = eccentricity[t] / eccentricities[t]
         confirmed[t] = verdict[t] == Verdict.TREE if verdict[t] >= 0 else hits[t] >= hits_to_confirm

@@ -21,8 +21,8 @@ class TrackTable:
         stamp_ns: int64, of `x` and of the last observation; first_ns: of the first.
         hits: int64, observations; score: hits less misses.
         eccentricity: Sum over the observations with a finite one; eccentricities: their number.
-        radius: Sum of radii over their variances [1/m]; radius_weight: sum of 1/variance [1/m^2];
-            radii: number of them.
+        radius: Sum of weights times radii; radius_weight: sum of weights, 1 / (sigma distance)^2 [1/m^4];
+            radius_reach: sum of weights times distances; radii: number of them.
         sides: int64: bit k is set when the sector k around the trunk was seen.
         verdict: int64: what was gathered says of it, see Verdict; -1 for nothing.
     """
@@ -39,6 +39,7 @@ class TrackTable:
     eccentricities: Int
     radius: Float
     radius_weight: Float
+    radius_reach: Float
     radii: Int
     sides: Int
     verdict: Int
@@ -60,6 +61,7 @@ class TrackTable:
             eccentricities=ints.copy(),
             radius=floats.copy(),
             radius_weight=floats.copy(),
+            radius_reach=floats.copy(),
             radii=ints.copy(),
             sides=ints.copy(),
             verdict=np.full(rows, -1, np.int64),

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
-from pipeline.parameters.stages import Tracking
+from pipeline.parameters.stages import Gathering, Tracking
 from pipeline.records import Columns, Detections, Int, Trees, Verdict
 from pipeline.tracking.anchor import anchor
 from pipeline.tracking.assignment import assign, in_map
+from pipeline.tracking.backing import backed
+from pipeline.tracking.bending import bent
 from pipeline.tracking.judging import assign_verdicts, tree_columns
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.merge import merge_near
@@ -20,6 +23,9 @@ SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
 SCORE_STANDING = 5.0  # at least, of a tree that what was gathered stands for
 GATHERED_SIGMA = 0.1  # m; the middle of the returns of one side lies so far before the axis
 NANOSECONDS = 1e-9
+DUE_NS = 5_000_000_000  # after its first sight a trunk so near has a column: a dozen scans were gathered
+DUE_REACH = 10.0  # m
+DUE_SHARE = 0.4  # of how far away returns are gathered: what stands farther may have been seen by few scans
 SHARED_SIGMA = 0.01  # m; bark and taper: the views of one trunk share part of their error
 SHARED_COVARIANCE = SHARED_SIGMA**2 * np.eye(2)
 
@@ -105,12 +111,29 @@ class Tracker:
         touched = np.ones(len(self.tracks), np.bool_)
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius).with_score()
 
-    def judge(self, stamp_ns: int, columns: Columns) -> None:
+    def bend(self, bend: Bend, stamps_ns: Int) -> None:
+        """Move the trees with a path that was bent; `stamps_ns`: of its scans, ascending."""
+        self.tracks = bent(self.tracks, np.searchsorted(stamps_ns, self.tracks.first_ns), bend)
+
+    def judge(self, stamp_ns: int, columns: Columns, parameters: Gathering) -> Columns:
         """Take the verdicts of what was gathered: a track is confirmed by them alone, and a tree that no
-        single scan showed begins its track here."""
+        single scan showed begins its track here.
+
+        Args:
+            stamp_ns: Of the scan.
+            columns: As the votes and rules have them.
+            parameters: Of the votes, how many a tree needs; and how far away returns were gathered.
+
+        Returns:
+            The columns with those as trees too that the tracks back (see `pipeline.tracking.backing`).
+        """
+        columns = backed(columns, self.tracks, parameters.tree_share)
         trees = tree_columns(columns)
         place = columns.axis[trees, :2]
-        fresh = assign_verdicts(self.tracks, columns, trees)
+        t, at = self.tracks, self._at
+        reach = min(DUE_REACH, DUE_SHARE * parameters.range_max)
+        near = np.hypot(t.x[:, 0] - at.x, t.x[:, 1] - at.y) < reach
+        fresh = assign_verdicts(t, columns, trees, near & (stamp_ns - t.first_ns >= DUE_NS))
         own = np.tile(GATHERED_SIGMA**2 * np.eye(2), (len(fresh), 1, 1))
         from_here = self._at.inverse().apply(place[fresh])
         Sigma = self._pose_covariance
@@ -120,6 +143,7 @@ class Tracker:
         t.verdict[len(t) - len(fresh) :] = Verdict.TREE
         standing = t.verdict == Verdict.TREE
         t.score[standing] = np.maximum(t.score[standing], SCORE_STANDING)
+        return columns
 
     def _update(self, rows: Int, stamp_ns: int, z: Float, R: Float, B: Float) -> None:
         p, t = self.parameters, self.tracks
@@ -151,6 +175,7 @@ class Tracker:
             t.radii,
             t.radius,
             t.radius_weight,
+            t.radius_reach,
             t.eccentricity,
             t.eccentricities,
             t.verdict,
@@ -193,6 +218,7 @@ def _gather(
         t.eccentricities,
         t.radius,
         t.radius_weight,
+        t.radius_reach,
         t.radii,
         t.sides,
     )

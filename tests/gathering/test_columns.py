@@ -20,10 +20,12 @@ def examined(points):
     return examine(mean, returns, LOW, TILE)
 
 
-def figures_of(axis, profiles):
+def figures_of(axis, profiles, met=None, passed=None):
     out = np.empty((len(axis), COUNT))
     seen = np.full(len(axis), 5.0)
-    features(axis, profiles, seen, np.ones(len(axis)), np.zeros(len(axis)), out)
+    none = np.zeros((len(axis), SLICES), np.int32)
+    met, passed = none if met is None else met, none if passed is None else passed
+    features(axis, profiles, seen, np.ones(len(axis)), np.zeros(len(axis)), met, passed, out)
     return out
 
 

@@ -51,6 +51,7 @@ def test_a_figure_decides_at_its_threshold(tmp_path):
         {ALL_AROUND: [{"figure": "colour", "at_most": 1.0, "yes": LEAF, "no": LEAF}]},
         {ALL_AROUND: [{"figure": "tilt", "at_most": "high", "yes": LEAF, "no": LEAF}]},
         {ALL_AROUND: [{"figure": "tilt", "at_most": 1.0, "yes": LEAF}]},
+        {ALL_AROUND: [{"figure": "tilt", "at_most": 10**400, "yes": LEAF, "no": LEAF}]},
     ],
 )
 def test_a_damaged_file_is_refused_with_a_remedy(tmp_path, changes):

@@ -5,24 +5,30 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.gathering import Gathering, View
-from pipeline.gathering.gathering import FOLD, GONE_SCANS
+from pipeline.gathering import Forest, Gathering, View, depth_image, no_columns
+from pipeline.gathering.forest import CLASSES
+from pipeline.gathering.gathering import FOLD
+from pipeline.gathering.judged import GONE_SCANS
 from pipeline.geometry import Pose2, Pose3
 from pipeline.mapper import Mapper
 from pipeline.parameters import preset
 from pipeline.records import Columns, Float32, Scan, Sensor, Step, Verdict
 from pipeline.terrain import SECTORS
 from pipeline.tracking import Tracker
+from pipeline.tracking.tracker import DUE_NS
 from pipeline.visibility import BINS
 from tests.gathering.clouds import bush, trunk
+from tests.pipeline.strategies import detections
 
 FOREST = preset("forest")
 NOWHERE_FREE = np.zeros(BINS)
+NOTHING_SEEN = depth_image(np.zeros((0, 3), np.float32))
 
 
 def view(free=NOWHERE_FREE, pose=None):
     """From the origin, 1 m above flat ground, as steep as 45 degrees."""
-    return View(pose or Pose2(), np.zeros(3), free, np.ones(BINS), np.full((SECTORS, 200), -1.0))
+    flat = np.full((SECTORS, 200), -1.0)
+    return View(pose or Pose2(), np.zeros(3), free, np.ones(BINS), NOTHING_SEEN, flat)
 
 
 def gathered(*clouds: Float32, free=NOWHERE_FREE, scans=1):
@@ -68,6 +74,30 @@ def test_how_high_a_scan_looked_is_told_from_the_ground():
     )  # 3 m out at 45 degrees, plus 1 m
 
 
+def test_another_forest_votes_on_all_columns_from_the_next_scan_on():
+    def sure(name: str, _all_around: bool) -> Forest:
+        one, none = np.zeros(1, np.int32), np.full(1, -1, np.int32)
+        kind = 0 if name == "package" else 1
+        return Forest(one, none, np.zeros(1), one, one, np.eye(len(CLASSES))[kind : kind + 1])
+
+    gathering = Gathering(FOREST.gathering, all_around=True, forests=sure)
+    points = trunk(5.0, 1.0, 0.15, top=5.9)
+    gathering.add(points, points[:, 2].copy(), 0, view())
+    tree = at(gathering.columns, 5.0, 1.0)
+    assert gathering.columns.verdict[tree] == Verdict.TREE
+    before = gathering.snapshot()
+    other = FOREST.replace({"gathering.forest": "0" * 16}).gathering
+    nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+    for restored in (False, True):
+        gathering.parameters = other
+        if restored:
+            gathering.restore(before)
+        gathering.add(nothing, none, 1, view())
+        assert gathering.columns.share[:, 1].tolist() == [1.0] * len(gathering.columns.verdict)
+        assert gathering.columns.verdict[tree] == Verdict.POLE
+    assert before.columns.verdict[tree] == Verdict.TREE, "a snapshot stays as it was"
+
+
 def test_going_back_gives_the_same_again():
     clouds = [trunk(4.0 + 0.001 * k, 1.0, 0.1, points=300, seed=k) for k in range(FOLD + 20)]
     gathering = Gathering(FOREST.gathering, all_around=True)
@@ -93,13 +123,43 @@ def test_a_tree_that_no_scan_showed_begins_a_track_and_keeps_its_number():
     columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
     tracker = Tracker(FOREST.tracking)
     for _ in range(3):
-        tracker.judge(1, columns)
+        tracker.judge(1, columns, FOREST.gathering)
     trees = tracker.trees()
     assert trees.number.tolist() == [1]
     assert trees.confirmed.tolist() == [True]
     assert trees.observations.tolist() == [0]
     assert np.isnan(trees.dbh[0])
     assert trees.position[0] == pytest.approx([5.0, 1.0], abs=0.03)
+
+
+@pytest.mark.parametrize(("x", "stays"), [(6.0, False), (15.0, True)])
+def test_hits_make_no_tree_where_a_column_is_overdue(x, stays):
+    """Beside a true trunk something is seen that never stands upright; from afar nobody can say so yet."""
+    columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
+    tracker = Tracker(FOREST.tracking)
+    second = 1_000_000_000
+    for k in range(3):
+        found = detections([[5.0, 1.0], [x, -3.0]])
+        tracker.process(k * second, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+    shown = []
+    for stamp_ns in (3 * second, DUE_NS):
+        tracker.judge(stamp_ns, columns, FOREST.gathering)
+        shown.append(tracker.trees().confirmed.tolist())
+    assert shown == [[True, True], [True, stays]]
+    late = gathered(trunk(x, -3.0, 0.15, top=5.9), scans=3).columns
+    tracker.judge(2 * DUE_NS, late, FOREST.gathering)
+    assert tracker.trees().confirmed.tolist() == [True, True], "a column that comes late counts"
+
+
+def test_hits_count_where_returns_are_gathered_only_from_nearer():
+    """Nobody can miss a column at 6 m who remembers no return from farther than 5 m."""
+    nothing, near = no_columns(), FOREST.gathering.model_copy(update={"range_max": 5.0})
+    for parameters, stays in ((FOREST.gathering, False), (near, True)):
+        tracker = Tracker(FOREST.tracking)
+        for k in range(3):
+            tracker.process(k, Pose2(), np.eye(3) * 1e-6, detections([[6.0, -3.0]]), NOWHERE_FREE, 15.0)
+        tracker.judge(DUE_NS, nothing, parameters)
+        assert tracker.trees().confirmed.tolist() == [stays]
 
 
 def test_the_paper_gathers_nothing():

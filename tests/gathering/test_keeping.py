@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from typing import IO
 
 import numpy as np
 import pytest
@@ -49,3 +50,14 @@ def test_what_training_needs_is_looked_for_before_hours_of_simulating(tmp_path, 
     assert "no such folder" in capsys.readouterr().err
     assert main(["train", str(tmp_path / "place"), "--out", str(tmp_path / "forest.json")]) == 1
     assert "no labelled scans" in capsys.readouterr().err
+
+
+def test_a_file_that_cannot_be_written_whole_is_not_there(tmp_path, monkeypatch):
+    def half(file: IO[bytes], **_columns: object) -> None:
+        file.write(b"PK")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", half)
+    with pytest.raises(StemmapError, match="No space left"):
+        kept_or_made(tmp_path, "a scene", examples)
+    assert not list(tmp_path.iterdir())

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
 from pipeline.health import Health
 from pipeline.parameters.stages import Slam
@@ -19,8 +20,9 @@ from pipeline.records import Detections, PoseEstimate
 from pipeline.slam import slip
 from pipeline.slam.gaussian import rows_of
 from pipeline.slam.health import Recent, ScanTold, is_astray, judged
+from pipeline.slam.loop import Loop
 from pipeline.slam.motion import Motion, accumulated, compound, moved_pose
-from pipeline.slam.pose_graph.keyframe import observe
+from pipeline.slam.pose_graph.keyframe import observe, placed
 from pipeline.slam.pose_graph.smoother import Additions
 from pipeline.slam.pose_graph.state import NOTHING, GraphState
 from pipeline.slam.state import SlamState
@@ -68,6 +70,33 @@ class GraphSlam:
         state.since_update = np.inf
         state.recent = Recent(mapped=state.recent.mapped)
 
+    def close(self, _index: int, loop: Loop) -> Bend:
+        """See FastSlam.close: a keyframe where the loop ends, to which lead both the odometry and the
+        keyframe that was taken near by before; the graph bends all between."""
+        s, before, k = self.state, self.path(), self.state.keyframes
+        pose, additions = loop.T_map_base.as_array(), Additions()
+        additions.pose(k, pose)
+        additions.odometry(k, s.motion, s.motion_covariance)
+        scan = loop.anchor - len(s.past)
+        if scan < 0:
+            additions.pose_prior(k, pose, loop.covariance)
+        else:
+            i = s.keyframe_of[scan]
+            known = s.smoother.estimate()[0][i]
+            turn = np.eye(3)
+            turn[:2, :2] = Pose2(*known).rotation()
+            motion = (Pose2(*known).inverse() @ loop.T_map_base).as_array()
+            additions.tie(i, k, motion, turn.T @ loop.covariance @ turn)
+        poses, points = s.smoother.update(additions)
+        s.keyframe_motion.append(s.motion)
+        if s.keyframe_of:
+            s.keyframe_of[-1], s.since[-1] = k, np.zeros(3)
+        s.landmarks, s.pose = placed(s.landmarks, poses, points), poses[-1]
+        s.covariance = s.smoother.joint_covariance(k, s.pose[2], [])
+        s.motion, s.motion_covariance, s.since_update = np.zeros(3), np.zeros((3, 3)), np.inf
+        s.recent = Recent(mapped=s.recent.mapped)
+        return Bend(before, self.path(), loop.first, loop.last)
+
     @property
     def is_astray(self) -> bool:
         """Whether the known trees are not where they should be seen."""
@@ -93,6 +122,14 @@ class GraphSlam:
         """All landmarks: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""
         known = self.state.landmarks
         return known.mean, known.covariance.reshape(-1, 4)[:, [0, 1, 3]]
+
+    def begun_since(self, scan: int) -> tuple[Float, Float]:
+        """See FastSlam.begun_since."""
+        s = self.state
+        known, row = s.landmarks, max(scan - len(s.past), 0)
+        k = s.keyframe_of[row] if row < len(s.keyframe_of) else s.keyframes
+        rows = (known.begun >= k) & (known.hits >= self.parameters.hits_to_weigh)
+        return known.mean[rows], known.covariance[rows].reshape(-1, 4)[:, [0, 1, 3]]
 
     def _move(self, motion: Motion) -> None:
         s = self.state

@@ -12,7 +12,7 @@ from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int, Int32
 from pipeline.slam.health import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
-from pipeline.slam.proposal import LIKELY
+from pipeline.slam.pairs import LIKELY
 
 
 def moved_joint(m: Float, Sigma: Float, motion: Float, Q: Float) -> None:

@@ -164,7 +164,7 @@ def _extend(
     s.pose = poses[-1]
     alive = known.score > 0.0
     alive[one_tree[:, 1]] = False
-    s.landmarks = _placed(replace(known, node=node), poses, points).take(alive)
+    s.landmarks = placed(replace(known, node=node), poses, points).take(alive)
     waiting = s.landmarks.birth[s.landmarks.node < 0]
     s.sightings = s.sightings.take(np.isin(s.sightings.birth, waiting))
 
@@ -197,9 +197,12 @@ def _count(
     birth = s.detections + np.flatnonzero(~old)
     fresh = Landmarks(
         np.full(n, -1), np.full(n, k), centre[~old], at[~old], C[~old],
-        np.ones(n, np.int32), np.ones(n), birth, np.full(n, s.driven),
+        np.ones(n, np.int32), np.ones(n), birth, np.full(n, s.driven), np.full(n, k),
     )  # fmt: skip
-    grown = Landmarks(known.node, anchor, local, mean, covariance, hits, score, known.birth, seen_at)
+    grown = replace(
+        known, anchor=anchor, local=local, mean=mean, covariance=covariance, hits=hits, score=score,
+        seen_at=seen_at,
+    )  # fmt: skip
     s.landmarks = grown.with_more(fresh)
     births = np.empty(len(centre), np.int64)
     births[old], births[~old] = known.birth[rows], birth
@@ -210,7 +213,7 @@ def _count(
     s.detections += len(centre)
 
 
-def _placed(known: Landmarks, poses: Float, points: Float) -> Landmarks:
+def placed(known: Landmarks, poses: Float, points: Float) -> Landmarks:
     """Where the graph has its landmarks now, and the anchors of the others."""
     mean, inside = known.mean.copy(), known.node >= 0
     mean[inside] = points[known.node[inside]]

@@ -22,7 +22,7 @@ class Landmarks:
         anchor: int64, keyframe; local: shape (L, 2), place in its frame [m]; of those in no graph.
         mean: shape (L, 2) [m]; covariance: shape (L, 2, 2) [m^2], given the path, in the frame of the map.
         hits: int32; score: hits less misses, the existence; birth: int64, serial number of the detection.
-        seen_at: Distance driven until it was seen last [m].
+        seen_at: Distance driven until it was seen last [m]; begun: int64, the keyframe that saw it first.
     """
 
     node: Int
@@ -34,6 +34,7 @@ class Landmarks:
     score: Float
     birth: Int
     seen_at: Float
+    begun: Int
 
     def take(self, rows: Int | Bool) -> Landmarks:
         """Some of them, copied."""

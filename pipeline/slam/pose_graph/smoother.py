@@ -51,9 +51,12 @@ class Additions:
 
     def odometry(self, k: int, motion: Float, covariance: Float) -> None:
         """Motion from keyframe k - 1 to k with its covariance, both in the frame of k - 1."""
+        self.tie(k - 1, k, motion, covariance)
+
+    def tie(self, i: int, k: int, motion: Float, covariance: Float) -> None:
+        """Motion from keyframe i to k, which need not follow it, with its covariance in the frame of i."""
         noise = self._noise(_in_own_axes(covariance, motion[2]))
-        step = self._gtsam.Pose2(*motion)
-        self.graph.add(self._gtsam.BetweenFactorPose2(_x(k - 1), _x(k), step, noise))
+        self.graph.add(self._gtsam.BetweenFactorPose2(_x(i), _x(k), self._gtsam.Pose2(*motion), noise))
 
     def sights(self, keyframes: Int, nodes: Int, centre: Float, R: Float) -> None:
         """Landmarks seen from keyframes: places in the base frame, shape (D, 2) [m], and covariances,

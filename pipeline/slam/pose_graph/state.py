@@ -11,8 +11,8 @@ from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.health import Recent
 from pipeline.slam.maps import MapColumns
 from pipeline.slam.pose_graph.landmarks import Landmarks, Sightings, no_sightings
-from pipeline.slam.pose_graph.path import interpolated
 from pipeline.slam.pose_graph.smoother import Additions, Smoother
+from pipeline.slam.poses import interpolated
 from pipeline.slam.resampling import normalised
 from pipeline.slam.state import SlamState
 
@@ -101,7 +101,7 @@ class GraphState:
         L = len(known.hits)
         landmarks = Landmarks(
             np.arange(L), np.zeros(L, np.int64), np.zeros((L, 2)), known.mean, full,
-            known.hits, known.score.astype(np.float64), known.birth, np.zeros(L),
+            known.hits, known.score.astype(np.float64), known.birth, np.zeros(L), np.zeros(L, np.int64),
         )  # fmt: skip
         return cls(
             smoother, landmarks, pose.copy(), covariance,

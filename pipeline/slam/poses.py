@@ -1,4 +1,4 @@
-"""The path at every scan, from keyframes that a loop may have moved since."""
+"""Rows of poses, and the path at every scan from keyframes that a loop may have moved since."""
 
 from __future__ import annotations
 
