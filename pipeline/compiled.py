@@ -25,13 +25,35 @@ from numba.core import event
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_IMPORT = re.compile(r"^from ([\w.]+) import (\([^)]*\)|.*)$", re.MULTILINE)
+_FROM = re.compile(r"^from ([\w.]+) import (\([^)]*\)|.*)$", re.MULTILINE)
+_IMPORT = re.compile(r"^import (.*)$", re.MULTILINE)
 _NAME = re.compile(r"\w+")
+_DOTTED = re.compile(r"[\w.]+")
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a loop over arrays to machine code; it holds no interpreter lock while it runs."""
-    kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    # A kernel that does not say whether it counts would do as the one that calls it.
+    kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=True)(function)
+    _keep_by_all_sources(kernel, function.__module__)
+    return kernel
+
+
+def compiled_borrowing(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile an inner loop that makes no array and keeps none: it only borrows those that it is handed, so
+    it need not count who holds them. Counting is an atomic operation wherever an array is named in a tuple
+    of arrays, which costs more than the arithmetic of a loop over few landmarks."""
+    kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function)
+    _keep_by_all_sources(kernel, function.__module__)
+    return kernel
+
+
+def compiled_within(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile an inner loop, as above, into each kernel that calls it: a call hands over every array of a
+    tuple of arrays by eight numbers, which costs more than a short loop itself."""
+    kernel: Callable[P, R] = numba.njit(
+        cache=True, nogil=True, error_model="numpy", _nrt=False, inline="always"
+    )(function)
     _keep_by_all_sources(kernel, function.__module__)
     return kernel
 
@@ -41,7 +63,7 @@ def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
     faster. The order of the terms is set when it is compiled: runs on one kind of processor agree in
     every byte, two kinds may differ in the last bit, as with the library's products of matrices."""
     kernel: Callable[P, R] = numba.njit(
-        cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz"}
+        cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz"}, _nrt=True
     )(function)
     _keep_by_all_sources(kernel, function.__module__)
     return kernel
@@ -95,8 +117,11 @@ def sources_digest(module: str) -> str:
 def _imported(module: str) -> frozenset[str]:
     """The modules that are loaded and named in the imports of this one."""
     names: set[str] = set()
-    for origin, what in _IMPORT.findall(_source(module).decode()):
+    text = _source(module).decode()
+    for origin, what in _FROM.findall(text):
         names |= {origin, *(f"{origin}.{name}" for name in _NAME.findall(what))}
+    for what in _IMPORT.findall(text):
+        names |= set(_DOTTED.findall(what))
     return frozenset(name for name in names if name in sys.modules)
 
 

@@ -18,6 +18,7 @@ def judge(clusters: Clusters, parameters: Detection) -> Clusters:
     p, c = parameters, clusters
     verdict = _verdicts(
         c.hidden,
+        c.cut,
         c.extent,
         c.eccentricity,
         c.radial_std,
@@ -25,6 +26,7 @@ def judge(clusters: Clusters, parameters: Detection) -> Clusters:
         c.arc,
         p.size_max,
         p.height_extent_min,
+        p.whole,
         p.e_min,
         p.e_max,
         p.cylindrical_stddev_thresh,
@@ -38,6 +40,7 @@ def judge(clusters: Clusters, parameters: Detection) -> Clusters:
 @compiled
 def _verdicts(
     hidden: Bool,
+    cut: Bool,
     extent: Float,
     eccentricity: Float,
     radial_std: Float,
@@ -45,6 +48,7 @@ def _verdicts(
     arc: Float,
     size_max: float,
     height_extent_min: float,
+    whole: bool,
     e_min: float,
     e_max: float,
     deviation_max: float,
@@ -62,6 +66,8 @@ def _verdicts(
             verdict[k] = Verdict.TOO_THICK
         elif extent[k, 2] < height_extent_min:
             verdict[k] = Verdict.TOO_LOW
+        elif whole and cut[k]:  # what comes below is told by a whole side of the trunk
+            verdict[k] = Verdict.AT_BORDER
         elif eccentricity[k] < e_min:
             verdict[k] = Verdict.TOO_ROUND
         elif eccentricity[k] > e_max:
@@ -159,11 +165,22 @@ def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
     has_circle = np.isfinite(c.radius)
     radius = np.where(has_circle, c.radius, np.nan)
     arc = np.where(has_circle, c.arc, np.nan)
+    cut = c.cut & p.whole
     width, up = np.maximum(c.extent[:, 0], c.extent[:, 1]), c.extent[:, 2]
     return (
         Check(Verdict.HIDDEN, "edge hidden", "", c.hidden.astype(np.float64), "", np.nan, "", c.hidden),
         _at_most(Verdict.TOO_THICK, "width", "m", width, p.size_max, "size_max"),
         _at_least(Verdict.TOO_LOW, "visible height", "m", up, p.height_extent_min, "height_extent_min"),
+        Check(
+            Verdict.AT_BORDER,
+            "cut off at the border",
+            "",
+            cut.astype(np.float64),
+            "",
+            np.nan,
+            "detection.whole" if p.whole else "",
+            cut,
+        ),
         _at_least(Verdict.TOO_ROUND, "eccentricity", "", c.eccentricity, p.e_min, "e_min"),
         _at_most(Verdict.TOO_LONG, "eccentricity", "", c.eccentricity, p.e_max, "e_max"),
         _at_most(

@@ -30,3 +30,12 @@ def direction_bin(x: float, y: float, bins: int) -> int:
     The sectors are cut by the diamond of `direction_turn`; the widest is twice as wide as the narrowest.
     """
     return min(int(np.floor(direction_turn(x, y) * bins)), bins - 1)
+
+
+def bin_direction(k: int, bins: int) -> tuple[float, float]:
+    """The unit vector to the middle of a sector of `direction_bin`; k counts around, over the last too."""
+    along = 4.0 * ((k % bins + 0.5) / bins) - 1.0
+    side = along - 1.0 if 0.0 <= along <= 2.0 else (-1.0 - along if along < 0.0 else 3.0 - along)
+    x = (1.0 - abs(side)) * (1.0 if 0.0 <= along <= 2.0 else -1.0)
+    length = float(np.hypot(x, side))
+    return x / length, side / length

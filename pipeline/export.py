@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -14,9 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.files import UNFINISHED, hold
 from pipeline.geometry import Float
 from pipeline.records import Frame, HeightMap, Path, Trees, Verdict
 
+ROWS = "detections.csv"  # is written as the run goes
 TREE_COLUMNS = (
     "tree",
     "x_m",
@@ -198,13 +201,15 @@ class RunFiles:
         self._made_folder = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         # A folder of its own, so that two runs into one place do not mix their halves.
-        self._staging = FilePath(tempfile.mkdtemp(prefix=".unfinished-", dir=folder))
-        rows = self._staging / "detections.csv"
+        self._staging = FilePath(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder))
+        rows = self._staging / ROWS
         if earlier is not None and (earlier / rows.name).is_file():
             shutil.copyfile(earlier / rows.name, rows)
         else:
             rows.write_text(csv_text(DETECTION_COLUMNS, []), encoding="utf-8", newline="")
         self._detections = rows.open("a", encoding="utf-8", newline="")
+        with contextlib.suppress(OSError):  # a disk of a network may know no locks
+            hold(self._detections)
 
     def add(self, frame: Frame, start_ns: int) -> None:
         """Write the clusters of one scan."""
@@ -247,7 +252,7 @@ class RunFiles:
         else:
             (self._staging / "state.zip").write_bytes(state)
         # run.json last: where it stands, the others do too
-        for name in ("detections.csv", *states, *texts):
+        for name in (ROWS, *states, *texts):
             (self._staging / name).replace(self._folder / name)
         self._staging.rmdir()
 

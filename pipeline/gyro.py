@@ -61,6 +61,11 @@ class Gyro:
             self._readings.popleft()
         self._learn_bias(rate, standing=standing)
 
+    def forget_since(self, stamp_ns: int) -> None:
+        """Drop the readings of this time and later: they were of no such time."""
+        while self._readings and self._readings[-1][0] >= stamp_ns:
+            self._readings.pop()
+
     def _learn_bias(self, rate: float, *, standing: bool) -> None:
         if not standing:
             self._block.clear()

@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from pipeline.gathering import Forest, Gathering, GatheringState, View, steepest_by_direction
+import numpy as np
+
+from pipeline import loops
+from pipeline.gathering import ForestOf, Gathering, GatheringState, View, package_alone
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.growing_path import GrowingPath
 from pipeline.gyro import fused
 from pipeline.height_map import HeightMapper, HeightMapState
 from pipeline.parameters import Parameters
-from pipeline.perception import Seen, perceive
-from pipeline.records import Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step
+from pipeline.perception import Looked, Seen, decide, look
+from pipeline.records import Columns, Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step, Trees
 from pipeline.recovery import Mapped, Recovery, RecoveryState
-from pipeline.slam import BackEnd, BackEndState, Motion
+from pipeline.slam import BackEnd, BackEndState, Loop, Motion
 from pipeline.slam.motion import noise_of, step_variances
 from pipeline.tracking import Tracker
 from pipeline.tracking.table import TrackTable
-from pipeline.turns import is_fused, is_gathered
 from pipeline.watch import Watch, no_watch
+
+LOOP = "a loop is closed: path and map since the place was left are bent, so that the trees there stand once"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapperState:
-    """An independent copy of all that the mapper knows between two scans."""
+    """An independent copy of all that the mapper knows between two scans.
+
+    `placed` is the scan since which the path is driven: no odometry leads to it, for the robot was put there.
+    """
 
     slam: BackEndState
     gathering: GatheringState
@@ -33,7 +41,29 @@ class MapperState:
     next_number: int
     odometry: Pose2 | None
     path_length: int
+    placed: int = 0
     recovery: RecoveryState[MapperState] = field(default_factory=RecoveryState)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noted:
+    """What the stages made of one scan, for who wants to begin again at a later one of them.
+
+    Attributes:
+        seen: What the scan showed; estimate: where that was.
+        landmarks: Of SLAM after the scan: positions, shape (L, 2) [m], and covariances xx, xy, yy, (L, 3).
+        columns: What is gathered, where the scan was; else None.
+        is_usual: Whether neither the pose nor the map hung on the trees: the robot was not lost, and no loop
+            was looked for among them.
+    """
+
+    index: int
+    stamp_ns: int
+    seen: Seen
+    estimate: PoseEstimate
+    landmarks: tuple[Float, Float]
+    columns: Columns | None
+    is_usual: bool
 
 
 class Mapper:
@@ -45,7 +75,13 @@ class Mapper:
         T_base_lidar: Where it stands on the robot.
         seed: Of every random number.
         watch: Is entered around each stage with its name, so that the caller can measure it.
-        forest: Votes on what was gathered; None takes the one that comes with the package.
+        forests: Where the forest is found that votes on what was gathered.
+
+    Attributes:
+        note: Is told of each scan once it is mapped; None where nobody listens.
+
+    Raises:
+        StemmapError: There is no such forest.
     """
 
     def __init__(
@@ -56,19 +92,22 @@ class Mapper:
         T_base_lidar: Pose3,
         seed: int,
         watch: Watch = no_watch,
-        forest: Forest | None = None,
+        forests: ForestOf = package_alone,
     ) -> None:
         self._parameters = parameters
         self._sensor = sensor
         self._T_base_lidar = T_base_lidar
         self._watch = watch
         self._slam = BackEnd(parameters.slam, seed)
-        self._gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=forest)
+        self._gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forests=forests)
         self._ground = HeightMapper()
         self._tracker = Tracker(parameters.tracking)
         self._odometry: Pose2 | None = None
         self._path = GrowingPath()
+        self._placed = 0
         self._recovery: Recovery[MapperState] = Recovery(seed)
+        self.note: Callable[[Noted], None] | None = None
+        self._asked_trees = False
 
     @property
     def parameters(self) -> Parameters:
@@ -77,9 +116,9 @@ class Mapper:
 
     @parameters.setter
     def parameters(self, parameters: Parameters) -> None:
+        self._gathering.parameters = parameters.gathering  # first: it may not find its forest
         self._parameters = parameters
         self._slam.parameters = parameters.slam
-        self._gathering.parameters = parameters.gathering
         self._tracker.parameters = parameters.tracking
 
     @property
@@ -95,57 +134,93 @@ class Mapper:
 
     def process(self, step: Step) -> Frame:
         """Map one scan."""
-        p, watch = self._parameters, self._watch
+        return self.take(step, self.look(step))
 
-        seen = perceive(step, self._sensor, self._T_base_lidar, p, watch)
+    def look(self, step: Step) -> Looked:
+        """What a scan shows; nothing of it is taken into the map yet."""
+        return look(step, self._sensor, self._T_base_lidar, self._parameters, self._watch)
 
-        with watch("slam"):
+    def take(self, step: Step, looked: Looked) -> Frame:
+        """Map a scan by what it shows: all of `process` that hangs on more than the scan itself. Of the
+        step's scan only the time is asked."""
+        p = self._parameters
+        self._asked_trees = False
+        seen = decide(looked, p.detection, self._watch)
+
+        with self._watch("slam"):
             motion, odometry = self._motion(step)
             moved = self._with_gyro(step, motion)
             estimate, told = self._recovery.locate(
                 step.index,
                 moved,
                 seen.detections,
-                seen.free,
+                looked.free,
                 p,
-                Mapped(self._slam, self._known, self._take_back, self._tracker.trees),
+                Mapped(
+                    self._slam,
+                    self._known,
+                    self._take_back,
+                    self._trees,
+                    lambda estimate: self._mapped(
+                        estimate, np.concatenate([self._path.motion, [moved.step.as_array()]])
+                    ),
+                    lambda loop: self._bend(step.index, loop),
+                    lambda pose, covariance: self._put(step.index, pose, covariance, step.index + 1),
+                ),
             )
 
         if not self._recovery.searching:  # while it is lost, the map stays as it is
             self._track(step.scan.stamp_ns, seen, estimate)
-            self._map(step, seen, estimate)
+            self._map(step, looked, estimate)
         elif self._gathering.is_unsettled:
-            with watch("gathering"):
+            with self._watch("gathering"):
                 self._gathering.settle()
 
+        self._path.append(step.scan.stamp_ns, estimate, moved.step)
+        closed = self._close_loop(step.index, estimate)
+        if closed is not None:
+            estimate, told = closed, (*told, LOOP)
         trees = self._tracker.trees()
-
-        self._path.append(step.scan.stamp_ns, estimate)
+        if self.note is not None:
+            self.note(self._noted(step, seen, estimate))
         return Frame(
             index=step.index,
             stamp_ns=step.scan.stamp_ns,
-            raw=seen.raw,
-            filtered=seen.filtered,
-            labels=seen.labels,
+            raw=looked.raw,
+            filtered=looked.filtered,
+            labels=looked.labels,
             clusters=seen.clusters,
             detections=seen.detections,
             estimate=estimate,
             T_odom_base=odometry,
-            sensor_offset=seen.sensor_offset,
+            sensor_offset=looked.sensor_offset,
             trees=trees,
-            counts={
-                "returns": len(step.scan.points),
-                "without a value": step.scan.dropped,
-                "out of range": len(step.scan.points) - len(seen.raw),
-                **seen.counts,
-            },
-            warnings=(*step.warnings, *seen.warnings, *told),
+            counts=looked.counts,
+            warnings=(*step.warnings, *looked.warnings, *told),
             columns=self._gathering.columns if p.gathering.method == "columns" else None,
             ground=None if p.ground.method == "none" else self._ground.state.record,
-            base_z=(self._ground.state.sensor_z or 0.0) - float(seen.sensor_offset[2])
+            base_z=(self._ground.state.sensor_z or 0.0) - float(looked.sensor_offset[2])
             if self._ground.state.scans
             else 0.0,
+            clearance=looked.clearance,
         )
+
+    def _noted(self, step: Step, seen: Seen, estimate: PoseEstimate) -> Noted:
+        gathered = seen.looked.overview is not None and not self._recovery.searching
+        return Noted(
+            step.index,
+            step.scan.stamp_ns,
+            seen,
+            estimate,
+            self._slam.landmarks(),
+            self._gathering.columns if gathered else None,
+            not self._asked_trees and not self._recovery.searching,
+        )
+
+    def _trees(self) -> Trees:
+        """For stages before the tracking."""
+        self._asked_trees = True
+        return self._tracker.trees()
 
     def _with_gyro(self, step: Step, motion: Pose2) -> Motion:
         moved = Motion(motion, step.slack, step.doubt, step.measured)
@@ -165,30 +240,75 @@ class Mapper:
                 estimate.T_map_base,
                 estimate.covariance,
                 seen.detections,
-                seen.free,
+                seen.looked.free,
                 view_range,
                 seen.heights,
                 estimate.relative,
             )
             tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, view_range)
 
-    def _map(self, step: Step, seen: Seen, estimate: PoseEstimate) -> None:
+    def _map(self, step: Step, looked: Looked, estimate: PoseEstimate) -> None:
         """What is not taken from every scan (see turns): the columns that judge the trees, and the ground."""
-        p, watch = self._parameters.gathering, self._watch
-        if seen.above is not None and p.method == "columns" and is_gathered(step.index, p.every):
-            boxed, height, terrain = seen.above
+        watch, over = self._watch, looked.overview
+        if over is not None:
             with watch("gathering"):
-                steepest = steepest_by_direction(seen.raw, seen.sensor_offset, self._sensor.rings > 0)
-                view = View(estimate.T_map_base, seen.sensor_offset, seen.free, steepest, terrain.height)
-                self._gathering.add(boxed, height, step.index, view)
-                self._tracker.judge(step.scan.stamp_ns, self._gathering.columns)
+                view = View(
+                    estimate.T_map_base,
+                    looked.sensor_offset,
+                    looked.free,
+                    over.steepest,
+                    over.depth,
+                    over.terrain,
+                )
+                self._gathering.add(over.points, over.height, step.index, view)
+                p = self._parameters.gathering
+                columns = self._tracker.judge(step.scan.stamp_ns, self._gathering.columns, p)
+                self._gathering.columns = columns
         elif self._gathering.is_unsettled:
             with watch("gathering"):
                 self._gathering.settle()
 
-        if seen.above is not None and is_fused(step.index, p.every):
+        if looked.terrain is not None:
             with watch("height map"):
-                self._ground.add(seen.above[2], estimate.T_map_base, seen.sensor_offset)
+                self._ground.add(looked.terrain, estimate.T_map_base, looked.sensor_offset)
+
+    def _close_loop(self, index: int, estimate: PoseEstimate) -> PoseEstimate | None:
+        """The pose after a loop was closed, if this scan closes one: see `pipeline.loops`."""
+        p = self._parameters.relocalisation
+        if p.method == "none" or self._recovery.searching or not loops.is_due(index, self._path.sigma_xy):
+            return None
+        with self._watch("slam"):
+            loop = loops.find_loop(self._mapped(estimate, self._path.motion), p)
+            if loop is None:
+                return None
+            self._bend(index, loop)
+            self._recovery.forget()
+            return self._slam.estimate(estimate)
+
+    def _mapped(self, estimate: PoseEstimate, motion: Float) -> loops.Mapped:
+        path, noise = self._slam.path(), noise_of(self._parameters.slam)
+        return loops.Mapped(
+            self._path.stamp_ns,
+            path,
+            self._trees,
+            self._slam.begun_since,
+            estimate,
+            noise,
+            motion,
+            self._placed,
+        )
+
+    def _bend(self, index: int, loop: Loop) -> None:
+        """Close a loop: path and map are bent."""
+        bend = self._slam.close(index, loop)
+        self._tracker.bend(bend, self._path.stamp_ns)
+        self._gathering.bend(bend)
+        self._ground.bend(bend)
+
+    def _put(self, index: int, T_map_base: Pose2, covariance: Float, first: int) -> None:
+        """Put the base somewhere; `first`: the scan from which on the path goes on there."""
+        self._slam.place(index, T_map_base, covariance)
+        self._placed = first
 
     def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
         """The odometry's step since the last scan that had one, and its pose; without any the robot
@@ -209,12 +329,14 @@ class Mapper:
             self._tracker.next_number,
             self._odometry,
             len(self._path),
+            self._placed,
             self._recovery.state.copy(),
         )
 
-    def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float) -> None:
-        """Go on from a state of another mapper; `stamp_ns` and `sigma_xy` are its path's, one a scan."""
-        self._path = GrowingPath(stamp_ns, sigma_xy)
+    def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float, motion: Float) -> None:
+        """Go on from a state of another mapper; `stamp_ns`, `sigma_xy` and `motion`, by the odometry to each
+        scan from the one before, are its path's, one a scan."""
+        self._path = GrowingPath(stamp_ns, sigma_xy, motion)
         self.restore(state)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
@@ -223,8 +345,13 @@ class Mapper:
         Args:
             covariance: Of x, y [m], yaw [rad], shape (3, 3).
         """
-        self._slam.place(index, T_map_base, covariance)
+        self._put(index, T_map_base, covariance, index)
         self._odometry = None
+
+    @property
+    def motion(self) -> Float:
+        """x, y [m], yaw [rad] by the odometry to each scan from the one before, shape (N, 3)."""
+        return self._path.motion.copy()
 
     def restore(self, state: MapperState) -> None:
         """Go back to a snapshot of this mapper's own past; the state itself is left untouched."""
@@ -232,6 +359,7 @@ class Mapper:
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
         self._path.cut(state.path_length)
+        self._placed = state.placed
         self._recovery.state = state.recovery.copy()
 
     def _take_back(self, before: MapperState) -> None:

@@ -78,5 +78,6 @@ def _clusters(place: Float, dbh: Float) -> Clusters:
         arc=np.zeros(n),
         extent=np.stack([dbh, dbh, unknown], axis=1),
         hidden=np.zeros(n, np.bool_),
+        cut=np.zeros(n, np.bool_),
         verdict=np.full(n, Verdict.TREE, np.int32),
     )

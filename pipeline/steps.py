@@ -26,6 +26,7 @@ SAME_TIME_NS = 50_000_000
 MOST_POSES = 64
 STANDS = (0.005, 0.002)  # m, rad; a robot that stands stays within it
 SETTLES_NS = 300_000_000
+AHEAD_NS = 1_000_000_000
 TILTS_NS = 90_000_000
 FASTEST = 20.0  # rad/s; a robot that maps trees, whatever it shakes like, does not turn this fast
 
@@ -179,15 +180,36 @@ class Joiner:
         return near if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS else None
 
     def _add_imu(self, imu: Imu) -> None:
-        if self._turned_ns is None or imu.stamp_ns > self._turned_ns:
-            self._turned_ns = imu.stamp_ns
-            self._add_turn_rate(imu)
+        if (
+            self._turned_ns is not None
+            and imu.stamp_ns <= self._turned_ns
+            and not self._was_ahead(imu.stamp_ns)
+        ):
+            self._leave_out("IMU readings that were not later than the one before")
+            return
+        self._turned_ns = imu.stamp_ns
+        self._add_turn_rate(imu)
         if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
             return
         if self._imu and imu.stamp_ns <= self._imu[-1].stamp_ns:
             return
         self._imu.append(imu)
         self._forget(self._imu, imu.stamp_ns)
+
+    def _was_ahead(self, stamp_ns: int) -> bool:
+        """Whether the IMU's reading before was of no such time, so that this one counts in its place: then it
+        lies farther from all else than this one does, by more than the order of messages can be mixed up."""
+        last = self._turned_ns
+        others = [*(s.stamp_ns for s in self._scans), *(r.stamp_ns for r in self._odometry)]
+        if last is None or last - stamp_ns < AHEAD_NS or not others:
+            return False
+        if abs(stamp_ns - max(others)) >= abs(last - max(others)):
+            return False
+        self._gyro.forget_since(stamp_ns)
+        while self._imu and self._imu[-1].stamp_ns >= stamp_ns:
+            self._imu.pop()
+        self._leave_out("IMU readings that were ahead of their time")
+        return True
 
     def _add_turn_rate(self, imu: Imu) -> None:
         if not np.all(np.isfinite(imu.angular_velocity)):

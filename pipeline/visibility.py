@@ -28,7 +28,7 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
         sensor_offset: shape (3,) [m].
     """
     looked = np.zeros(BINS, np.bool_)
-    for k in _directions(raw, sensor_offset):
+    for k in directions(raw, sensor_offset):
         looked[k] = True
     free = np.full(BINS, np.inf)
     for i in range(filtered.shape[0]):
@@ -49,7 +49,7 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
 
 
 @compiled
-def _directions(points: Float32, sensor_offset: Float) -> NDArray[np.uint16]:
+def directions(points: Float32, sensor_offset: Float) -> NDArray[np.uint16]:
     """The `direction_bin` of each point, written without branches over plain rows, so that the processor
     takes several at once."""
     n = points.shape[0]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import SourceError
+from pipeline.gathering import ForestOf, package_alone
 from pipeline.geometry import Float
 from pipeline.parameters import Parameters
 from pipeline.plot.cloud import Cloud
@@ -98,7 +99,7 @@ class PlotMap:
     warnings: tuple[str, ...]
 
 
-def map_plot(cloud: Cloud, parameters: Parameters) -> PlotMap:
+def map_plot(cloud: Cloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
     """Map a whole cloud.
 
     Raises:
@@ -115,7 +116,7 @@ def map_plot(cloud: Cloud, parameters: Parameters) -> PlotMap:
     verdict = judge(figures, r_min, r_max)
     kept = ~same(figures, verdict)
     fits, figures, verdict = fits[kept], figures[kept], verdict[kept]
-    places, share = find_upright(near.points)
+    places, share = find_upright(near.points, forests(parameters.gathering.forest, True))
     _refuse_what_is_known(figures, verdict, places, share)
     tree = verdict == Verdict.TREE
     # From west to east, so that numbers can be found again.

@@ -133,6 +133,15 @@ def fit_circle(xy: Float, reach: float, r_min: float, r_max: float, out: Float) 
     return bool(out[9] >= 5.0)
 
 
+def without_scatter(radius: Float, scatter: Float) -> Float:
+    """Radii [m] less what the points' scatter [m] has added to them.
+
+    Points that err by s in both directions lie s^2 / 2 r farther from the middle, in the mean (Rice).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.maximum(radius - 0.5 * scatter * scatter / radius, 0.5 * radius)
+
+
 @compiled
 def _coverage(xy: Float, x: float, y: float, r: float, tolerance: float) -> tuple[float, float]:
     """The angle around the circle that points on it fill [rad], and how many they are."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
+from pipeline.plot.circle import without_scatter
 from pipeline.plot.slices import Slices
 from pipeline.plot.stems import BREAST, lines
 from pipeline.records import Bool, Int32, Verdict
@@ -113,13 +114,19 @@ def judge(stems: Float, r_min: float, r_max: float) -> Int32:
 def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
     """Diameter at breast height and its sigma [m], shape (K,), NaN where no arc carries one.
 
+    It is measured across the axis: a level slice of a trunk that leans by theta is an ellipse, wider by
+    1 / cos theta along the lean, and the circle through it has the mean of both.
+
     Args:
         stems: See `describe_stems`.
         arc_min: That must be seen [rad].
     """
     told = (stems[:, COVERAGE] >= arc_min) & (stems[:, NEAR] <= CLOSE) & (stems[:, SLICES] >= 3)
     told &= 2.0 * stems[:, SIGMA_R] < 0.5 * stems[:, RADIUS]
-    return np.where(told, 2.0 * stems[:, RADIUS], np.nan), np.where(told, 2.0 * stems[:, SIGMA_R], np.nan)
+    across = 2.0 / (1.0 + np.sqrt(1.0 + stems[:, LEAN_X] ** 2 + stems[:, LEAN_Y] ** 2))
+    radius = without_scatter(stems[:, RADIUS], stems[:, SCATTER])
+    dbh, sigma = 2.0 * across * radius, 2.0 * stems[:, SIGMA_R]
+    return np.where(told, dbh, np.nan), np.where(told, sigma, np.nan)
 
 
 def same(stems: Float, verdict: Int32) -> Bool:

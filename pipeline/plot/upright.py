@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.gathering.columns import MARGIN, examine
 from pipeline.gathering.features import COUNT, features
-from pipeline.gathering.forest import CLASSES, standard_forest, vote
+from pipeline.gathering.forest import CLASSES, Forest, vote
 from pipeline.gathering.memory import SLICE, SLICES, TILE, Memory
 from pipeline.geometry import Float
 from pipeline.records import Float32
@@ -20,11 +20,12 @@ OFTEN = 50.0  # scans that all saw it
 MOST_VOXELS = 1 << 20
 
 
-def find_upright(points: Float32) -> tuple[Float, Float]:
+def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
     """Upright columns and the votes on them.
 
     Args:
         points: shape (N, 4): x, y, z, height above the ground [m].
+        forest: That votes.
 
     Returns:
         Places, shape (K, 2) [m], and shares of the kinds in the order of CLASSES, shape (K, 6).
@@ -37,11 +38,13 @@ def find_upright(points: Float32) -> tuple[Float, Float]:
         axis, profiles = examine(mean, returns, tile * TILE, TILE)
         n = len(axis)
         row = np.zeros((n, COUNT))
-        features(axis, profiles, np.full(n, SLICES * SLICE), np.full(n, OFTEN), np.zeros(n), row)
+        met = (profiles[:, :, 0] > 0.0).astype(np.int32)
+        always = (np.full(n, SLICES * SLICE), np.full(n, OFTEN), np.zeros(n))
+        features(axis, profiles, *always, met, 1 - met, row)
         axes.append(axis)
         figures.append(row)
     axis = np.concatenate(axes)
-    share = vote(np.concatenate(figures), standard_forest(all_around=True))
+    share = vote(np.concatenate(figures), forest)
     strongest = np.argsort(-axis[:, 4], kind="stable")
     kept = _apart(axis[strongest, :2])
     return axis[strongest, :2][kept], share[strongest][kept]

@@ -46,6 +46,7 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
         arc=stem[:, 8],
         extent=extent,
         hidden=labels.hidden,
+        cut=np.zeros(len(size), np.bool_),
         verdict=np.full(len(size), Verdict.OTHER, np.int32),
     )
 

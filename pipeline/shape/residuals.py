@@ -59,9 +59,10 @@ def normal_equations(
         ux, uy, reach, h = directions_x[i], directions_y[i], lengths[i], heights[i]
         axis_x, axis_y = cx + ax * h, cy + ay * h
         behind, across = reach - (ux * axis_x + uy * axis_y), uy * axis_x - ux * axis_y
-        # Of a beam whose edge alone meets the trunk the middle of that part returns, and not its own.
+        # Of a beam that meets the trunk in part the middle of that part returns, and not its own.
         beam, aside = BEAM * reach, abs(across)
-        aside = max(aside - 0.5 * max(aside + beam - radius, 0.0), aside - beam)
+        part = 0.5 * (max(aside - beam, -radius) + min(aside + beam, radius))
+        aside = max(part, aside - beam)
         away = np.sqrt(behind * behind + aside * aside) + 1e-9
         cosine, sine = -behind / away, aside / away
         sine = sine if across >= 0.0 else -sine

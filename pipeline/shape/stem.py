@@ -103,14 +103,15 @@ def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> No
 @compiled
 def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, stem: Float) -> None:
     """The answer into `stem`; `some` is room for a part of the rays."""
-    half = middle_half(rays, n)
+    half = middle_half(rays, n, 0.0, 0.0)
+    away = np.hypot(half.x, half.y)
     # The outermost beams leave a part of the trunk between them and the next, less what their width catches.
-    coarse = 0.5 * max(azimuth_step - 2.0 * BEAM, 0.0) * np.hypot(half.x, half.y)
+    coarse = 0.5 * max(azimuth_step - 2.0 * BEAM, 0.0) * away
     width = half.radius + coarse
     p = np.array([half.x, half.y, 0.0, 0.0, min(max(width, RADIUS_MIN), RADIUS_MAX)])
     p[0] += half.c * p[4]
     p[1] += half.s * p[4]
-    least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * width + 0.3 * azimuth_step * np.hypot(p[0], p[1])
+    least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * width + 0.3 * azimuth_step * away
     g, H, step, L = np.empty(5), np.empty((5, 5)), np.empty(5), np.empty((5, 5))
     few = _some(rays, n, some)
     within = TUKEY * np.sqrt(sigma * sigma + BARK * BARK)
@@ -138,7 +139,12 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
         p[4] = max(p[4], 0.005)
         if nearly and (longest < CONVERGED or gain < NEGLIGIBLE**2):
             break
-        nearly = nearly or longest < NEARLY or k >= ITERATIONS // 2
+        if not nearly and (longest < NEARLY or k >= ITERATIONS // 2):
+            nearly = True
+            # A leaning trunk fills more than its width; now that the lean is known, it is taken out.
+            half = middle_half(rays, n, p[2], p[3])
+            width = half.radius + coarse
+            least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * width + 0.3 * azimuth_step * away
     # The residuals tell how rough the bark is, and a poor fit knows less than the sensor's sigma promises.
     _write(p, L, max(SMOOTH, kept / (n * (sigma * sigma + BARK * BARK))), stem)
     stem[7], stem[8] = np.sqrt(squares / n), visible_arc(rays, n, p)

@@ -55,8 +55,11 @@ class Middle(NamedTuple):
 
 
 @compiled
-def middle_half(rays: Float, n: int) -> Middle:
-    """The quartiles ask nothing of what stands beside the trunk, as branches do."""
+def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> Middle:
+    """The quartiles ask nothing of what stands beside the trunk, as branches do.
+
+    The axis shifts by so much in x and y per metre of height, which would else be taken for width.
+    """
     x, y = 0.0, 0.0
     for i in range(n):
         x += rays[0, i] * rays[2, i]
@@ -64,8 +67,9 @@ def middle_half(rays: Float, n: int) -> Middle:
     away = max(np.sqrt(x * x + y * y), 1e-9)
     c, s = x / away, y / away
     across, ordered, front = np.empty(n), np.empty(n), np.empty(n)
+    shift = c * lean_y - s * lean_x
     for i in range(n):
-        across[i] = rays[2, i] * (c * rays[1, i] - s * rays[0, i])
+        across[i] = rays[2, i] * (c * rays[1, i] - s * rays[0, i]) - shift * rays[3, i]
         ordered[i] = across[i]
     ordered.sort()
     middle = _quantile(ordered, n, 0.5)

@@ -77,7 +77,7 @@ def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
         duration_s: Length of the run [s]; the table reaches a little beyond.
     """
     until = duration_s + 0.5
-    limit = _speed_limit(course, speed)
+    limit = speed_limit(course, speed)
     laps = max(1, int(np.ceil(until * speed / course.s[-1])) + 1) if course.closed else 1
     v = np.concatenate([np.tile(limit[:-1], laps), limit[:1] if course.closed else limit[-1:]])
     s = np.arange(v.size) * (course.s[1] - course.s[0])
@@ -101,7 +101,8 @@ def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
     )
 
 
-def _speed_limit(course: Course, speed: float) -> Float:
+def speed_limit(course: Course, speed: float) -> Float:
+    """How fast each place of a course may be driven [m/s]: turns at 0.5 rad/s at most."""
     mode = "wrap" if course.closed else "nearest"
     limit = np.minimum(speed, _YAW_RATE / np.maximum(np.abs(course.curvature), 1e-6))
     window = int(0.6 / _DS)

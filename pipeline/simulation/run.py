@@ -14,8 +14,8 @@ from pipeline.simulation.drive import RATE_HZ, drive_course, lay_course
 from pipeline.simulation.inertial import IMU_HZ, Inertial, inertial_readings
 from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
 from pipeline.simulation.motion import Motion, lay_on_terrain
+from pipeline.simulation.obeying import ObeyingDrive
 from pipeline.simulation.scene import Scene, build_scene
-from pipeline.simulation.solids import Solids
 from pipeline.simulation.uri import EXACT, RunRequest
 from pipeline.simulation.wheel_qualities import QUALITIES
 from pipeline.simulation.wheels import ODOMETRY_HZ, wheel_odometry
@@ -24,7 +24,7 @@ from pipeline.simulation.wheels import ODOMETRY_HZ, wheel_odometry
 VERSION = 1
 START_NS = 1_700_000_000_000_000_000
 MOUNTING = Pose3(np.eye(3), np.array([0.1, 0.0, 0.8]))
-SCENE, SHAKE, WHEELS, INERTIAL, SCAN = range(5)
+SCENE, SHAKE, WHEELS, INERTIAL, SCAN, SENSE = range(6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ class SimulatedRun:
         times = (begin + self.lidar.column_offsets_ns().astype(np.int64)) / 1e9
         R, o = self.motion.sensor_at(times, self.T_base_lidar)
         rng = stream(SCAN, self.request, k)
-        solids = self._solids(times, R, o)
+        solids = self.scene.solids_at(times, R, o)
         return sweep_scene(self.lidar, solids, self.scene.terrain, R, o, START_NS + begin, rng)
 
     def odometry_record(self, n: int) -> Odometry:
@@ -91,19 +91,10 @@ class SimulatedRun:
         mounting = [*self.T_base_lidar.R.ravel().tolist(), *self.T_base_lidar.t.tolist()]
         text = f"stemmap simulation {VERSION}; {self.request}; {self.request.scenario}; {mounting}"
         text += f"; drive {self.request.drive}" if self.request.drive else ""  # the first is as it was before
+        text += "; obeys" if self.request.obeys else ""
+        crossings = self.request.scenario.crossings
+        text += f"; crossings {crossings}" if crossings else ""
         return hashlib.sha256(text.encode()).hexdigest()
-
-    def _solids(self, times: Float, R: Float, o: Float) -> Solids:
-        """What stands there, each person as they stand when the beam passes them."""
-        solids = self.scene.still
-        middle = times.size // 2
-        for n, person in enumerate(self.scene.persons):
-            at, _ = person.place(float(times[middle]))
-            away = R[middle].T @ (np.array([at[0], at[1], o[middle, 2]]) - o[middle])
-            turned = (np.pi - float(np.arctan2(away[1], away[0]))) / (2.0 * np.pi)
-            column = min(int(turned * times.size), times.size - 1)
-            solids = solids.join(self.scene.person_solids(n, float(times[column])))
-        return solids
 
 
 def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> SimulatedRun:
@@ -115,12 +106,18 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
     scenario = request.scenario
     lidar = SpinningLidar(range_sigma=request.sigma)
     course = lay_course(np.array(scenario.waypoints), scenario.closed)
-    drive = drive_course(course, scenario.speed, request.duration_s)
     scene = build_scene(scenario, course, stream(SCENE, request))
+    mounting = MOUNTING if T_base_lidar is None else T_base_lidar
+    if request.obeys:
+        own = stream(SENSE, request)
+        obeying = ObeyingDrive(course, scenario.speed, scene, mounting, int(own.integers(2**31)))
+        drive = obeying.run(request.duration_s)
+    else:
+        drive = drive_course(course, scenario.speed, request.duration_s)
     motion = lay_on_terrain(drive, scene.terrain, stream(SHAKE, request))
     return SimulatedRun(
         request=request,
-        T_base_lidar=MOUNTING if T_base_lidar is None else T_base_lidar,
+        T_base_lidar=mounting,
         lidar=lidar,
         scene=scene,
         motion=motion,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -41,6 +41,8 @@ class Scenario:
         lean: Standard deviation of the lean [degrees].
         poles, bushes, standing, walking, boxes, undergrowth: How many.
         placed: What stands at a given place, in the frame of the map.
+        crossings: Persons who walk to and fro: from x, y to x, y [m], and their speed [m/s].
+        obeys: Whether the robot slows down and stops for what stands in its way.
     """
 
     line: str
@@ -65,6 +67,8 @@ class Scenario:
     boxes: int = 0
     undergrowth: int = 0
     placed: tuple[Placed, ...] = ()
+    crossings: tuple[tuple[float, float, float, float, float], ...] = field(default=(), repr=False)
+    obeys: bool = field(default=False, repr=False)
 
 
 def _ring(radius: float, wobble: float, lobes: int, points: int) -> Waypoints:
@@ -168,6 +172,18 @@ SCENARIOS: dict[str, Scenario] = {
         standing=2,
         walking=2,
         boxes=3,
+    ),
+    "crossing": Scenario(
+        line="Two persons cross the way and a trunk stands in it: the robot waits, and stops for good",
+        waypoints=((0.0, 0.0), (5.0, 0.0), (10.0, 0.2), (15.0, 0.0), (22.0, 0.0)),
+        closed=False,
+        speed=0.8,
+        duration_s=40.0,
+        half_side=18.0,
+        trees=24,
+        placed=(Placed("tree", 18.0, 0.05, 0.40), Placed("pole", 4.0, 0.9, 0.10)),
+        crossings=((8.0, -5.0, 8.0, 4.0, 0.5), (13.5, 8.5, 13.5, -3.0, 0.5)),
+        obeys=True,
     ),
 }
 

@@ -49,6 +49,23 @@ class Scene:
         """The body of person n at time t [s]."""
         return self.persons[n].solids(t, self.terrain)
 
+    def solids_at(self, times: Float, R: Float, o: Float) -> Solids:
+        """What stands there, each person as they stand when the beam of a sweep passes them.
+
+        Args:
+            times: Of the sweep's columns, shape (C,) [s].
+            R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
+        """
+        solids = self.still
+        middle = times.size // 2
+        for n, person in enumerate(self.persons):
+            at, _ = person.place(float(times[middle]))
+            away = R[middle].T @ (np.array([at[0], at[1], o[middle, 2]]) - o[middle])
+            turned = (np.pi - float(np.arctan2(away[1], away[0]))) / (2.0 * np.pi)
+            column = min(int(turned * times.size), times.size - 1)
+            solids = solids.join(self.person_solids(n, float(times[column])))
+        return solids
+
 
 def build_scene(scenario: Scenario, course: Course, rng: np.random.Generator) -> Scene:
     """Build the scene.
@@ -122,6 +139,10 @@ class _Work:
             add_bush(self.builder, self._number("bush", x, y), x, y, radius, self._ground(x, y), rng)
         for _ in range(plan.walking):
             self._add_walker()
+        for x, y, to_x, to_y, speed in plan.crossings:
+            self.kinds.append("walker")
+            ends = (np.array([x, y]), np.array([to_x, to_y]))
+            self.persons.append(Person(len(self.kinds) - 1, *ends, 0.0, speed, 0.0))
         for _ in range(plan.undergrowth):
             place = self.plot.centre + self.plot.half_side * rng.uniform(-1.0, 1.0, 2)
             if self.plot.from_course(place[None])[0] > 1.0:

@@ -20,12 +20,14 @@ _KEYS = {
     "duration": "seconds, 1 to 3600",
     "trees": "how many, 0 to 2000",
     "drive": "another drive through the same scene, 0 to 1000",
+    "obstacles": "obey (slow down and stop for them) or ignore",
 }
+_OBSTACLES = ("obey", "ignore")
 CLOUD = "cloud"
 _CLOUD_KEYS = {
-    "file": "the cloud of a plot, .laz or .las",
+    "file": "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd",
     "truth": "a table (CSV) of its trees in the coordinates of the cloud",
-    **{key: meaning for key, meaning in _KEYS.items() if key not in ("trees", "drive")},
+    **{key: meaning for key, meaning in _KEYS.items() if key not in ("trees", "drive", "obstacles")},
 }
 
 
@@ -41,6 +43,7 @@ class RunRequest:
         duration_s: [s].
         trees: How many stand there.
         drive: Other drives through the same scene have other noise.
+        obeys: Whether the robot slows down and stops for what stands in its way.
         file, truth: Of a run through a real cloud: its file, and the table of its trees, or empty.
     """
 
@@ -51,6 +54,7 @@ class RunRequest:
     duration_s: float
     trees: int
     drive: int = field(default=0, repr=False)
+    obeys: bool = field(default=False, repr=False)
     file: str = ""
     truth: str = ""
 
@@ -81,6 +85,9 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
     odometry = values.get("odometry", "normal")
     if odometry not in (*QUALITIES, EXACT):
         raise _refusal(uri, "odometry", odometry)
+    obstacles = values.get("obstacles", _OBSTACLES[0] if scenario.obeys else _OBSTACLES[1])
+    if obstacles not in _OBSTACLES:
+        raise _refusal(uri, "obstacles", obstacles)
     most = 2000 if not scenario.placed else scenario.trees
     return RunRequest(
         name=name,
@@ -90,6 +97,7 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
         duration_s=_real(uri, "duration", values.get("duration", str(scenario.duration_s)), 1.0, 3600.0),
         trees=_whole(uri, "trees", values.get("trees", str(scenario.trees)), most),
         drive=_whole(uri, "drive", values.get("drive", "0"), 1000),
+        obeys=obstacles == _OBSTACLES[0],
     )
 
 

@@ -92,6 +92,7 @@ def clusters(**columns: Any):
         arc=np.array([2.0]),
         extent=np.array([[0.2, 0.4, 1.0]]),
         hidden=np.array([False]),
+        cut=np.array([False]),
         verdict=np.array([Verdict.OTHER], np.int32),
     )
     return replace(good, **{name: np.asarray(value) for name, value in columns.items()})

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.acquisition import acquire
+from pipeline.acquisition import HOUSING, acquire, acquire_near
 from pipeline.geometry import Pose3
 from pipeline.parameters import preset
 from pipeline.records import Step
@@ -101,6 +101,29 @@ def test_both_ends_of_the_range_belong_to_it_and_nan_to_nothing():
     rows = [[0.5, 0, 0], [0, 40, 0], [0, 0, 0.49], [0, 0, 40.01], [np.nan, 1, 1], [np.inf, 1, 1], [0, 0, 0]]
     points, _ = acquire(Step(0, scan(1, rows), None), Pose3.identity(), p)
     np.testing.assert_array_equal(points, np.array([[0.5, 0, 0], [0, 40, 0]], np.float32))
+
+
+@LAW
+@given(st.integers(0, 999), st.floats(0.0, 3.0))
+def test_each_return_is_near_or_taken_or_out_of_reach(seed, nearest):
+    rng = np.random.default_rng(seed)
+    rows = rng.uniform(-3.0, 3.0, (60, 3)).astype(np.float32)
+    rows[::7] = np.nan
+    p = FOREST.model_copy(update={"range_min": nearest, "deskew": False})
+    step = Step(0, scan(1, rows), None, 0.2, -0.1, tilt_known=True)
+    taken, near = acquire(step, MOUNTING, p)[0], acquire_near(step, MOUNTING, p)
+    distance = np.linalg.norm(rows.astype(np.float64), axis=1)
+    assert len(taken) == np.count_nonzero(distance >= nearest)
+    assert len(near) == np.count_nonzero((distance < nearest) & (distance >= HOUSING))
+    assert near.dtype == np.float32
+    whole = acquire(step, MOUNTING, p.model_copy(update={"range_min": 0.0}))[0]
+    chosen = distance[np.isfinite(distance)]
+    np.testing.assert_allclose(near, whole[(chosen < nearest) & (chosen >= HOUSING)], atol=1e-6)
+
+
+def test_the_robot_itself_does_not_move_by_its_own_speed():
+    step = Step(0, scan(1, [[0.3, 0, 0], [0, 0, 0]], [100_000_000] * 2), None, twist=(2.0, 0.0, 0.0))
+    np.testing.assert_allclose(acquire_near(step, Pose3.identity(), FOREST), [[0.3, 0, 0]])
 
 
 @pytest.mark.parametrize("offsets", [None, []])

@@ -46,3 +46,17 @@ def test_trees_out_of_reach_are_left_alone():
 def test_no_tree_and_no_landmark_are_no_harm():
     held(tracks(np.zeros((0, 2))), [[1.0, 1.0]])
     assert held(tracks([[1.0, 1.0]]), []).score[0] == 4.0
+
+
+def test_a_moved_tree_keeps_a_covariance_that_is_one():
+    """The old place was correlated with the velocity; the landmark's is not."""
+    random = np.random.default_rng(0)
+    A = random.normal(size=(4, 4))
+    tracks = TrackTable.empty(1)
+    tracks.x[0, :2], tracks.P[0], tracks.score[0] = [5.0, 0.0], A @ A.T, 5.0
+    small = np.array([[1e-4, 0.0, 1e-4]])
+    Sigma = 1e-6 * np.eye(3)
+    tracks.P[0, :2, :2] = 1e-3 * np.eye(2)
+    anchor(tracks, np.array([[5.5, 0.0]]), small, Pose2(), Sigma, Sigma, 15.0, 1.0, 0.3)
+    assert tracks.x[0, 0] == 5.5
+    assert np.all(np.linalg.eigvalsh(tracks.P[0]) > 0.0)

@@ -87,3 +87,51 @@ def test_two_million_points_are_one_scan():
     low = many[:, 2] == np.float32(-0.8)
     near = low & (np.hypot(many[:, 0], many[:, 1]) < 10.0)
     assert np.abs(np.median(height_above(many[near], terrain))) < 0.3
+
+
+def test_two_million_points_are_one_frame_without_a_tree():
+    many = RNG.uniform(-30.0, 30.0, (2_000_000, 3)).astype(np.float32)
+    many[:, 2] = -0.8 + np.abs(many[:, 2]) / 100.0  # grass on a level ground
+    (frame,) = map(mapper().process, _steps(many, 1))
+    assert frame.counts["returns"] == 2_000_000
+    assert (
+        sum(frame.counts[name] for name in ("out of range", "out of the box", "ground or too high"))
+        > 1_900_000
+    )
+    assert not frame.trees.confirmed.any()
+    assert len(frame.detections.cluster) == 0
+
+
+def stand(trunk, rng):
+    """Level ground, grass, two bushes without a stem, and a trunk of 1.2 m around (5, 0) or none."""
+    flat = CLOUDS["the ground alone"]
+    grass = np.column_stack([rng.uniform(-9.0, 9.0, (3000, 2)), rng.uniform(-0.8, -0.65, 3000)])
+    bushes = [
+        rng.normal(middle, (0.3, 0.3, 0.15), (400, 3)) for middle in ((4.0, 3.0, -0.4), (-3.0, 2.0, -0.4))
+    ]
+    parts = [flat, grass, *bushes]
+    if trunk:
+        turn, up = rng.uniform(0.5 * np.pi, 1.5 * np.pi, 1500), rng.uniform(-0.8, 3.0, 1500)
+        parts.append(np.column_stack([5.0 + 0.2 * np.cos(turn), 0.2 * np.sin(turn), up]))
+    return np.concatenate(parts).astype(np.float32)
+
+
+def test_a_cloud_without_trees_gives_frames_and_none():
+    frames = list(map(mapper().process, _steps(stand(False, np.random.default_rng(1)), 12)))
+    assert not any(frame.trees.confirmed.any() for frame in frames)
+    assert NO_GROUND not in frames[-1].warnings
+    assert len(frames[-1].clusters.size) > 0, "the bushes are looked at"
+
+
+@pytest.mark.parametrize("limit", [4.85, 4.95, 5.0, 6.0])
+def test_a_trunk_that_the_border_cuts_is_a_frame_and_gets_no_wrong_diameter(limit):
+    """The front face of the pass-through box cuts the trunk of 40 cm around (5, 0), or just does not."""
+    run = mapper()
+    run.parameters = FOREST.replace({"filters.x_max": limit})
+    points = stand(True, np.random.default_rng(2))
+    frames = [run.process(step) for step in _steps(points, 12)]
+    trees = frames[-1].trees
+    near = np.hypot(trees.position[:, 0] - 5.0, trees.position[:, 1]) < 0.3
+    assert not (trees.confirmed & ~near).any(), "none is invented"
+    told = trees.dbh[np.isfinite(trees.dbh)]
+    assert np.all(np.abs(told - 0.4) < 0.05)

@@ -6,11 +6,23 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 
 CALLER = """
 from pipeline.compiled import compiled
 from wood.leaf import FACTOR, grown
+
+@compiled
+def twice(x):
+    return FACTOR * grown(x)
+"""
+CALLER_OF_MODULE = """
+import wood.leaf
+from pipeline.compiled import compiled
+
+FACTOR, grown = wood.leaf.FACTOR, wood.leaf.grown
 
 @compiled
 def twice(x):
@@ -58,10 +70,11 @@ def call(folder: Path, factor: float, more: float, program: str = CALL) -> list[
     return told.stdout.split()
 
 
-def test_a_kernel_is_compiled_anew_when_what_it_calls_in_another_file_changes(tmp_path):
+@pytest.mark.parametrize("caller", [CALLER, CALLER_OF_MODULE])
+def test_a_kernel_is_compiled_anew_when_what_it_calls_in_another_file_changes(tmp_path, caller):
     (tmp_path / "wood").mkdir()
     (tmp_path / "wood" / "__init__.py").touch()
-    (tmp_path / "wood" / "tree.py").write_text(CALLER)
+    (tmp_path / "wood" / "tree.py").write_text(caller)
     assert call(tmp_path, 2.0, 1.0) == ["4.0", "0"]
     assert call(tmp_path, 2.0, 1.0) == ["4.0", "1"]
     assert call(tmp_path, 2.0, 3.0) == ["8.0", "0"]

@@ -24,6 +24,7 @@ REASONS: list[tuple[Verdict, dict[str, Any]]] = [
     (Verdict.TOO_THICK, {"extent": [[1.3, 0.2, 1.0]]}),
     (Verdict.TOO_THICK, {"radius": [0.7]}),
     (Verdict.TOO_LOW, {"extent": [[0.2, 0.4, 0.4]]}),
+    (Verdict.AT_BORDER, {"cut": [True]}),
     (Verdict.TOO_LONG, {"eccentricity": [61.0]}),
     (Verdict.TOO_LONG, {"eccentricity": [np.inf]}),
     (Verdict.NOT_ROUND, {"radial_std": [0.07]}),
@@ -73,7 +74,12 @@ def test_without_a_circle_its_figures_are_not_asked_for():
 
 def test_the_paper_keeps_by_eccentricity_and_radial_deviation_alone():
     thing = clusters(
-        extent=[[0.5, 2.0, 0.1]], radius=[np.nan], radius_sigma=[np.nan], arc=[0.0], eccentricity=[19.9]
+        extent=[[0.5, 2.0, 0.1]],
+        radius=[np.nan],
+        radius_sigma=[np.nan],
+        arc=[0.0],
+        eccentricity=[19.9],
+        cut=[True],
     )
     assert judge(thing, PAPER).verdict.tolist() == [Verdict.TREE]
     for column, value, verdict in (
@@ -127,6 +133,14 @@ def test_no_clusters_give_no_detections():
     assert len(detections(judge(none, FOREST), np.zeros(3), FOREST).cluster) == 0
 
 
+def test_what_a_missing_part_changes_is_asked_after_the_border():
+    cut = clusters(cut=[True], eccentricity=[999.0], radial_std=[9.0], arc=[0.0], radius=[9.0])
+    assert judge(cut, FOREST).verdict.tolist() == [Verdict.AT_BORDER]
+    assert judge(clusters(cut=[True], extent=[[0.2, 1.3, 1.0]]), FOREST).verdict.tolist() == [
+        Verdict.TOO_THICK
+    ]
+
+
 @pytest.mark.parametrize(("verdict", "columns"), REASONS, ids=lambda v: getattr(v, "label", str(v)))
 def test_each_check_holds_its_value_against_its_limit(verdict, columns):
     table = clusters(**columns)
@@ -152,8 +166,10 @@ def test_without_a_circle_nothing_is_asked_of_it():
 figures = st.one_of(st.floats(0.0, 5.0), st.just(np.nan), st.just(np.inf))
 
 
-@given(st.lists(figures, min_size=6, max_size=6), st.booleans(), st.sampled_from(sorted(PRESETS)))
-def test_the_checks_decide_as_the_judge_does(row, hidden, name):
+@given(
+    st.lists(figures, min_size=6, max_size=6), st.booleans(), st.booleans(), st.sampled_from(sorted(PRESETS))
+)
+def test_the_checks_decide_as_the_judge_does(row, hidden, cut, name):
     along, up, eccentricity, radial_std, radius, arc = row
     table = clusters(
         extent=[[along, 0.1, up]],
@@ -162,6 +178,7 @@ def test_the_checks_decide_as_the_judge_does(row, hidden, name):
         radius=[0.3 * radius],
         arc=[arc],
         hidden=[hidden],
+        cut=[cut],
     )
     p = preset(name).detection
     failing = [check.verdict for check in checks(table, p) if check.fails[0]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -220,6 +221,31 @@ def test_a_unit_that_has_said_but_one_number_tells_nothing():
     assert gyro.turn(START, START + 90 * MS) is None
     gyro.add(reading(100, 0.1), (0.0, 0.0), standing=False, needed_ns=START)
     assert gyro.turn(START, START + 100 * MS) is not None
+
+
+@pytest.mark.parametrize("ahead_ms", [2_000, 86_400_000])
+def test_a_reading_from_the_future_is_counted_and_silences_nobody(ahead_ms):
+    records = told_by_robot(0.32, 0.3)
+    k = next(i for i, r in enumerate(records) if isinstance(r, Imu) and r.stamp_ns > START + 2_000 * MS)
+    wrong = replace(records[k], stamp_ns=records[k].stamp_ns + ahead_ms * MS)
+    losses = Counter[str]()
+    joined = list(steps([*records[:k], wrong, *records[k:]], losses=losses))
+    assert losses == {"IMU readings that were ahead of their time": 1}
+    whole = list(steps(records))
+    later = [s.scan.stamp_ns > START + 2_300 * MS for s in whole]
+    turns = [[s.turn for s, late in zip(run, later, strict=True) if late] for run in (joined, whole)]
+    assert any(turn is not None for turn in turns[1])
+    assert [t is None for t in turns[0]] == [t is None for t in turns[1]]
+
+
+def test_an_imu_reading_that_comes_late_or_twice_is_counted():
+    records = told_by_robot(0.32, 0.3)
+    of_imu = [i for i, r in enumerate(records) if isinstance(r, Imu)]
+    losses = Counter[str]()
+    twice = [*records[: of_imu[60]], records[of_imu[40]], records[of_imu[59]], *records[of_imu[60] :]]
+    told, wanted = list(steps(twice, losses=losses)), list(steps(records))
+    assert losses == {"IMU readings that were not later than the one before": 2}
+    assert [s.turn for s in told] == [s.turn for s in wanted]
 
 
 @pytest.mark.parametrize("at", [3, 12, 19, 25, 36])

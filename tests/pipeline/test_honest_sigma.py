@@ -16,6 +16,7 @@ from tests.benchmarks.stands import STRAIGHT
 from tests.pipeline.strategies import LAW, NOTHING_SEEN, detections, seeds
 
 POSE = np.diag([0.1, 0.1, 0.0]) ** 2
+MANY = 1e12  # particles, of which no sampling noise is left
 
 
 def spd(rng, n, scale=1.0):
@@ -115,16 +116,38 @@ def test_an_error_of_the_heading_moves_what_lies_far_from_where_it_was_made():
 def test_what_the_particles_forgot_is_remembered_where_the_landmarks_stand():
     wide, thin = np.eye(3) * 0.04, np.eye(3) * 1e-4
     here = np.zeros(3)
-    memory = FrameMemory().marked(0, here, wide)
+    memory = FrameMemory().marked(0, 0, here, wide)
     landmarks = (np.array([[2.0, 0.0]]), np.array([3]), np.array([5], np.int32), 3)
-    told, memory = memory.told(here, thin, *landmarks, 10.0)
+    told, memory = memory.told(here, thin, MANY, *landmarks, 10.0)
     np.testing.assert_allclose(told, wide, atol=1e-9)
     away = np.array([5.0, 0.0, 0.0])
-    told, _ = memory.told(away, thin, *landmarks, 1.0)  # no landmark near: what was hidden stays hidden
+    told, _ = memory.told(away, thin, MANY, *landmarks, 1.0)  # no landmark near: what was hidden stays hidden
     np.testing.assert_allclose(told, thin + carried(wide - thin, 5.0, 0.0), atol=1e-9)
     older = (np.array([[2.0, 0.0]]), np.array([-1]), np.array([5], np.int32), 3)
-    told, _ = FrameMemory().told(here, thin, *older, 10.0)
+    told, _ = FrameMemory().told(here, thin, MANY, *older, 10.0)
     np.testing.assert_allclose(told, thin)
+
+
+@LAW
+@given(seeds, st.sampled_from([1.0, 30.0, 1000.0]))
+def test_what_is_larger_by_sampling_noise_alone_counts_for_nothing_and_by_much_for_all(seed, n_eff):
+    rng = np.random.default_rng(seed)
+    A, noise = spd(rng, 3), 4.0 / np.sqrt(n_eff)
+    np.testing.assert_allclose(at_least(A, A * (1.0 + 0.9 * noise), noise), A, rtol=1e-6, atol=1e-9)
+    much = 1.0 + 100.0 * noise
+    both = at_least(A, A * much, noise)
+    np.testing.assert_allclose(both, A * much, rtol=1e-3, atol=1e-6)
+    assert np.linalg.eigvalsh(both - at_least(A, A * (1.0 + 50.0 * noise), noise)).min() > 0.0
+
+
+def test_keeping_the_larger_of_two_noisy_covariances_again_and_again_makes_none_larger():
+    """A hundred marks of one unchanging covariance, each of them and each spread taken from particles."""
+    rng, n = np.random.default_rng(0), 80
+    kept = np.eye(3)
+    for _ in range(100):
+        drawn = rng.normal(size=(n, 3))
+        kept = at_least(drawn.T @ drawn / n, kept, 4.0 / np.sqrt(n))
+    assert np.trace(kept) / 3.0 < 1.25
 
 
 def test_a_spread_along_a_line_may_be_as_long_as_a_forest():
@@ -141,14 +164,14 @@ def test_a_robot_that_heads_backwards_makes_no_marks_while_it_stands():
     memory = FrameMemory()
     for k in range(10):
         yaw = (np.pi - 0.001) * (-1.0) ** k
-        memory = memory.marked(k, np.array([0.0, 0.0, yaw]), np.eye(3))
+        memory = memory.marked(k, k, np.array([0.0, 0.0, yaw]), np.eye(3))
     assert len(memory.serial) == 1
 
 
 def test_marks_stand_apart():
     memory = FrameMemory()
     for k in range(100):
-        memory = memory.marked(k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3))
+        memory = memory.marked(k, k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3))
     assert 15 <= len(memory.serial) <= 20
     assert np.all(np.diff(memory.pose[:, 0]) > 0.49)
 

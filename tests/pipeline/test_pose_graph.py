@@ -15,7 +15,7 @@ from pipeline.saved_map import SavedMap
 from pipeline.slam import BackEnd, FastSlam, GraphState, Motion, SlamState
 from pipeline.slam.health import RECOGNISED, TOLD
 from pipeline.slam.pose_graph.joint import correct_by_pose, moved_joint, recognise_jointly
-from pipeline.slam.pose_graph.path import composed, interpolated, inverse
+from pipeline.slam.poses import composed, interpolated, inverse
 from pipeline.sources import open_source
 from pipeline.steps import steps
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
@@ -289,7 +289,7 @@ def test_the_mapper_goes_on_from_what_it_saved():
     again = [first.process(step) for step in every[25:]][-1]
     assert again.estimate.T_map_base == ends.estimate.T_map_base
     second = mapper()
-    second.load(saved.state(), saved.stamp_ns, saved.sigma_xy)
+    second.load(saved.state(), saved.stamp_ns, saved.sigma_xy, saved.motion)
     other = [second.process(step) for step in every[25:]][-1]
     away = other.estimate.T_map_base.inverse() @ ends.estimate.T_map_base
     assert np.hypot(away.x, away.y) < 0.1

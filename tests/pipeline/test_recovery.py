@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.mapper import Mapper
 from pipeline.parameters import preset
+from pipeline.saved_map import SavedMap
 from pipeline.sources import open_source
 from pipeline.steps import steps
 from tests.pipeline.test_mapper import as_bytes
@@ -76,6 +77,21 @@ def test_a_kidnapped_robot_says_so_and_is_good_again_within_fifty_scans():
     told = [word for frame in mapped()[1] for word in frame.warnings]
     assert any("is lost" in word for word in told)
     assert any("found again" in word for word in told)
+    assert not any("bent" in word for word in told), "who was carried did not drift"
+
+
+def test_no_loop_bends_what_was_driven_before_it_was_put_in_place():
+    m = mapper()
+    before, after = kidnapped()
+    for step in before:
+        m.process(step)
+    state = m.snapshot()
+    assert state.placed == 0
+    told = iter(m.process(step).warnings for step in after)
+    assert any("found again" in word for words in told for word in words)
+    assert m.snapshot().placed == len(m.path.x) == len(m.motion) > JUMP
+    m.restore(state)
+    assert m.snapshot().placed == 0
 
 
 def test_it_stands_where_it_was_put():
@@ -131,3 +147,20 @@ def test_wherever_it_lands(landing):
         m.process(step)
     states = [m.process(step).health.state for step in after]
     assert states[-1] != "lost"
+
+
+def test_a_map_saved_while_lost_goes_on_to_the_same_bytes():
+    m = mapper()
+    before, after = kidnapped()
+    for step in before:
+        m.process(step)
+    for step in after[:5]:
+        m.process(step)
+    saved = SavedMap.of(m)
+    assert saved.search is not None
+    other, state = mapper(), saved.state()
+    other.load(state, saved.stamp_ns, saved.sigma_xy, saved.motion)
+    once = [as_bytes(m.process(step)) for step in after[5:15]]
+    assert [as_bytes(other.process(step)) for step in after[5:15]] == once
+    with pytest.raises(ValueError, match="search"):
+        replace(saved, search=replace(saved.search, since=10**6)).state()

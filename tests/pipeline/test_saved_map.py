@@ -44,7 +44,7 @@ def test_from_a_saved_map_another_mapper_goes_on_to_the_same_bytes():
     state, wanted, path = saved()
     read = through_a_file(state)
     m = mapper()
-    m.load(read.state(), read.stamp_ns, read.sigma_xy)
+    m.load(read.state(), read.stamp_ns, read.sigma_xy, read.motion)
     assert fed(m, run()[0][12:]) == wanted
     assert as_bytes(m.path) == path
 
@@ -69,11 +69,14 @@ def test_a_small_file_that_unpacks_to_gigabytes_is_refused_before_it_does():
 def test_a_placed_robot_stands_where_it_was_put():
     state, _, _ = saved()
     m = mapper()
-    m.load(state.state(), state.stamp_ns, state.sigma_xy)
+    m.load(state.state(), state.stamp_ns, state.sigma_xy, state.motion)
     m.place(12, Pose2(2.0, -1.0, 0.5), np.diag([0.01, 0.01, 0.001]) ** 2)
     frame = m.process(replace(run()[0][12], T_odom_base=Pose2(70.0, 50.0, 3.0)))
     told = frame.estimate.particles
-    assert len(m.path.x) == 13
+    assert len(m.path.x) == len(m.motion) == 13
+    assert m.snapshot().placed == 12
+    again = through_a_file(SavedMap.of(m))
+    assert (again.placed, again.motion.tobytes()) == (12, m.motion.tobytes())
     assert np.ptp(told[:, 0]) > 0.0
     np.testing.assert_allclose(told.mean(axis=0), [2.0, -1.0, 0.5], atol=0.5)
 
@@ -85,11 +88,18 @@ def test_a_placed_robot_stands_where_it_was_put():
     "changed",
     [
         FrameMemory(serial=np.arange(5)),
-        FrameMemory(np.array([3, 1]), np.zeros((2, 3)), np.zeros((2, 3, 3))),
+        FrameMemory(np.array([3, 1]), np.arange(2), np.zeros((2, 3)), np.zeros((2, 3, 3))),
+        FrameMemory(np.arange(2), np.array([0, 10**6]), np.zeros((2, 3)), np.zeros((2, 3, 3))),
         FrameMemory(hidden=np.full((3, 3), np.nan)),
         FrameMemory(at=np.zeros(2)),
     ],
-    ids=["marks without poses", "marks out of order", "no number", "a pose of two numbers"],
+    ids=[
+        "marks without poses",
+        "marks out of order",
+        "a mark of no scan",
+        "no number",
+        "a pose of two numbers",
+    ],
 )
 def test_a_frame_that_compiled_code_would_read_beyond_is_refused(changed):
     state, _, _ = saved()
@@ -164,6 +174,10 @@ def _with_maps(state, **changes: Any):
     "change",
     [
         lambda s: replace(s, stamp_ns=s.stamp_ns[:-1]),
+        lambda s: replace(s, motion=s.motion[:-1]),
+        lambda s: replace(s, motion=s.motion + np.nan),
+        lambda s: replace(s, placed=-1),
+        lambda s: replace(s, placed=13),
         lambda s: replace(s, next_number=0),
         lambda s: _with_maps(s, places=s.slam.maps.places + 10_000),
         lambda s: _with_maps(s, block=s.slam.maps.block + 1),

@@ -50,7 +50,7 @@ def test_pairs_are_all_within_the_gate_and_sorted(seed: int, distance_max: float
     fill(cells, mean, 60, scale)
     found: dict[tuple[int, int], float] = {}
     for _ in range(2):  # the second time in the turns of the first
-        n = likely_pairs(pose, centre, R, mean, covariance, cells, scale, gate2, distance_max, room)
+        n = likely_pairs(pose, c, s, centre, R, mean, covariance, cells, scale, gate2, distance_max, room)
         found = {
             (int(d), int(j)): cost
             for d, j, cost in zip(room.detection[:n], room.landmark[:n], room.cost[:n], strict=True)

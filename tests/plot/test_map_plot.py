@@ -98,6 +98,51 @@ def test_what_is_no_plot_gives_no_tree_and_no_exception(points):
     assert len(map_plot(Made(points), FOREST).trees.number) == 0
 
 
+CANOPY = np.random.default_rng(1).uniform(0.0, 10.0, (60_000, 3)) * (1.0, 1.0, 0.2) + (0.0, 0.0, 8.0)
+LOW = np.random.default_rng(2).uniform(0.0, 10.0, (60_000, 3)) * (1.0, 1.0, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("points", "warns"),
+    [
+        (LOW, "nothing stands higher"),
+        (np.vstack([CANOPY, [[5.0, 5.0, 0.0]]]), ""),
+        (CANOPY, ""),
+    ],
+    ids=["grass alone", "crowns over one return", "crowns without a ground"],
+)
+def test_a_plot_without_trees_or_ground_gives_warnings_and_no_tree(points, warns):
+    m = map_plot(Made(points), FOREST)
+    assert len(m.trees.number) == 0
+    assert any(warns in warning for warning in m.warnings) or not warns
+
+
+@pytest.mark.parametrize("cut", [2.85, 3.0, 3.1])
+def test_a_stem_that_the_border_of_the_plot_cuts_has_no_diameter_from_less_than_half(cut):
+    """A stem of 30 cm at (3, 3), of which the border leaves what lies left of x = cut."""
+    rng = np.random.default_rng(5)
+    points = np.concatenate(
+        [ground(6.0, 0.05, rng), stem(3.0, 3.0, 0.15, rng, sigma=0.003), bush(1.0, 1.0, rng)]
+    )
+    m = map_plot(Made(points[points[:, 0] < cut]), FOREST)
+    assert len(m.trees.number) <= 1, "none is invented"
+    if len(m.trees.number):
+        assert np.hypot(*(m.trees.position[0] - 3.0)) < 0.05
+    told = m.trees.dbh[np.isfinite(m.trees.dbh)]
+    assert np.all(np.abs(told - 0.3) < 0.02)
+    assert len(told) == 0 or cut > 2.9
+
+
+def test_two_million_points_are_a_plot_like_any_other():
+    points = np.resize(plot(np.random.default_rng(10), per_m2=600), (2_000_000, 3))
+    points += np.random.default_rng(11).normal(0.0, 0.002, points.shape)
+    m = map_plot(Made(points, part=1 << 19), FOREST)
+    assert m.counts["read"] == 2_000_000
+    _, away = errors(m.trees.position, PLACES)
+    assert len(m.trees.number) == len(PLACES)
+    assert away.max() < 0.03
+
+
 def test_points_far_away_are_left_out_and_counted():
     points = plot(np.random.default_rng(8), per_m2=600)
     m = map_plot(Made(np.vstack([points, [[5000.0, 5000.0, 0.0]]])), FOREST)

@@ -26,7 +26,7 @@ def test_each_scenario_opens_and_its_path_keeps_clear(name):
         away = np.hypot(path.x[:, None] - trees.x, path.y[:, None] - trees.y)
         radius = np.where(np.isnan(trees.dbh), 0.3, 0.5 * trees.dbh)
         assert (away - radius).min() >= 0.4
-        walkers = sum(kind == "walker" for kind in source.run.scene.kinds)
+        walkers = sum(kind == "walker" for kind in source.run.scene.kinds) - len(plan.crossings)
         assert walkers == plan.walking
 
 
@@ -122,5 +122,5 @@ def test_who_stands_only_sways():
 
 def test_menu_lists_every_scenario():
     menu = scenarios()
-    assert list(menu) == ["sim:stand", "sim:paper", "sim:slope", "sim:dense", "sim:long"]
+    assert list(menu) == ["sim:stand", "sim:paper", "sim:slope", "sim:dense", "sim:long", "sim:crossing"]
     assert all(len(line) > 20 for line in menu.values())

@@ -1,0 +1,63 @@
+"""From which scan on a change acts: the run before it is gone on from there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pipeline.geometry import Float
+from pipeline.mapper import MapperState
+from pipeline.parameters import Parameters
+from pipeline.records import Int
+from pipeline.rerun.clusters import ClusterTable
+from pipeline.rerun.journal import Entry
+
+# What a stage gives hangs on these: nothing of the run before holds where one of them changes.
+WHOLE = ("acquisition", "filters", "ground", "clustering", "shape", "slam", "relocalisation")
+LATE = {"tree_share"}  # of the gathering: it only turns votes into verdicts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Basis:
+    """A run that was mapped with one set of parameters from its first scan on.
+
+    Attributes:
+        parameters: The set.
+        entries: Of its scans, see `Journal`.
+        states: Of its mapper by the number of scans they hold, that before the first among them.
+        stamp_ns, sigma_xy, motion: Of its path, as `Mapper.load` takes them, as long as any state's.
+    """
+
+    parameters: Parameters
+    entries: tuple[Entry, ...]
+    states: Mapping[int, MapperState]
+    stamp_ns: Int
+    sigma_xy: Float
+    motion: Float
+
+    def holds_for(self, parameters: Parameters) -> bool:
+        """Whether other parameters find the same clusters, and ask for poses and gather in the same way."""
+        before, now = self.parameters, parameters
+        return all(getattr(before, stage) == getattr(now, stage) for stage in WHOLE) and (
+            before.gathering.model_dump(exclude=LATE) == now.gathering.model_dump(exclude=LATE)
+        )
+
+    def begin(self, parameters: Parameters, clusters: ClusterTable) -> tuple[int, bool]:
+        """Where other parameters can begin: with the state of so many scans, and whether the trees of these
+        scans must be tracked anew (see `Tail`).
+
+        Args:
+            parameters: That are tried.
+            clusters: Of at least as many scans as there are entries, or what is behind them is not used.
+        """
+        before, now = self.parameters, parameters
+        if not self.holds_for(now):
+            return 0, False
+        same = min(len(self.entries), len(clusters))
+        if before.detection != now.detection:
+            same = clusters.first_judged_otherwise(before.detection, now.detection, same)
+        late = before.tracking != now.tracking or before.gathering != now.gathering
+        if late:
+            same = next((k for k in range(same) if not self.entries[k].is_usual), same)
+        scans = max(known for known in self.states if known <= same)
+        return scans, late and scans > 0

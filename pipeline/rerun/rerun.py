@@ -1,0 +1,150 @@
+"""A run mapped again from what its scans showed, with other parameters from the first scan on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from pipeline.errors import StemmapError
+from pipeline.mapper import Mapper, MapperState
+from pipeline.records import Frame, Step
+from pipeline.rerun.basis import Basis
+from pipeline.rerun.journal import Journal
+from pipeline.rerun.kept import DamagedError, KeptScans
+from pipeline.rerun.key import look_key
+from pipeline.rerun.tail import Recalled, Tail
+
+Reread = Callable[[], Iterator[Step]]
+
+
+class Rerun:
+    """Maps the scans of a run one after the other; the map is that which `Mapper.process` would give.
+
+    Where a run with other parameters is known, the scans before the first one that the change touches are
+    passed over; where it touches nothing before the tracking, trees alone are tracked anew. What was kept is
+    used where the parameters look at a scan in the same way; else all scans are read once more, and what they
+    show now is kept beside.
+
+    Args:
+        mapper: Fresh, with the parameters that are tried.
+        kept: The scans. More may come while the rerun goes on.
+        reread: The steps of the run from its first on; None where they come only once.
+        basis: What is known of the run with other parameters; of the same seed and sensor.
+
+    Attributes:
+        journal: What the stages make of each scan.
+        passed: Scans that are as they were and were not mapped again.
+    """
+
+    def __init__(
+        self, mapper: Mapper, kept: KeptScans, reread: Reread | None = None, basis: Basis | None = None
+    ) -> None:
+        self.mapper = mapper
+        self.journal = Journal()
+        self.passed = 0
+        self._kept = kept
+        self._key = look_key(mapper.parameters)
+        self._next = 0
+        self._reread = reread
+        self._steps: Iterator[Step] | None = None
+        self._fresh: KeptScans | None = None
+        self._tail: Tail | None = None
+        self._until = 0  # scans that are tracked anew alone
+        mapper.note = lambda noted: self.journal.note(noted, mapper.parameters.slam)
+        if basis is not None:
+            self._go_on_from(basis)
+
+    @property
+    def done(self) -> int:
+        """Scans that are mapped."""
+        return self._next
+
+    @property
+    def kept(self) -> KeptScans:
+        """What the scans show to these parameters, as far as they are mapped."""
+        return self._kept if self._fresh is None else self._fresh
+
+    def frames(self, scans: int) -> Iterator[Frame | Recalled]:
+        """Map on until so many scans are mapped; the frames have no points and no clearance, unless the
+        scans were read once more.
+
+        Raises:
+            StemmapError: A scan is not kept and cannot be read once more, or what was kept is damaged.
+        """
+        while self._next < scans:
+            mapped = self._frame() if self._tail is None else self._tracked(self._tail)
+            self._next += 1
+            yield mapped
+
+    def state(self) -> MapperState | None:
+        """All that is known between two scans; None where no mapper was."""
+        return self.mapper.snapshot() if self._tail is None else self._tail.state()
+
+    def go_back(self, scans: int, state: MapperState) -> None:
+        """Stand where so many scans were mapped, with the state that the mapper had then."""
+        self._next, self._steps, self._tail = scans, None, None
+        self.mapper.restore(state)
+
+    def close(self) -> None:
+        """Forget what was kept beside."""
+        self._steps = None
+        if self._fresh is not None:
+            self._fresh.close()
+
+    def _go_on_from(self, basis: Basis) -> None:
+        scans, anew = basis.begin(self.mapper.parameters, self._kept.clusters)
+        if scans == 0:
+            return
+        entries = basis.entries[:scans]
+        self.journal.take(entries)
+        state = basis.states[0] if anew else basis.states[scans]
+        self.mapper.load(state, basis.stamp_ns, basis.sigma_xy, basis.motion)
+        if anew:
+            states = {known: basis.states[known] for known in basis.states if known <= scans}
+            self._tail, self._until = Tail(self.mapper.parameters, entries, states), scans
+        else:
+            self._next = self.passed = scans
+
+    def _tracked(self, tail: Tail) -> Recalled:
+        recalled = tail.track()
+        state = tail.state() if tail.done == self._until else None
+        if state is not None:
+            self.mapper.restore(state)
+            self._tail = None
+        return recalled
+
+    def _frame(self) -> Frame:
+        kept = self.kept
+        if kept.has(self._next, self._key):
+            try:
+                return self.mapper.take(*kept.scan(self._next))
+            except DamagedError:
+                if self._reread is None:
+                    raise
+                kept.forget_from(self._next)
+        step = self._read_on()
+        looked = self.mapper.look(step)
+        self.kept.put(step, looked, self._key)
+        return self.mapper.take(step, looked)
+
+    def _read_on(self) -> Step:
+        if self._reread is None:
+            raise StemmapError(
+                "the scans of a live run cannot be read once more, and what these parameters change has to "
+                "be looked for in them",
+                remedy="Open the recording of the run",
+            )
+        if self._steps is None:
+            self._steps = self._reread()
+            if self._fresh is None:
+                self._fresh = self._begun_anew()
+        for step in self._steps:
+            if step.index == self._next:
+                return step
+        raise StemmapError(f"the source does not give scan {self._next} again", remedy="Open it anew")
+
+    def _begun_anew(self) -> KeptScans:
+        """What is kept up to here, in a file of its own."""
+        fresh = KeptScans(self._kept.folder)
+        for k in range(self._next):
+            fresh.put(*self._kept.scan(k), self._key)
+        return fresh

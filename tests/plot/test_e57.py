@@ -1,0 +1,49 @@
+"""E57 clouds, written by pye57."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SourceError
+from pipeline.sources.clouds import is_cloud, open_cloud
+
+pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
+
+
+def write(path: Path, stations: int = 2) -> np.ndarray:
+    """So many stations 10 m apart in UTM coordinates, each turned; all points in the frame of the file."""
+    rng = np.random.default_rng(1)
+    file = pye57.E57(str(path), mode="w")
+    R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    everything = []
+    for k in range(stations):
+        own = rng.uniform(-5.0, 5.0, (300, 3))
+        t = np.array([450_000.0 + 10.0 * k, 6_800_000.0, 120.0])
+        columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), own.T.copy(), strict=True))
+        turn = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+        file.write_scan_raw(columns, rotation=turn, translation=t)
+        everything.append(own @ R.T + t)
+    file.close()
+    return np.concatenate(everything)
+
+
+def test_all_stations_stand_in_the_frame_of_the_file(tmp_path: Path):
+    wanted = write(tmp_path / "plot.e57")
+    cloud = open_cloud(str(tmp_path / "plot.e57"))
+    assert is_cloud(str(tmp_path / "plot.e57"))
+    assert (cloud.description.points, cloud.description.kind) == (600, "E57, 2 stations")
+    found = np.concatenate(list(cloud.parts())) + cloud.description.offset
+    np.testing.assert_allclose(found, wanted, atol=2e-3)
+    assert cloud.losses == {}
+
+
+@pytest.mark.parametrize("keep", [0.1, 0.5, 0.95])
+def test_a_cut_file_is_one_clear_error(keep: float, tmp_path: Path):
+    write(tmp_path / "plot.e57")
+    whole = (tmp_path / "plot.e57").read_bytes()
+    (tmp_path / "plot.e57").write_bytes(whole[: int(keep * len(whole))])
+    with pytest.raises(SourceError, match="E57"):
+        list(open_cloud(str(tmp_path / "plot.e57")).parts())
