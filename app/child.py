@@ -8,6 +8,7 @@ import json
 import sys
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from pipeline.errors import SourceError, StemmapError
 
@@ -16,7 +17,9 @@ EXAMINE = (sys.executable, "-P", "-m", "app.examine")
 PATIENCE_S = 120.0
 LARGEST_ANSWER = 64 << 20
 
-_at_once = asyncio.Semaphore(2)
+_MOST_AT_ONCE = 2
+# A semaphore belongs to the loop in which somebody first waited for it.
+_rooms: WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Semaphore] = WeakKeyDictionary()
 
 
 class TookTooLongError(StemmapError):
@@ -32,7 +35,7 @@ async def ask(
         SourceError: What was asked about cannot be read; the error says why.
         TookTooLongError: There was no answer in time.
     """
-    async with _at_once:
+    async with _room():
         process = await asyncio.create_subprocess_exec(
             *command,
             stdin=asyncio.subprocess.PIPE,
@@ -48,6 +51,11 @@ async def ask(
                 process.kill()
             await process.wait()
     return _told(said, question)
+
+
+def _room() -> asyncio.Semaphore:
+    """Of the running loop."""
+    return _rooms.setdefault(asyncio.get_running_loop(), asyncio.Semaphore(_MOST_AT_ONCE))
 
 
 async def _talk(process: asyncio.subprocess.Process, question: bytes) -> bytes:

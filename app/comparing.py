@@ -28,7 +28,8 @@ async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
     Returns:
         The tables as the page shows them; what is of b stands in the frame of a.
     """
-    pose, how = (Pose2(), "same recording") if same_source else await _laid(a, b)
+    known, how = (Pose2(), "same recording") if same_source else await laid(a, b)
+    pose, how = (Pose2(), f"as they stand: {how}") if known is None else (known, how)
     place_a, place_b = _places(a), pose.apply(_places(b))
     pairs, only_a, only_b = await asyncio.to_thread(
         _paired, a["map"]["trees"], b["map"]["trees"], place_a, place_b
@@ -53,14 +54,15 @@ async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
     }
 
 
-async def _laid(a: Run, b: Run) -> tuple[Pose2, str]:
-    """The pose of b in a, and how it is known, in words."""
+async def laid(a: Run, b: Run) -> tuple[Pose2 | None, str]:
+    """The pose of b in a, both with their `map`, and how it is known, in words; None and why, where it is
+    not."""
     try:
         found = await child.ask({"ask": "laid", "local": _stems(b), "reference": _stems(a)})
     except StemmapError as error:
-        return Pose2(), f"as they stand: {error.what}"
+        return None, error.what
     if found["pose"] is None:
-        return Pose2(), f"as they stand: their stems do not agree with certainty ({found['reason']})"
+        return None, f"their stems do not agree with certainty ({found['reason']})"
     return Pose2(*found["pose"]), f"laid upon one another by {found['stems']} stems"
 
 

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 
+from app.mappers import mapper_of
 from app.saved_run import RunSource, SavedRun
 from app.tally import Tally
 from pipeline.errors import StemmapError
@@ -98,7 +99,7 @@ def go_on(
         saved.tally, len(path), saved.sources, saved.start_ns, int(path[-1]), losses=Counter(saved.losses)
     )
     if start == "resume":
-        mapper.load(saved.map.state(), path, saved.map.sigma_xy)
+        mapper.load(saved.map.state(), path, saved.map.sigma_xy, saved.map.motion)
         return _resumed(beginning, source)
     found: Match | None = None
     pose = start if isinstance(start, Pose2) else None
@@ -108,7 +109,7 @@ def go_on(
             source, mapper.parameters, Stems.of_trees(saved.map.trees(mapper.parameters)), odometry, seed
         )
         pose, covariance = found.pose, found.covariance
-    mapper.load(replace(saved.map.state(), odometry=None), path, saved.map.sigma_xy)
+    mapper.load(replace(saved.map.state(), odometry=None), path, saved.map.sigma_xy, saved.map.motion)
     if pose is None:
         end = mapper.path
         pose = Pose2(float(end.x[-1]), float(end.y[-1]), float(end.yaw[-1]))
@@ -156,8 +157,7 @@ def localise(
     Raises:
         StemmapError: No part of the source was found, with the reason of the last refusal.
     """
-    known = source.description
-    mapper = Mapper(parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed)
+    mapper = mapper_of(source.description, parameters, seed)
     due, frame, match = float(FIRST_TRY), None, None
     for step in steps(source.records(), odometry=odometry):
         frame = mapper.process(step)
@@ -176,7 +176,7 @@ def localise(
             return match
     raise StemmapError(
         f"the robot was not found in the saved map: {match.reason if match else 'there is no scan'}",
-        where=known.uri,
+        where=source.description.uri,
         remedy="Say where it starts with --start X,Y,YAW (m, m, degrees) or --start last",
     )
 

@@ -14,27 +14,32 @@ import msgspec
 import numpy as np
 
 from app.annotating import Annotating
+from app.camera_desk import CameraDesk
 from app.events import Events
 from app.hands import SOMEBODY, hand
 from app.keeper import Keeper
 from app.live import Live
 from app.live_payload import map_payload, truth_payload
 from app.logbook import Glance, Logbook
-from app.messages import Open, Play, Seek, SetParameters, Status
+from app.looping import Loop
+from app.map_changes import MapChanges
+from app.messages import Open, Play, SetParameters, Status
 from app.neighbours import SceneLike, WorkerLike
 from app.parameter_sets import ParameterSets
 from app.parameter_state import ParameterState
-from app.scores import Scores
-from app.selection import Selection
+from app.places import Places, Turns
+from app.scores import Scores, score_payload
+from app.selecting import Selecting
 from app.standing_scan import BeforeAfter, counts_of
 from app.story.asking import Asking
-from app.story.questions import NoStoryError
-from app.story.records import ClusterStory
+from app.sweeping.asking_page import question_of
+from app.sweeping.sensitivity import Sensitivity
 from app.throttle import Throttle
+from app.tune_search import TuneSearch
 from app.worker_mailbox import joined
-from app.worker_messages import Answer, Begin, FromWorker, Opened, Report, Shown, ToWorker
+from app.worker_messages import Answer, Begin, FromWorker, Opened, Remapped, Report, Rough, Shown, ToWorker
 from pipeline.parameters.model import Value
-from pipeline.records import Path, TruthTrees
+from pipeline.records import Path, Trees, TruthTrees
 
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 _SCENE_PAUSE_S = 0.09
@@ -60,6 +65,7 @@ class Dashboard:
         self.annotating.changed, self.annotating.edited = self._use_truth, self._mark_edits
         self.live = live
         self.scores = Scores(self._tell_score)
+        self.sensitivity = Sensitivity(lambda told: live.tell("sensitivity", told))
         self.status = Status(state="starting", detail="Starting")
         self.shown: Shown | None = None
         self.path: Path | None = None
@@ -67,15 +73,23 @@ class Dashboard:
         self.truth: TruthTrees | None = None
         self.sets = ParameterSets(self.keeper, self._show_parameters)
         self._before_after = BeforeAfter()
-        self.selection = Selection()
         self.asking = Asking(lambda question: self.worker.send(question), lambda: self._run)
-        self._selecting: asyncio.Task[None] | None = None
-        self.scene_viewers = 0
+        self.camera = CameraDesk(self.asking)
+        self.selecting = Selecting(
+            self.asking,
+            live,
+            lambda tree, ring: self.scene.select(tree, ring),
+            run=lambda: self._run,
+            newest=lambda: None if self.shown is None else self.shown.frame.index,
+        )
+        self.pages, self.scenes = Places(), Places()
+        self.viewers_turns = Turns()
         self.scene_hand = SOMEBODY  # who moved something in the scene last
         self.source = Open("")
+        self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
-        self.loop: tuple[float, float] | None = None
-        self._turning = False
+        self.search = TuneSearch(lambda told: live.tell("search", told))
+        self.loop = Loop(live, lambda command: self.worker.send(command))
         self._run: int | None = None
         self._notice = ""
         self._restarts = 0
@@ -98,8 +112,10 @@ class Dashboard:
     async def close(self) -> None:
         """End the worker and the scene."""
         self.scores.close()
-        self._leave_selecting()
+        await self.sensitivity.leave()
+        self.selecting.leave()
         self._show_scene.cancel()
+        await self.search.leave()
         await self.logbook.close()
         await self.worker.close()
         await self.keeper.close()
@@ -123,20 +139,15 @@ class Dashboard:
         self.scene.choose(name, value)
         self.live.tell("view", self.scene.view)
 
-    def play_in_loop(self, loop: tuple[float, float] | None) -> None:
-        """Play from the first to the second time [s] again and again; None plays on at the end."""
-        self._tell_loop(loop)
-
-    def _tell_loop(self, loop: tuple[float, float] | None) -> None:
-        self.loop, self._turning = loop, False
-        self.live.tell("loop", None if loop is None else {"from_s": loop[0], "to_s": loop[1]})
-
     async def open(self, source: Open) -> None:
         """Leave the run and open another source."""
         self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
-        self._run, self.source = None, source
+        self._run, self.source, self.digest = None, source, ""
+        self.camera.forget()
         self.logbook.leave()
         self.annotating.leave()
+        await self.sensitivity.leave()
+        await self.search.leave()
         await self._forget()
         await self.command(source)
 
@@ -184,6 +195,7 @@ class Dashboard:
         change(self.parameters)
         if self.parameters.step != step:
             self._before_after.step()
+        await self._send_parameters()  # first of all: the scan is mapped again while all others are told
         self._show_parameters()
         if self.shown is not None:
             self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
@@ -191,13 +203,29 @@ class Dashboard:
         state = self.parameters
         who = hand.get() or self.scene_hand
         self.logbook.changed(before.flat(), state.parameters.flat(), state.preset, state.revision, who)
-        await self._send_parameters()
         self._score()
+
+    async def reach(self, *, whole: bool) -> None:
+        """Let changes of parameters act on the whole run, which is mapped again at once, or from the standing
+        scan on."""
+        self.parameters.whole = whole
+        self._show_parameters()
+        await self._send_parameters()
+
+    def how_much_matters(self, name: str, values: list[Value]) -> None:
+        """Have the whole run scored over values of a parameter.
+
+        Raises:
+            StemmapError: It cannot be, and why.
+        """
+        state = self.parameters.parameters
+        self.sensitivity.ask(
+            question_of(self.source, self.digest, self.status, self.truth, state, name, values)
+        )
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree everywhere; None selects nothing."""
-        self._leave_selecting()
-        self._select(Selection(number))
+        self.selecting.tree(number)
 
     async def select_cluster(self, scan: int, cluster: int) -> None:
         """Select a cluster everywhere, as it stands in a scan that was shown lately, with its tree.
@@ -205,45 +233,7 @@ class Dashboard:
         Raises:
             NoStoryError: It is not known any more.
         """
-        run = self._run
-        story = await self.cluster_story(scan, cluster)
-        if run == self._run:  # else it was left meanwhile
-            self._select(Selection(story.tree, story))
-
-    def select_cluster_soon(self, scan: int, cluster: int) -> None:
-        """The same without waiting, for who cannot be told that it is not known any more; of clicks that
-        follow one another the last counts."""
-        self._leave_selecting()
-        self._selecting = asyncio.create_task(self._select_if_known(scan, cluster), name="select")
-
-    def _leave_selecting(self) -> None:
-        if self._selecting is not None:
-            self._selecting.cancel()
-
-    async def _select_if_known(self, scan: int, cluster: int) -> None:
-        try:
-            await self.select_cluster(scan, cluster)
-        except NoStoryError as error:
-            self.live.tell("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
-
-    async def cluster_story(self, scan: int | None, cluster: int) -> ClusterStory:
-        """The story of a cluster: the selected one as it was when it was selected, others of scans that were
-        shown lately; None is the newest scan.
-
-        Raises:
-            NoStoryError: There is none.
-        """
-        kept = self.selection.cluster
-        if kept is not None and (kept.scan, kept.cluster) == (scan, cluster):
-            return kept
-        newest = None if self.shown is None else self.shown.frame.index
-        return await self.asking.cluster(newest if scan is None else scan, cluster)
-
-    def _select(self, selection: Selection) -> None:
-        self.selection = selection
-        self.scene.select(selection.tree, selection.ring)
-        self.live.tell("selection", selection.as_plain())
-        self.live.tell("missing", None)
+        await self.selecting.cluster(scan, cluster)
 
     def _show_parameters(self) -> None:
         state = self.parameters
@@ -257,7 +247,8 @@ class Dashboard:
 
     async def _send_parameters(self) -> None:
         state = self.parameters
-        await self.worker.send(SetParameters(state.parameters.model_dump(), state.revision))
+        values = state.parameters.model_dump()
+        await self.worker.send(SetParameters(values, state.revision, state.whole))
 
     # --- what the worker says --------------------------------------------------------------------
 
@@ -266,17 +257,40 @@ class Dashboard:
         match message:
             case Report(status=status):
                 self._set_status(status)
-            case Opened():
+            case Opened() if message.asked in ("", self.source.uri):  # else it was left before it was open
                 await self._begin(message)
             case Shown():
                 self._show(message)
-                await self._go_round(message)
+                if message.run == self._run:
+                    await self.loop.shown(message.time_s, self.status)
             case Answer():
                 self.asking.take(message)
+            case Remapped(run=run, changes=changes) if run == self._run:
+                self._remapped(changes)
+            case Rough(run=run, revision=revision, trees=trees) if run == self._run:
+                await self._tell_rough(run, revision, trees)
+
+    async def _tell_rough(self, run: int, revision: int, trees: Trees) -> None:
+        """The run is being mapped again: what will come of it, roughly, with its score."""
+        score = None
+        if self.truth is not None:
+            evaluation = self.parameters.parameters.evaluation
+            score = await asyncio.to_thread(score_payload, trees, self.truth, evaluation, self.path_xy)
+            if run != self._run:  # another one was opened meanwhile
+                return
+        places = np.round(trees.position, 3).tolist()
+        self.live.tell("rough", {"revision": revision, "places": places, "score": score})
+
+    def _remapped(self, changes: MapChanges) -> None:
+        """The run was mapped again: the map has other trees, and other numbers."""
+        self.live.tell("remapped", msgspec.to_builtins(changes))
+        self.events.remapped(changes.confirmed)
+        self._tell_events()
+        self.selecting.renamed(dict(changes.renamed))
 
     async def _begin(self, opened: Opened) -> None:
         """A source is open and waits: parameters that suit it first, then it plays."""
-        self._run = opened.run
+        self._run, self.digest = opened.run, opened.digest or opened.uri
         await self.annotating.begin(opened.digest or opened.uri, opened.uri, opened.truth)
         if self._run != opened.run:  # it was left meanwhile
             return
@@ -302,11 +316,13 @@ class Dashboard:
         self._before_after.forget()
         self.events.forget()
         self._tell_events()
-        self._tell_loop(None)
+        self.loop.choose(None)
+        self.live.tell("remapped", {})
+        self.live.tell("rough", {})
         self._show_scene.cancel()
         self.scene.clear()
         self._use_truth()
-        await self.select_tree(None)
+        self.selecting.tree(None)
 
     def _use_truth(self) -> None:
         """Show the truth, score against it, and tell what was annotated."""
@@ -353,18 +369,6 @@ class Dashboard:
     def _tell_score(self, score: dict[str, Any] | None) -> None:
         self.live.tell("evaluation", score)
         self.logbook.scored(score)
-
-    async def _go_round(self, shown: Shown) -> None:
-        """At the end of the loop go to its beginning, while the run plays."""
-        if self.loop is None or shown.run != self._run:
-            return
-        if shown.time_s < self.loop[1]:
-            self._turning = False
-        elif not self._turning and self.status.state in ("playing", "finished"):
-            self._turning = True  # pictures that are under way must not turn it once more
-            await self.worker.send(Seek(self.loop[0]))
-            if self.status.state == "finished":
-                await self.worker.send(Play())
 
     def _score(self) -> None:
         if self.shown is not None and self.truth is not None:

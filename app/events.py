@@ -64,6 +64,18 @@ class Events:
             self._note(f"health {frame.index}", Event(time_s, "health", text))
         return self._events.keys() != known
 
+    def remapped(self, confirmed: list[tuple[int, float]]) -> None:
+        """The map is another one.
+
+        Args:
+            confirmed: Number of each of its trees, and when it was confirmed [s].
+        """
+        self._events = {k: e for k, e in self._events.items() if e.kind not in ("tree", "health")}
+        self._confirmed = {number for number, _ in confirmed}
+        self._health = "good"
+        for number, time_s in confirmed:
+            self._note(f"tree {number}", Event(time_s, "tree", f"Tree {number} confirmed"))
+
     def warned(self, warnings: list[str], time_s: float) -> bool:
         """Take the warnings that stand; returns whether there is a new one."""
         new = [warning for warning in warnings if warning not in self._warnings]

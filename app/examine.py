@@ -33,6 +33,14 @@ def recording(question: dict[str, Any]) -> dict[str, Any]:
         }
 
 
+def inside(question: dict[str, Any]) -> dict[str, Any]:
+    """The topics of a source, what they are read as, and where the LiDAR stands."""
+    from app.inside import heard, recorded
+    from app.robot.address import is_live
+
+    return (heard if is_live(question["path"]) else recorded)(question["path"])
+
+
 def finished(question: dict[str, Any]) -> dict[str, Any]:
     """The map and the figures in a folder that `stemmap map` wrote."""
     import numpy as np
@@ -88,6 +96,7 @@ def laid(question: dict[str, Any]) -> dict[str, Any]:
 
 QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "recording": recording,
+    "inside": inside,
     "finished": finished,
     "laid": laid,
 }

@@ -49,7 +49,7 @@ class Snapshots(Generic[S]):
 
     def offer(self, scans: int, state: S) -> None:
         """Keep a state if it is due."""
-        if scans % self._spacing or scans in self._states:
+        if not self.is_due(scans):
             return
         self._states[scans] = state
         while len(self._states) > 1 and self._are_too_many():
@@ -60,6 +60,14 @@ class Snapshots(Generic[S]):
         if len(self._states) > _MOST_STATES:
             return True
         return sum(self._size_of(state) for state in self._states.values()) > _MOST_BYTES
+
+    def is_due(self, scans: int) -> bool:
+        """Whether `offer` would keep a state of so many scans."""
+        return scans % self._spacing == 0 and scans not in self._states
+
+    def first(self, scans: int) -> dict[int, S]:
+        """The states that hold at most so many scans."""
+        return {known: state for known, state in self._states.items() if known <= scans}
 
     def newest(self, scans: int) -> tuple[int, S]:
         """The newest state that holds at most so many scans, with its number of scans."""
@@ -81,6 +89,15 @@ class ParameterHistory:
     def at(self, index: int) -> Parameters:
         """The parameters that a scan was or will be mapped with."""
         return self._sets[bisect_right(self._starts, index) - 1]
+
+    def until(self, scans: int) -> int:
+        """Of the first scans, how many were mapped with the parameters of the first one."""
+        return min([scans, *self._starts[1:2]])
+
+    def were_always(self, parameters: Parameters, aside: set[str]) -> bool:
+        """Whether each scan was mapped with these values, those of some stages left aside."""
+        wanted = parameters.model_dump(exclude=aside)
+        return all(known.model_dump(exclude=aside) == wanted for known in self._sets)
 
     def set_from(self, index: int, parameters: Parameters) -> bool:
         """From a scan on, these are in force. Returns whether anything became different: if not,

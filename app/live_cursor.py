@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from array import array
 from collections import Counter, deque
-from typing import cast
 
-from app.odometry import odometry_used
+from app.odometry import Chosen
 from app.robot.source import LiveSource
 from pipeline.errors import SourceError
 from pipeline.records import Step
-from pipeline.steps import Joiner, OdometryChoice
+from pipeline.sources.base import Source
+from pipeline.sources.with_motion import WithMotion
+from pipeline.steps import Joiner
 
 
 class LiveCursor:
@@ -18,14 +19,15 @@ class LiveCursor:
 
     Args:
         source: The robot. The cursor does not close it.
-        odometry: The choice of odometry.
+        chosen: What tells the motion.
+        moving: The robot with that motion.
     """
 
-    def __init__(self, source: LiveSource, odometry: str) -> None:
+    def __init__(self, source: LiveSource, chosen: Chosen, moving: Source) -> None:
         self._source = source
         self.losses = Counter[str]()
-        used = odometry_used(source.description, cast(OdometryChoice, odometry))
-        self._joiner = Joiner(use_odometry=used != "static", index=0, losses=self.losses)
+        self._moving = moving if isinstance(moving, WithMotion) else None
+        self._joiner = Joiner(use_odometry=chosen.steps != "static", index=0, losses=self.losses)
         self._ready: deque[Step] = deque()
         self._stamps = array("q")
 
@@ -53,7 +55,8 @@ class LiveCursor:
             if not records:
                 return None
             for record in records:
-                self._joiner.add(record)
+                for told in (record,) if self._moving is None else self._moving.pass_on(record):
+                    self._joiner.add(told)
                 self._ready.extend(self._joiner.ready())
         return self._ready[0]
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from app.story.history import half_axes
 from app.worker_messages import Shown
+from pipeline.clearance import Clearance
 from pipeline.health import Health
 from pipeline.records import Frame, Trees, TruthTrees, Verdict
 
@@ -39,6 +40,7 @@ def map_payload(shown: Shown) -> dict[str, Any]:
         "clusters": clusters_payload(frame),
         "counts": dict(frame.counts),
         "layers": layer_counts(frame),
+        "clearance": clearance_payload(frame.clearance),
     }
 
 
@@ -52,6 +54,14 @@ def layer_counts(frame: Frame) -> dict[str, int]:
         "particles": len(frame.estimate.particles),
         "trees": int(np.count_nonzero(frame.trees.confirmed)),
     }
+
+
+def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
+    """How far the way is free; what is not known, or nowhere, is None."""
+    if clearance is None:
+        return None
+    ahead, beside = _known(clearance.ahead), _known(clearance.beside)
+    return {"zone": clearance.zone.label, "ahead_m": ahead, "beside_m": beside, "within_m": clearance.within}
 
 
 def health_payload(health: Health) -> dict[str, Any]:

@@ -25,6 +25,7 @@ class Status:
         detail: What happened, what it means, what to do; empty when all is well.
         source: The URI.
         kind: The source's format in words.
+        odometry: Where the motion comes from, in words.
         time_s, end_s: Of the standing scan, and of the last scan where it is known.
         scan_index: Of the standing scan, -1 before the first.
         scans: Number of scans in the run, None where it is not known.
@@ -41,6 +42,8 @@ class Status:
         live: Whether the source is a robot that is heard live.
         robot: Its namespace, empty for none.
         robots: The namespaces of all robots that publish scans where it is heard.
+        remapped: How much of the run is mapped again (see `SetParameters`), from 0 to 1; None when it is not.
+        camera: Whether there are pictures of a camera.
         recording: Where a live run is recorded to, or why it is no more; empty where it is not.
     """
 
@@ -48,6 +51,7 @@ class Status:
     detail: str = ""
     source: str = ""
     kind: str = ""
+    odometry: str = ""
     time_s: float = 0.0
     end_s: float | None = None
     scan_index: int = -1
@@ -67,6 +71,8 @@ class Status:
     robot: str = ""
     robots: list[str] = field(default_factory=list)
     recording: str = ""
+    camera: bool = False
+    remapped: float | None = None
 
 
 class Play(msgspec.Struct, frozen=True, tag="play"):
@@ -97,10 +103,11 @@ class SetSpeed(msgspec.Struct, frozen=True, tag="set_speed"):
 
 class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
     """Parameters, already validated, as nested values; they act on the next scan, and when paused on
-    the standing scan at once."""
+    the standing scan at once. If `whole` says so, the run is mapped again with them from its first scan."""
 
     values: dict[str, Any]
     revision: int
+    whole: bool = False
 
 
 class Open(msgspec.Struct, frozen=True, tag="open"):
@@ -110,6 +117,9 @@ class Open(msgspec.Struct, frozen=True, tag="open"):
         uri, odometry, seed: What is mapped, and how.
         record: Path of the file that a live run is recorded to; empty for none. No browser may say it.
         publish: Whether a live run's results go back to the robot's network.
+        topics: Topic by role where somebody chose it.
+        mount: Where the LiDAR stands on the robot: x, y, z [m], roll, pitch, yaw [rad]; None: as the source
+            says.
     """
 
     uri: str
@@ -117,6 +127,8 @@ class Open(msgspec.Struct, frozen=True, tag="open"):
     seed: int = 0
     record: str = ""
     publish: bool = False
+    topics: dict[str, str] = {}
+    mount: tuple[float, ...] | None = None
 
 
 Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path as FilePath
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from app.continuing import Beginning, Continued, at_origin, go_on
 from app.driven import breaks_of, driven
 from app.finished import as_written
-from app.odometry import odometry_used, odometry_warnings
+from app.forests import kept_forests
+from app.odometry import Chosen, with_odometry
 from app.preset_words import changed_values, preset_words
 from app.saved_run import FORMAT, SavedRun
 from app.stopwatch import Stopwatch
 from app.summary import start_lines, summary_lines
 from app.tally import Tally
+from app.tree_pictures import FOLDER as PICTURES
+from app.tree_pictures import keep_pictures
 from app.version import version
+from app.words import count
 from pipeline.compiled import on_compiling
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import Evaluation, PathError, evaluate, path_error
 from pipeline.export import RunFiles, terrain_text
 from pipeline.mapper import Mapper
@@ -30,7 +34,6 @@ from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path, Trees, Truth, TruthTrees
 from pipeline.saved_map import SavedMap
 from pipeline.sources.base import Source
-from pipeline.steps import OdometryChoice
 
 MEASURED_SCANS = 100_000  # of which times are kept for the medians
 
@@ -50,6 +53,7 @@ class OfflineRun:
     """What to map, and how.
 
     Attributes:
+        odometry: Where the motion comes from, as asked, see `app.odometry`.
         stop_after: So many scans.
         revisions: Other parameters, each from a scan on, in their order.
         on_frame: Told of each scan's results.
@@ -59,7 +63,7 @@ class OfflineRun:
     preset: str
     parameters: Parameters
     seed: int
-    odometry: OdometryChoice
+    odometry: str
     truth_trees: TruthTrees | None = None
     continued: Continued | None = None
     stop_after: int | None = None
@@ -105,15 +109,30 @@ def map_run(
     stopwatch = Stopwatch(scans=MEASURED_SCANS)
     try:
         with on_compiling(stopwatch.disturb):
-            return _map(plan, files, progress, stopwatch)
+            outcome, mapped = _map(plan, files, progress, stopwatch)
     except BaseException:
         files.abandon()
         raise
     finally:
         progress.close()
+    if plan.continued is None:  # the path of an earlier drive has no pictures here
+        _keep_pictures(mapped, folder, outcome)
+    return outcome
 
 
-def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopwatch) -> Outcome:
+class _Mapped(NamedTuple):
+    """What pictures of trees are made of, once the map is written."""
+
+    source: Source
+    trees: Trees
+    path: Path
+
+
+def _map(
+    plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopwatch
+) -> tuple[Outcome, _Mapped]:
+    moving, chosen = with_odometry(plan.source, plan.odometry)
+    plan = replace(plan, source=moving)
     description = plan.source.description
     mapper = Mapper(
         plan.parameters,
@@ -121,11 +140,12 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopw
         T_base_lidar=description.T_base_lidar,
         seed=plan.seed,
         watch=stopwatch,
+        forests=kept_forests(),
     )
-    begun = _beginning(plan, mapper)
+    begun = _beginning(plan, mapper, chosen)
     tally, start_ns, frame = begun.tally, begun.start_ns, None
     left_out = Counter[str]()
-    to_map = begun.steps(plan.source, odometry_used(description, plan.odometry), left_out)
+    to_map = begun.steps(plan.source, chosen.steps, left_out)
     for step in islice(to_map, plan.stop_after):
         _use_revisions(plan, mapper, step.index)
         # The first scan loads the kernels, which takes many times longer than to map it.
@@ -153,6 +173,7 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopw
         tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, tally, frame, (seconds, metres), start_ns, evaluation, error, losses)
+    record["odometry_used"] = chosen.words
     if len(begun.sources) > 1:
         first, *others = begun.sources
         record["source"].update(uri=first.uri, sha256=first.digest)
@@ -160,6 +181,7 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopw
     outcome = Outcome(
         summary=[
             *summary_lines(description.uri, frame, (seconds, metres), evaluation, error),
+            f"odometry: {chosen.words}",
             preset_words(plan.preset, plan.parameters),
             *start_lines(begun.sources[-1]),
             *tally.health.summary(),
@@ -171,7 +193,21 @@ def _map(plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopw
     )
     further = {"terrain.csv": terrain_text(mapper.height_map)}
     files.finish(frame.trees, path, start_ns, record, state, further)
-    return outcome
+    return outcome, _Mapped(plan.source, frame.trees, path)
+
+
+def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: Outcome) -> None:
+    """The map stands whole: whatever happens here takes nothing away from it."""
+    try:
+        kept, told = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
+    except (StemmapError, OSError) as error:
+        kept, told = 0, f"not all pictures of trees were made: {error}"
+    except KeyboardInterrupt:
+        kept, told = 0, "not all pictures of trees were made: it was stopped; the map is whole"
+    if kept:
+        outcome.summary.append(f"{count(kept, 'picture')} of trees in {folder / PICTURES}")
+    if told:
+        outcome.warnings.append(told)
 
 
 def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
@@ -193,12 +229,12 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
     return told
 
 
-def _beginning(plan: OfflineRun, mapper: Mapper) -> Beginning:
-    description = plan.source.description
-    warnings = [*odometry_warnings(description, plan.odometry), *description.warnings]
+def _beginning(plan: OfflineRun, mapper: Mapper, chosen: Chosen) -> Beginning:
+    told = (chosen.warning,) if chosen.warning else ()
+    warnings = [*told, *plan.source.description.warnings]
     if plan.continued is None:
         return at_origin(plan.source, warnings)
-    return go_on(plan.continued, plan.source, mapper, plan.odometry, plan.seed, warnings)
+    return go_on(plan.continued, plan.source, mapper, chosen.steps, plan.seed, warnings)
 
 
 def _saved(

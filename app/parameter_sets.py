@@ -63,8 +63,13 @@ class ParameterSets:
                 self._values[row.name] = read_file(row.toml, row.name)
         self._changed()
 
-    async def save(self, name: str, preset_name: str, parameters: Parameters, who: str) -> None:
+    async def save(
+        self, name: str, preset_name: str, parameters: Parameters, who: str, text: str = ""
+    ) -> None:
         """Keep parameters under a name, in place of those that have it.
+
+        Args:
+            text: A file of them that says more, to be kept in place of the plain one.
 
         Raises:
             ParameterError: A preset has this name.
@@ -72,7 +77,7 @@ class ParameterSets:
         """
         if name in PRESETS:
             raise ParameterError("a preset has this name", where=name, remedy="Choose another")
-        text = file_of(preset_name, parameters)
+        text = text or file_of(preset_name, parameters)
         await self._keeper.ask(lambda store: store.sets.save(name, text, who))
         await self.load()
 

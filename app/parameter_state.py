@@ -41,12 +41,17 @@ class ParameterState:
 
     Attributes:
         step: Grows with each change that is a step of its own.
+        whole: Whether a change acts on the whole run, which is mapped again then, or from the standing scan
+            on.
+        check: Called with parameters before they hold; raises a StemmapError for those that cannot.
     """
 
     def __init__(self, begin: Begin = preset_alone, clock: Callable[[], float] = time.monotonic) -> None:
         self._begin, self._clock = begin, clock
         self.preset, self.parameters = begin(DEFAULT_PRESET)
         self.revision = self.step = 0
+        self.whole = True
+        self.check: Callable[[Parameters], None] = lambda _: None
         self._chosen = False
         self._undo: list[_Standing] = []
         self._redo: list[_Standing] = []
@@ -130,7 +135,8 @@ class ParameterState:
             return False
         try:
             preset_name, parameters = self._begin(name)
-        except ParameterError:  # flags that fitted the default need not fit this one
+            self.check(parameters)
+        except StemmapError:  # flags that fitted the default need not fit this one
             return False
         if (preset_name, parameters) == (self.preset, self.parameters):
             return False
@@ -139,9 +145,10 @@ class ParameterState:
         return True
 
     def as_plain(self) -> dict[str, Any]:
-        """What changes: preset, revision, values, the names that differ from the preset, and how many steps
-        can be undone and done again."""
+        """What changes: what a change acts on, preset, revision, values, the names that differ from the
+        preset, and how many steps can be undone and done again."""
         return {
+            "whole": self.whole,
             "preset": self.preset,
             "revision": self.revision,
             "undo": len(self._undo),
@@ -158,6 +165,7 @@ class ParameterState:
     def _become(self, preset_name: str, parameters: Parameters, goes_on: bool = False) -> None:
         """Let this hold from now on; `goes_on`: as part of the step before."""
         before = _Standing(self.preset, self.parameters)
+        self.check(parameters)
         self._gesture = (frozenset(), 0.0)
         self._chosen = True
         self.revision += 1
@@ -172,6 +180,7 @@ class ParameterState:
     def _go_back(self, steps: list[_Standing], others: list[_Standing], none: str) -> None:
         if not steps:
             raise StemmapError(none)
+        self.check(steps[-1].parameters)
         others.append(_Standing(self.preset, self.parameters))
         self.preset, self.parameters = steps.pop()
         self._gesture = (frozenset(), 0.0)

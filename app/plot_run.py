@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from app.finished import as_written
+from app.forests import kept_forests
 from app.preset_words import changed_values, preset_words
 from app.summary import evaluation_lines
 from app.version import version
@@ -73,7 +74,7 @@ def _map(
     cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, files: RunFiles
 ) -> PlotOutcome:
     about = cloud.description
-    plot = map_plot(cloud, parameters)
+    plot = map_plot(cloud, parameters, kept_forests())
     trees = replace(plot.trees, position=plot.trees.position + about.offset[:2])
     evaluation = None
     if truth is not None:

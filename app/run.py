@@ -12,12 +12,28 @@ from typing import Any, Protocol
 from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
 from app.live_cursor import LiveCursor
+from app.remapping import Remapping, Told
 from app.stopwatch import Stopwatch
 from app.story.history import TreeHistory
 from pipeline.errors import SourceError, StemmapError
+from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
-from pipeline.records import Frame, Path, Step
+from pipeline.perception import Looked
+from pipeline.records import Frame, Path, Step, Trees
+from pipeline.rerun import (
+    Basis,
+    DamagedError,
+    Journal,
+    KeptScans,
+    Reread,
+    Rerun,
+    look_key,
+    rough_trees,
+)
 from pipeline.sources.base import Source
+
+_NO_PART_OF_THE_MAP = {"evaluation", "obstacles"}  # stages
+_NS = 1_000_000_000
 
 
 class MapperLike(Protocol):
@@ -33,6 +49,7 @@ class MapperLike(Protocol):
 
 
 MakeMapper = Callable[[Source, Parameters, int, Stopwatch], MapperLike]
+Remake = Callable[[Parameters], MapperLike]
 
 
 class Run:
@@ -44,6 +61,13 @@ class Run:
         cursor: Reads the source's steps.
         parameters: In force from the first scan on.
         stopwatch: The one that the mapper measures with.
+        odometry: Where the motion comes from, in words.
+        remake: Makes a fresh mapper for this source, so that the run can be mapped again.
+        reread: The steps from the first scan on; None where they come only once.
+        kept: What is kept of the scans, of this run or an earlier opening of its source.
+
+    Attributes:
+        is_bare: Whether the picture of the standing scan lacks its points, see `map_next`.
     """
 
     def __init__(
@@ -53,12 +77,17 @@ class Run:
         cursor: Cursor | LiveCursor,
         parameters: Parameters,
         stopwatch: Stopwatch,
+        odometry: str = "",
+        remake: Remake | None = None,
+        reread: Reread | None = None,
+        kept: KeptScans | None = None,
     ) -> None:
         self.source = source
+        self.odometry = odometry
         self.stopwatch = stopwatch
         self.frame: Frame | None = None
         self.standing = -1
-        self.history = TreeHistory()
+        self._told = Told()
         self._mapper = mapper
         self._cursor = cursor
         self._parameters = ParameterHistory(parameters)
@@ -66,6 +95,20 @@ class Run:
         self._step: Step | None = None
         self._before: Any = None
         self._broken = False
+        self._remake, self._reread = remake, reread
+        self._kept = KeptScans() if kept is None else kept
+        self.is_bare = self._hurried = False
+        self._key = look_key(parameters)
+        self._remapping: Remapping | None = None
+        self._journal = Journal()
+        self._rough: Trees | None = None
+        if isinstance(mapper, Mapper):
+            mapper.note = lambda noted: self._journal.note(noted, mapper.parameters.slam)
+
+    @property
+    def history(self) -> TreeHistory:
+        """What each scan made of the trees."""
+        return self._told.history
 
     @property
     def start_ns(self) -> int:
@@ -85,14 +128,18 @@ class Run:
         step = self._cursor.peek()
         return None if step is None else step.scan.stamp_ns
 
-    def map_next(self) -> Frame | None:
-        """Map the next scan; None at the end of the run."""
+    def map_next(self, *, hurried: bool = False) -> Frame | None:
+        """Map the next scan; None at the end of the run. Who is in a hurry takes what is kept of it, and gets
+        a picture without points."""
         step = self._cursor.take()
         if step is None:
             return None
         self._before = self._mapper.snapshot()
         self._snapshots.offer(step.index, self._before)
-        return self._map(step)
+        self._hurried = hurried
+        frame = self._map(step)
+        self._hurried = False
+        return frame
 
     def map_again(self) -> Frame | None:
         """Map the standing scan once more, from the state before it; None if there is none."""
@@ -128,14 +175,118 @@ class Run:
     def _map(self, step: Step) -> Frame:
         wanted = self._parameters.at(step.index)
         if self._mapper.parameters is not wanted:
-            self._mapper.parameters = wanted
+            self._mapper.parameters, self._key = wanted, look_key(wanted)
         self._broken = True
         with self.stopwatch.whole_scan():
-            self.frame = self._mapper.process(step)
+            self.frame = self._process(step)
         self._broken = False
         self._step, self.standing = step, step.index
-        self.history.record(self.frame, self.start_ns)
+        self._told.record(self.frame, self.start_ns)
         return self.frame
+
+    def _process(self, step: Step) -> Frame:
+        mapper = self._mapper
+        if not isinstance(mapper, Mapper):
+            return mapper.process(step)
+        looked = self._remembered(step) if self._hurried else None
+        self.is_bare = looked is not None
+        looked = looked or mapper.look(step)
+        self._kept.put(step, looked, self._key)
+        return mapper.take(step, looked)
+
+    def _remembered(self, step: Step) -> Looked | None:
+        """What is kept of a scan, if these parameters look at it in the same way."""
+        if not self._kept.has(step.index, self._key):
+            return None
+        try:
+            known, looked = self._kept.scan(step.index)
+        except DamagedError:
+            self._kept.forget_from(step.index)
+            return None
+        return looked if known.scan.stamp_ns == step.scan.stamp_ns else None
+
+    def remap(self, parameters: Parameters) -> None:
+        """Begin to map the run again from its first scan; what was begun before is given up. Nothing is begun
+        where it would give the same map."""
+        self.stay()
+        if self._parameters.were_always(parameters, _NO_PART_OF_THE_MAP):
+            return
+        mapper = self._remake(parameters) if self._remake else None
+        if not isinstance(mapper, Mapper):
+            return
+        basis = self._basis()
+        self._rough = None if basis is None else rough_trees(basis, self._kept.clusters, parameters)
+        rerun = Rerun(mapper, self._kept, self._reread, basis)
+        if basis is None or not rerun.passed:
+            self._remapping = Remapping(rerun, self.start_ns)
+            return
+        time_s = (self._cursor.stamp_ns(rerun.passed) - self.start_ns) / _NS
+        told = self._told.before(rerun.passed, time_s)
+        self._remapping = Remapping(rerun, self.start_ns, told, self._snapshots.first(rerun.passed))
+
+    def _basis(self) -> Basis | None:
+        """What the scans so far were mapped to with one set of parameters."""
+        if not isinstance(self._mapper, Mapper) or self._broken:
+            return None
+        entries = self._journal.first(self._parameters.until(max(self.standing, 0)))
+        states = self._snapshots.first(len(entries))
+        if self._before is not None and self._before.path_length <= len(entries):
+            states[self._before.path_length] = self._before
+        path, motion = self._mapper.path, self._mapper.motion
+        return Basis(self._parameters.at(0), entries, states, path.stamp_ns, path.sigma_xy, motion)
+
+    def stay(self) -> None:
+        """Give up what `remap` began; the map stays as it is."""
+        if self._remapping is not None:
+            self._remapping.rerun.close()
+            self._remapping = None
+
+    @property
+    def remapped(self) -> float | None:
+        """How much of the run is mapped again, up to the standing scan; None when nothing is."""
+        r = self._remapping
+        if r is None or not self.is_whole:
+            return None
+        return min(r.rerun.done / max(self.standing, 1), 1.0)
+
+    @property
+    def rough(self) -> Trees | None:
+        """Where trees will be, roughly, once the run is mapped again; None where nobody knows."""
+        return None if self._remapping is None else self._rough
+
+    @property
+    def not_kept(self) -> str:
+        """Why the run cannot, or could not, be mapped again from what is kept; empty where it can."""
+        return "; ".join(filter(None, (self._kept.refusal, self._kept.told)))
+
+    def remap_on(self, scans: int) -> tuple[Frame, dict[int, float]] | None:
+        """Map again so many scans more. When all are, the run goes on with that map as if its parameters had
+        been in force from the start: gives the standing scan, and when each tree was confirmed [s].
+
+        Raises:
+            StemmapError: A scan cannot be looked at again. The map stays as it is.
+        """
+        remapping = self._remapping
+        if remapping is None or self._step is None or self._broken:  # on the way to another scan
+            return None
+        try:
+            with self.stopwatch.aside():
+                there = remapping.work(scans, self.standing)
+        except BaseException:  # a fault in the mapper too: who tries again and again would never stop
+            self.stay()
+            raise
+        if not there:
+            return None
+        self._remapping = None
+        if remapping.rerun.kept is not self._kept:
+            self._kept.close()
+            self._kept = remapping.rerun.kept
+        self._mapper, self._snapshots = remapping.rerun.mapper, remapping.snapshots
+        self._told, self._journal = remapping.told, remapping.rerun.journal
+        self._parameters = ParameterHistory(remapping.parameters)
+        self._key = look_key(remapping.parameters)
+        self._before = self._mapper.snapshot()
+        return self._map(self._step), self._told.confirmed_s
 
     def parameters_at(self, index: int) -> Parameters:
         """What a scan was or will be mapped with."""
@@ -195,4 +346,6 @@ class Run:
 
     def close(self) -> None:
         """Let go of the source."""
+        self.stay()
+        self._kept.close()
         self.source.close()

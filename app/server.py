@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 from fastapi import FastAPI, Request
 from starlette.exceptions import HTTPException
@@ -14,14 +17,30 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.dashboard import Dashboard
+from app.forests import Forests
 from app.keeper import Keeper
+from app.learning import Learning
 from app.live import Live
 from app.messages import Open
 from app.neighbours import SceneLike, WorkerLike
 from app.parameter_state import ParameterState
 from app.replies import BadRequestError, error_reply, failure_reply
 from app.routes import annotations as annotation_routes
-from app.routes import page, parameter_sets, parameters, pictures, results, run, runs, sockets, story
+from app.routes import (
+    camera,
+    page,
+    parameter_sets,
+    parameters,
+    pictures,
+    results,
+    run,
+    runs,
+    sensitivity,
+    sockets,
+    story,
+    tuning,
+)
+from app.routes import learning as learning_routes
 from app.routes import uploads as upload_routes
 from app.security import BodyTooLargeError, Guard, viewer_token
 from app.settings import Settings
@@ -34,22 +53,42 @@ _log = logging.getLogger(__name__)
 ROUTERS = tuple(
     module.router
     for module in (
+        camera,
         page,
         run,
         runs,
+        sensitivity,
         parameters,
         parameter_sets,
         pictures,
         results,
         annotation_routes,
+        learning_routes,
         upload_routes,
         story,
+        tuning,
         sockets,
     )
 )
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
 MakeWorker = Callable[[Dashboard], WorkerLike]
+
+
+@dataclass(frozen=True, slots=True)
+class OfFleet:
+    """What a dashboard knows of the fleet that it belongs to.
+
+    Attributes:
+        port: Of the page of all robots.
+        open_records: Tells the records of the runs that are open in any of its dashboards.
+    """
+
+    port: int
+    open_records: Callable[[], set[int | None]]
+
+
+Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 
 _HEADERS = (
     (b"x-content-type-options", b"nosniff"),
@@ -69,6 +108,7 @@ def build(
     parameter_state: ParameterState,
     make_scene: MakeScene | None = None,
     make_worker: MakeWorker | None = None,
+    fleet: OfFleet | None = None,
 ) -> FastAPI:
     """The application.
 
@@ -79,22 +119,38 @@ def build(
         source: Opened at the start.
         parameter_state: The parameters at the start.
         make_scene, make_worker: Stand in for viser and for the worker's process in tests.
+        fleet: That it belongs to; None when it is alone.
     """
+    parameter_state.check = Forests(settings.folder).check
     dashboard = Dashboard(parameter_state, Live(), Keeper(settings.folder, settings.database))
 
+    learning = Learning(dashboard.keeper, settings.folder, lambda told: dashboard.live.tell("learning", told))
     uploads = Uploads(settings.uploads, settings.upload_limit, dashboard.keeper)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(uploads.clear)
-        dashboard.worker = (make_worker or _worker)(dashboard)
+        dashboard.worker = (make_worker or partial(_worker, settings.folder))(dashboard)
         dashboard.scene = (make_scene or _scene)(dashboard, asyncio.get_running_loop())
         await dashboard.start(source)
         try:
             yield
         finally:
+            await learning.close()
             await dashboard.close()
 
+    app = guarded(settings, port=port, token=token, lifespan=lifespan)
+    app.state.dashboard, app.state.settings = dashboard, settings
+    app.state.fleet_port = None if fleet is None else fleet.port
+    app.state.open_records = fleet.open_records if fleet else lambda: {dashboard.logbook.record}
+    app.state.uploads, app.state.learning = uploads, learning
+    for router in ROUTERS:
+        app.include_router(router)
+    return app
+
+
+def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) -> FastAPI:
+    """An application without a route that lets through only who may, and answers errors for people."""
     guard = Middleware(
         Guard,
         token=token,
@@ -113,10 +169,7 @@ def build(
         openapi_url=None,
         redirect_slashes=False,
     )
-    app.state.dashboard, app.state.settings = dashboard, settings
-    app.state.uploads, app.state.viewer_token = uploads, viewer_token(token)
-    for router in ROUTERS:
-        app.include_router(router)
+    app.state.token, app.state.viewer_token = token, viewer_token(token)
     _answer_errors(app)
     return app
 
@@ -165,10 +218,11 @@ def _answer_errors(app: FastAPI) -> None:
         return error_reply(500, "this is a fault in stemmap", remedy="The terminal shows where it happened")
 
 
-def _worker(dashboard: Dashboard) -> WorkerLike:
-    from app.worker_process import WorkerProcess
+def _worker(folder: Path | None, dashboard: Dashboard) -> WorkerLike:
+    from app.worker_process import WORKER, WorkerProcess
 
-    return WorkerProcess(dashboard.receive)
+    kept = () if folder is None else (str(folder / "kept"),)
+    return WorkerProcess(dashboard.receive, (*WORKER, *kept))
 
 
 def _scene(dashboard: Dashboard, loop: asyncio.AbstractEventLoop) -> SceneLike:

@@ -48,14 +48,18 @@ def serve(
     port = listening.getsockname()[1]
     token = settings.token or new_token()
     app = build(settings, port=port, token=token, source=source, parameter_state=parameter_state)
-    link = f"http://{_name(settings.host)}:{port}/?token={token}"
+    link = link_of(settings, port, token)
     if viewer:
-        looking = f"http://{_name(settings.host)}:{port}/?token={viewer_token(token)}"
-        print(f"for looking only: {looking}", flush=True)  # noqa: T201
-    server = _Server(uvicorn_config(app, settings), settings, link, open_browser=open_browser)
+        print(f"for looking only: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
+    server = LinkedServer(uvicorn_config(app, settings), settings, link, open_browser=open_browser)
     with contextlib.closing(listening):
         asyncio.run(server.serve(sockets=[listening]))
     return 0 if server.started else 1
+
+
+def link_of(settings: Settings, port: int, token: str) -> str:
+    """The link that opens the page."""
+    return f"http://{_name(settings.host)}:{port}/?token={token}"
 
 
 def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
@@ -84,7 +88,7 @@ def bind(settings: Settings) -> socket.socket:
     reason = OSError("no port was tried")
     for port in ports:
         try:
-            listening = _bound(settings.host, port)
+            listening = bound(settings.host, port)
         except socket.gaierror as error:
             raise StemmapError(
                 f"no address is known by this name: {error.strerror}",
@@ -105,7 +109,12 @@ def bind(settings: Settings) -> socket.socket:
     )
 
 
-def _bound(host: str, port: int) -> socket.socket:
+def bound(host: str, port: int) -> socket.socket:
+    """A listening socket on a port.
+
+    Raises:
+        OSError: It is not free, or not of this machine.
+    """
     family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     listening = socket.socket(family, kind, protocol)
     try:
@@ -120,7 +129,7 @@ def _bound(host: str, port: int) -> socket.socket:
     return listening
 
 
-class _Server(uvicorn.Server):
+class LinkedServer(uvicorn.Server):
     """Says where it is once it is ready, and ends without a traceback."""
 
     def __init__(self, config: uvicorn.Config, settings: Settings, link: str, *, open_browser: bool) -> None:

@@ -6,29 +6,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Literal
 
-import numpy as np
-
 from app.cursor import Cursor, Synchroniser
+from app.keeping import Keep, keep_without_name
 from app.live_cursor import LiveCursor
+from app.map_changes import MapChanges, changes_between
 from app.messages import LONGEST_S, State, Status
-from app.odometry import odometry_warnings
+from app.odometry import with_odometry
 from app.robot.recording import Recording
 from app.robot.source import LiveSource
 from app.run import MakeMapper, Run
-from app.session_status import clock, describe, opened_of
+from app.session_status import Said, describe, opened_of
 from app.stopwatch import Stopwatch
+from app.story import of_run
 from app.story.records import ClusterStory, TreeStory
-from app.story.telling import make_ready, tell_cluster, tell_tree
+from app.story.telling import make_ready
+from app.way import Way
 from app.worker_messages import Opened
 from pipeline.errors import SourceError, StemmapError
 from pipeline.parameters import Parameters
-from pipeline.records import Frame, Path
-from pipeline.sources.base import Source
+from pipeline.records import Frame, Path, Trees
+from pipeline.sources.base import Source, SourceOptions
 
-OpenSource = Callable[[str, int], Source | LiveSource]
+OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
 MakeSynchroniser = Callable[[str], Synchroniser]
 Pace = Literal["idle", "replay", "hurry", "live"]
 
@@ -43,10 +46,11 @@ class Session:
     can be opened, and play begins anew.
 
     Args:
-        open_source: From a URI and a seed.
+        open_source: From a URI, and what is chosen about it.
         make_mapper: A fresh mapper for a source, from parameters, seed and a stopwatch.
         make_synchroniser: From the choice of odometry.
         parameters: In force at the beginning.
+        keep: Where what the scans show is kept.
     """
 
     def __init__(
@@ -55,21 +59,21 @@ class Session:
         make_mapper: MakeMapper,
         make_synchroniser: MakeSynchroniser,
         parameters: Parameters,
+        keep: Keep = keep_without_name,
     ) -> None:
         self._open_source = open_source
         self._make_mapper = make_mapper
         self._make_synchroniser = make_synchroniser
-        self._parameters = parameters
+        self._parameters, self._keep = parameters, keep
         self._revision = 0
         self._asked: tuple[str, str, int] | None = None
-        self._record, self._publish = "", False
+        self._open_again: Callable[[], Opened | None] = lambda: None
         self._run: Run | None = None
         self._robot: LiveSource | None = None
         self._state: State = "starting"
         self._detail = ""
-        self._target_index: int | None = None
-        self._target_ns: int | None = None
-        self._under_way = False
+        self._way = Way()
+        self._remap_there = False  # once the sought scan is reached
         self._warnings: dict[str, None] = {}
 
     @property
@@ -80,7 +84,7 @@ class Session:
             return "idle"
         if self._robot is not None:
             return "live" if self._run is None or self._state == "playing" else "idle"
-        if self._seeking:
+        if self._way.sought:
             return "hurry"
         return "replay" if self._state == "playing" else "idle"
 
@@ -97,19 +101,31 @@ class Session:
     @property
     def time_s(self) -> float:
         """Of the picture, since the run's first scan."""
-        if self._run is None or self._run.frame is None:
-            return 0.0
-        return (self._run.frame.stamp_ns - self._run.start_ns) / _NS
+        frame = self.frame
+        return 0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / _NS
+
+    @property
+    def run(self) -> Run | None:
+        """What is mapped, None before it is open."""
+        return self._run
 
     def next_ns(self) -> int | None:
         """Time of the next scan; None at the end of the run."""
         return self._run.peek_ns() if self._run else None
 
     def open(
-        self, uri: str, odometry: str, seed: int, record: str = "", *, publish: bool = False
+        self,
+        uri: str,
+        odometry: str,
+        seed: int,
+        record: str = "",
+        *,
+        publish: bool = False,
+        options: SourceOptions | None = None,
     ) -> Opened | None:
-        """Leave the present run and stand, paused, before the first scan of another source. A robot is
-        recorded to the file `record`, unless that is empty, and told of its map if `publish` says so.
+        """Leave the present run and stand, paused, before the first scan of another source, with the topics
+        and mounting of `options`. A robot is recorded to the file `record`, unless that is empty, and told of
+        its map if `publish` says so.
 
         Returns:
             What was opened; None of a robot that is still to be heard, see `listen`.
@@ -118,8 +134,9 @@ class Session:
             SourceError: It cannot be read.
         """
         self._leave()
-        self._asked, self._record, self._publish = (uri, odometry, seed), record, publish
-        source = self._open_source(uri, seed)
+        self._asked = uri, odometry, seed
+        self._open_again = lambda: self.open(uri, odometry, seed, record, publish=publish, options=options)
+        source = self._open_source(uri, replace(options or SourceOptions(), seed=seed))
         if isinstance(source, LiveSource):
             try:
                 source.use(Recording(FilePath(record)) if record else None, publish=publish)
@@ -144,20 +161,27 @@ class Session:
         return self._begin(self._robot, *self._asked[1:])
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
-        synchronise = self._make_synchroniser(odometry)
         try:
-            warnings = odometry_warnings(source.description, odometry)
+            moving, chosen = with_odometry(source, odometry)
         except SourceError:
             source.close()
             raise
-        stopwatch = Stopwatch()
-        mapper = self._make_mapper(source, self._parameters, seed, stopwatch)
-        cursor: Cursor | LiveCursor = Cursor(source, synchronise)
-        if isinstance(source, LiveSource):
-            cursor = LiveCursor(source, odometry)
-        self._run = Run(source, mapper, cursor, self._parameters, stopwatch)
+        stopwatch, synchronise = Stopwatch(), self._make_synchroniser(chosen.steps)
+        self._run = Run(
+            moving,
+            self._make_mapper(moving, self._parameters, seed, stopwatch),
+            LiveCursor(source, chosen, moving)
+            if isinstance(source, LiveSource)
+            else Cursor(moving, synchronise),
+            self._parameters,
+            stopwatch,
+            chosen.words,
+            remake=lambda parameters: self._make_mapper(moving, parameters, seed, stopwatch),
+            reread=None if isinstance(source, LiveSource) else lambda: synchronise(moving.records(None)),
+            kept=self._keep(source, chosen.words, seed),
+        )
         self._state, self._detail = "paused", ""
-        self._warn((*source.description.warnings, *warnings))
+        self._warn((*source.description.warnings, *([chosen.warning] if chosen.warning else [])))
         return opened_of(self._run)
 
     def prepare(self) -> None:
@@ -181,18 +205,17 @@ class Session:
         run = self._run
         if run is None or self.pace == "idle":
             return None
-        if self._seeking and not self._under_way:
-            self._set_out(run)
-        if self._has_arrived(run):
+        self._way.set_out(run)
+        if self._way.is_at_end(run):
             return self._arrive(run)
-        frame = run.map_next()
+        frame = run.map_next(hurried=self._way.sought)
         if frame is None:
             self._state = "finished" if self._robot is None else self._state
         else:
             self._warn(frame.warnings)
             if self._robot is not None:
                 self._robot.mapped(frame, run.path)
-        if self._has_arrived(run) or (frame is None and self._seeking):
+        if self._way.is_at_end(run) or (frame is None and self._way.sought):
             return self._arrive(run)
         return frame
 
@@ -209,11 +232,9 @@ class Session:
         if self._run is None and self._robot is not None and self._state != "failed":
             return None  # it plays when it is heard
         if self._run is None or self._state == "failed":
-            if self._asked is None:
-                return None
-            opened = self.open(*self._asked, self._record, publish=self._publish)
+            opened = self._open_again()
         elif self._state == "finished":
-            self._seek_index(0)
+            self._way.to_scan(0)
         if self._run is not None:
             self._state, self._detail = "playing", ""
         return opened
@@ -227,9 +248,9 @@ class Session:
         """Pause, and stand so many scans further or back."""
         if self._run is None or self._is_live():
             return
-        here = self._run.standing if self._target_index is None else self._target_index
+        here = self._run.standing if self._way.index is None else self._way.index
         self._settle()
-        self._seek_index(max(0, here + scans))
+        self._way.to_scan(max(0, here + scans))
 
     def seek(self, time_s: float) -> None:
         """Stand at the last scan not later than a time; the run then goes on as it did before."""
@@ -238,15 +259,11 @@ class Session:
         if self._state != "playing":
             self._settle()
         seconds = min(max(time_s, 0.0), LONGEST_S)
-        stamp_ns = self._run.start_ns + round(seconds * _NS)
-        index = self._run.index_at(stamp_ns)
-        if index is not None:
-            self._seek_index(index)
-        else:
-            self._target_index, self._target_ns, self._under_way = None, stamp_ns, False
+        self._way.to_time(self._run, self._run.start_ns + round(seconds * _NS))
 
-    def set_parameters(self, parameters: Parameters, revision: int) -> Frame | None:
-        """Use other parameters: from the next scan on, or from the sought or the standing scan on.
+    def set_parameters(self, parameters: Parameters, revision: int, *, whole: bool = False) -> Frame | None:
+        """Use other parameters: from the next scan on, or from the sought or the standing scan on; and if
+        `whole` says so, begin to map the run again with them from its first scan (see `remap`).
 
         Returns:
             The standing scan, mapped again, when the run stands still; else None.
@@ -255,14 +272,47 @@ class Session:
         run = self._run
         if run is None:
             return None
-        if self._seeking:  # see `_arrive`
+        run.stay()
+        if self._way.sought:  # see `_arrive`
+            self._remap_there = whole
             return None
         stands = self._state != "playing" and run.standing >= 0
         from_scan = run.standing + (0 if stands else 1)
         run.use(parameters, from_scan)
         if self._robot is not None:
             self._robot.use_parameters(revision, from_scan, parameters)
+        if whole and run.standing >= 0:
+            run.remap(parameters)
         return run.map_again() if stands and self._state != "failed" else None
+
+    @property
+    def is_remapping(self) -> bool:
+        """Whether `remap` has work that can be done now."""
+        return self._run is not None and self._run.remapped is not None and not self._way.sought
+
+    @property
+    def rough(self) -> Trees | None:
+        """See `Run.rough`."""
+        return self._run.rough if self._run is not None else None
+
+    def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
+        """Map so many scans of the run again. Once all are, the map is another one: gives the standing scan
+        with it, and what it changes."""
+        run = self._run
+        if run is None or run.frame is None:
+            return None
+        before = run.frame
+        try:
+            done = run.remap_on(scans)
+        except StemmapError as error:
+            self._warn([f"the run was not mapped again, its map is as before: {error}"])
+            return None
+        if done is None:
+            return None
+        frame, confirmed_s = done
+        if self._robot is not None:
+            self._robot.use_parameters(self._revision, 0, run.parameters_at(0))
+        return frame, changes_between(before, frame, self._revision, confirmed_s)
 
     def cluster_story(self, frame: Frame, cluster: int) -> ClusterStory:
         """The story of a cluster of a frame of this run, which may have lost its raw points.
@@ -270,11 +320,7 @@ class Session:
         Raises:
             StemmapError: There is no such cluster.
         """
-        run = self._run
-        if run is None or not 0 <= cluster < len(frame.clusters.size):
-            raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
-        parameters = run.parameters_at(frame.index)
-        return tell_cluster(frame, cluster, parameters, run.source.description.sensor, run.start_ns)
+        return of_run.cluster_story(self._run, frame, cluster)
 
     def tree_story(self, number: int) -> TreeStory:
         """The story of a tree as the standing scan knows it.
@@ -282,15 +328,7 @@ class Session:
         Raises:
             StemmapError: There is no such tree now.
         """
-        run = self._run
-        frame = run.frame if run else None
-        row = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
-        if run is None or frame is None or not len(row):
-            raise StemmapError(
-                f"tree {number} is not known at this time of the run", remedy="Play on, or select another"
-            )
-        parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
-        return tell_tree(frame, int(row[0]), parameters, sensor, run.start_ns, run.history)
+        return of_run.tree_story(self._run, number)
 
     def compare(self, sets: Sequence[Parameters]) -> list[Frame]:
         """The standing scan under each of other parameters; the run stays as it is.
@@ -305,21 +343,22 @@ class Session:
     def fail(self, detail: str) -> None:
         """Say that the run cannot go on, and why."""
         self._state, self._detail = "failed", detail
-        self._forget_target()
+        self._way.forget()
+        if self._run is not None:
+            self._run.stay()
 
     def status(self) -> Status:
         """How the run goes; what only a clock can tell is left at 0."""
-        return describe(
-            self._run,
-            self._robot,
+        said = Said(
             state=self._state,
             detail=self._detail,
             uri=self._asked[0] if self._asked else "",
             time_s=self.time_s,
             warnings=tuple(self._warnings),
             revision=self._revision,
-            going_to=self._going_to(),
+            going_to=self._way.words(self._run),
         )
+        return describe(self._run, self._robot, said)
 
     def close(self) -> None:
         """Let go of the source."""
@@ -331,62 +370,27 @@ class Session:
             self._warn(["a live run goes on as it comes: to step and seek, open its recording"])
         return self._robot is not None
 
-    @property
-    def _seeking(self) -> bool:
-        return self._target_index is not None or self._target_ns is not None
-
-    def _going_to(self) -> str:
-        """The sought scan in words; empty when none is."""
-        run = self._run
-        if run is None or not self._seeking:
-            return ""
-        if self._target_ns is not None:
-            return clock((self._target_ns - run.start_ns) / _NS)
-        if self._target_index is not None and self._target_index < run.known:
-            return clock((run.stamp_ns(self._target_index) - run.start_ns) / _NS)
-        return f"scan {self._target_index}"
-
     def _settle(self) -> None:
         self._state, self._detail = "paused", ""
-
-    def _seek_index(self, index: int) -> None:
-        self._target_index, self._target_ns, self._under_way = index, None, False
-
-    def _set_out(self, run: Run) -> None:
-        """Begin the way to the sought scan: not before work begins, so that targets that are
-        overtaken by another while a person drags the timeline cost nothing and leave no trace."""
-        self._under_way = True
-        if self._target_index is None:
-            run.approach(run.known)
-        elif self._target_index != run.standing or not run.is_whole:
-            run.approach(self._target_index)
-
-    def _has_arrived(self, run: Run) -> bool:
-        if self._target_index is not None:
-            return run.standing >= self._target_index
-        if self._target_ns is None or run.standing < 0:
-            return False
-        following = run.peek_ns()
-        return following is not None and following > self._target_ns
 
     def _arrive(self, run: Run) -> Frame | None:
         """Stand at the sought scan. The map before it is as it was; the parameters in force now act
         from this scan on, whenever on the way they came."""
-        self._forget_target()
-        return run.map_again() if run.use(self._parameters, run.standing) else run.frame
-
-    def _forget_target(self) -> None:
-        self._target_index = self._target_ns = None
-        self._under_way = False
+        self._way.forget()
+        changed = run.use(self._parameters, run.standing)
+        frame = run.map_again() if changed or run.is_bare else run.frame
+        there, self._remap_there = self._remap_there, False
+        if there:
+            run.remap(self._parameters)
+        return frame
 
     def _leave(self) -> None:
-        if self._run is not None:
-            self._run.close()
-        elif self._robot is not None:
-            self._robot.close()
-        self._run = self._robot = None
+        owner = self._run or self._robot
+        if owner is not None:
+            owner.close()
+        self._run, self._robot, self._remap_there = None, None, False
         self._warnings.clear()
-        self._forget_target()
+        self._way.forget()
 
     def _warn(self, warnings: Iterable[str]) -> None:
         for warning in warnings:

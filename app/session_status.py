@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from app.camera import has_camera
 from app.driven import driven
 from app.messages import State, Status
 from app.robot.source import LiveSource
@@ -15,20 +16,31 @@ from app.worker_messages import Opened
 _NS = 1_000_000_000
 
 
-def describe(
-    run: Run | None,
-    robot: LiveSource | None,
-    *,
-    state: State,
-    detail: str,
-    uri: str,
-    time_s: float,
-    warnings: tuple[str, ...],
-    revision: int,
-    going_to: str,
-) -> Status:
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What the session says itself; see `Status`.
+
+    Attributes:
+        state, detail: How it goes, and why.
+        uri: Of the source, as it was asked for.
+        time_s: Of the standing scan.
+        warnings: The newest last.
+        revision: Of the parameters in force.
+        going_to: The sought scan in words.
+    """
+
+    state: State
+    detail: str
+    uri: str
+    time_s: float
+    warnings: tuple[str, ...]
+    revision: int
+    going_to: str
+
+
+def describe(run: Run | None, robot: LiveSource | None, said: Said) -> Status:
     """The status of a run, or of none; speed, rate and lateness are the driver's to fill in."""
-    status = _of_run(run, state, detail, uri, time_s, warnings, revision, going_to)
+    status = _of_session(said) if run is None else _of_run(run, said)
     return status if robot is None else _live(status, robot)
 
 
@@ -47,27 +59,25 @@ def _live(status: Status, robot: LiveSource) -> Status:
     )
 
 
-def _of_run(
-    run: Run | None,
-    state: State,
-    detail: str,
-    uri: str,
-    time_s: float,
-    warnings: tuple[str, ...],
-    revision: int,
-    going_to: str,
-) -> Status:
-    if run is None:
-        return Status(state=state, detail=detail, source=uri, warnings=list(warnings), revision=revision)
+def _of_session(said: Said) -> Status:
+    return Status(
+        state=said.state,
+        detail=said.detail,
+        source=said.uri,
+        warnings=list(said.warnings),
+        revision=said.revision,
+    )
+
+
+def _of_run(run: Run, said: Said) -> Status:
     description = run.source.description
     losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
     frame = run.frame
-    return Status(
-        state=state,
-        detail=detail,
-        source=uri,
+    return replace(
+        _of_session(said),
         kind=description.kind,
-        time_s=time_s,
+        odometry=run.odometry,
+        time_s=said.time_s,
         end_s=None if description.end_ns is None else (description.end_ns - run.start_ns) / _NS,
         scan_index=-1 if frame is None else frame.index,
         scans=description.scans,
@@ -76,9 +86,10 @@ def _of_run(
         trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
         distance_m=round(driven(run.path)[1], 3),
         health="good" if frame is None else frame.health.state,
-        warnings=list(warnings + losses),
-        revision=revision,
-        going_to=going_to,
+        warnings=[*said.warnings, *losses, *([run.not_kept] if run.not_kept else [])],
+        going_to=said.going_to,
+        camera=has_camera(description),
+        remapped=run.remapped,
     )
 
 

@@ -115,7 +115,7 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
             name.strip().lower() for name in given.get("STEMMAP_HOSTS", "").split(",") if name.strip()
         ),
         recordings=_folder(recordings) if recordings else None,
-        folder=_data_folder(given),
+        folder=data_folder(given),
         database=given.get("STEMMAP_DATABASE", ""),
         upload_limit=_gigabytes(given.get("STEMMAP_UPLOAD_GB", "20")),
     )
@@ -132,8 +132,8 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
     return settings.folder / "recordings" / time.strftime("live-%Y%m%d-%H%M%S.mcap", time.gmtime(now_s))
 
 
-def _data_folder(given: Mapping[str, str]) -> Path | None:
-    """Where annotations are kept: the folder that was named, else the usual one of the system."""
+def data_folder(given: Mapping[str, str]) -> Path | None:
+    """The data folder: the one that was named, else the usual one of the system."""
     if named := given.get("STEMMAP_FOLDER"):
         return Path(named).expanduser()
     home = given.get("HOME") or given.get("USERPROFILE")

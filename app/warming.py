@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from app.forests import kept_forests
 from app.stopwatch import Stopwatch
 from pipeline.parameters import Parameters
 
@@ -22,6 +23,7 @@ def warm_up(parameters: Parameters | None = None) -> None:
         T_base_lidar=known.T_base_lidar,
         seed=0,
         watch=Stopwatch(),
+        forests=kept_forests(),
     )
     for step in steps(source.records()):
         mapper.process(step)

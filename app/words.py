@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+COMPILING = "compiling for this machine; this can take a minute or two, once for each kind of source"
+
 
 def count(n: int, one: str, many: str = "") -> str:
     """A number with its noun: "1 scan", "1,200 scans", "2 spans of scans".

@@ -1,4 +1,5 @@
-"""The process that owns the source and the mapper: `python -m app.worker`.
+"""The process that owns the source and the mapper: `python -m app.worker [FOLDER]`. What scans show is
+kept in the folder.
 
 Commands come on stdin, messages go to stdout; both as app.wire says. It ends when stdin ends, so it
 never outlives the web process.
@@ -11,13 +12,17 @@ import queue
 import signal
 import sys
 import threading
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import BinaryIO
 
+from app.keeping import keep_in, keep_without_name
 from app.session import Session
 from app.stopwatch import Stopwatch
 from app.story.recent import Recent
 from app.wire import WireError, to_worker
+from app.words import COMPILING
 from app.worker_driver import Driver
 from app.worker_mailbox import Mailbox
 from app.worker_messages import ToWorker
@@ -29,8 +34,13 @@ from pipeline.sources.base import Source
 _GRACE_S = 1.0
 
 
-def new_session() -> Session:
-    """A session on the real pipeline, for the worker and for commands that map in process."""
+def new_session(folder: Path | None = None) -> Session:
+    """A session on the real pipeline, for the worker and for commands that map in process.
+
+    Args:
+        folder: Where what scans show is kept for the next opening of a recording; None keeps nothing.
+    """
+    from app.forests import kept_forests
     from app.opening import open_any
     from app.robot.source import LiveSource
     from app.warming import warm_up
@@ -43,11 +53,16 @@ def new_session() -> Session:
     def make_mapper(source: Source, parameters: Parameters, seed: int, watch: Stopwatch) -> Mapper:
         known = source.description
         return Mapper(
-            parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed, watch=watch
+            parameters,
+            sensor=known.sensor,
+            T_base_lidar=known.T_base_lidar,
+            seed=seed,
+            watch=watch,
+            forests=kept_forests(),
         )
 
-    def open_ready(uri: str, seed: int) -> Source | LiveSource:
-        source = open_any(uri, SourceOptions(seed=seed))
+    def open_ready(uri: str, options: SourceOptions) -> Source | LiveSource:
+        source = open_any(uri, options)
         if isinstance(source, LiveSource):  # it is not listened to before this session asks for its scans
             warm_up()
         return source
@@ -57,6 +72,7 @@ def new_session() -> Session:
         make_mapper=make_mapper,
         make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
         parameters=Parameters(),
+        keep=keep_without_name if folder is None else keep_in(folder),
     )
 
 
@@ -69,10 +85,24 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     recent = Recent()
     mailbox = Mailbox(outgoing, recent)
     driver = Driver(session, commands, mailbox.put, recent=recent)
-    with on_compiling(driver.compiling):
+    with on_compiling(_said_once(driver.compiling)):
         driver.run()
     mailbox.close()
     finished.set()
+
+
+def _said_once(told: Callable[[], None]) -> Callable[[], None]:
+    """Hands on each kernel that is being compiled, and says the first one in the terminal."""
+    said = False
+
+    def compiling() -> None:
+        nonlocal said
+        if not said:
+            said = True
+            print(f"stemmap: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
+        told()
+
+    return compiling
 
 
 def _read(incoming: BinaryIO, commands: queue.Queue[ToWorker | None], finished: threading.Event) -> None:
@@ -108,4 +138,4 @@ def run_as_worker(session: Session) -> None:
 
 
 if __name__ == "__main__":
-    run_as_worker(new_session())
+    run_as_worker(new_session(Path(sys.argv[1]) if len(sys.argv) > 1 else None))

@@ -17,20 +17,26 @@ from typing import TypeVar
 
 import msgspec
 
+from app.camera import camera_picture
 from app.messages import Advance, Command, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
+from app.opening import options_of
 from app.pacer import Pacer
 from app.picture import for_comparison
 from app.session import Session
 from app.story.recent import Recent
+from app.words import COMPILING
 from app.worker_messages import (
     Answer,
+    AskCamera,
     AskCompare,
     AskTree,
     Begin,
     FromWorker,
     Opened,
     Question,
+    Remapped,
     Report,
+    Rough,
     Shown,
     ToWorker,
 )
@@ -45,9 +51,13 @@ T = TypeVar("T")
 # that is sought: rarely enough that a short way shows no flicker.
 _REPORT_S = 0.25
 _GLIMPSE_S = 0.5
-COMPILING = "Compiling for this machine; this can take a minute or two, and only the first time"
+_COMPILING = COMPILING.capitalize()
 # How often a robot is asked for what came: a little of a scan's time, and less than 1 % of a core.
 _LISTEN_S = 0.005
+# How long scans are mapped again between two looks at the commands, and how many scans of a run that plays
+# are mapped before it is done once, however late the run is.
+_REMAP_S = 0.02
+_SCANS_A_REMAP = 4
 
 
 class Driver:
@@ -76,12 +86,13 @@ class Driver:
         self._recent = recent or Recent()
         self._taken: deque[ToWorker | None] = deque()
         self._pacer = Pacer()
-        self._run = 0
+        self._run, self._asked = 0, ""
         self._held = False
         self._prepared = False
         self._reported: tuple[Status, float] | None = None
         self._glimpse_at = 0.0
         self._long_way_at = 0.0
+        self._mapped = 0  # scans since a scan was mapped again
 
     def run(self) -> None:
         """Work until None comes as a command."""
@@ -97,6 +108,8 @@ class Driver:
                 return
             if isinstance(command, Question):
                 self._put(self._answer(command))  # nobody who asks changes how the run goes
+                if self._says_compiling:  # an answer may need other code than the run
+                    self._report()
             else:
                 self._obey(command)
 
@@ -117,6 +130,8 @@ class Driver:
     def _patience(self) -> float | None:
         """Seconds until the next scan is to be mapped; None when only a command can start work."""
         pace = self._session.pace
+        if self._session.is_remapping:
+            return 0.0
         if pace == "idle":
             return None
         if pace == "live":
@@ -127,6 +142,12 @@ class Driver:
         return 0.0 if stamp_ns is None else self._pacer.delay(stamp_ns, self._clock())
 
     def _map(self) -> None:
+        if self._session.is_remapping:
+            if self._mapped >= _SCANS_A_REMAP or not self._is_due():
+                self._mapped = 0
+                self._remap()
+                return
+            self._mapped += 1
         if self._session.pace == "live" and self._session.next_ns() is None:
             self._listen()
             return
@@ -149,6 +170,31 @@ class Driver:
             self._report()
         else:
             self._report_when_due(now)
+
+    def _is_due(self) -> bool:
+        """Whether a scan is to be mapped now."""
+        pace = self._session.pace
+        if pace == "idle":
+            return False
+        stamp_ns = self._session.next_ns()
+        if pace == "live":
+            return stamp_ns is not None
+        return not self._prepared or stamp_ns is None or self._pacer.delay(stamp_ns, self._clock()) <= 0.0
+
+    def _remap(self) -> None:
+        """Use the time between two scans, or while the run stands, to map it again."""
+        until = self._clock() + _REMAP_S
+        done = self._session.remap(1)
+        while done is None and self._session.is_remapping and self._clock() < until:
+            done = self._session.remap(1)
+        if done is None:
+            self._report_when_due(self._clock())
+            return
+        frame, changes = done
+        self._recent.forget()  # they were judged with other parameters
+        self._put(Remapped(self._run, changes))
+        self._show(frame)
+        self._report()
 
     def _report_when_due(self, now: float) -> None:
         if self._reported is None or now >= self._reported[1] + _REPORT_S:
@@ -182,8 +228,10 @@ class Driver:
                 session.seek(time_s)
             case SetSpeed(factor=factor):
                 self._pacer.speed = factor
-            case SetParameters(values=values, revision=revision):
-                self._show(session.set_parameters(validated(values), revision))
+            case SetParameters(values=values, revision=revision, whole=whole):
+                self._show(session.set_parameters(validated(values), revision, whole=whole))
+                if session.rough is not None:
+                    self._put(Rough(self._run, revision, session.rough))
             case Open():
                 self._open(command)
             case Begin():
@@ -197,6 +245,10 @@ class Driver:
             if isinstance(question, AskCompare):
                 sets = [validated(values) for values in question.sets]
                 return Answer(ticket, frames=[for_comparison(f) for f in self._session.compare(sets)])
+            if isinstance(question, AskCamera):
+                run = self._session.run
+                source = None if run is None else run.source
+                return Answer(ticket, camera=camera_picture(source, question.stamp_ns))
             if isinstance(question, AskTree):
                 return Answer(ticket, tree=self._session.tree_story(question.tree))
             frame = self._recent.find(question.run, question.scan)
@@ -213,11 +265,16 @@ class Driver:
             return Answer(ticket, missing=f"{fault}. The terminal shows where")
 
     def _open(self, command: Open) -> None:
-        self._run += 1
+        self._run, self._asked = self._run + 1, command.uri
         opening = f"Opening {command.uri}"
         self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
         opened = self._session.open(
-            command.uri, command.odometry, command.seed, command.record, publish=command.publish
+            command.uri,
+            command.odometry,
+            command.seed,
+            command.record,
+            publish=command.publish,
+            options=options_of(command),
         )
         if opened is not None:
             self._tell_opened(opened)
@@ -231,7 +288,7 @@ class Driver:
 
     def _tell_opened(self, opened: Opened) -> None:
         self._prepared = self._held = False
-        self._put(msgspec.structs.replace(opened, run=self._run))
+        self._put(msgspec.structs.replace(opened, run=self._run, asked=self._asked))
 
     def _begin(self, command: Begin) -> None:
         if command.run != self._run:  # another was opened since
@@ -258,14 +315,18 @@ class Driver:
     def compiling(self) -> None:
         """Say that work waits for a kernel that is being compiled; called while it works."""
         self._session.disturb()
-        if self._reported is None or self._reported[0].detail == COMPILING:
+        if self._reported is None or self._says_compiling:
             return
         # What was told last, because the session is in the middle of its work.
-        status = replace(self._reported[0], detail=COMPILING)
+        status = replace(self._reported[0], detail=_COMPILING)
         if status.state == "playing":
             status = replace(status, state="waiting")
         self._reported = (status, -math.inf)  # so that what comes of it is told at once
         self._put(Report(status))
+
+    @property
+    def _says_compiling(self) -> bool:
+        return self._reported is not None and self._reported[0].detail == _COMPILING
 
     def _show(self, frame: Frame | None) -> None:
         path = self._session.path

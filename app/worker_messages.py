@@ -7,9 +7,11 @@ from typing import Any
 
 import msgspec
 
+from app.camera import CameraPicture
+from app.map_changes import MapChanges
 from app.messages import Command, Status
 from app.story.records import ClusterStory, TreeStory
-from pipeline.records import Frame, Path, TruthTrees
+from pipeline.records import Frame, Path, Trees, TruthTrees
 
 
 class Opened(msgspec.Struct, frozen=True, tag="opened"):
@@ -24,6 +26,7 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
         end_s: Time of the last scan since the first, None where it is not known.
         truth: What is known for certain to stand there, or None.
         digest: Of what was recorded; empty where it is not known.
+        asked: The URI of the `Open` that this answers; empty where it is not known.
     """
 
     uri: str
@@ -34,6 +37,7 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
     truth: TruthTrees | None
     run: int = 0
     digest: str = ""
+    asked: str = ""
 
 
 class Shown(msgspec.Struct, frozen=True, tag="shown"):
@@ -118,13 +122,26 @@ class AskCompare(msgspec.Struct, frozen=True, tag="ask_compare"):
     sets: list[dict[str, Any]]
 
 
+class AskCamera(msgspec.Struct, frozen=True, tag="ask_camera"):
+    """Tell what the run's camera saw.
+
+    Attributes:
+        ticket, run: As in `AskCluster`.
+        stamp_ns: About when.
+    """
+
+    ticket: int
+    run: int
+    stamp_ns: int
+
+
 class Answer(msgspec.Struct, frozen=True, tag="answer"):
     """What was asked for.
 
     Attributes:
         ticket: Of the question.
-        cluster, tree, frames: One of them is told, unless `missing` says why there is none; the frames one
-            for each set, without raw points.
+        cluster, tree, frames, camera: One of them is told, unless `missing` says why there is none; the
+            frames one for each set, without raw points.
         missing: Why there is none, and what to do.
     """
 
@@ -132,9 +149,36 @@ class Answer(msgspec.Struct, frozen=True, tag="answer"):
     cluster: ClusterStory | None = None
     tree: TreeStory | None = None
     frames: list[Frame] | None = None
+    camera: CameraPicture | None = None
     missing: str = ""
 
 
-FromWorker = Opened | Shown | Report | Answer
-Question = AskCluster | AskTree | AskCompare
+class Remapped(msgspec.Struct, frozen=True, tag="remapped"):
+    """The run was mapped again: the pictures from here on are of another map.
+
+    Attributes:
+        run: As in `Shown`.
+        changes: What is different.
+    """
+
+    run: int
+    changes: MapChanges
+
+
+class Rough(msgspec.Struct, frozen=True, tag="rough"):
+    """Where trees will be, roughly, once the run is mapped again.
+
+    Attributes:
+        run: As in `Shown`.
+        revision: Of the parameters.
+        trees: Without diameters; their numbers hold for nothing else.
+    """
+
+    run: int
+    revision: int
+    trees: Trees
+
+
+FromWorker = Opened | Shown | Report | Answer | Remapped | Rough
+Question = AskCluster | AskTree | AskCompare | AskCamera
 ToWorker = Command | Begin | Question

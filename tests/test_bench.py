@@ -133,6 +133,10 @@ def test_wrong_words_are_said_in_one_line(capsys: pytest.CaptureFixture[str], tm
     assert "there is no benchmark 'speed'" in capsys.readouterr().err
     assert main(["bench", "scan", "--out", str(tmp_path / "none" / "b.md")]) == FAILED
     assert "no such folder" in capsys.readouterr().err
+    assert main(["bench", "scan", "--pictures", str(tmp_path)]) == WRONG_USAGE
+    assert "'scan' has no picture" in capsys.readouterr().err
+    assert main(["bench", "loops", "--pictures", str(tmp_path / "none")]) == FAILED
+    assert "no such folder" in capsys.readouterr().err
     assert main(["bench", "--date", "tomorrow"]) == WRONG_USAGE
     assert "not a date" in capsys.readouterr().err
 

@@ -19,7 +19,7 @@ OPENS, CLOSES = "<!-- parameters -->", "<!-- /parameters -->"
 def run(*words: str) -> str:
     """Run a tool of this environment on the whole project; what it said when it was not content."""
     told = subprocess.run(
-        [sys.executable, "-m", *words], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
+        [sys.executable, "-m", *words], cwd=ROOT, capture_output=True, text=True, timeout=900, check=False
     )
     return "" if told.returncode == 0 else f"{told.stdout}\n{told.stderr}"
 

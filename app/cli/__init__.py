@@ -15,6 +15,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from typing import NoReturn
 
 from app.version import version
 from pipeline.errors import ParameterError, StemmapError, UsageError
@@ -30,6 +31,7 @@ COMMANDS = (
     "export",
     "params",
     "train",
+    "tune",
     "bench",
 )
 
@@ -49,6 +51,19 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> None:  # type: ignore[override]
         self.exit(WRONG_USAGE, f"{self.prog}: {message}. Help: {self.prog} --help\n")
+
+
+def command() -> NoReturn:
+    """The program `stemmap`: `main` with the words of this process, whose code the process ends with."""
+    code = main()
+    if "zenoh" in sys.modules:
+        # All is written and closed. Its threads outlive a session and now and then abort a process that is
+        # taking the interpreter down, which would report a map that stands whole as a crash.
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def main(arguments: list[str] | None = None) -> int:

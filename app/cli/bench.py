@@ -23,6 +23,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="FILE", type=Path, help="Markdown file (default: docs/benchmarks.md of the tree)"
     )
     parser.add_argument(
+        "--pictures",
+        metavar="DIR",
+        type=Path,
+        help="draw path, truth and map of the named benchmarks into a folder, and measure nothing",
+    )
+    parser.add_argument(
         "--date",
         metavar="YYYY-MM-DD",
         type=_date,
@@ -45,6 +51,12 @@ def run(arguments: argparse.Namespace) -> int:
         known = descriptions()
         for name, line in known.items():
             print(f"{name:{max(map(len, known))}}  {line}")
+        return 0
+    if arguments.pictures is not None:
+        from tests.benchmarks.plots import draw_all
+
+        for file in draw_all(arguments.names, arguments.pictures):
+            print(f"{file}: {file.stat().st_size / 1000:.0f} kB", flush=True)
         return 0
     out = arguments.out or _ROOT / "docs" / "benchmarks.md"
     day = arguments.date or date.today()

@@ -14,9 +14,11 @@ if TYPE_CHECKING:
     from pipeline.sources import SourceOptions
 
 SOURCE_HELP = (
-    "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of .bin or .pcd scans "
-    "or of TreeManagerState_<i>.csv stems, a whole cloud (.laz, .las), a robot that is heard live "
-    "(zenoh:tcp/host:7447, velodyne:ADDRESS:PORT?from=SENSOR), or a simulated run such as sim:stand"
+    "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of scans (.bin, .pcd, .ply, "
+    ".npy, .npz, .las, .laz) or of TreeManagerState_<i>.csv stems, "
+    "a whole cloud (.laz, .las, .e57, .ply, .npy, .npz), "
+    "a robot that is heard live (zenoh:tcp/host:7447, dds:?domain=0, velodyne:ADDRESS:PORT?from=SENSOR), "
+    "or a simulated run such as sim:stand"
 )
 
 
@@ -60,9 +62,11 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--odometry",
-        choices=("auto", "wheels", "static"),
+        type=_odometry,
+        metavar="auto|wheels|kiss-icp|static|file:POSES",
         default="auto",
-        help="auto: what the source has; wheels: it must have some; static: the robot stands still",
+        help="auto: what the source has, else kiss-icp; wheels: it must have some; kiss-icp: scans are laid "
+        "over one another; static: the robot stands still; file:poses.txt: poses of the LiDAR (TUM, KITTI)",
     )
 
 
@@ -75,7 +79,7 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
         type=_topic,
         action="append",
         default=[],
-        help="topic of a recording for scan, odometry or imu, where the fullest one is not meant",
+        help="topic of a recording for scan, odometry, imu, gnss or camera, in place of the fullest one",
     )
     parser.add_argument(
         "--mount",
@@ -101,22 +105,31 @@ def add_live_flags(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def recording_place(arguments: argparse.Namespace) -> str:
+def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
     """The file that --record means, "" where nothing is recorded.
 
     Raises:
-        ParameterError: The source is no live one.
+        ParameterError: One of the sources is no live one.
     """
     import time
 
-    from app.robot.address import is_live
+    from app.robot.address import is_live, parse_address
 
-    if (arguments.record is not None or arguments.publish) and not is_live(arguments.source):
+    asked = arguments.record is not None or arguments.publish
+    if asked and not all(is_live(uri) for uri in sources):
         raise ParameterError(
             "--record and --publish are of a robot that is heard live", remedy="Leave them away"
         )
-    if arguments.publish and not arguments.source.lower().startswith("zenoh:"):
-        raise ParameterError("a sensor has no network to publish to", remedy="Leave --publish away")
+    if asked and any(getattr(parse_address(uri), "mapped_there", False) for uri in sources):
+        raise ParameterError(
+            "a robot that maps by itself records and publishes by itself",
+            remedy="Leave --record and --publish away, or give them to `stemmap map` on the robot",
+        )
+    if arguments.publish and not all(uri.lower().startswith("zenoh:") for uri in sources):
+        raise ParameterError(
+            "results are published over Zenoh alone; a sensor and plain DDS are only heard",
+            remedy="Leave --publish away",
+        )
     if arguments.record is None:
         return ""
     if arguments.record:
@@ -131,10 +144,18 @@ def says_parameters(arguments: argparse.Namespace) -> bool:
     return bool(arguments.preset or arguments.config or arguments.assignments)
 
 
+def _odometry(text: str) -> str:
+    if text in ("auto", "wheels", "kiss-icp", "static") or (text.startswith("file:") and len(text) > 5):
+        return text
+    raise argparse.ArgumentTypeError(f"{text!r} is not auto, wheels, kiss-icp, static or file:poses.txt")
+
+
 def _topic(text: str) -> tuple[str, str]:
     role, equals, name = text.partition("=")
-    if not (equals and name and role in ("scan", "odometry", "imu")):
-        raise argparse.ArgumentTypeError(f"{text!r} is not scan=NAME, odometry=NAME or imu=NAME")
+    if not (equals and name and role in ("scan", "odometry", "imu", "gnss", "camera")):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not scan=NAME, odometry=NAME, imu=NAME, gnss=NAME or camera=NAME"
+        )
     return role, name
 
 
@@ -193,6 +214,7 @@ def chosen_parameters(
 
     Raises:
         ParameterError: A name, value or file does not fit.
+        StemmapError: The decision trees that are named are not here.
     """
     from pipeline.parameters import assign, from_toml, preset
 
@@ -207,4 +229,9 @@ def chosen_parameters(
                 f"cannot read the file of parameters: {reason}", where=str(arguments.config)
             ) from None
         parameters = from_toml(text, parameters, str(arguments.config))
-    return name, assign(parameters, arguments.assignments)
+    parameters = assign(parameters, arguments.assignments)
+    if parameters.gathering.forest != "package":
+        from app.forests import kept_forests
+
+        kept_forests().check(parameters)
+    return name, parameters

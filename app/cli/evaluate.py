@@ -1,30 +1,42 @@
-"""`stemmap evaluate`: a finished map against the ground truth."""
+"""`stemmap evaluate`: finished maps against the ground truth; with `--param-grid` runs under many sets."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import StemmapError
+from app.cli.choices import plain, source
+from app.cli.grid import add_grid_flags, distances, refuse_without_grid, run_grid
+from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from app.finished import FinishedRun
+    from pipeline.evaluation import Evaluation
     from pipeline.records import TruthTrees
 
-HELP = "judge a mapped run by ground truth trees"
+HELP = "judge mapped runs by ground truth trees, or compare many sets of parameters on runs"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("run", metavar="DIR", type=Path, help="what `stemmap map` wrote")
+    parser.add_argument(
+        "runs",
+        metavar="RUN",
+        nargs="+",
+        type=source,
+        help="folders that `stemmap map` wrote; with --param-grid recordings and simulated runs too",
+    )
     parser.add_argument(
         "--truth",
         metavar="FILE",
         type=Path,
-        help="trees (CSV) in the frame of the map; default: the source's own",
+        action="append",
+        default=[],
+        help="trees (CSV) in the frame of the map, for all runs or one FILE each; default: the source's own",
     )
     parser.add_argument(
         "--dbh-unit", choices=("m", "cm", "mm"), help="of a truth column that does not say it"
@@ -34,49 +46,88 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--reach", metavar="M", help="truth farther than this from the path is not asked for [m]"
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
+    add_grid_flags(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Judge it and print the scores."""
-    from dataclasses import asdict
+    """Judge them and print the scores."""
+    if len(arguments.truth) not in (0, 1, len(arguments.runs)):
+        raise ParameterError(
+            f"{len(arguments.truth)} tables of true trees for {len(arguments.runs)} runs",
+            remedy="Give --truth once for all of them, or once for each in their order",
+        )
+    if arguments.param_grid:
+        return run_grid(arguments)
+    refuse_without_grid(arguments)
+    if len(arguments.runs) == 1:
+        return _print(arguments, *_judged(arguments, 0))
+    failed, plains = 0, {}
+    for number, name in enumerate(arguments.runs):
+        try:
+            evaluation, whole = _judged(arguments, number)
+        except StemmapError as error:  # one that cannot be judged does not end the others
+            print(f"stemmap: {plain(name)}: {error}", file=sys.stderr)
+            failed += 1
+            continue
+        if arguments.json:
+            plains[name] = asdict(evaluation)
+            continue
+        print(f"{plain(name)}:")
+        _print(arguments, evaluation, whole)
+    if arguments.json:
+        print(json.dumps(plains, indent=1))
+    return 0 if not failed else 1 if failed == len(arguments.runs) else 3
 
-    import numpy as np
 
-    from app.finished import read_run
+def _print(arguments: argparse.Namespace, evaluation: Evaluation, whole: bool) -> int:
     from app.summary import evaluation_lines
-    from app.tally import far_truth
-    from pipeline.evaluation import evaluate
-    from pipeline.parameters import assign
 
-    finished = read_run(arguments.run)
-    changes = [
-        f"evaluation.{name}={value}"
-        for name, value in (("match_distance", arguments.match_distance), ("reach", arguments.reach))
-        if value is not None
-    ]
-    parameters = assign(finished.parameters, changes)
-    truth = _truth(arguments, finished)
-    # A whole cloud was mapped without a path: all of the truth is asked for.
-    path = None if finished.of_cloud else np.stack([finished.path.x, finished.path.y], axis=1)
-    evaluation = evaluate(finished.trees, truth, parameters.evaluation, path)
-    if path is not None and evaluation.TA.of + evaluation.TR.of == 0:
-        print(f"warning: {far_truth(evaluation.reach)}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(asdict(evaluation), indent=1))
     else:
-        for line in evaluation_lines(evaluation, whole=path is None):
+        for line in evaluation_lines(evaluation, whole=whole):
             print(line)
     return 0
 
 
-def _truth(arguments: argparse.Namespace, finished: FinishedRun) -> TruthTrees:
+def _judged(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, bool]:
+    """The scores of a run, and whether all of the truth was asked for."""
+    import numpy as np
+
+    from app.finished import read_run
+    from app.tally import far_truth
+    from app.words import count
+    from pipeline.evaluation import evaluate
+    from pipeline.parameters import assign
+
+    folder = Path(arguments.runs[number])
+    finished = read_run(folder)
+    parameters = assign(finished.parameters, distances(arguments))
+    truth = _truth(arguments, finished, number)
+    # A whole cloud was mapped without a path: all of the truth is asked for.
+    path = None if finished.of_cloud else np.stack([finished.path.x, finished.path.y], axis=1)
+    evaluation = evaluate(finished.trees, truth, parameters.evaluation, path)
+    if evaluation.TA.of + evaluation.TR.of == 0:
+        raise StemmapError("the ground truth has no trees" if path is None else far_truth(evaluation.reach))
+    if evaluation.TA.of and not evaluation.TA.count:
+        raise StemmapError(
+            f"none of {count(evaluation.TA.of, 'true tree')} has a mapped tree within "
+            f"{parameters.evaluation.match_distance:g} m",
+            where=str(folder),
+            remedy="Check that the ground truth stands in the frame of the map: the first pose is its origin",
+        )
+    return evaluation, path is None
+
+
+def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) -> TruthTrees:
     from contextlib import closing
 
     from pipeline.sources import SourceOptions, open_source
     from pipeline.truth_table import read_truth_trees
 
-    if arguments.truth is not None:
-        return read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit)
+    if arguments.truth:
+        file = arguments.truth[number if len(arguments.truth) > 1 else 0]
+        return read_truth_trees(file, dbh_unit=arguments.dbh_unit)
     uri = finished.uri
     if finished.of_cloud:
         raise StemmapError(

@@ -12,6 +12,7 @@ from app.cli.choices import SOURCE_HELP, add_source_flags, plain, program, seed,
 if TYPE_CHECKING:
     from pipeline.records import Sensor, Truth
     from pipeline.sources import Source, SourceDescription
+    from pipeline.sources.base import RecordedTopic
 
 HELP = "say what is in a recording and what can be done with it"
 
@@ -67,6 +68,7 @@ def _record(opened: Source) -> dict[str, Any]:
 
 
 def _lines(opened: Source) -> list[str]:
+    from app.odometry import choose_odometry
     from app.words import count
 
     d, truth = opened.description, opened.truth()
@@ -83,8 +85,9 @@ def _lines(opened: Source) -> list[str]:
         ("scans", _scans(d)),
         ("LiDAR", _sensor(d.sensor)),
         ("mounted", f"x {x:.2f} m, y {y:.2f} m, z {z:.2f} m on the robot"),
-        ("odometry", "yes" if d.has_odometry else "no: it is mapped as if the robot stood still"),
+        ("odometry", "yes" if d.has_odometry else f"no; taken: {choose_odometry(d, 'auto').words}"),
         ("IMU", "yes" if d.has_imu else "no"),
+        *([("GNSS", d.gnss)] if d.gnss else []),
         ("truth", ", ".join(known) or "none; give trees with --truth trees.csv"),
         ("preset", f"{d.preset} suits it"),
         ("SHA-256", d.digest),
@@ -100,11 +103,20 @@ def _topic_lines(d: SourceDescription) -> list[str]:
         return []
     lines = ["", "topics (* is read; --topic ROLE=NAME chooses another)"]
     width = max(len(plain(topic.name)) for topic in d.topics)
+    seconds = 0.0 if d.start_ns is None or d.end_ns is None else (d.end_ns - d.start_ns) * 1e-9
     for topic in d.topics:
-        mark, use = ("*", topic.read_as) if topic.read_as else (" ", topic.fits and f"could be {topic.fits}")
+        mark, use = ("*", f"read as {topic.read_as}") if topic.read_as else (" ", _not_read(topic))
         name, kind = plain(topic.name), plain(topic.type)
-        lines.append(f" {mark} {name:{width}}  {topic.messages:>8,}  {kind}  {use}".rstrip())
+        rate = (
+            f"{(topic.messages - 1) / seconds:7.1f} Hz" if seconds > 0.0 and topic.messages > 1 else " " * 10
+        )
+        lines.append(f" {mark} {name:{width}}  {topic.messages:>8,}  {rate}  {kind}  {use}".rstrip())
     return lines
+
+
+def _not_read(topic: RecordedTopic) -> str:
+    could = f", could be {topic.fits}" if topic.fits and topic.messages else ""
+    return f"not read: {plain(topic.why_not)}{could}"
 
 
 def _commands(d: SourceDescription) -> list[str]:

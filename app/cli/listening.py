@@ -35,7 +35,7 @@ def recording_of(arguments: argparse.Namespace) -> Recording | None:
     from app.cli.choices import recording_place
     from app.robot.recording import Recording
 
-    place = recording_place(arguments)
+    place = recording_place(arguments, arguments.source)
     return Recording(Path(place)) if place else None
 
 

@@ -68,7 +68,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         dest="kind",
         choices=("auto", "scans", "plot"),
         default="auto",
-        help="plot: the file is one whole cloud of a plot (auto: .las and .laz are)",
+        help="plot: the file is one whole cloud of a plot (auto: .las, .laz, .ply, .npy and .npz are, "
+        "one .pcd is a scan)",
     )
     parser.set_defaults(seed=None)
     parser.epilog = (
@@ -85,8 +86,11 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--start is of a continued map", remedy="Name it with --continue DIR")
     chosen_parameters(arguments, "forest")  # a mistyped flag is said before anything heavy is loaded
 
+    from app.unfinished import left_in
     from pipeline.sources.clouds import is_cloud
 
+    for line in left_in(arguments.out):
+        print(f"warning: {line}", file=sys.stderr)
     if arguments.kind == "plot" or (arguments.kind == "auto" and is_cloud(arguments.source)):
         return _run_plot(arguments)
     return _run_scans(arguments)

@@ -46,7 +46,9 @@ def _print_table(name: str, parameters: Parameters) -> None:
     print(f"{words[0].upper()}{words[1:]}. Change a value with --set stage.name=value.\n")
     values = parameters.flat()
     for spec in field_specs():
-        if spec.minimum is None:
+        if spec.kind == "name":
+            bounds = "a name"
+        elif spec.minimum is None:
             bounds = " | ".join(spec.choices) or "true | false"
         else:
             bounds = f"{spec.minimum:g} .. {spec.maximum:g} {spec.unit}".rstrip()

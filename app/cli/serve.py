@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from app.cli.choices import (
     SOURCE_HELP,
@@ -15,8 +16,12 @@ from app.cli.choices import (
     recording_place,
     source,
 )
-from app.settings import DEFAULT_PORT, VARIABLES, from_environment
+from app.settings import DEFAULT_PORT, VARIABLES, Settings, from_environment
 from pipeline.errors import SourceError
+
+if TYPE_CHECKING:
+    from app.messages import Open
+    from app.robot.address import ZenohAddress
 
 HELP = "open the dashboard in a browser"
 
@@ -29,9 +34,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "source",
         metavar="SOURCE",
         type=source,
-        nargs="?",
-        default=_DEFAULT_SOURCE,
-        help=f"{SOURCE_HELP} (default: {_DEFAULT_SOURCE})",
+        nargs="*",
+        help=f"{SOURCE_HELP} (default: {_DEFAULT_SOURCE}); several, or a router with several robots, "
+        "get a dashboard each and one page of all",
     )
     parser.add_argument(
         "--port",
@@ -63,21 +68,71 @@ def run(arguments: argparse.Namespace) -> int:
         settings = replace(settings, host=arguments.host)
     if arguments.port is not None:
         settings = replace(settings, port=arguments.port)
-    _look_for(arguments.source)
-    record = recording_place(arguments)
+    uris = arguments.source or [_DEFAULT_SOURCE]
+    for uri in uris:
+        _look_for(uri)
+    _tell_of_unfinished(settings)
+    record = recording_place(arguments, *uris)
     chosen_parameters(arguments, "forest")  # a mistyped flag is said now, not on the page
 
     from app.messages import Open
     from app.parameter_state import ParameterState
     from app.serving import serve
 
+    sources = [Open(uri, arguments.odometry, arguments.seed, record, arguments.publish) for uri in uris]
+
+    def make_parameters() -> ParameterState:
+        return ParameterState(lambda suggested: chosen_parameters(arguments, suggested))
+
+    watched = _watched(sources)
+    if watched is not None or len(sources) > 1:
+        from app.fleet.names import named
+        from app.fleet.serving import serve_fleet
+
+        return serve_fleet(
+            settings,
+            sources={} if watched is not None else named(sources),
+            make_parameters=make_parameters,
+            watched=watched,
+            open_browser=not arguments.no_browser,
+            viewer=arguments.viewer,
+        )
     return serve(
         settings,
-        source=Open(arguments.source, arguments.odometry, arguments.seed, record, arguments.publish),
-        parameter_state=ParameterState(lambda suggested: chosen_parameters(arguments, suggested)),
+        source=sources[0],
+        parameter_state=make_parameters(),
         open_browser=not arguments.no_browser,
         viewer=arguments.viewer,
     )
+
+
+def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
+    """The router whose robots are all shown: one that was asked for with robot=*, or that has several."""
+    from app.robot.address import ALL_ROBOTS, ZenohAddress, is_live, parse_address
+
+    if len(sources) != 1 or not is_live(sources[0].uri):
+        return None
+    address = parse_address(sources[0].uri)
+    if not isinstance(address, ZenohAddress) or address.robot not in ("", ALL_ROBOTS):
+        return None
+    if address.mapped_there:
+        return address, sources[0]
+    if address.robot == ALL_ROBOTS:
+        return replace(address, robot=""), sources[0]
+    if address.topics:  # a topic is of one robot
+        return None
+    from app.fleet.watching import robots_at
+
+    return (address, sources[0]) if len(robots_at(address)) > 1 else None
+
+
+def _tell_of_unfinished(settings: Settings) -> None:
+    from app.unfinished import unfinished
+    from app.words import count
+
+    if left := unfinished(settings):
+        they = count(len(left), "run was", "runs were")
+        print(f"{they} ended before the map was whole; the page Runs can delete what is left of them")
 
 
 def _look_for(uri: str) -> None:
@@ -89,7 +144,7 @@ def _look_for(uri: str) -> None:
         raise SourceError(
             "there is no such file or folder", where=uri, remedy="Simulated runs begin with sim:"
         )
-    if scheme in ("zenoh", "velodyne"):
+    if scheme in ("zenoh", "velodyne", "dds"):
         from app.robot.address import parse_address
 
         parse_address(uri)

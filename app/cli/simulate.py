@@ -12,6 +12,7 @@ from app.cli.waiting import compiling_is_said
 
 if TYPE_CHECKING:
     from pipeline.records import Record
+    from pipeline.sources.camera import Picture
     from pipeline.sources.simulated import SimulatedSource
 
 HELP = "write a simulated run as an MCAP of ROS 2 messages, with its ground truth"
@@ -30,6 +31,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--seed", type=seed, metavar="N", help="of everything random in the run; 0 if not given"
     )
     parser.add_argument("--duration", type=float, metavar="S", help="length of the run in seconds")
+    parser.add_argument(
+        "--camera", action="store_true", help="add simple pictures of a camera that looks ahead, two a second"
+    )
     parser.add_argument("--force", action="store_true", help="overwrite files that are there already")
     parser.epilog = "The ground truth is attached to the recording, and written beside it as RUN.trees.csv."
 
@@ -39,6 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the recording and the table of trees beside it."""
     from app.words import count
     from pipeline.recording import write_recording
+    from pipeline.recording.rendering import CAMERA, with_pictures
     from pipeline.sources.simulated import open_simulated
 
     out: Path = arguments.out
@@ -47,12 +52,16 @@ def run(arguments: argparse.Namespace) -> int:
     source = open_simulated(_uri(arguments))
     description = source.description
     truth = source.truth()
+    records: Iterator[Record | Picture] = _with_progress(source)
+    if arguments.camera:
+        records = with_pictures(_with_progress(source), source.run.scene.truth, source.run.true_path())
     write_recording(
         out,
-        _with_progress(source),
+        records,
         sensor=description.sensor,
         T_base_lidar=description.T_base_lidar,
         truth=truth,
+        camera=CAMERA if arguments.camera else None,
     )
     _write_trees(table, source)
     print(f"{out}: {count(description.scans or 0, 'scan')}; its ground truth is attached, and in {table}")

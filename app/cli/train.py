@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import StemmapError
+from app.cli.choices import seed as whole_seed
+from pipeline.errors import StemmapError, UsageError
 
 if TYPE_CHECKING:
     from app.training.growing import Examples
@@ -22,13 +22,27 @@ REACH = 25.0  # m, of labelled scans
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument(
-        "labelled",
-        metavar="FOLDER",
-        type=Path,
+        "places",
+        metavar="SOURCE",
         nargs="*",
-        help="scans of one place (velodyne/*.bin, labels/*.label), or one .bin with its .label beside it",
+        help="scans of one place (velodyne/*.bin, labels/*.label), or one .bin with its .label beside it; "
+        "with --annotations runs that were annotated (default: all that were)",
     )
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="JSON file to write")
+    parser.add_argument(
+        "--annotations",
+        action="store_true",
+        help="let the decision trees of the package learn from what was annotated in the dashboard, and show "
+        "what old and new ones are worth on things that they did not see",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help="JSON file to write (with --annotations: into the data folder, to be used by its name)",
+    )
+    parser.add_argument(
+        "--seed", type=whole_seed, default=0, metavar="N", help="of every random number (default: 0)"
+    )
     parser.add_argument("--scenes", default=SCENES, help=f"simulated scenes (default: {SCENES})")
     parser.add_argument(
         "--seeds",
@@ -51,9 +65,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Gather examples, grow the trees, print what they are worth on scenes left out, write them."""
+    if arguments.annotations:
+        from app.cli.learning import learn_from_annotations
+
+        return learn_from_annotations(arguments.places, arguments.out, arguments.seed)
+    if arguments.out is None:
+        raise UsageError("there is no file to write to", remedy="Name it with --out FILE")
+    arguments.labelled = [Path(place) for place in arguments.places]
+    from app.forests import write_forest
     from app.training.growing import PLANS, as_json, can_grow, grow
     from app.training.judging import leave_one_out
-    from pipeline.files import write_beside
     from pipeline.parameters import preset
 
     _look_for(arguments)
@@ -63,10 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
     for line in leave_one_out(examples, preset("forest").gathering.tree_share):
         print(line)
     scenes = _scenes(arguments)
-    grown = {kind: grow(examples, kind) for kind in PLANS if can_grow(examples, kind)}
-    text = json.dumps(as_json(grown, scenes), separators=(",", ":"))
-    with write_beside(arguments.out) as file:
-        file.write_text(text.replace('{"figure"', '\n{"figure"') + "\n", encoding="utf-8")
+    grown = {kind: grow(examples, kind, arguments.seed) for kind in PLANS if can_grow(examples, kind)}
+    write_forest(as_json(grown, scenes), arguments.out)
     print(f"{len(examples)} sets of examples, written to {arguments.out}")
     return 0
 

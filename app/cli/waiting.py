@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-COMPILING = "compiling for this machine; this can take a minute or two, and only the first time"
+from app.words import COMPILING
 
 
 @contextmanager

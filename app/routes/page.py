@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import mimetypes
 from pathlib import Path, PurePosixPath
+from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Request
-from starlette.responses import FileResponse, Response
+from starlette.responses import FileResponse, RedirectResponse, Response
 
 from app.replies import error_reply, json_reply
 from app.security import role_of
@@ -46,12 +47,23 @@ def runs_page(request: Request) -> Response:
     return _file(request, page_folder() / "runs.html", _PAGE_POLICY)
 
 
+@router.get("/robots")
+def all_robots(request: Request) -> Response:
+    """Lead back to the page of the fleet that this dashboard belongs to."""
+    port = request.app.state.fleet_port
+    if port is None:
+        return error_reply(404, "this dashboard stands alone", remedy="Open / in its place")
+    return lead_on(request, port)
+
+
 @router.get("/api/access")
 def access(request: Request) -> Response:
-    """What the link allows, and for who may change things the link for those who may look."""
+    """What the link allows, for who may change things the link for those who may look, and whether there are
+    other robots."""
     role = role_of(request.scope)
     link = f"/?token={request.app.state.viewer_token}" if role == "owner" else None
-    return json_reply({"role": role, "viewer_link": link})
+    robots = None if request.app.state.fleet_port is None else "/robots"
+    return json_reply({"role": role, "viewer_link": link, "robots": robots})
 
 
 @router.get("/static/plotly.min.js")
@@ -73,6 +85,22 @@ def page_file(request: Request, path: str) -> Response:
 def viser_page(request: Request) -> Response:
     """The 3D scene's page, of the installed viser."""
     return _file(request, client_page(), _VISER_POLICY)
+
+
+def lead_on(request: Request, port: int) -> Response:
+    """On to another port of this host, with the token that who asks may use there."""
+    owner = role_of(request.scope) == "owner"
+    token = request.app.state.token if owner else request.app.state.viewer_token
+    asked = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
+    host = f"[{asked}]" if ":" in asked else asked
+    answer = RedirectResponse(f"http://{host}:{port}/?token={token}", 303)
+    answer.headers["Cache-Control"] = "no-store"
+    return answer
+
+
+def page_answer(request: Request, path: Path) -> Response:
+    """A page of ours, with the policy of a page."""
+    return _file(request, path, _PAGE_POLICY)
 
 
 def _file(request: Request, path: Path, policy: str) -> Response:

@@ -17,11 +17,11 @@ from app.routes.access import Dash
 router = APIRouter(prefix="/api/sets")
 
 # Letters of any script, so that it can be read everywhere and never steers a terminal or a path.
-_NAME = r"^\w[\w .+-]{0,39}\Z"
+SET_NAME = r"^\w[\w .+-]{0,39}\Z"
 _WHO = NAME
 _LONGEST_FILE = 100_000
 
-_Name = Annotated[str, Meta(pattern=_NAME)]
+_Name = Annotated[str, Meta(pattern=SET_NAME)]
 
 
 class _Save(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

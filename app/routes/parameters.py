@@ -27,6 +27,10 @@ class _Preset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: _Name
 
 
+class _Reach(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    whole: bool
+
+
 class _Reset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: Annotated[list[_Name], Meta(max_length=500)] = []
 
@@ -50,6 +54,14 @@ async def use_preset(request: Request, dashboard: Dash) -> Response:
     """Take all values of a preset."""
     wanted: _Preset = await body_of(request, _Preset)
     await dashboard.use_preset(wanted.name)
+    return await read(dashboard)
+
+
+@router.put("/parameters/reach")
+async def reach(request: Request, dashboard: Dash) -> Response:
+    """Say what a change acts on: the whole run, or the scans from the standing one on."""
+    wanted: _Reach = await body_of(request, _Reach)
+    await dashboard.reach(whole=wanted.whole)
     return await read(dashboard)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import nullcontext
 from typing import Annotated
 
 import msgspec
@@ -14,6 +15,7 @@ from app.dashboard import Dashboard
 from app.picture_payload import comparison_payload, stages_payload
 from app.replies import body_of, error_reply
 from app.routes.access import Dash
+from app.security import role_of
 from pipeline.parameters import Parameters
 
 router = APIRouter(prefix="/api")
@@ -42,7 +44,8 @@ async def compare(request: Request, dashboard: Dash) -> Response:
     """The standing scan under two sets of parameters."""
     wanted: _Compare = await body_of(request, _Compare)
     sets = [_named(dashboard, name) for name in (wanted.a, wanted.b)]
-    frames = await dashboard.asking.compare(sets)
+    async with dashboard.viewers_turns.turn() if role_of(request.scope) == "viewer" else nullcontext():
+        frames = await dashboard.asking.compare(sets)
     first, second = (each.flat() for each in sets)
     differences = [[name, value, second[name]] for name, value in first.items() if second[name] != value]
     distance = dashboard.parameters.parameters.evaluation.match_distance

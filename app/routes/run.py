@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Sequence
+from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl, urlencode
@@ -14,6 +15,7 @@ from fastapi import APIRouter, Request
 from msgspec import Meta
 from starlette.responses import Response
 
+from app.child import ask
 from app.messages import LONGEST_S, Advance, Open, Pause, Play, Seek, SetSpeed
 from app.replies import BadRequestError, body_of, error_reply, json_reply
 from app.routes.access import Dash
@@ -31,12 +33,26 @@ NOT_FROM_AFAR = "from another machine only scenarios and the recordings of the f
 _Command = Play | Pause | Advance | Seek | SetSpeed
 
 
+_Role = Literal["scan", "odometry", "imu", "gnss", "camera"]
+_Length = Annotated[float, Meta(ge=-100.0, le=100.0)]
+_Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
+
+
 class OpenRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a browser may ask to have opened."""
 
     uri: Annotated[str, Meta(min_length=1, max_length=_LONGEST_URI)]
-    odometry: Literal["auto", "wheels", "static"] = "auto"
+    odometry: Literal["auto", "wheels", "kiss-icp", "static"] = "auto"
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    topics: dict[_Role, Annotated[str, Meta(max_length=256)]] = {}
+    #: x, y, z [m], roll, pitch, yaw [degrees] of the LiDAR on the robot.
+    mount: tuple[_Length, _Length, _Length, _Angle, _Angle, _Angle] | None = None
+
+
+class _Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is to be looked into."""
+
+    uri: Annotated[str, Meta(min_length=1, max_length=_LONGEST_URI)]
 
 
 @router.get("/status")
@@ -65,11 +81,11 @@ async def loop(request: Request, dashboard: Dash) -> Response:
     """Play a part of the run again and again, or no more."""
     wanted: _Loop = await body_of(request, _Loop)
     if wanted.from_s is None or wanted.to_s is None:
-        dashboard.play_in_loop(None)
+        dashboard.loop.choose(None)
     elif wanted.to_s - wanted.from_s < SHORTEST_LOOP_S:
         raise BadRequestError("the loop is too short", remedy=f"Make it {SHORTEST_LOOP_S} s or longer")
     else:
-        dashboard.play_in_loop((wanted.from_s, wanted.to_s))
+        dashboard.loop.choose((wanted.from_s, wanted.to_s))
     return json_reply({}, 202)
 
 
@@ -80,14 +96,26 @@ async def open_source(request: Request, dashboard: Dash) -> Response:
     settings: Settings = request.app.state.settings
     uri = what_may_be_opened(wanted.uri, settings)
     if uri is None:
-        return error_reply(
-            403,
-            NOT_FROM_AFAR,
-            where=wanted.uri,
-            remedy="Put it into the folder of recordings, or open it on the machine itself",
-        )
-    await dashboard.open(Open(uri, wanted.odometry, wanted.seed))
+        return _not_from_afar(wanted.uri)
+    mount = None if wanted.mount is None else (*wanted.mount[:3], *map(radians, wanted.mount[3:]))
+    topics = {str(role): name for role, name in wanted.topics.items()}
+    await dashboard.open(Open(uri, wanted.odometry, wanted.seed, topics=topics, mount=mount))
     return json_reply({}, 202)
+
+
+@router.post("/inside")
+async def inside(request: Request) -> Response:
+    """The topics of a recording or of a robot, and where the LiDAR stands; read by a process of its own."""
+    wanted: _Look = await body_of(request, _Look)
+    uri = what_may_be_opened(wanted.uri, request.app.state.settings)
+    if uri is None:
+        return _not_from_afar(wanted.uri)
+    return json_reply(await ask({"ask": "inside", "path": uri}))
+
+
+def _not_from_afar(uri: str) -> Response:
+    remedy = "Put it into the folder of recordings, or open it on the machine itself"
+    return error_reply(403, NOT_FROM_AFAR, where=uri, remedy=remedy)
 
 
 @router.get("/sources")

@@ -22,6 +22,8 @@ from app.routes.run import NOT_FROM_AFAR, what_may_be_opened
 from app.settings import Settings
 from app.store.book import RunBook
 from app.store.records import UnknownError
+from app.unfinished import delete as delete_unfinished
+from app.unfinished import unfinished
 
 router = APIRouter(prefix="/api/runs")
 
@@ -34,7 +36,7 @@ _Number = Annotated[int, Path(ge=0, le=2**31 - 1)]
 
 @router.get("")
 async def listed(request: Request, dashboard: Dash) -> Response:
-    """All runs, the newest first, and the finished folders; maps are left out."""
+    """All runs, the newest first, the finished folders and what is left of killed runs; maps are left out."""
     settings: Settings = request.app.state.settings
     rows = await dashboard.keeper.ask(lambda store: store.book.listed())
     folders = await asyncio.to_thread(finished_folders, settings)
@@ -45,6 +47,7 @@ async def listed(request: Request, dashboard: Dash) -> Response:
             "folders": [
                 {"key": f"{_FOLDER}{name}", "name": name, "changed_s": changed[name]} for name in folders
             ],
+            "unfinished": await asyncio.to_thread(unfinished, settings),
             "open": dashboard.logbook.record,
         }
     )
@@ -84,13 +87,24 @@ async def rename(request: Request, number: _Number, dashboard: Dash) -> Response
     return await _done(dashboard, number, lambda book: book.rename(number, name))
 
 
+@router.delete("/unfinished")
+async def take_away(request: Request, name: _Asked) -> Response:
+    """Delete what a killed run left in the data folder; nothing brings it back, and nothing is lost by it."""
+    try:
+        await asyncio.to_thread(delete_unfinished, name, request.app.state.settings)
+    except UnknownError as error:
+        return failure_reply(404, error)
+    return json_reply({"name": name})
+
+
 @router.delete("/{number}")
-async def delete(number: _Number, dashboard: Dash) -> Response:
+async def delete(request: Request, number: _Number, dashboard: Dash) -> Response:
     """Take it away; `restore` brings it back."""
-    if number == dashboard.logbook.record:
-        return error_reply(
-            409, "this run is open", where=f"run {number}", remedy="Open another one first, then delete it"
-        )
+    if number in request.app.state.open_records():
+        own = number == dashboard.logbook.record
+        what = "this run is open" if own else "this run is open in the dashboard of another robot"
+        remedy = "Open another one first, then delete it" if own else "Open another one there, then delete it"
+        return error_reply(409, what, where=f"run {number}", remedy=remedy)
     return await _done(dashboard, number, lambda book: book.delete(number))
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 from typing import Annotated
 
 import msgspec
 from fastapi import APIRouter
 from msgspec import Meta
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
+from app.browser_feed import telling
 from app.dashboard import Dashboard
 from app.hands import hand
-from app.live import Listener
 from app.routes.access import Dash
 from app.security import role_of
 from app.viser_bridge import bridge
@@ -21,7 +19,6 @@ from app.viser_bridge import bridge
 router = APIRouter()
 
 _REFUSED = 1003
-_MOST_BROWSERS = 50
 _TRY_AGAIN_LATER = 1013
 
 
@@ -47,23 +44,14 @@ _decoder: msgspec.json.Decoder[_Select | _SelectCluster] = msgspec.json.Decoder(
 @router.websocket("/api/live")
 async def live(browser: WebSocket, dashboard: Dash) -> None:
     """States as they change, newest wins; takes selections."""
-    if dashboard.live.listeners >= _MOST_BROWSERS:
-        await browser.close(_TRY_AGAIN_LATER)
-        return
-    await browser.accept()
-    with dashboard.live.listener() as listener:
-        sending = asyncio.create_task(_send(browser, listener))
-        try:
-            await _receive(browser, dashboard, may_touch=role_of(browser.scope) == "owner")
-        finally:
-            sending.cancel()
-            with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
-                await sending
-
-
-async def _send(browser: WebSocket, listener: Listener) -> None:
-    async for message in listener.messages():
-        await browser.send_text(message.decode())
+    role = role_of(browser.scope)
+    with dashboard.pages.place(role) as free:
+        if not free:
+            await browser.close(_TRY_AGAIN_LATER)
+            return
+        await browser.accept()
+        async with telling(browser, dashboard.live):
+            await _receive(browser, dashboard, may_touch=role == "owner")
 
 
 async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_touch: bool) -> None:
@@ -76,25 +64,22 @@ async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_touch: bool)
         if not may_touch:  # a selection is everybody's
             continue
         if isinstance(wanted, _SelectCluster):
-            dashboard.select_cluster_soon(wanted.scan, wanted.cluster)
+            dashboard.selecting.cluster_soon(wanted.scan, wanted.cluster)
         else:
-            await dashboard.select_tree(wanted.tree)
+            dashboard.selecting.tree(wanted.tree)
 
 
 @router.websocket("/viser")
 @router.websocket("/viser/")
 async def viser(browser: WebSocket, dashboard: Dash) -> None:
     """The 3D scene."""
-    if dashboard.scene_viewers >= _MOST_BROWSERS:
-        await browser.close(_TRY_AGAIN_LATER)
-        return
-    name = hand.get()
+    role, name = role_of(browser.scope), hand.get()
 
     def sign() -> None:
         dashboard.scene_hand = name
 
-    dashboard.scene_viewers += 1
-    try:
-        await bridge(browser, dashboard.scene, looks_only=role_of(browser.scope) != "owner", touched=sign)
-    finally:
-        dashboard.scene_viewers -= 1
+    with dashboard.scenes.place(role) as free:
+        if not free:
+            await browser.close(_TRY_AGAIN_LATER)
+            return
+        await bridge(browser, dashboard.scene, looks_only=role != "owner", touched=sign)

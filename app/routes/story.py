@@ -23,7 +23,7 @@ async def cluster(
 ) -> Response:
     """Verdict, checks and fit of a cluster of a scan that was shown lately; without `scan` of the newest."""
     try:
-        return json_reply(await dashboard.cluster_story(scan, number))
+        return json_reply(await dashboard.selecting.story(scan, number))
     except NoStoryError as error:
         return failure_reply(404, error)
 

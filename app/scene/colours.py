@@ -21,7 +21,9 @@ BUSH: Rgb = (153, 153, 51)
 OTHER: Rgb = (136, 136, 136)
 UNCERTAIN: Rgb = (240, 228, 66)
 TRUTH: Rgb = (230, 159, 0)
-GROUND: Rgb = (56, 53, 47)
+# The background shines through: one scene is seen in light pages and in dark ones.
+GROUND: Rgb = (122, 115, 102)
+GROUND_OPACITY = 0.35
 PATH: Rgb = (150, 156, 164)
 ODOMETRY: Rgb = (96, 101, 108)
 ROBOT: Rgb = (214, 45, 45)

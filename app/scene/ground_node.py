@@ -27,6 +27,7 @@ class GroundNode:
             np.eye(3, dtype=np.float32),
             np.array([[0, 1, 2]], dtype=np.uint32),
             color=colours.GROUND,
+            opacity=colours.GROUND_OPACITY,
             side="double",
             cast_shadow=False,
             receive_shadow=False,

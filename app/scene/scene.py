@@ -25,6 +25,7 @@ from app.scene.tune_panel import TunePanel
 from app.scene.tuning import SceneCommands, Tuning, Value
 from app.scene.view import View
 from app.scene.voxel_node import VoxelNode
+from app.scene.way_node import WayNode
 from pipeline.geometry import Pose2
 from pipeline.parameters import Parameters, preset
 from pipeline.records import Frame, TruthTrees
@@ -179,6 +180,7 @@ class Scene:
         self._voxels = VoxelNode(scene, f"{ROBOT}/scan")
         self._gathered = MapCloud(scene, self._accumulated)
         self._errors = ErrorNode(scene)
+        self._way = WayNode(scene, ROBOT)
 
     def _renew(self) -> None:
         old = self._server
@@ -215,6 +217,7 @@ class Scene:
         """The layers that are made only while people want to see them."""
         size = self._parameters.filters.voxel_size
         self._voxels.show(frame.filtered, size, self._view.layers["voxels"])
+        self._way.show(frame.clearance, self._parameters.obstacles, self._view.layers["way"])
         if self._view.layers["errors"]:
             wanted = self._parameters.evaluation
             self._errors.show(frame.trees, self._truth, self._path, wanted, self._map.ground)

@@ -117,6 +117,9 @@ def make_widget(gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiIn
         return gui.add_checkbox(label, bool(value), hint=spec.doc)
     if spec.kind == "choice":
         return gui.add_dropdown(label, spec.choices, initial_value=str(value), hint=spec.doc)
+    if spec.kind == "name":
+        # Chosen on the page: here each letter that is typed would be a change.
+        return gui.add_text(label, str(value), disabled=True, hint=spec.doc)
     kind = int if spec.kind == "int" else float
     low, high, step = (kind(bound or 0) for bound in (spec.minimum, spec.maximum, spec.step))
     return gui.add_slider(label, low, high, step, kind(value), hint=f"{spec.doc} ({spec.name})")

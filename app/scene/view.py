@@ -26,6 +26,7 @@ LAYERS = {
     "path": "Path",
     "odometry": "Path by odometry",
     "voxels": "Voxels",
+    "way": "Way and obstacles",
 }
 # Off until somebody asks for them: they cost time to draw, or cover what lies below.
 OFF_AT_FIRST = ("odometry", "voxels", "gathered", "errors")
@@ -43,6 +44,7 @@ COLOURS = {
     "trees": colours.TREE,
     "truth": colours.TRUTH,
     "errors": colours.ERROR,
+    "way": colours.PATH,
 }
 CHOICES = {"colour_by": COLOUR_BY, "label_by": LABEL_BY}
 

@@ -16,6 +16,7 @@ from typing import Any, Literal
 from sqlalchemy import Connection, Insert, Row, func, insert, select, update
 
 from app.store import tables
+from app.store.annotated import AnnotatedSource, annotated_sources
 from app.store.book import RunBook
 from app.store.opening import open_engine
 from app.store.records import (
@@ -85,6 +86,10 @@ class Store:
         with self._engine.begin() as connection:
             rows = connection.execute(query.order_by(_annotations.c.id)).all()
         return [Annotation(row.id, _content(row), row.who, row.at_ns, row.version) for row in rows]
+
+    def annotated_sources(self) -> list[AnnotatedSource]:
+        """All sources with annotations, and how each was mapped last."""
+        return annotated_sources(self._engine)
 
     def add(self, run: int, author: Author, contents: Sequence[Content]) -> list[int]:
         """Add annotations in one step; returns their ids.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from app.camera import CameraPicture
 from app.story.questions import NoStoryError, Questions, Send
 from app.story.records import ClusterStory, TreeStory
 from app.worker_messages import Answer
@@ -52,6 +53,14 @@ class Asking:
             NoStoryError: There is none.
         """
         return await self._questions.compare(self._shown_run(), [each.model_dump() for each in sets])
+
+    async def camera(self, stamp_ns: int) -> CameraPicture:
+        """What the run's camera saw at a time.
+
+        Raises:
+            NoStoryError: There is no picture.
+        """
+        return await self._questions.camera(self._shown_run(), stamp_ns)
 
     def _shown_run(self) -> int:
         run = self._run()

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from app.story.records import History
 from pipeline.records import Frame
+from pipeline.rerun import Recalled
 
 _WIDTH = 11  # scan, number, observations, time, x, y, var x, cov xy, var y, DBH, its sigma
 _SCAN, _NUMBER, _OBSERVATIONS, _TIME = range(4)
@@ -31,7 +32,15 @@ class TreeHistory:
     def __len__(self) -> int:
         return self._count
 
-    def record(self, frame: Frame, start_ns: int) -> None:
+    def before(self, scan: int) -> TreeHistory:
+        """A memory of its own, of what the scans before one made of the trees."""
+        known = TreeHistory()
+        count = int(np.searchsorted(self._rows[: self._count, _SCAN], scan))
+        known._rows, known._count = self._rows[: max(count, 1024)].copy(), count
+        known._spacing = self._spacing
+        return known
+
+    def record(self, frame: Frame | Recalled, start_ns: int) -> None:
         """Take a scan. What was known of this and later scans is forgotten: the run went back.
 
         Args:

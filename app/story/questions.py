@@ -7,8 +7,9 @@ import itertools
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+from app.camera import CameraPicture
 from app.story.records import ClusterStory, TreeStory
-from app.worker_messages import Answer, AskCluster, AskCompare, AskTree, Question
+from app.worker_messages import Answer, AskCamera, AskCluster, AskCompare, AskTree, Question
 from pipeline.errors import StemmapError
 from pipeline.records import Frame
 
@@ -68,6 +69,17 @@ class Questions:
         if answer.frames is None:
             raise NoStoryError(answer.missing or "there is nothing to compare")
         return answer.frames
+
+    async def camera(self, run: int, stamp_ns: int) -> CameraPicture:
+        """What the run's camera saw at a time.
+
+        Raises:
+            NoStoryError: There is no picture, or nobody answers.
+        """
+        answer = await self._ask(AskCamera(next(self._tickets), run, stamp_ns))
+        if answer.camera is None:
+            raise NoStoryError(answer.missing or "there is no picture")
+        return answer.camera
 
     def take(self, answer: Answer) -> None:
         """Hand an answer to who waits for it, if anybody still does."""

@@ -29,6 +29,11 @@ class Recent:
             while len(self._frames) > _MOST:
                 self._frames.popitem(last=False)
 
+    def forget(self) -> None:
+        """Remember none of them any more."""
+        with self._lock:
+            self._frames.clear()
+
     def find(self, run: int, scan: int) -> Frame | None:
         """The picture of a scan as it was sent last; None when that was too long ago."""
         with self._lock:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from app.forests import kept_forests
 from app.story.history import TreeHistory, half_axes
 from app.story.records import Asked, Circle, ClusterStory, Gathered, Told, TreeStory
 from pipeline.detection import checks
@@ -141,7 +142,8 @@ def gathered(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor)
     if distance[row] > _COLUMN_REACH:
         return None
     share, verdict = columns.share[row], Verdict(int(columns.verdict[row]))
-    effect = what_told(columns.figures[row], standard_forest(sensor.rings > 0), Verdict.TREE)
+    forest = kept_forests()(parameters.gathering.forest, sensor.rings > 0)
+    effect = what_told(columns.figures[row], forest, Verdict.TREE)
     strongest = np.argsort(-np.abs(effect), kind="stable")[:_MOST_TOLD]
     return Gathered(
         verdict=verdict.label,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.gathering.features import NAMES
+from pipeline.gathering.features import NAMES, RAYS
 from pipeline.gathering.forest import ALL_AROUND, CLASSES, ONE_WAY
 from pipeline.records import Float, Int, Verdict
 
@@ -30,6 +30,7 @@ class Plan:
         tree: What a tree counts: by it the share of votes that parts trees from all else best is the
             same for both kinds of sensor.
         upright: How many times more poles and persons count: they are few and hard to tell.
+        rays: Whether figures that rays tell are asked for.
     """
 
     method: str
@@ -43,13 +44,19 @@ class Plan:
     simulated: float
     tree: float
     upright: float
+    rays: bool
 
 
 # A sensor that looks one way sees a trunk from one side and no higher than its field of view: trained on
-# simulated parks too, it finds fewer real ones (docs/trunks.md has the figures).
+# simulated parks too, it finds fewer real ones, and four real parks are too few to learn from what rays
+# tell (docs/trunks.md has the figures).
 PLANS = {
-    ALL_AROUND: Plan("best", 16, 18, 6, 300, 0.3, same=5.0, other=1.0, simulated=1.0, tree=0.67, upright=2.0),
-    ONE_WAY: Plan("extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.25, upright=1.0),
+    ALL_AROUND: Plan(
+        "best", 40, 18, 6, 150, 0.3, same=5.0, other=1.0, simulated=1.0, tree=0.67, upright=2.0, rays=True
+    ),
+    ONE_WAY: Plan(
+        "extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.25, upright=1.0, rays=False
+    ),
 }
 
 
@@ -100,6 +107,8 @@ def grow(examples: list[Examples], kind: str, seed: int = 0) -> Grown:
     weight[np.isin(label, UPRIGHT)] *= plan.upright
     used = (label != DOUBTFUL) & (weight > 0.0)
     figures, label, weight = figures[used], label[used], weight[used]
+    if not plan.rays:
+        figures = figures[:, :RAYS]
     method = ExtraTreesClassifier if plan.method == "extra" else RandomForestClassifier
     trees = method(
         plan.trees,
@@ -132,7 +141,7 @@ def _shares(tree: Any, figures: Float, label: Int, weight: Float) -> Float:  # n
 
 def shares(grown: Grown, figures: Float) -> Float:
     """Votes in the order of CLASSES, shape (N, classes)."""
-    leaf = grown.trees.apply(figures.astype(np.float32))
+    leaf = grown.trees.apply(figures[:, : grown.trees.n_features_in_].astype(np.float32))
     votes: Float = np.mean([share[leaf[:, k]] for k, share in enumerate(grown.share)], axis=0)
     return votes
 
@@ -145,18 +154,20 @@ def as_json(grown: dict[str, Grown], scenes: list[str]) -> dict[str, Any]:
         "classes": [kind.label for kind in CLASSES],
         **{
             kind: [
-                _node(tree.tree_, share, 0) for tree, share in zip(g.trees.estimators_, g.share, strict=True)
+                node_of(tree.tree_, share, 0)
+                for tree, share in zip(g.trees.estimators_, g.share, strict=True)
             ]
             for kind, g in grown.items()
         },
     }
 
 
-def _node(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
+def node_of(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
+    """The JSON of a node of a tree of scikit-learn; `share`: of the kinds in each node, (nodes, classes)."""
     if tree.children_left[row] < 0:
         return {"share": [int(v) if v in (0.0, 1.0) else v for v in share[row].tolist()]}
-    yes = _node(tree, share, tree.children_left[row])
-    no = _node(tree, share, tree.children_right[row])
+    yes = node_of(tree, share, tree.children_left[row])
+    no = node_of(tree, share, tree.children_right[row])
     if "share" in yes and yes == no:
         return yes
     threshold = round(float(tree.threshold[row]), 4)

@@ -12,6 +12,7 @@ import numpy as np
 
 from app.training.growing import Examples
 from pipeline.errors import StemmapError
+from pipeline.files import write_beside
 
 
 def kept_or_made(folder: Path | None, scene: str, make: Callable[[], Iterable[Examples]]) -> list[Examples]:
@@ -27,14 +28,15 @@ def kept_or_made(folder: Path | None, scene: str, make: Callable[[], Iterable[Ex
             for k, e in enumerate(made)
             for name in ("axis", "figures", "label")
         }
-        np.savez(
-            file,
-            scene=scene,
-            simulated=made[0].simulated,
-            all_around=made[0].all_around,
-            sets=len(made),
-            **columns,
-        )
+        with write_beside(file) as partial, partial.open("wb") as out:
+            np.savez(
+                out,
+                scene=scene,
+                simulated=made[0].simulated,
+                all_around=made[0].all_around,
+                sets=len(made),
+                **columns,
+            )
     return made
 
 

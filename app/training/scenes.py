@@ -13,7 +13,7 @@ from app.training.stands import furnished_stand
 from app.training.streets import simulate_street
 from pipeline import ground
 from pipeline.acquisition import acquire
-from pipeline.gathering import Gathering, View, steepest_by_direction
+from pipeline.gathering import Gathering, View, depth_image, steepest_by_direction
 from pipeline.gathering.forest import CLASSES, Forest
 from pipeline.geometry import Pose2, Pose3
 from pipeline.parameters import Parameters
@@ -49,7 +49,7 @@ def gathered(
 ) -> Iterator[Columns]:
     """The columns of a run mapped with the poses it tells, after each of MARKS scans and at the end."""
     taken = 0
-    gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forest=_no_forest())
+    gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forests=_no_forest)
     before = b""
     for step in run:
         repeated = step.scan.points.tobytes()
@@ -61,7 +61,8 @@ def gathered(
         height = height_above(raw, terrain)
         free = clear_range(raw, ground.in_band(raw, height, parameters.ground), offset)
         steepest = steepest_by_direction(raw, offset, sensor.rings > 0)
-        view = View(step.T_odom_base or Pose2(), offset, free, steepest, terrain.height)
+        pose = step.T_odom_base or Pose2()
+        view = View(pose, offset, free, steepest, depth_image(raw), terrain.height)
         gathering.add(raw, height, step.index, view)
         taken += 1
         if taken in MARKS:
@@ -196,7 +197,7 @@ def _distance(axis: Float, place: Float) -> Float:
     return distance
 
 
-def _no_forest() -> Forest:
+def _no_forest(_name: str, _all_around: bool) -> Forest:
     """One leaf that knows nothing: the trees are what is being made."""
     none = np.full(1, -1, np.int32)
     zero = np.zeros(1, np.int32)

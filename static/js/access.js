@@ -4,10 +4,10 @@ import { get } from "./api.js";
 import { byId, el } from "./dom.js";
 
 // What changes something for everybody, or gives the server work; of panels the contents, so that they can be scrolled.
-const TOUCHED = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#compare-button", "#source-button", "#notice-open"];
+const TOUCHED = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#source-button", "#notice-open"];
 const PANELS = ["panel-annotate", "panel-tune"];
 
-export let access = { role: "owner", viewer_link: null };
+export let access = { role: "owner", viewer_link: null, robots: null };
 export const looksOnly = () => access.role === "viewer";
 // An action that changes something: who may only look finds no such entry, and no key does it.
 export const edits = (run) => Object.assign((...given) => (looksOnly() ? undefined : run(...given)), { edits: true });
@@ -24,6 +24,10 @@ export async function startAccess() {
     access = await get("/api/access");
   } catch {
     return; // not connected; what may not be done is refused anyway
+  }
+  if (access.robots) {
+    const title = "The page of all robots: a card each, and one map";
+    document.querySelector(".strip-end").prepend(el("a", { id: "robots-link", class: "quiet small", href: access.robots, text: "All robots", title }));
   }
   if (!looksOnly()) return;
   document.body.classList.add("viewer");

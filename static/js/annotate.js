@@ -1,7 +1,8 @@
 // What a person says of the trees: goes to the server one edit after the other, and comes back to all browsers.
 
-import { request } from "./api.js";
+import { get, request } from "./api.js";
 import { recall, remember } from "./dom.js";
+import { percent } from "./format.js";
 import { select } from "./live.js";
 import { changed, on, state } from "./state.js";
 import { visible } from "./tabs.js";
@@ -21,6 +22,8 @@ export const draft = {
   undo: 0,
   redo: 0,
 };
+const DOUBTS_EVERY = 2000; // [ms]
+const doubts = { of: new Map(), needed: 0, asking: false, again: 0 }; // what the decision trees are unsure of, by the tree's number
 const versions = new Map(); // "id:version" of what was seen to the version that our own edit made of it
 let last = Promise.resolve(), nudging = 0;
 
@@ -126,8 +129,32 @@ function nearestRow({ x, y }) {
   return best;
 }
 
+// The one whose votes lie nearest to what makes a tree comes first; of those without votes the one seen least often.
 export const unjudged = () => (state.map?.trees ?? []).filter((tree) => !nearestRow(tree))
-  .sort((a, b) => a.observations - b.observations || a.number - b.number);
+  .sort((a, b) => margin(a) - margin(b) || a.observations - b.observations || a.number - b.number);
+
+const NEVER = 9; // wider than any margin of votes
+function margin({ number }) {
+  const votes = doubts.of.get(number)?.votes ?? null;
+  return votes === null ? NEVER : Math.abs(votes - doubts.needed);
+}
+
+export function doubtInWords({ number }) {
+  const doubt = doubts.of.get(number);
+  if (!doubt || doubt.votes === null) return "";
+  return `, votes: tree ${percent(doubt.votes)} (${percent(doubts.needed)} are needed), ${doubt.next} ${percent(doubt.next_votes)}`;
+}
+
+async function askDoubts() {
+  if (doubts.asking || performance.now() < doubts.again || !annotating()) return;
+  doubts.asking = true;
+  const told = await get("/api/doubts").catch(() => null);
+  Object.assign(doubts, { asking: false, again: performance.now() + DOUBTS_EVERY });
+  if (!told) return;
+  doubts.needed = told.needed;
+  doubts.of = new Map(told.trees.map((doubt) => [doubt.tree, doubt]));
+  news();
+}
 
 // The selected tree is one, or is something else; then to the next, unless another was selected meanwhile.
 export async function judge(kind) {
@@ -142,7 +169,7 @@ export async function judge(kind) {
   if (!draft.error && state.selected === tree.number) next();
 }
 
-// The one seen least often first; after it the next.
+// The one that is doubted most first; after it the next.
 export function next() {
   const left = unjudged();
   const place = left.findIndex(({ number }) => number === state.selected);
@@ -214,5 +241,6 @@ export function startAnnotating() {
     }
     news();
   });
+  on("map tab", askDoubts);
   on("tab", () => annotating() || !draft.adding || toggleAdding(false));
 }

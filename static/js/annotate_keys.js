@@ -6,7 +6,7 @@ const STEP = 0.01; // [m]
 const ARROWS = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP], ArrowDown: [0, -STEP] };
 
 export const ANNOTATE_KEYS = [
-  ["a", "add trees by clicks on the map (in the tab Annotate, as those below)"], ["shift+click", "in the 3D scene: add a tree there"], ["y n", "the selected tree is one, or is none"], ["tab", "the next tree that nobody judged"],
+  ["a", "add trees by clicks on the map (in the tab Annotate, as those below)"], ["shift+click", "in the 3D scene: add a tree there"], ["y n", "the selected tree is one, or is none"], ["tab", "the next tree that nobody judged, the most doubted first"],
   ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete it"], ["ctrl+z ctrl+shift+z", "undo, and do again"],
 ];
 

@@ -1,8 +1,9 @@
 // The tab Annotate: how much is judged, what can be done, and the list of annotations.
 
-import { callMe, change, choose, draft, importTable, judge, KINDS, myName, NAME, next, redo, remove, rows, toggleAdding, truthInWords, undo, unjudged } from "./annotate.js";
+import { callMe, change, choose, doubtInWords, draft, importTable, judge, KINDS, myName, NAME, next, redo, remove, rows, toggleAdding, truthInWords, undo, unjudged } from "./annotate.js";
 import { byId, el, setText } from "./dom.js";
 import { count, figure, fixed } from "./format.js";
+import { learnSection, startLearning } from "./learn.js";
 import { on, state } from "./state.js";
 import { visible } from "./tabs.js";
 
@@ -34,7 +35,7 @@ function build() {
       button("annotate-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("annotate-redo", "Redo", "Do it again (Ctrl+Shift+Z)", redo)),
     el("div", { class: "annotate-tools" },
       button("annotate-add", "Add", "Add trees by clicks on the map (a)", () => toggleAdding()),
-      button("annotate-next", "Next", "The next found tree that nobody judged, the one seen least often first (Tab on the map)", next),
+      button("annotate-next", "Next", "The next found tree that nobody judged, the one that the decision trees doubt most first (Tab on the map)", next),
       button("annotate-yes", "Is a tree", "The selected found tree is one (y)", () => judge("tree")),
       button("annotate-no", "Is no tree", "The selected found tree is something else (n)", () => judge(draft.kind)), el("label", { class: "annotate-as" }, "it is ", kind)),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
@@ -46,7 +47,8 @@ function build() {
       el("label", {}, "Your name ", name),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; the headers of other tools are known", () => file.click()), unit, file,
       el("a", { class: "small", href: "/api/annotations.csv", download: "truth.csv", text: "CSV" }),
-      el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "GeoJSON" })));
+      el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "GeoJSON" })),
+    learnSection());
 }
 
 async function take(file, unit) {
@@ -121,7 +123,7 @@ function hint() {
   if (draft.adding) return "Click on the map where a tree stands; the ring shows where it will be. Esc ends.";
   if (draft.said) return draft.said;
   const tree = unjudged().find(({ number }) => number === state.selected);
-  if (tree) return `Tree ${tree.number}, seen in ${count(tree.observations, "scan")}, ${tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm`}: is it one? y or n; Tab leaves it and goes to the next.`;
+  if (tree) return `Tree ${tree.number}, seen in ${count(tree.observations, "scan")}, ${tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm`}${doubtInWords(tree)}: is it one? y or n; Tab leaves it and goes to the next.`;
   if (!rows().length) return "Say which trees really stand here: press Next and judge what was found, or Add and click on the map what was missed (or shift-click in the 3D scene).";
   return truthInWords();
 }
@@ -147,6 +149,7 @@ function later() {
 
 export function startAnnotatePanel() {
   build();
+  startLearning();
   on("map", later);
   on("annotating", () => { if (draft.error || draft.adding) draft.said = ""; fill(); });
   on("tab annotations selection", fill);

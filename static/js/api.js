@@ -26,13 +26,16 @@ export const post = (path, body) =>
 export const patch = (path, body) =>
   request(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
 
+export const put = (path, body) =>
+  request(path, { method: "PUT", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+
 // Bytes instead of JSON.
 export const block = async (path, options = {}) => (await answered(path, options)).arrayBuffer();
 export const blockFor = (path, body) =>
   block(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
 
 export const get = (path) => request(path);
-export const open = (uri, odometry) => post("/api/open", { uri, odometry, seed: 0 });
+export const open = (uri, odometry, chosen = {}) => post("/api/open", { uri, odometry, seed: 0, ...chosen });
 
 // Commands go one after the other, so that two quick steps are two steps.
 let last = Promise.resolve();

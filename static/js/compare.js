@@ -22,7 +22,7 @@ function build() {
   for (const [k, side] of ["a", "b"].entries()) {
     const list = el("select", { "aria-label": `Set ${side.toUpperCase()}`, "data-set": side, onchange: refresh });
     const canvas = el("canvas", { tabindex: "0", role: "img", "aria-label": `Clusters by set ${side.toUpperCase()}` });
-    const take = el("button", { class: "small", text: "Use", title: "Take this set for the run", onclick: () => use(nameOf(side)) });
+    const take = el("button", { "data-edit": true, class: "small", text: "Use", title: "Take this set for the run", onclick: () => use(nameOf(side)) });
     sides[side] = { k, list, canvas, take, picture: new PointPicture(canvas, eye, redraw) };
     byId(`compare-${side}`).replaceChildren(el("div", { class: "compare-head" }, el("i", { class: `sign ${side}`, text: side.toUpperCase() }), list, take), canvas);
   }

@@ -17,10 +17,15 @@ const takers = {
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   annotations(message) { state.annotations = message; },
+  learning(message) { state.learning = message; },
   selection(message) { takeSelection(message.tree ?? null, message.cluster ?? null); },
   events(message) { state.events = message.events; },
   view(message) { state.view = message; },
+  remapped(message) { state.remapped = message.ghost ? message : null; },
+  rough(message) { state.rough = message.places ? { ...message, ghost: message.places.map(([x, y]) => [x, y, null]), changes: [] } : null; },
+  search(message) { state.search = message; },
   loop(message) { state.loop = message.to_s === undefined ? null : message; },
+  sensitivity(message) { state.sensitivity = message.name ? message : null; },
   missing(message) { state.missing = message; },
 };
 
@@ -58,6 +63,7 @@ export function connect() {
   socket = new WebSocket(`${scheme}://${location.host}/api/live`);
   socket.onopen = () => {
     wait = FIRST_WAIT;
+    chosen = null; // what was sent over the link before may never have arrived
     Object.assign(state, { connected: true, lostAt: 0, heardAt: performance.now() });
     state.odometry.length = 0;
     changed("connection");
@@ -79,7 +85,8 @@ function send(message) {
 export function select(tree) {
   if (socket?.readyState !== WebSocket.OPEN) return;
   send({ type: "select", tree });
-  chosen = { tree, until: performance.now() + ANSWER_WAIT };
+  // What is selected already has no answer, and to wait for one would hide what is selected next, elsewhere.
+  if (state.selected !== tree || state.selectedCluster) chosen = { tree, until: performance.now() + ANSWER_WAIT };
   Object.assign(state, { selected: tree, selectedCluster: null });
   changed("selection");
 }

@@ -3,6 +3,7 @@
 import { startAnnotating } from "./annotate.js";
 import { startAnnotatePanel } from "./annotate_panel.js";
 import { startAnnotateScene } from "./annotate_scene.js";
+import { startCamera } from "./camera.js";
 import { startCompare } from "./compare.js";
 import { startClusters } from "./clusters.js";
 import { startDrawer } from "./drawer.js";
@@ -30,6 +31,6 @@ import { startTunePanel } from "./tune_panel.js";
 import { startTuning } from "./tune.js";
 import { startWelcome } from "./welcome.js";
 
-for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startAnnotateScene, startTunePanel, startTuning, startOverlay, startStages, startCompare,
+for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startAnnotateScene, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
   startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startPalette, startDrawer, startWelcome, startShare]) start();
 connect();

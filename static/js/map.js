@@ -3,7 +3,7 @@
 import { draft } from "./annotate.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "./annotate_map.js";
 import { byId, setText } from "./dom.js";
-import { saveCanvas } from "./download.js";
+import { saveCanvas, saveCsv } from "./download.js";
 import { figure, NONE } from "./format.js";
 import { select, selectCluster } from "./live.js";
 import { measureAt, measuredText, measureTowards, measuring } from "./measure.js";
@@ -91,6 +91,12 @@ function describe(tree, truth, cluster) {
   if (cluster !== null && !tree) lines.push(`Cluster: ${state.map.clusters.verdict[cluster]}, ${state.map.clusters.size[cluster]} points`);
   if (truth) lines.push(`Truth: ${truth.kind}${truth.dbh_cm === null ? "" : `, ${figure(truth.dbh_cm)} cm`}`);
   return lines.join("\n") || NONE;
+}
+
+function drawnAsTable() {
+  const trees = (state.map?.trees ?? []).map((tree) => ["tree", tree.number, tree.x, tree.y, tree.dbh_cm]);
+  const truth = (state.truth ?? []).map(({ kind, x, y, dbh_cm: dbh }) => [`truth: ${kind}`, null, x, y, dbh]);
+  return [["what", "number", "x_m", "y_m", "dbh_cm"], ...trees, ...truth, ...state.path.map(([x, y], scan) => ["path", scan, x, y, null])];
 }
 
 function hover(px, py) {
@@ -194,8 +200,9 @@ export function startMap() {
     redraw();
   }, { passive: false });
   byId("map-png").addEventListener("click", () => saveCanvas("map.png", canvas));
+  byId("map-csv").addEventListener("click", () => saveCsv("map.csv", drawnAsTable()));
   byId("map-fit").addEventListener("click", () => { view.moved = false; view.fit(bounds(), true); redraw(); });
   on("annotating", lookAtNext);
-  on("map truth selection measure tab annotations annotating compare", redraw);
+  on("map truth selection measure tab annotations annotating compare ghost", redraw);
   on("theme", repaint);
 }

@@ -14,6 +14,7 @@ export function drawMap(pen, view, state, colours) {
   drawLine(pen, view, alignedOdometry(state), colours.odometry, 1.2);
   drawLine(pen, view, state.path, colours.path, 2);
   for (const truth of state.truth ?? []) drawTruth(pen, view, truth, colours);
+  if (state.ghost) drawGhost(pen, view, state.ghost, colours);
   const trees = state.map?.trees ?? [];
   drawClusters(pen, view, state.map?.clusters, colours);
   for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected, colours);
@@ -99,6 +100,30 @@ export function drawTruth(pen, view, truth, colours) {
     for (const [dx, dy] of [[5, 0], [0, 5], [-5, 0], [0, -5]]) pen.lineTo(px + dx, py + dy);
   }
   pen.stroke();
+}
+
+// The map as it was before the run was mapped again: dashed where a tree stood, and a ring around what is not as it was.
+function drawGhost(pen, view, { ghost, changes }, colours) {
+  Object.assign(pen, { strokeStyle: colours.axis, lineWidth: 1.5 });
+  pen.setLineDash([3, 3]);
+  for (const [x, y, dbh] of ghost) {
+    pen.beginPath();
+    pen.arc(...view.toScreen(x, y), symbolRadius({ dbh_cm: dbh === null ? null : 100 * dbh }, view.scale) + 2, 0, TURN);
+    pen.stroke();
+  }
+  pen.setLineDash([]);
+  pen.lineWidth = 2;
+  for (const { kind, x, y } of changes) {
+    const [px, py] = view.toScreen(x, y);
+    pen.strokeStyle = kind === "vanished" ? colours.robot : colours.selection;
+    pen.beginPath();
+    pen.arc(px, py, 13, 0, TURN);
+    if (kind === "vanished") { // crossed out
+      pen.moveTo(px - 9, py - 9);
+      pen.lineTo(px + 9, py + 9);
+    }
+    pen.stroke();
+  }
 }
 
 // Small squares: what this scan took for something else than a tree.

@@ -3,7 +3,7 @@
 import { byId } from "./dom.js";
 import { changed } from "./state.js";
 
-const NAMES = ["stages", "compare"];
+const NAMES = ["stages", "compare", "camera"];
 let current = null;
 
 export const shownOver = (name) => current === name;

@@ -2,6 +2,7 @@
 
 import { get, open } from "./api.js";
 import { byId, el, setText } from "./dom.js";
+import { chosenFor, startInside } from "./source_inside.js";
 import { on, state } from "./state.js";
 import { startUpload } from "./upload.js";
 
@@ -44,7 +45,7 @@ export async function ask(uri) {
   say("");
   setText(byId("source-open"), "Opening…");
   try {
-    await open(uri, byId("source-odometry").value);
+    await open(uri, byId("source-odometry").value, chosenFor(uri));
   } catch (error) {
     finish(error.message);
   }
@@ -77,6 +78,7 @@ export function startSources() {
     event.preventDefault();
     ask(byId("source-uri").value.trim());
   });
+  startInside();
   on("status", follow);
   startUpload(async ({ uri }) => { if (!dialog.open) await openSources(); ask(uri); });
 }

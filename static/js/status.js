@@ -70,6 +70,7 @@ function show() {
     cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
   }
   cells.health.cell.title = healthFigures();
+  cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   setText(byId("source-name"), shortSource(status.source) || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
@@ -105,6 +106,19 @@ function showState() {
   showNotice(quiet);
 }
 
+// What stands in the robot's way, below the strip so that nothing moves for it. A screen reader says the zone when it
+// changes, not every distance.
+const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "? The sensor does not see the way ahead" };
+
+function showWay() {
+  const clearance = state.map?.clearance;
+  const text = clearance && !NO_FIGURES.includes(state.status?.state) && WAY[clearance.zone];
+  byId("way").hidden = !text;
+  byId("way").dataset.zone = clearance?.zone ?? "";
+  if (text) setText(byId("way-zone"), text);
+  setText(byId("way-distance"), clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
+}
+
 function showNotice(quiet) {
   const notice = byId("notice");
   const status = state.status;
@@ -127,6 +141,7 @@ const seconds = (since) => Math.floor((performance.now() - since) / 1000);
 export function startStatus() {
   build();
   on("status map evaluation", show);
+  on("status map", showWay);
   on("status connection", showState);
   setInterval(showState, 1000);
 }

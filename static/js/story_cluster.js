@@ -32,6 +32,7 @@ function why(story) {
   if (!story.checks.length) return "Another program found it; it is taken as it is.";
   const failed = story.checks.find((check) => check.fails);
   if (!failed) return "It passed every check below, so it was taken as a stem and feeds SLAM.";
+  if (failed.verdict === "at border") return "It goes on beyond the box, the range or the side of the view, so a part of it is not seen.";
   if (!failed.relation) return "Something nearer hides its edge, so its middle cannot be told.";
   const side = failed.relation === "at most" ? "above" : "below";
   return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${failed.title}, ${plain(failed.limit, failed.unit)}.`;
@@ -81,7 +82,7 @@ function figures(story) {
   const fit = story.circle;
   const rows = [["points", String(story.size)], ["λ1/λ2", story.eccentricity === null && story.size > 1 ? "∞" : figure(story.eccentricity)], ["from sensor", `${figure(story.distance)} m`]];
   if (fit) {
-    rows.push(["radius", `${figure(100 * fit.radius)} ± ${figure(100 * fit.radius_sigma, 2)} cm`], ["visible arc", `${figure(fit.arc_deg)}°`],
+    rows.push(["radius", `${figure(100 * fit.radius)} ± ${figure(100 * fit.radius_sigma, 2)} cm`], ["diameter", `${figure(200 * fit.radius)} ± ${figure(200 * fit.radius_sigma, 2)} cm`], ["visible arc", `${figure(fit.arc_deg)}°`],
       ["axis leans", `${figure(fit.lean_deg, 2)}°`], ["centre ±", `${figure(100 * fit.ellipse[0], 2)} × ${figure(100 * fit.ellipse[1], 2)} cm`]);
   } else rows.push(["circle", "none fitted"]);
   return el("dl", { class: "list" }, ...rows.flatMap(([title, value]) => [el("dt", { text: title }), el("dd", { text: value })]));
@@ -98,7 +99,7 @@ function residuals(story) {
   const marks = [-180, -90, 0, 90, 180].map((degrees) => text(x((degrees * Math.PI) / 180), height - 3, `${degrees}°`, "small", "middle"));
   const band = svg("rect", { x: left, width: width - left - 18, y: y(sigma), height: y(-sigma) - y(sigma), class: "band" });
   return el("figure", {},
-    el("figcaption", { text: `Residuals in mm around the stem; 0° faces the sensor, the band is its sigma of ${figure(sigma, 2)} mm` }),
+    el("figcaption", { text: `How far each point lies outside (+) or inside (−) the circle, in mm, around the stem; 0° faces the sensor, the band is how much it errs (1 sigma, ${figure(sigma, 2)} mm)` }),
     picture(width, height, "Residuals in millimetres over the angle around the stem", band, line(left, y(0), width - 18, y(0), "zero"),
       text(left - 5, y(most) + 8, `+${figure(most, 2)}`, "small", "end"), text(left - 5, y(0) + 4, "0", "small", "end"),
       text(left - 5, y(-most), `−${figure(most, 2)}`, "small", "end"), ...dots, ...marks));

@@ -17,9 +17,14 @@ const HINTS = {
   gone: "part of the scans with free view in which nothing stood there", "returns a slice": "logarithm of the returns in a slice",
   thick: "width across the long side, m", wide: "width along the long side, m", uneven: "how unevenly wide the slices are",
   "part of the view filled": "part of the height that was looked at which the stem fills",
+  opaque: "part of the rays at this height that ended at it; the others passed and ended behind",
+  "free above what is clean": "how much above the stem rays passed before the next return, m",
+  "free above the highest return": "how much above its top rays passed, m", "rays up to": "up to this height rays tell what stands there, m",
+  "nothing above what is clean": "from the stem up to the next return, m",
 };
 const hint = (name) => HINTS[name] ?? HINTS[Object.keys(HINTS).find((key) => name.startsWith(key))] ?? "";
 const RULES = {
+  tree: (g) => `single scans fitted a round trunk on more than half of its sides, so votes for what is not round count a tenth. With them a tree needs ${percent(g.tree_share)} of the votes.`,
   moving: (g) => `Nothing stood there in ${g.absent} of the ${g.absent + g.present} scans with free view, so it moved away.`,
   wall: () => "It goes on sideways and is wide but not thick: a rule takes that for part of a wall before the votes count.",
   "too few points": () => "So few voxels can be piled up by chance; the votes do not count.",

@@ -1,14 +1,16 @@
-// The table of trees (Table 2): sorted by any column, with a box to find one.
+// The table of trees (Table 2): sorted by any column, sifted by what is typed above it.
 
 import { byId, el, setText } from "./dom.js";
+import { saveCanvas } from "./download.js";
 import { count, figure, fixed, NONE } from "./format.js";
 import { select } from "./live.js";
 import { on, state } from "./state.js";
 import { openStory } from "./story.js";
+import { filterOf, HELP, sigma } from "./table_filter.js";
+import { pictureOf } from "./table_picture.js";
 import { visible } from "./tabs.js";
 
 const EVERY = 400; // [ms] between two fillings; nobody reads faster
-const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2));
 
 // key, title, tooltip, text, what it is sorted by
 const COLUMNS = [
@@ -18,7 +20,7 @@ const COLUMNS = [
   ["sigma", "± cm", "Standard deviation of the position", (t) => figure(sigma(t), 2), sigma],
   ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm ?? -1],
   ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity],
-  ["seen", "seen", "Number of scans it was seen in", (t) => String(t.observations), (t) => t.observations],
+  ["seen", "seen", "Number of scans that detected it; 0: found only in what the scans gathered together", (t) => String(t.observations), (t) => t.observations],
 ];
 const rows = new Map();
 let order = { key: "number", descending: false };
@@ -78,7 +80,8 @@ function fill() {
   if (!visible("trees")) return;
   const all = state.map?.trees ?? [];
   const wanted = byId("find").value.trim();
-  const trees = sorted(wanted ? all.filter((tree) => String(tree.number).startsWith(wanted)) : all);
+  const { holds, refused } = filterOf(wanted);
+  const trees = sorted(all.filter(holds));
   const body = byId("trees").tBodies[0];
   trees.forEach((tree, place) => {
     const row = rowOf(tree);
@@ -87,11 +90,14 @@ function fill() {
   while (body.rows.length > trees.length) body.lastChild.remove();
   setText(byId("tree-count"), wanted ? `${trees.length} of ${all.length}` : count(all.length, "tree"));
   byId("trees").hidden = !trees.length;
-  setText(byId("trees-empty"), trees.length ? "" : emptyText(all.length, wanted));
+  byId("trees-png").disabled = !trees.length;
+  byId("find").setAttribute("aria-invalid", String(Boolean(refused)));
+  setText(byId("trees-empty"), trees.length ? "" : emptyText(all.length, wanted, refused));
 }
 
-function emptyText(all, wanted) {
-  if (all) return `No tree number begins with “${wanted}”.`;
+function emptyText(all, wanted, refused) {
+  if (all && refused) return `“${refused}” is not understood. ${HELP}`;
+  if (all) return `No tree fits “${wanted}”.`;
   return state.map ? "No tree yet. A tree is listed when it was seen in enough scans; the tab Clusters tells what became of the clusters."
     : "Nothing mapped yet. Press play, or open a run.";
 }
@@ -103,7 +109,9 @@ function later() {
 export function startTable() {
   head();
   byId("find").addEventListener("input", fill);
-  on("map", later);
+  byId("find").title = HELP;
+  byId("trees-png").addEventListener("click", () => saveCanvas("trees.png", pictureOf(byId("trees"))));
+  on("map truth annotations", later);
   on("tab", fill);
   on("selection", () => {
     for (const [number, row] of rows) row.setAttribute("aria-selected", String(number === state.selected));

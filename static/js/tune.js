@@ -19,7 +19,7 @@ export const savedSets = () => state.sets?.sets ?? [];
 export const specOf = (name) => tuning.specs.find((spec) => spec.name === name);
 
 // Requests go one after the other, so that undo undoes what was done before it.
-function ask(work) {
+export function attempt(work) {
   last = last.then(async () => {
     try {
       const done = await work();
@@ -43,20 +43,20 @@ export async function setValue(name, value) {
   while (Object.keys(waiting).length) {
     const changes = waiting;
     waiting = {};
-    await ask(() => patch("/api/parameters", { changes }));
+    await attempt(() => patch("/api/parameters", { changes }));
   }
   sending = false;
   changed("tuning");
 }
 
 export const isMoving = (name) => name in waiting;
-export const undo = () => state.parameters?.undo && ask(() => post("/api/parameters/undo", {}));
-export const redo = () => state.parameters?.redo && ask(() => post("/api/parameters/redo", {}));
-export const reset = (names) => ask(() => post("/api/parameters/reset", { names }));
-export const use = (name) => ask(() => post("/api/sets/use", { name }));
-export const save = (name) => ask(() => post("/api/sets", { name, who: myName() }));
-export const forget = (name) => ask(() => post("/api/sets/delete", { name }));
-export const takeFile = (file, text) => ask(() => post("/api/sets/upload", { file: file.slice(0, 100), text }));
+export const undo = () => state.parameters?.undo && attempt(() => post("/api/parameters/undo", {}));
+export const redo = () => state.parameters?.redo && attempt(() => post("/api/parameters/redo", {}));
+export const reset = (names) => attempt(() => post("/api/parameters/reset", { names }));
+export const use = (name) => attempt(() => post("/api/sets/use", { name }));
+export const save = (name) => attempt(() => post("/api/sets", { name, who: myName() }));
+export const forget = (name) => attempt(() => post("/api/sets/delete", { name }));
+export const takeFile = (file, text) => attempt(() => post("/api/sets/upload", { file: file.slice(0, 100), text }));
 export const refuse = (text) => { tuning.error = text; changed("tuning"); };
 
 // Ctrl+Z, Ctrl+Shift+Z and Ctrl+Y while the tab is open and nobody types. Returns whether it was meant for it.

@@ -4,8 +4,12 @@ import { byId, el, setText } from "./dom.js";
 import { countsBeforeAfter } from "./tune_counts.js";
 import { on, state } from "./state.js";
 import { forget, isChanged, isTuning, redo, refuse, reset, save, savedSets, specOf, takeFile, tuning, undo, use } from "./tune.js";
+import { arrange, rankOf } from "./tune_find.js";
 import { rowOf } from "./tune_row.js";
+import { matterButton, startSensitivity } from "./tune_sensitivity.js";
 import { openTab } from "./tabs.js";
+import { searchPart, startSearch } from "./tune_search.js";
+import { startWholeRun, wholeRun } from "./tune_whole.js";
 
 const LARGEST_FILE = 100_000;
 const SET_NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .+-]{0,39}$/u;
@@ -41,7 +45,7 @@ function build() {
       el("input", { id: "tune-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && closeName() }),
       el("button", { class: "small primary", text: "Save" }), el("button", { class: "small", type: "button", text: "Cancel", onclick: closeName })),
     el("p", { id: "tune-error", class: "error", role: "alert", hidden: true }),
-    counts,
+    counts, wholeRun, searchPart,
     el("p", { id: "tune-summary", class: "note dim" }),
     el("div", { class: "tune-files" }, find, el("label", { class: "tune-only" }, only, " changed only")),
     el("div", { id: "tune-rows" }, ...stages),
@@ -51,7 +55,7 @@ function build() {
 
 function stageOf(stage) {
   const specs = tuning.specs.filter((spec) => spec.stage === stage);
-  for (const spec of specs) rows.set(spec.name, rowOf(spec));
+  for (const spec of specs) rows.set(spec.name, rowOf(spec, ...(spec.kind === "name" ? [] : [matterButton(spec)])));
   const told = el("small");
   const group = el("details", { "data-stage": stage }, el("summary", {}, stage, told), ...specs.map(({ name }) => rows.get(name).node));
   group.open = OPEN_FIRST.includes(stage);
@@ -62,22 +66,28 @@ function stageOf(stage) {
 
 const sifting = () => Boolean(byId("tune-find").value.trim() || byId("tune-only").checked);
 
-// Shows what is searched for, and opens the stages where it is.
+// Shows what is searched for, what begins with it first, and opens the stages where it is.
 function sift() {
   const words = byId("tune-find").value.trim().toLowerCase().split(/\s+/).filter(Boolean);
   const only = byId("tune-only").checked;
   let found = 0;
+  const stages = [];
   for (const { group, specs, open } of groups.values()) {
     let here = 0;
-    for (const { name } of specs) {
-      const { node } = rows.get(name);
-      node.hidden = !words.every((word) => node.dataset.words.includes(word)) || (only && !isChanged(name));
+    const ranked = [];
+    for (const spec of specs) {
+      const { node } = rows.get(spec.name);
+      node.hidden = !words.every((word) => node.dataset.words.includes(word)) || (only && !isChanged(spec.name));
       here += node.hidden ? 0 : 1;
+      ranked.push({ node, rank: node.hidden || !words.length ? 0 : rankOf(spec, words) });
     }
+    arrange(group, ranked);
+    stages.push({ node: group, rank: here ? Math.min(...ranked.filter(({ node }) => !node.hidden).map(({ rank }) => rank)) : 0 });
     group.hidden = !here;
     group.open = sifting() ? here > 0 : open;
     found += here;
   }
+  arrange(byId("tune-rows"), stages);
   byId("tune-none").hidden = found > 0;
   setText(byId("tune-none"), only && !words.length ? "Nothing differs from the preset. Move a slider, and it is listed here." : "No parameter has these words. Clear the search to see all.");
 }
@@ -166,6 +176,9 @@ export function openParameter(name) {
 export const openSearch = () => { openTab("tune"); byId("tune-find")?.focus(); };
 
 export function startTunePanel() {
+  startWholeRun();
+  startSensitivity();
+  startSearch();
   on("specs", build);
   on("parameters sets", () => isTuning() && show());
   on("tuning", showError);

@@ -3,18 +3,18 @@
 import { el } from "./dom.js";
 import { isChanged, isMoving, redo, refuse, reset, setValue, shown, undo, valueOf } from "./tune.js";
 
-const FINE = 1000; // places of a slider
+export const FINE = 1000; // places of a slider
 const BENT = 3; // how a slider is bent whose usual values lie near its lower end
 
 // Sliders are bent where a straight one would have the useful values within a few pixels.
 const power = ({ minimum, maximum, default: usual }) => (minimum >= 0 && usual - minimum < 0.2 * (maximum - minimum) ? BENT : 1);
 
-function toPlace(spec, value) {
+export function toPlace(spec, value) {
   const part = (value - spec.minimum) / (spec.maximum - spec.minimum);
   return Math.round(FINE * Math.min(1, Math.max(0, part)) ** (1 / power(spec)));
 }
 
-function fromPlace(spec, place) {
+export function fromPlace(spec, place) {
   return rounded(spec, spec.minimum + (spec.maximum - spec.minimum) * (place / FINE) ** power(spec));
 }
 
@@ -24,15 +24,15 @@ function rounded(spec, value) {
   return Math.min(spec.maximum, Math.max(spec.minimum, Number((spec.minimum + steps * step).toFixed(9))));
 }
 
-// Returns {node, show}; `show` brings it in step with what the server holds.
-export function rowOf(spec) {
+// `further` stands beside the name. Returns {node, show}; `show` brings it in step with what the server holds.
+export function rowOf(spec, ...further) {
   const id = `tune-${spec.name}`;
   const back = el("button", { class: "quiet icon back", "aria-label": `Reset ${spec.title}`, text: "↺", onclick: () => reset([spec.name]) });
   const label = el("label", { for: id, title: `${spec.doc} (${spec.name})` }, el("i", { class: "mark-changed", "aria-hidden": "true", text: "●" }), spec.title,
     spec.unit ? el("small", { text: ` ${spec.unit}` }) : "");
-  const [inputs, fill] = spec.kind === "bool" ? box(spec, id) : spec.kind === "choice" ? list(spec, id) : number(spec, id);
+  const [inputs, fill] = spec.kind === "bool" ? box(spec, id) : spec.kind === "choice" ? list(spec, id) : spec.kind === "name" ? word(spec, id) : number(spec, id);
   const node = el("div", { class: "tune-row", "data-parameter": spec.name, "data-words": `${spec.name} ${spec.title} ${spec.doc} ${spec.stage}`.toLowerCase() },
-    label, ...inputs, back);
+    el("span", { class: "tune-name" }, label, ...further), ...inputs, back);
   const show = (wanted) => {
     const different = isChanged(spec.name);
     node.classList.toggle("changed", different);
@@ -52,6 +52,11 @@ function list(spec, id) {
   const input = el("select", { id, class: "wide", onchange: () => setValue(spec.name, input.value) },
     ...spec.choices.map((value) => el("option", { value, text: value })));
   return [[input], (value) => { input.value = value; }];
+}
+
+function word(spec, id) {
+  const input = el("input", { id, class: "wide", type: "text", maxlength: "60", autocomplete: "off", spellcheck: "false", onchange: () => setValue(spec.name, input.value.trim()) });
+  return [[input], (value) => { if (document.activeElement !== input) input.value = value; }];
 }
 
 function number(spec, id) {

@@ -1,6 +1,6 @@
 // What a person sees at the first visit, once.
 
-import { byId, recall, remember } from "./dom.js";
+import { byId, recall, remember, setText } from "./dom.js";
 import { openSources } from "./sources.js";
 import { on } from "./state.js";
 
@@ -12,6 +12,10 @@ export function startWelcome() {
   on("status", ({ status }) => {
     if (asked || recall("welcomed") !== null) return;
     asked = true;
-    if (status.source.startsWith("sim:")) card.showModal(); // who opens a recording knows what this is
+    if (!status.source.startsWith("sim:")) return; // who opens a recording knows what this is
+    const over = status.state === "finished";
+    setText(byId("welcome-title"), over ? "A robot has mapped a stand of trees" : "A robot is mapping a stand of trees");
+    setText(byId("welcome-on"), over ? "Look at its map" : "Keep watching");
+    card.showModal();
   });
 }

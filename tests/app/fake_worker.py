@@ -11,12 +11,12 @@ from app.session import Session
 from app.worker import run_as_worker
 from pipeline.errors import SourceError
 from pipeline.parameters import Parameters
-from pipeline.sources.base import Source
+from pipeline.sources.base import Source, SourceOptions
 from pipeline.steps import steps
 from tests.app.fakes import FakeMapper, FakeSource
 
 
-def open_source(uri: str, _seed: int) -> Source:
+def open_source(uri: str, _options: SourceOptions) -> Source:
     name, _, scans = uri.partition(":")
     if name == "missing":
         raise SourceError("there is no such file", where=uri)

@@ -31,7 +31,7 @@ from pipeline.records import (
     Truth,
     TruthTrees,
 )
-from pipeline.sources.base import Source, SourceDescription
+from pipeline.sources.base import Source, SourceDescription, SourceOptions
 from pipeline.steps import steps
 
 PERIOD_NS = 100_000_000
@@ -179,6 +179,7 @@ def frame(
         radial_std=np.zeros(1),
         arc=np.zeros(1),
         hidden=np.zeros(1, np.bool_),
+        cut=np.zeros(1, np.bool_),
         extent=np.zeros((1, 3)),
         verdict=np.array([8], np.int32),
     )
@@ -229,7 +230,7 @@ def truth_trees() -> TruthTrees:
 def make_session(source: FakeSource, parameters: Parameters | None = None) -> Session:
     """A session on a fake source (opened again and again) with fake mappers."""
 
-    def open_source(uri: str, _seed: int) -> Source:
+    def open_source(uri: str, _options: SourceOptions) -> Source:
         if uri == "missing:":
             raise SourceError("there is no such file", where=uri)
         source.closed = False

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import pytest_asyncio
@@ -53,6 +54,15 @@ def scene_calls(dashboard: Dashboard) -> list[tuple[str, Any]]:
 def browser_knows(dashboard: Dashboard) -> dict[str, Any]:
     messages = [json.loads(text) for _, text in dashboard.live.messages_after(0)]
     return {message["type"]: message for message in messages}
+
+
+async def test_a_source_that_was_left_before_it_was_open_is_not_shown(dashboard: Dashboard) -> None:
+    await dashboard.open(Open("fake:second"))
+    before = len(worker(dashboard).commands)
+    await dashboard.receive(msgspec.structs.replace(opened(run=1), asked="fake:"))
+    assert len(worker(dashboard).commands) == before
+    await dashboard.receive(msgspec.structs.replace(opened(run=2), asked="fake:second"))
+    assert begun(dashboard).run == 2
 
 
 async def test_an_opened_source_is_played(dashboard: Dashboard) -> None:
@@ -210,7 +220,7 @@ async def test_a_cluster_is_selected_with_its_tree_and_stands_while_the_run_goes
 ) -> None:
     await dashboard.receive(opened())
     await dashboard.receive(Shown(1, 0.0, frame(231, 0), 0, path([0.0])))
-    dashboard.select_cluster_soon(231, 4)
+    dashboard.selecting.cluster_soon(231, 4)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     (question,) = [m for m in worker(dashboard).commands if isinstance(m, AskCluster)]
@@ -222,7 +232,7 @@ async def test_a_cluster_is_selected_with_its_tree_and_stands_while_the_run_goes
     assert told["tree"] == 12
     assert told["cluster"] == {"scan": 231, "cluster": 4, "verdict": "too long", "x": 3.0, "y": 4.0}
     await dashboard.receive(Shown(1, 9.0, frame(900, 9), 0, path([0.0])))
-    assert await dashboard.cluster_story(231, 4) == cluster_story()  # the worker is not asked again
+    assert await dashboard.selecting.story(231, 4) == cluster_story()  # the worker is not asked again
     await dashboard.select_tree(None)
     assert browser_knows(dashboard)["selection"]["cluster"] is None
 
@@ -233,7 +243,7 @@ async def test_a_cluster_that_is_not_known_any_more_selects_nothing_and_says_so(
     await dashboard.receive(opened())
     await dashboard.receive(Shown(1, 0.0, frame(231, 0), 0, path([0.0])))
     await dashboard.select_tree(4)
-    dashboard.select_cluster_soon(2, 4)
+    dashboard.selecting.cluster_soon(2, 4)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     (question,) = [m for m in worker(dashboard).commands if isinstance(m, AskCluster)]
@@ -241,12 +251,12 @@ async def test_a_cluster_that_is_not_known_any_more_selects_nothing_and_says_so(
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert browser_knows(dashboard)["missing"]["detail"] == "scan 2 was shown too long ago"
-    assert dashboard.selection.tree == 4
+    assert dashboard.selecting.selection.tree == 4
 
 
 async def test_a_loop_goes_round_once_at_its_end_and_again_after_its_beginning(dashboard: Dashboard) -> None:
     await dashboard.receive(opened())
-    dashboard.play_in_loop((1.0, 2.0))
+    dashboard.loop.choose((1.0, 2.0))
     assert browser_knows(dashboard)["loop"]["to_s"] == 2.0
 
     async def played(state: Any, *times: float) -> list[Any]:
@@ -260,8 +270,8 @@ async def test_a_loop_goes_round_once_at_its_end_and_again_after_its_beginning(d
     assert await played("playing", 1.0, 1.9, 2.3) == [Seek(1.0)]
     assert await played("paused", 1.0, 2.5) == []  # who stands beyond the end stays there
     assert await played("finished", 1.0, 2.5) == [Seek(1.0), Play()]
-    dashboard.play_in_loop(None)
+    dashboard.loop.choose(None)
     assert await played("playing", 1.0, 9.0) == []
-    dashboard.play_in_loop((1.0, 2.0))
+    dashboard.loop.choose((1.0, 2.0))
     await dashboard.open(Open("other:"))
     assert browser_knows(dashboard)["loop"]["value"] is None

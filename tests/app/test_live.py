@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.live import Live
-from app.live_payload import ellipses, first_difference
+from app.live_payload import clearance_payload, ellipses, first_difference
+from pipeline.clearance import Clearance, Zone
 
 
 async def following(stream: Any, n: int) -> list[dict[str, Any]]:
@@ -90,3 +91,9 @@ def test_the_ellipse_gives_the_covariance_back(a: float, b: float, angle: float)
     R = np.array([[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]])
     np.testing.assert_allclose(R @ np.diag([big**2, small**2]) @ R.T, covariance, atol=2e-3)
     assert big >= small
+
+
+def test_the_page_is_told_how_far_the_way_is_free() -> None:
+    assert clearance_payload(None) is None
+    told = clearance_payload(Clearance(Zone.SLOW, 1.23456, within=3.0))
+    assert told == {"zone": "slow", "ahead_m": 1.235, "beside_m": None, "within_m": 3.0}

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import tomllib
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import httpx
+import msgspec
 import pytest
 import pytest_asyncio
 
 from app.dashboard import Dashboard
+from app.map_changes import MapChanges
 from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
 from app.routes.run import what_may_be_opened
 from app.settings import Settings
-from app.worker_messages import Answer, AskCluster, Report, Shown
+from app.worker_messages import Answer, AskCluster, Remapped, Report, Rough, Shown
 from pipeline.parameters import field_specs, preset
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, running
@@ -134,6 +137,41 @@ async def test_a_change_reaches_worker_scene_and_answer(both: Running) -> None:
     assert (reset.json()["changed"], reset.json()["revision"]) == ([], 2)
     paper = await client.post("/api/parameters/preset", json={"name": "paper"})
     assert paper.json()["values"] == preset("paper").flat()
+
+
+async def test_what_a_change_acts_on_is_told_to_the_worker(both: Running) -> None:
+    client, dashboard = both
+    assert (await client.get("/api/parameters")).json()["whole"] is True
+    for whole in (False, True):
+        answer = await client.put("/api/parameters/reach", json={"whole": whole})
+        assert answer.json()["whole"] is whole
+        sent = told(dashboard)[-1]
+        assert isinstance(sent, SetParameters)
+        assert sent.whole is whole
+    assert (await client.put("/api/parameters/reach", json={"whole": "yes"})).status_code == 422
+
+
+async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    await dashboard.select_tree(2)
+    changes = MapChanges(1, 3, 4, 2, [(0.0, 1.0, None)], [(1, 1), (2, 5)], [], [(1, 0.1), (5, 0.2)])
+    frame = dashboard.shown.frame if dashboard.shown else None
+    assert frame is not None
+    await dashboard.receive(Rough(7, 1, frame.trees))  # of a run that was left
+    assert "places" not in json.loads(dashboard.live._messages["rough"][1])
+    await dashboard.receive(Rough(1, 1, frame.trees))
+    rough = json.loads(dashboard.live._messages["rough"][1])
+    assert (rough["revision"], len(rough["places"])) == (1, len(frame.trees.number))
+    await dashboard.receive(Remapped(7, changes))  # of a run that was left
+    assert dashboard.selecting.selection.tree == 2
+    await dashboard.receive(Remapped(1, changes))
+    assert dashboard.selecting.selection.tree == 5
+    marks = [e for e in dashboard.events.as_plain()["events"] if e["kind"] == "tree"]
+    assert [(e["t"], e["text"]) for e in marks] == [(0.1, "Tree 1 confirmed"), (0.2, "Tree 5 confirmed")]
+    assert (await client.get("/api/trees")).status_code == 200
+    await dashboard.receive(Remapped(1, msgspec.structs.replace(changes, renamed=[(1, 1)])))
+    assert dashboard.selecting.selection.tree is None
 
 
 @pytest.mark.parametrize(
@@ -379,7 +417,7 @@ async def test_stories_are_told_and_refused_in_words(both: Running) -> None:
 async def test_a_loop_is_set_and_left_and_a_wrong_one_refused(both: Running) -> None:
     client, dashboard = both
     assert (await client.post("/api/loop", json={"from_s": 1.0, "to_s": 4.0})).status_code == 202
-    assert dashboard.loop == (1.0, 4.0)
+    assert dashboard.loop.span == (1.0, 4.0)
     for wrong in (
         {"from_s": 4.0, "to_s": 4.2},
         {"from_s": 9.0, "to_s": 1.0},
@@ -387,6 +425,6 @@ async def test_a_loop_is_set_and_left_and_a_wrong_one_refused(both: Running) -> 
         {},
     ):
         assert (await client.post("/api/loop", json=wrong)).status_code == 422
-    assert dashboard.loop == (1.0, 4.0)
+    assert dashboard.loop.span == (1.0, 4.0)
     assert (await client.post("/api/loop", json={"from_s": None, "to_s": None})).status_code == 202
-    assert dashboard.loop is None
+    assert dashboard.loop.span is None

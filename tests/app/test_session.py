@@ -373,7 +373,7 @@ def test_what_the_odometry_means_is_a_warning_or_a_failure() -> None:
     session = make_session(source)
     session.open("fake:", "static", 0)
     assert ["static" in warning for warning in session.status().warnings] == [True]
-    source.description = replace(source.description, has_odometry=False)
+    source.description = replace(source.description, has_odometry=False, scans=1)
     session.open("fake:", "auto", 0)
     assert ["no odometry" in warning for warning in session.status().warnings] == [True]
     with pytest.raises(SourceError, match="no odometry"):

@@ -231,7 +231,7 @@ async def test_a_slow_browser_holds_viser_back() -> None:
 
 
 async def test_more_browsers_than_the_machine_can_bear_are_sent_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.routes.sockets._MOST_BROWSERS", 2)
+    monkeypatch.setattr("app.places.MOST", {"owner": 2, "viewer": 2})
 
     async def handler(connection: ServerConnection) -> None:
         await connection.send(b"hello")
@@ -243,7 +243,7 @@ async def test_more_browsers_than_the_machine_can_bear_are_sent_away(monkeypatch
             with pytest.raises(InvalidStatus):
                 await browser(host)
         async with asyncio.timeout(10):
-            while dashboard.scene_viewers:
+            while len(dashboard.scenes):
                 await asyncio.sleep(0.01)
         async with browser(host) as again:
             assert await again.recv() == b"hello"

@@ -17,7 +17,8 @@ from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpe
 from app.picture import MOST_POINTS, picture_of
 from app.story.recent import Recent
 from app.wire import from_worker
-from app.worker_driver import COMPILING, Driver
+from app.words import COMPILING
+from app.worker_driver import Driver
 from app.worker_mailbox import Mailbox, joined, rows_in_common
 from app.worker_messages import (
     Answer,
@@ -30,6 +31,7 @@ from app.worker_messages import (
     Shown,
     ToWorker,
 )
+from pipeline.errors import StemmapError
 from pipeline.parameters import Parameters
 from pipeline.records import Path
 from tests.app.fakes import FakeSource, frame, make_session, opened, path
@@ -109,9 +111,26 @@ def test_a_kernel_that_is_compiled_is_said_once_and_no_silence_follows() -> None
     driver.run()
     reports = [m.status for m in said if isinstance(m, Report)]
     (waits,) = (k for k, status in enumerate(reports) if status.state == "waiting")
-    assert reports[waits].detail == COMPILING
+    assert reports[waits].detail == COMPILING.capitalize()
     assert reports[waits].source == "fake:"
     assert (reports[waits + 1].state, reports[waits + 1].detail) == ("playing", "")
+
+
+def test_an_answer_that_compiled_leaves_nothing_to_wait_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    session, said = make_session(FakeSource(3)), list[FromWorker]()
+    waiting: queue.Queue[ToWorker | None] = queue.Queue()
+    for message in (Open("fake:"), AskTree(1, 1, 1), None):
+        waiting.put(message)
+    driver = Driver(session, waiting, said.append)
+
+    def compile_first(number: int) -> None:
+        driver.compiling()
+        raise StemmapError(f"tree {number} is not known")
+
+    monkeypatch.setattr(session, "tree_story", compile_first)
+    driver.run()
+    assert any(m.status.detail == COMPILING.capitalize() for m in said if isinstance(m, Report))
+    assert last_status(said).detail == ""
 
 
 def test_the_answer_to_an_opening_begins_that_run_only() -> None:
@@ -372,7 +391,7 @@ def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None
     said: list[FromWorker] = []
     for message in (Open("fake:"), AskCluster(1, 1, 0, 0), AskCluster(2, 1, 0, 7), None):
         waiting.put(message)
-    monkeypatch.setattr("app.session.tell_cluster", lambda *_: cluster_story())
+    monkeypatch.setattr("app.story.of_run.tell_cluster", lambda *_: cluster_story())
     Driver(make_session(FakeSource(3)), waiting, said.append, recent=recent).run()
     answers = [message for message in said if isinstance(message, Answer)]
     assert answers[0].cluster == cluster_story()

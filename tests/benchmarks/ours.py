@@ -16,6 +16,7 @@ from tests.benchmarks.turns import StageTimes, serve
 PEERS_NAME = {
     "clustering": "clustering",
     "shape": "shape and detection",
+    "free view": "shape and detection",
     "detection": "shape and detection",
     "slam": "SLAM",
     "tracking": "tracking",

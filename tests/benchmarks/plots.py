@@ -1,20 +1,20 @@
-"""Pictures of path, truth and map for docs/results.md: `python -m tests.benchmarks.plots NAME --out DIR`.
+"""Pictures of path, truth and map for docs/results.md: `stemmap bench NAME --pictures DIR`.
 
 Everything is drawn in the frame of the map; truth and odometry are laid on the path by a rigid motion.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from pipeline.errors import StemmapError, UsageError
 from pipeline.evaluation.trajectory import fit_rigid
 from pipeline.mapper import Mapper
 from pipeline.parameters import preset
@@ -94,10 +94,11 @@ def sim_long() -> Drawn:
         return mapped(source, 0, f"{uri}, seed 0", "true path")
 
 
-PICTURES: dict[str, Callable[[], Drawn]] = {
-    "oxford": oxford,
-    "victoria_park": victoria_park,
-    "sim_long": sim_long,
+#: Of benchmarks, by their name.
+PICTURES: dict[str, tuple[str, Callable[[], Drawn]]] = {
+    "oxford": ("oxford.png", oxford),
+    "victoria": ("victoria_park.png", victoria_park),
+    "loops": ("sim_long.png", sim_long),
 }
 
 
@@ -175,17 +176,18 @@ def _data() -> Path:
     return Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
-def main() -> None:
-    """Draw one picture or more."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="+", choices=sorted(PICTURES), metavar="NAME")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    arguments = parser.parse_args()
-    for name in arguments.names:
-        file = arguments.out / f"{name}.png"
-        draw(PICTURES[name](), file)
-        print(f"{file}: {file.stat().st_size / 1000:.0f} kB")
+def draw_all(names: Sequence[str], folder: Path) -> Iterator[Path]:
+    """Draw the pictures of benchmarks, of all where none is named; gives the files as they come.
 
-
-if __name__ == "__main__":
-    main()
+    Raises:
+        StemmapError: There is no such folder, or a benchmark has no picture.
+    """
+    without = [name for name in names if name not in PICTURES]
+    if without:
+        raise UsageError(f"{without[0]!r} has no picture", remedy=f"Pictures: {', '.join(PICTURES)}")
+    if not folder.is_dir():
+        raise StemmapError("there is no such folder to write to", where=str(folder))
+    for name in names or PICTURES:
+        file_name, made = PICTURES[name]
+        draw(made(), folder / file_name)
+        yield folder / file_name

@@ -3,6 +3,8 @@ runs of SLAM and tracking and not ten of the whole pipeline. The order of calls 
 
 from __future__ import annotations
 
+import importlib.util
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,7 +24,7 @@ from pipeline.sources import open_source
 from pipeline.steps import steps
 from pipeline.tracking import Tracker
 from pipeline.visibility import clear_range
-from tests.benchmarks.table import Cell
+from tests.benchmarks.table import Cell, Table
 
 DUPLICATE = 1.0  # m; two trees of the map nearer than this in a stand of wider spacing
 
@@ -106,6 +108,28 @@ def mapped(rows: Sequence[Seen], truth: Truth, parameters: Parameters, seed: int
         path=path,
         tree_table=trees,
     )
+
+
+def methods() -> tuple[str, ...]:
+    """Those of `slam.method` that can run here."""
+    graph = ("graph",) if importlib.util.find_spec("gtsam") else ()
+    return ("fastslam1", "fastslam2", *graph)
+
+
+METHOD_SEEDS = (1, 2, 3)
+METHOD_COLUMNS = ("method", *COLUMNS, "s")
+
+
+def by_method(rows: Sequence[Seen], truth: Truth, parameters: Parameters, title: str) -> Table:
+    """The methods beside one another on the same scans: three seeds each, one for the graph."""
+    table: list[tuple[Cell, ...]] = []
+    for method in methods():
+        changed = parameters.replace({"slam.method": method})
+        for seed in METHOD_SEEDS[:1] if method == "graph" else METHOD_SEEDS:
+            begin = time.thread_time()
+            done = mapped(rows, truth, changed, seed)
+            table.append((method, *done.row(), time.thread_time() - begin))
+    return Table(title, METHOD_COLUMNS, tuple(table), ("s: CPU time of SLAM and tracking.",))
 
 
 def duplicates(position: Float) -> int:

@@ -24,14 +24,15 @@ from app.training.keeping import read_examples
 from app.training.scenes import labelled_points, trunks
 from pipeline.evaluation import evaluate
 from pipeline.evaluation.matching import match
-from pipeline.gathering.forest import ALL_AROUND, ONE_WAY, Forest, forest_of
+from pipeline.gathering.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, package_alone
 from pipeline.mapper import Mapper
 from pipeline.parameters import preset
-from pipeline.plot.circle import FIGURES, best_circle, fit_circle
+from pipeline.plot.circle import FIGURES, best_circle, fit_circle, without_scatter
 from pipeline.records import Float, Frame, Int
 from pipeline.sources import open_source
 from pipeline.sources.simulated import SimulatedSource
 from pipeline.steps import steps
+from tests.benchmarks.classes import ByClass
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 REACH, MATCH = 25.0, 0.5
@@ -75,19 +76,19 @@ def mapped(
     """A run mapped to its end: the last frame, the path (N, 2) [m], and the times. Of a simulated run every
     so many-th scan is made."""
     parameters = preset("forest").replace(EXACT_POSES if exact else {})
-    # As many scans are gathered as in a whole run.
-    parameters = parameters.replace({"gathering.every": max(parameters.gathering.every // every, 1)})
     watch = Stopwatch(scans=100_000)
     frame: Frame | None = None
     with closing(open_source(uri)) as source:
         about = source.description
+        if isinstance(source, SimulatedSource):  # as many scans are gathered as in a whole run
+            parameters = parameters.replace({"gathering.every": max(parameters.gathering.every // every, 1)})
         mapper = Mapper(
             parameters,
             sensor=about.sensor,
             T_base_lidar=about.T_base_lidar,
             seed=0,
             watch=watch,
-            forest=forest,
+            forests=package_alone if forest is None else lambda _name, _around: forest,
         )
         records = source.records(every=every) if isinstance(source, SimulatedSource) else source.records()
         for step in steps(records, odometry="static" if odometry == "static" else "auto"):
@@ -98,7 +99,7 @@ def mapped(
 
 
 def _real(scenes: Iterable[Path], examples: list[Examples]) -> None:
-    total = np.zeros(4, np.int64)
+    total, by_class = np.zeros(4, np.int64), ByClass()
     by_ring = np.zeros((len(RINGS), 3), np.int64)
     for scene in scenes:
         forest = _grown_without(scene, examples) if examples else None
@@ -106,13 +107,15 @@ def _real(scenes: Iterable[Path], examples: list[Examples]) -> None:
         place = frame.trees.position[frame.trees.confirmed]
         place = place[np.hypot(place[:, 0], place[:, 1]) <= REACH]
         points, label = labelled_points(scene)
-        score, rings = _score(place, points, label)
+        score, rings, false = _score(place, points, label)
+        by_class.add_labels(false, points, label)
         total += score
         by_ring += rings
         print(f"{scene.parent.name}/{scene.name}: {_rates(*score)}   {watch.scan_ms:.1f} ms a scan")
     print(f"all: {_rates(*total)}" + ("" if examples else "   (seen in training)"))
     for (near, far), (hit, of, false) in zip(RINGS, by_ring, strict=True):
         print(f"  {near:.0f} to {far:.0f} m: {hit} of {of} found, {false} false")
+    print(by_class.table("Wrongly taken, by what most points there are").markdown())
 
 
 def _rates(hit: int, of: int, false: int, poles: int) -> str:
@@ -122,8 +125,8 @@ def _rates(hit: int, of: int, false: int, poles: int) -> str:
     )
 
 
-def _score(place: Float, points: Float, label: Int) -> tuple[Int, Int]:
-    """Found, of, false, poles among the false; and the first three by distance.
+def _score(place: Float, points: Float, label: Int) -> tuple[Int, Int, Float]:
+    """Found, of, false, poles among the false; the first three by distance; and places of the false ones.
 
     What stands on a labelled trunk of fewer than 30 points, or beyond 25 m, is neither right nor false.
     """
@@ -140,7 +143,7 @@ def _score(place: Float, points: Float, label: Int) -> tuple[Int, Int]:
         of = (np.hypot(*truth.T) >= near) & (np.hypot(*truth.T) < far)
         there = (np.hypot(*place.T) >= near) & (np.hypot(*place.T) < far)
         rings[k] = np.count_nonzero(found & of), np.count_nonzero(of), np.count_nonzero(false & there)
-    return np.array([found.sum(), len(truth), false.sum(), on_pole.sum()]), rings
+    return np.array([found.sum(), len(truth), false.sum(), on_pole.sum()]), rings, place[false]
 
 
 def _away(place: Float, other: Float) -> Float:
@@ -166,6 +169,7 @@ def _grown_without(scene: Path, examples: list[Examples]) -> Forest:
 
 
 def _simulated(scene: str, seeds: list[int], every: int) -> None:
+    by_class = ByClass()
     for seed in seeds:
         uri = f"sim:{scene}?seed={seed}&odometry=exact"
         frame, path, watch = mapped(uri, odometry="auto", every=every, exact=True)
@@ -174,6 +178,7 @@ def _simulated(scene: str, seeds: list[int], every: int) -> None:
         assert truth is not None
         assert truth.trees is not None
         e = evaluate(frame.trees, truth.trees, preset("forest").evaluation, path)
+        by_class.add_map(frame.trees, truth.trees, path, preset("forest").evaluation)
         ms = watch.stage_ms
         stages = ("ground", "voxel grid", "clustering", "shape", "detection", "gathering")
         print(
@@ -185,6 +190,7 @@ def _simulated(scene: str, seeds: list[int], every: int) -> None:
             f"ground to verdict {sum(ms.get(s, 0.0) for s in stages):.1f} ms",
             flush=True,
         )
+    print(by_class.table(f"sim:{scene}: wrongly taken").markdown(), flush=True)
 
 
 def _dbh() -> None:
@@ -199,8 +205,9 @@ def _dbh() -> None:
         if not fit_circle(points[:, :2], REACH_OF_A_SLICE, RADIUS_MIN, RADIUS_MAX, circle):
             print(f"{name}: no circle, tape {tape:.1f} cm")
             continue
-        error.append(200.0 * circle[2] - tape)
-        said = f"{200 * circle[2]:.1f} +- {200 * np.sqrt(circle[6]):.1f} cm"
+        radius = float(without_scatter(circle[2], circle[7]))
+        error.append(200.0 * radius - tape)
+        said = f"{200 * radius:.1f} +- {200 * np.sqrt(circle[6]):.1f} cm"
         print(f"{name}: {said}, tape {tape:.1f} cm, {np.degrees(circle[8]):.0f} degrees seen")
     print(f"{len(error)} circles")
     print(f"trunk_dbh: RMSE {np.sqrt(np.mean(np.square(error))):.2f} cm, bias {np.mean(error):+.2f} cm")

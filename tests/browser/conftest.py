@@ -13,18 +13,9 @@ import pytest
 from playwright.sync_api import Browser, Playwright, expect, sync_playwright
 
 from tests.browser.dashboard import PATIENCE_S, Dashboard
+from tests.browser.flags import FLAGS
 from tests.browser.serving import Server
 
-FLAGS = [
-    "--no-sandbox",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-]
 PATIENCE_MS = 1000 * PATIENCE_S
 expect.set_options(timeout=PATIENCE_MS)
 
@@ -78,7 +69,7 @@ def opened(chromium: Browser, link: str, width: int = 1260, height: int = 720) -
         page = context.new_page()
         dashboard = Dashboard(page)
         page.goto(f"{link}&fixedDpr=0.3")
-        page.get_by_role("button", name="Keep watching").click()
+        page.locator("#welcome-on").click()
         yield dashboard
     finally:  # a page that a failed test left would go on drawing, and slow down all that come
         context.close()

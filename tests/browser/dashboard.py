@@ -88,8 +88,9 @@ class Dashboard:
             polling=200,
             timeout=1000 * COMPILING_S,
         )
-        if self.state == "playing":
-            self.page.locator("#play").click()
+        # Not by a click: it would begin anew a run that has just come to its end.
+        self.command({"type": "pause"})
+        self.until_server("/api/status", f"{STANDS}.includes(it.state) && it.state !== 'playing'")
         self.until("() => ['paused', 'finished'].includes(document.querySelector('#state').dataset.state)")
 
     def stand(self, time_s: float = 22.55) -> None:
@@ -103,7 +104,25 @@ class Dashboard:
         self.until_server("/api/parameters", "it.preset === 'forest' && it.changed.length === 0")
         self.command({"type": "seek", "time_s": time_s})
         there = f"it.time_s > {time_s} - 0.08 && it.time_s < {time_s} + 0.01"
-        self.until_server("/api/status", f"it.state === 'paused' && {there}")
+        self.until_server("/api/status", f"it.state === 'paused' && it.remapped === null && {there}")
+        self.until_shown()
+
+    def until_shown(self) -> None:
+        """Wait until the page and the scene show the scan at which the server stands.
+
+        The status comes before the pictures, and a busy machine draws the scene long after.
+        """
+
+        def told() -> tuple[list[int], list[int]]:
+            return cast(list[int], self.page.evaluate(SHOWN)), [
+                self.node_points(f"/world/robot/scan/{name}") for name in ("raw", "filtered")
+            ]
+
+        def there() -> bool:
+            (served, shown, *points), drawn = told()
+            return served == shown and points == drawn
+
+        self.eventually(there, told)
 
     @property
     def state(self) -> str:
@@ -168,6 +187,20 @@ class Dashboard:
         self.eventually(lambda: rest() and rest() and rest(), lambda: before)
         return before
 
+    def click_until(self, x: float, y: float, attribute: Callable[[], str | None], wanted: str) -> None:
+        """Click a place of the scene until an attribute has a value: a scene that is just being drawn anew on
+        a busy machine may miss a click.
+        """
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            self.page.mouse.click(x, y)
+            again = time.monotonic() + 8
+            while time.monotonic() < again:
+                if attribute() == wanted:
+                    return
+                self.page.wait_for_timeout(100)
+            assert time.monotonic() < deadline, f"clicks give {attribute()}, not {wanted}"
+
     def places_in_scene(self, name: str) -> list[tuple[float, float]]:
         """Where the middles of a node's copies are seen, in pixels of the page; by the number of the copy."""
         frame = self.page.locator("#scene").bounding_box()
@@ -178,6 +211,15 @@ class Dashboard:
 
 PRESET = """name => fetch('/api/parameters/preset', { method: 'POST', body: JSON.stringify({ name }),
   headers: { 'Content-Type': 'application/json' } })"""
+
+# The scan at which the server stands, that of the page, and the points of its first two stages.
+SHOWN = """async () => {
+  const [{ unpack }, { state }] = await Promise.all([
+    import('/static/js/points.js'), import('/static/js/state.js'),
+  ]);
+  const { index, arrays } = unpack(await (await fetch('/api/stages')).arrayBuffer());
+  return [index, state.map?.index ?? -1, arrays.raw.length / 3, arrays.points.length / 3];
+}"""
 
 PROJECTED = """name => {
   const { props } = window.__viserSceneTree.getState()[name].message;

@@ -15,8 +15,9 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
-from tests.browser.conftest import FLAGS, PATIENCE_MS
+from tests.browser.conftest import PATIENCE_MS
 from tests.browser.dashboard import Dashboard
+from tests.browser.flags import FLAGS
 from tests.browser.serving import Server
 
 SIZE = (1440, 900)
@@ -74,7 +75,7 @@ def main(folder: Path) -> None:
         page.set_default_timeout(PATIENCE_MS)
         dashboard = Dashboard(page)
         page.goto(server.link)
-        page.get_by_role("button", name="Keep watching").click()
+        page.locator("#welcome-on").click()
         dashboard.scene.get_by_text("Software WebGL").wait_for()
         dashboard.scene.locator(".mantine-Notification-closeButton").first.click()
         camera = Camera(page, folder)

@@ -21,7 +21,7 @@ class Server:
     """`stemmap serve SOURCE --no-browser`; `link` is what it printed.
 
     Args:
-        source: What it opens.
+        source: What it opens, several with spaces between.
         port: 0 for any free one.
         token: Of the link; empty for a new one.
         settings: Further variables of its environment.
@@ -30,7 +30,7 @@ class Server:
     def __init__(self, source: str = "sim:stand", port: int = 0, token: str = "", **settings: str) -> None:
         self._log: deque[str] = deque(maxlen=50)
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _START, "serve", source, "--no-browser", "--port", str(port)],
+            [sys.executable, "-c", _START, "serve", *source.split(), "--no-browser", "--port", str(port)],
             cwd=ROOT,
             env={**os.environ, **({"STEMMAP_TOKEN": token} if token else {}), **settings},
             stdout=subprocess.PIPE,
@@ -57,16 +57,20 @@ class Server:
 
     def stop(self) -> None:
         """End it as Ctrl-C does, and wait; once is enough."""
-        if self._process.returncode is not None:
-            return
-        self._process.terminate()
-        try:
-            self._process.wait(timeout=_PATIENCE_S)
-        finally:
-            self._process.kill()
+        if self._process.returncode is None:
+            self._process.terminate()
+            try:
+                self._process.wait(timeout=_PATIENCE_S)
+            finally:
+                self._process.kill()
         self._reader.join(timeout=10)
         assert self._process.stdout is not None
         self._process.stdout.close()
+
+    def kill(self) -> None:
+        """End it as kill -9 does; nothing is saved any more."""
+        self._process.kill()
+        self._process.wait(timeout=_PATIENCE_S)
 
     def _read_link(self) -> str:
         assert self._process.stdout is not None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,8 +12,9 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Position, expect
 
+from pipeline.sources import open_source
 from tests.browser.conftest import opened
-from tests.browser.dashboard import Dashboard
+from tests.browser.dashboard import COMPILING_S, Dashboard
 from tests.browser.serving import Server
 
 
@@ -41,6 +44,18 @@ def rows(dashboard: Dashboard) -> list[dict[str, Any]]:
     return found
 
 
+def doubted(dashboard: Dashboard) -> list[dict[str, Any]]:
+    """The found trees, the most doubted first, once the page asks for them in that order."""
+    trees = {tree["number"]: tree for tree in dashboard.ask("/api/trees")["trees"]}
+    told = [trees[each["tree"]] for each in dashboard.ask("/api/doubts")["trees"]]
+    numbers = "() => import('/static/js/annotate.js').then(it => it.unjudged().map(tree => tree.number))"
+    wanted = [tree["number"] for tree in told[:2]]
+    dashboard.eventually(
+        lambda: dashboard.page.evaluate(numbers)[:2] == wanted, lambda: dashboard.page.evaluate(numbers)
+    )
+    return told
+
+
 def place_of(dashboard: Dashboard, x: float, y: float) -> Position:
     """Where a place of the map [m] is seen on the canvas [pixels]."""
     scale = "([x, y]) => import('/static/js/map.js').then(map => map.screenOf(x, y))"
@@ -53,20 +68,19 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     canvas = page.locator("#map")
     expect(page.locator("#annotate-count")).to_contain_text("0 of")
     found = person.ask("/api/trees")["trees"]
-    first = min(found, key=lambda tree: (tree["observations"], tree["number"]))
+    first, second = doubted(person)[:2]
 
-    # The tree that was seen least often first; y confirms it, and the next is selected.
+    # The tree that the votes are least sure of first, with them; y confirms it, and the next is selected.
     canvas.press("Tab")
-    expect(page.locator("#annotate-hint")).to_contain_text(f"Tree {first['number']}, seen in")
+    hint = page.locator("#annotate-hint")
+    expect(hint).to_contain_text(f"Tree {first['number']}, seen in")
+    expect(hint).to_contain_text(re.compile(r"votes: tree [\d.]+ % \(40\.?0? % are needed\)"))
     canvas.press("y")
     expect(page.locator("#annotate-count")).to_contain_text(f"1 of {len(found)} found trees judged")
     (row,) = rows(person)
     assert (row["kind"], row["x"], row["y"]) == ("tree", first["x"], first["y"])
     mark = page.locator("#marks .mark.annotation")
     expect(mark).to_have_attribute("title", re.compile(r"0:15\.0 annotated: .+ edited an annotation"))
-    (second, *_) = sorted(
-        (tree for tree in found if tree is not first), key=lambda tree: (tree["observations"], tree["number"])
-    )
     expect(page.locator("#annotate-hint")).to_contain_text(f"Tree {second['number']}, seen in")
 
     # n refuses one that lies near the path: the scores know it at once.
@@ -200,6 +214,99 @@ def test_a_shift_click_on_a_stem_in_the_scene_adds_it(person: Dashboard):
     person.until_server("/api/annotations", "it.trees.length === 0")
     assert person.errors == []
 
+
+def test_learning_says_what_it_needs_begins_when_asked_and_is_stopped(person: Dashboard):
+    page = person.page
+    learn = page.get_by_role("region", name="Learn")
+    grow = learn.get_by_role("button", name="Grow a new decision tree")
+    expect(learn).to_contain_text("10 trees and 5 other things are needed")
+    expect(learn).to_contain_text("press n on a found tree that is none")
+    expect(grow).to_be_disabled()
+    table = "".join(f"{k},50,{'tree' if k < 10 else 'pole'}\n" for k in range(15))
+    page.evaluate(IMPORTED, "x_m,y_m,class\n" + table)
+    expect(learn).to_contain_text("Annotated in 1 run: 10 trees, 5 poles.")
+    grow.click()
+    stop = learn.get_by_role("button", name="Stop")
+    expect(stop).to_be_visible()
+    expect(learn).to_contain_text("Looking through sim:stand")
+    stop.click()
+    expect(grow).to_be_enabled()
+    person.until_server("/api/learning", "it.state === 'idle' && it.learned === null")
+    person.until_server("/api/parameters", "it.values['gathering.forest'] === 'package'")
+    assert person.errors == []
+
+
+@pytest.mark.slow
+def test_learned_trees_are_shown_beside_the_old_ones_and_used_when_asked(chromium: Browser, tmp_path: Path):
+    uri = "sim:stand?duration=4&trees=40"
+    truth = open_source(uri).truth()
+    assert truth is not None
+    assert truth.trees is not None
+    rows_of_truth = zip(truth.trees.x.tolist(), truth.trees.y.tolist(), truth.trees.kind, strict=True)
+    table = "".join(f"{x},{y},{kind}\n" for x, y, kind in rows_of_truth)
+    with Server(uri, STEMMAP_FOLDER=str(tmp_path)) as server, opened(chromium, server.link) as person:
+        person.pause()
+        person.until_server("/api/annotations", "it.run !== null")
+        person.page.evaluate(IMPORTED, "x_m,y_m,class\n" + table)
+        person.tab("Annotate")
+        learn = person.page.get_by_role("region", name="Learn")
+        learn.get_by_role("button", name="Grow a new decision tree").click()
+        use = learn.get_by_role("button", name="Use it")
+        expect(use).to_be_visible(timeout=1000 * COMPILING_S)
+        expect(learn.get_by_role("row", name=re.compile("^new"))).to_contain_text(" of ")
+        person.until_server("/api/parameters", "it.values['gathering.forest'] === 'package'")
+        use.click()
+        expect(learn.locator("#learn-used")).to_contain_text(
+            re.compile(r"In use: grown 20\d\d-.* from \d+ trees, .* in 1 run")
+        )
+        name = person.ask("/api/learning")["learned"]["name"]
+        person.until_server("/api/parameters", f"it.values['gathering.forest'] === '{name}'")
+        learn.get_by_role("button", name="Back to the package's").click()
+        person.until_server("/api/parameters", "it.values['gathering.forest'] === 'package'")
+        assert person.errors == []
+
+
+@pytest.mark.slow
+def test_what_was_annotated_outlives_a_killed_server_and_goes_out_as_files(chromium: Browser, tmp_path: Path):
+    with Server(STEMMAP_FOLDER=str(tmp_path)) as first, opened(chromium, first.link) as person:
+        person.stand(15.05)
+        person.until_server("/api/trees", "it.trees.length > 20")
+        person.tab("Annotate")
+        person.page.locator("#map").press("Tab")
+        person.page.locator("#map").press("y")
+        person.page.locator("#annotate-name").fill("Ann")
+        person.page.locator("#annotate-name").press("Enter")
+        person.page.locator("#map").press("y")
+        expect(person.page.locator("#annotate-count")).to_contain_text("2 of")
+        before = rows(person)
+        first.kill()
+    assert len(before) == 2
+    with Server(STEMMAP_FOLDER=str(tmp_path)) as again, opened(chromium, again.link) as other:
+        page = other.page
+        panel = other.tab("Annotate")
+        expect(page.locator("#annotations tbody tr")).to_have_count(2)
+        assert rows(other) == before
+        files = {}
+        for name in ("CSV", "GeoJSON"):
+            with page.expect_download() as download:
+                panel.get_by_role("link", name=name, exact=True).click()
+            files[name] = download.value.path().read_text(encoding="utf-8")
+        head, *lines = csv.reader(files["CSV"].splitlines())
+        written = [dict(zip(head, line, strict=True)) for line in lines]
+        for axis in ("x", "y"):
+            places = sorted(row[axis] for row in before)
+            assert sorted(float(row[f"{axis}_m"]) for row in written) == pytest.approx(places, abs=1e-3)
+        assert len(json.loads(files["GeoJSON"])["features"]) == 2
+        assert other.errors == []
+
+
+# A table is imported, as another browser would.
+IMPORTED = """async table => {
+  const { run } = await (await fetch("/api/annotations")).json();
+  const said = { run, table, browser: "c".repeat(32), who: "another" };
+  await fetch("/api/annotations/import", { method: "POST", headers: { "Content-Type": "application/json" },
+    body: JSON.stringify(said) });
+}"""
 
 # All annotations of the run are deleted, as another browser would.
 CLEARED = """async () => {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -76,7 +77,15 @@ def test_runs_are_kept_compared_renamed_deleted_and_played_again(own: Dashboard,
     folder.mkdir(parents=True)
     for name in ("run.json", "trees.csv"):
         (folder / name).write_text("")
+    half = folder / ".unfinished-abc"
+    half.mkdir()
+    os.utime(half, (0, 0))
     page.reload()
+    row = page.locator("#runs tr.unfinished")
+    expect(row).to_contain_text(f"Half a map in {folder.name}")
+    row.get_by_role("button", name="Delete").click()
+    expect(row).to_have_count(0)
+    assert not half.exists()
     page.get_by_role("button", name=folder.name).click()
     expect(page.locator("#run-detail .empty")).to_contain_text("run.json is damaged")
     rows.nth(1).get_by_role("button").click()

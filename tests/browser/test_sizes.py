@@ -16,13 +16,36 @@ SPILLS = """() => [...document.querySelectorAll('header *, main *, footer *')].f
   return box.right > innerWidth + 1 || box.left < -1;
 }).map(node => `${node.tagName}#${node.id}.${node.className}`)"""
 
+# The strip of figures cuts what does not fit: nothing may need to be cut.
+CUT = """() => {
+  const { right: edge } = document.querySelector('.figures').getBoundingClientRect();
+  const shown = [...document.querySelectorAll('.figures > div')].filter(node => node.offsetWidth > 0);
+  return shown.filter(node => node.getBoundingClientRect().right > edge + 1).map(node => node.dataset.figure);
+}"""
 
-@pytest.mark.parametrize("size", [(1440, 900), (1024, 768), (390, 844)])
+
+# What stands side by side in the strip may not lie upon one another.
+OVERLAPS = """() => {
+  const parts = [...document.querySelectorAll('.strip > *, .strip-end > *, #state b')].filter(node =>
+    node.offsetWidth > 0 && !node.matches('.strip-end, #state'));
+  const box = node => node.getBoundingClientRect();
+  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1
+    && a.top < b.bottom - 1 && b.top < a.bottom - 1;
+  return parts.flatMap((a, k) => parts.slice(k + 1).filter(b => meet(box(a), box(b)))
+    .map(b => `${a.id || a.tagName} and ${b.id || b.tagName}`));
+}"""
+
+
+@pytest.mark.parametrize("size", [(1440, 900), (1280, 800), (1024, 768), (390, 844)])
 def test_nothing_spills_over_the_edge(chromium: Browser, server: Server, size: tuple[int, int]):
     with opened(chromium, server.link, *size) as dashboard:
         dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
         assert dashboard.page.evaluate(SPILLS) == []
         assert dashboard.page.evaluate("document.documentElement.scrollWidth") <= size[0]
+        assert dashboard.page.evaluate(OVERLAPS) == []
+        assert dashboard.page.evaluate(CUT) == []
+        for name in ("runs-link", "palette-button", "share-button", "theme-button", "keys-button"):
+            expect(dashboard.page.locator(f"#{name}")).to_be_in_viewport(ratio=1)
         if size[0] == 1024:
             check_drawer(dashboard)
         if size[0] == 390:

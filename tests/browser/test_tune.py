@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def test_a_value_is_typed_marked_taken_back_and_reset(dashboard: Dashboard):
     dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
     row.get_by_role("button", name="Reset Radius eps").click()
     dashboard.until_server("/api/parameters", "it.changed.length === 0")
-    expect(row.get_by_role("button")).to_be_hidden()
+    expect(row.get_by_role("button", name="Reset Radius eps")).to_be_hidden()
 
 
 def test_a_slider_moves_by_its_step_and_shows_the_same_in_the_scene(dashboard: Dashboard):
@@ -88,9 +89,14 @@ def test_parameters_are_found_by_their_words(dashboard: Dashboard):
     expect(rows.first).to_be_visible()
     names = rows.evaluate_all("all => all.map(row => row.dataset.words)")
     assert all("heading" in words and "metre" in words for words in names)
+    page.locator("#tune-find").fill("eps")
+    titles = page.locator(".tune-row:visible label")
+    expect(titles.first).to_have_text(re.compile("Radius eps"))
+    assert titles.count() > 1
     page.locator("#tune-find").fill("no such thing at all")
     expect(page.locator("#tune-none")).to_contain_text("No parameter has these words")
     page.locator("#tune-find").fill("")
+    expect(page.locator("#tune-rows details").first).to_have_attribute("data-stage", "Acquisition")
     page.get_by_label("changed only").check()
     expect(page.locator("#tune-none")).to_contain_text("Nothing differs")
     page.get_by_label("changed only").uncheck()

@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -177,7 +179,7 @@ def test_a_file_of_parameters_that_does_not_fit_is_named(capsys, tmp_path, conte
         ("sim:paper?speed=3", 2, "speed"),
         ("sim:paper?duration=x", 2, "duration"),
         ("none.mcap", 1, "no such file"),
-        ("dds:robot", 1, "live"),
+        ("dds:robot", 1, "no address"),
         ("ftp://host/x", 2, "ftp"),
         ("x\0y", 1, "no such file"),
     ],
@@ -235,7 +237,12 @@ def test_a_mapping_that_is_stopped_leaves_nothing_half_written(tmp_path, capsys,
 
     monkeypatch.setattr(RunFiles, "add", then_stop)
     before = signal.getsignal(signal.SIGTERM)
-    stemmap(capsys, "map", RUN, "--out", tmp_path / "out").refused(1, "stopped")
+    # A shell that starts the tests in the background has them ignore Ctrl-C.
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        stemmap(capsys, "map", RUN, "--out", tmp_path / "out").refused(1, "stopped")
+    finally:
+        signal.signal(signal.SIGINT, inherited)
     assert signal.getsignal(signal.SIGTERM) is before
     assert scans[:3] == [0, 1, 2]
     assert not (tmp_path / "out").exists()
@@ -355,10 +362,18 @@ def test_evaluating_by_a_table_and_by_other_distances(mapped, tmp_path, capsys):
     stemmap(capsys, "evaluate", mapped, "--match-distance", "99").refused(2, "evaluation.match_distance")
 
 
-def test_truth_without_a_single_tree_is_no_crash(mapped, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ("", "no ground truth lies within"),
+        ("900,900\n", "no ground truth lies"),
+        ("1,0\n", "none of 1 true tree has"),
+    ],
+)
+def test_truth_that_judges_nothing_ends_with_1(mapped, tmp_path, capsys, rows, words):
     table = tmp_path / "truth.csv"
-    table.write_text("x_m,y_m\n")
-    assert stemmap(capsys, "evaluate", mapped, "--truth", table).code == 0
+    table.write_text(f"x_m,y_m\n{rows}")
+    stemmap(capsys, "evaluate", mapped, "--truth", table).refused(1, words)
 
 
 @pytest.mark.parametrize(
@@ -472,3 +487,17 @@ def test_presets_and_values_are_taken(tmp_path, capsys):
     assert (record["preset"], record["seed"]) == ("paper", 3)
     assert record["parameters"]["slam"]["particles"] == 5
     assert record["parameters"]["clustering"]["eps"] == 0.25
+
+
+@pytest.mark.parametrize("library", ["json", "zenoh"])
+def test_the_program_ends_with_the_code_and_all_it_said(tmp_path, library):
+    pytest.importorskip(library)
+    code = f"import {library}; from app.cli import command; command()"
+    words = [sys.executable, "-c", code, "info", str(tmp_path / "none.mcap")]
+    refused = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "none.mcap" in refused.stderr
+    words[3:] = ["--version"]
+    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (told.returncode, told.stderr) == (0, "")
+    assert told.stdout.startswith("stemmap")

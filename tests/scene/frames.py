@@ -56,6 +56,7 @@ def make_frame(index: int = 0, *, trees: int = 25, clusters: int = 8, pose: Pose
         arc=np.full(clusters, np.pi),
         extent=np.full((clusters, 3), 0.3),
         hidden=np.zeros(clusters, dtype=bool),
+        cut=np.zeros(clusters, dtype=bool),
         verdict=verdicts,
     )
     rows = np.nonzero(verdicts == Verdict.TREE)[0]

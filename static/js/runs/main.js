@@ -9,10 +9,11 @@ import { startTheme } from "../theme.js";
 import { startUpload } from "../upload.js";
 import { showTwo } from "./compare.js";
 import { repaint, say, showRun } from "./detail.js";
+import { unfinishedRows } from "./unfinished.js";
 import { scans, shortSource, when } from "./words.js";
 
 const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor"], ["trees", ""], ["F1", ""], ["preset", "minor"]];
-let known = { runs: [], folders: [], open: null };
+let known = { runs: [], folders: [], unfinished: [], open: null };
 const ticked = new Set();
 let deleted = null; // the run that Undo brings back
 
@@ -21,8 +22,7 @@ async function load() {
     known = await get("/api/runs");
     byId("runs-error").hidden = true;
   } catch (error) {
-    setText(byId("runs-error"), error.message);
-    byId("runs-error").hidden = false;
+    showError(error.message);
   }
   for (const key of ticked) if (![...known.runs, ...known.folders].some((run) => run.key === key)) ticked.delete(key);
   fill();
@@ -32,10 +32,10 @@ function fill() {
   const wanted = byId("runs-find").value.trim().toLowerCase();
   const fits = ({ name, uri = "" }) => `${name} ${uri}`.toLowerCase().includes(wanted);
   const [runs, folders] = [known.runs.filter(fits), known.folders.filter(fits)];
-  byId("runs").tBodies[0].replaceChildren(...runs.map(row), ...(folders.length ? [group("Finished maps in the data folder (stemmap map --out)"), ...folders.map(row)] : []));
+  byId("runs").tBodies[0].replaceChildren(...runs.map(row), ...(folders.length ? [group("Finished maps in the data folder (stemmap map --out)"), ...folders.map(row)] : []), ...unfinishedGroup(wanted));
   const all = known.runs.length + known.folders.length;
   setText(byId("runs-count"), count(all, "run"));
-  byId("runs").hidden = !(runs.length + folders.length);
+  byId("runs").hidden = !byId("runs").tBodies[0].rows.length;
   const empty = byId("runs-empty");
   empty.hidden = runs.length + folders.length > 0;
   setText(empty, all ? `No run is called “${wanted}”.` : "No run yet. A run is kept here as soon as the dashboard has mapped something of it: go to the dashboard and press play, or open a recording.");
@@ -45,6 +45,20 @@ function fill() {
 // A folder may be called as its owner likes: a+b, north & south.
 const addressOf = ({ key }) => `run=${encodeURIComponent(key)}`;
 const group = (text) => el("tr", { class: "group" }, el("td", { colspan: HEADS.length, text }));
+
+function unfinishedGroup(wanted) {
+  const left = known.unfinished.filter(({ name }) => name.toLowerCase().includes(wanted));
+  const told = async (problem) => {
+    await load();
+    if (problem) showError(problem);
+  };
+  return left.length ? [group("Ended before the map was whole"), ...unfinishedRows(left, HEADS.length, told)] : [];
+}
+
+function showError(words) {
+  setText(byId("runs-error"), words);
+  byId("runs-error").hidden = false;
+}
 
 function row(run) {
   const name = el("td", {}, el("button", { text: run.name, onclick: (event) => { event.stopPropagation(); go(addressOf(run)); } }),
@@ -118,8 +132,7 @@ async function undo() {
   try {
     await post(`/api/runs/${run.id}/restore`, {});
   } catch (error) {
-    setText(byId("runs-error"), error.message);
-    byId("runs-error").hidden = false;
+    showError(error.message);
     return;
   }
   await load();

@@ -20,7 +20,7 @@ NAME = "detection"
 LINE = "From the ground to the verdict, one scan of a VLP-16 and of 64 rings"
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
-STAGES = ("ground", "voxel grid", "clustering", "shape", "detection")
+STAGES = ("ground", "voxel grid", "clustering", "shape", "free view", "detection")
 VLP16_MS, RINGS_64_MS = 2.0, 15.0  # asked for
 VLP16_SCANS, EVERY = 500, 5
 WARM, ROUNDS = 1, 20  # times that the scans are gone through

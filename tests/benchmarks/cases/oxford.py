@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,12 +22,30 @@ COLUMNS = ("seed", "odometry RMS [m]", "RMS [m]", "median [m]", "largest [m]", "
 
 
 def run() -> list[Table]:
-    """One table with all frames, one with every fifth; the odometry differs by seed as well."""
+    """Tables with all frames, with every fifth, and by method; the odometry differs by seed as well."""
     from tests.benchmarks.tree_manager_folder import read_recorded
 
     root = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
     recorded = read_recorded(root / "oxford_evo" / "Evo.npz")
-    return [_table(recorded, every) for every in (1, 5)]
+    return [*(_table(recorded, every) for every in (1, 5)), _methods(recorded)]
+
+
+def _methods(recorded: Recorded) -> Table:
+    """The methods beside one another: three seeds, which differ in the odometry too."""
+    import tempfile
+
+    from tests.benchmarks.slam_runs import METHOD_SEEDS, methods
+    from tests.benchmarks.tree_manager_folder import write_states
+
+    with tempfile.TemporaryDirectory(prefix="stemmap-oxford-") as folder:
+        write_states(recorded, Path(folder), 1)
+        rows = []
+        for method in methods():
+            for seed in METHOD_SEEDS:
+                begin = time.thread_time()
+                row = _mapped(recorded, Path(folder), seed, method)
+                rows.append((method, *row, time.thread_time() - begin))
+    return Table("Oxford Evo by `slam.method`", ("method", *COLUMNS, "s"), tuple(rows), ("s: CPU time.",))
 
 
 def _table(recorded: Recorded, every: int) -> Table:
@@ -47,7 +66,9 @@ def _table(recorded: Recorded, every: int) -> Table:
     return Table(f"{LINE}: every {every}", COLUMNS, tuple(rows), (said,))
 
 
-def _mapped(recorded: Recorded, folder: Path, seed: int) -> tuple[int, float, float, float, float, int]:
+def _mapped(
+    recorded: Recorded, folder: Path, seed: int, method: str | None = None
+) -> tuple[int, float, float, float, float, int]:
     """The folder with a seed's odometry through source and mapper, as `stemmap map FOLDER` does it."""
     from contextlib import closing
 
@@ -71,7 +92,9 @@ def _mapped(recorded: Recorded, folder: Path, seed: int) -> tuple[int, float, fl
     (folder / TRAJECTORY).write_text(trajectory_text(recorded.stamp_ns, told), encoding="utf-8")
     with closing(open_source(str(folder))) as source:
         known = source.description
-        mapper = Mapper(preset(known.preset), sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed)
+        p = preset(known.preset)
+        p = p if method is None else p.replace({"slam.method": method})
+        mapper = Mapper(p, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed)
         frame = None
         for step in steps(source.records()):
             frame = mapper.process(step)

@@ -13,11 +13,12 @@ SEEDS = range(1, 11)
 
 
 def run() -> list[Table]:
-    """Ten seeds after one pass through the stages before SLAM."""
-    from tests.benchmarks.slam_runs import COLUMNS, mapped, seen_in, summary
+    """Ten seeds after one pass through the stages before SLAM, and the methods beside one another."""
+    from tests.benchmarks.slam_runs import COLUMNS, by_method, mapped, seen_in, summary
 
     data = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
     rows, truth, parameters = seen_in(str(data / "victoria_park" / "victoria_park_ascii.zip"))
     runs = [mapped(rows, truth, parameters, seed) for seed in SEEDS]
     note = "Rigid alignment in the plane, no shift of time; GPS itself has faults of up to 8 m."
-    return [Table(LINE, COLUMNS, tuple(r.row() for r in runs), (summary(runs), note))]
+    methods = by_method(rows, truth, parameters, "Victoria Park by `slam.method`")
+    return [Table(LINE, COLUMNS, tuple(r.row() for r in runs), (summary(runs), note)), methods]

@@ -1,0 +1,55 @@
+"""What the run's camera saw at the time of a scan; found by the mapping process, decoded elsewhere."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import msgspec
+
+from pipeline.errors import StemmapError
+from pipeline.sources.base import Source, SourceDescription
+from pipeline.sources.camera import Camera, Picture
+from pipeline.sources.rostypes import COMPRESSED_IMAGE, IMAGE
+from pipeline.sources.with_motion import WithMotion
+
+
+@runtime_checkable
+class WithCamera(Protocol):
+    """A source that may have pictures."""
+
+    def camera(self) -> tuple[Camera | None, str]: ...
+    def picture_near(self, stamp_ns: int) -> Picture | None: ...
+
+
+class CameraPicture(msgspec.Struct, frozen=True):
+    """A picture as it was recorded, and how the camera stands.
+
+    Attributes:
+        picture: Not decoded.
+        camera: None where nobody tells where things stand in it.
+        why: There is none.
+    """
+
+    picture: Picture
+    camera: Camera | None
+    why: str
+
+
+def has_camera(description: SourceDescription) -> bool:
+    """Whether a source has pictures."""
+    return any(t.read_as == "camera" and t.type in (IMAGE, COMPRESSED_IMAGE) for t in description.topics)
+
+
+def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
+    """The picture nearest to a time.
+
+    Raises:
+        StemmapError: There is none, and why.
+    """
+    origin: object = source.source if isinstance(source, WithMotion) else source
+    if source is None or not has_camera(source.description) or not isinstance(origin, WithCamera):
+        raise StemmapError("this run has no camera", remedy="Record a camera's topic beside the LiDAR")
+    picture = origin.picture_near(stamp_ns)
+    if picture is None:
+        raise StemmapError("no picture was taken at this time", remedy="Play on, or go to another scan")
+    return CameraPicture(picture, *origin.camera())

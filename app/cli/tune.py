@@ -1,0 +1,340 @@
+"""`stemmap tune`: searches for the parameters that map runs with known trees best."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from app.cli.choices import add_parameter_flags, add_run_flags, chosen_parameters, source
+from app.cli.waiting import compiling_is_said
+from pipeline.errors import ParameterError, StemmapError
+
+if TYPE_CHECKING:
+    from app.tuning.plan import Plan, PlannedRun
+    from app.tuning.search import Search
+    from app.tuning.trial import Trial
+
+HELP = "search for the parameters that map runs with known trees best"
+STOPPED = 3
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument(
+        "runs", metavar="RUN", nargs="+", type=source, help="recordings, folders, clouds or sim:"
+    )
+    parser.add_argument(
+        "--truth",
+        metavar="[RUN=]FILE",
+        dest="truths",
+        action="append",
+        default=[],
+        help="true trees (CSV) of a run, in the frame of its map; given again for each run, in their order "
+        "or with RUN= before; default: the run's own",
+    )
+    parser.add_argument(
+        "--dbh-unit", choices=("m", "cm", "mm"), help="of a truth column that does not say it"
+    )
+    parser.add_argument(
+        "--held-out",
+        metavar="RUN",
+        type=source,
+        action="append",
+        default=[],
+        help="a run that is scored beside and not searched over; may be given again",
+    )
+    parser.add_argument(
+        "--over",
+        metavar="NAME[=LOW..HIGH|=A,B]",
+        action="append",
+        default=[],
+        help="a parameter to search over, within its declared bounds or narrower ones; may be given again "
+        "(default: eight that decide what is a tree)",
+    )
+    parser.add_argument(
+        "--goal", choices=("f1", "ta", "position", "pairs"), default="f1",
+        help="F1 (the default); TA with false trees bounded; position RMSE or pair error with F1 not below "
+        "that of the start",
+    )  # fmt: skip
+    parser.add_argument(
+        "--false-max", metavar="SHARE", type=float, default=0.1,
+        help="with --goal ta: this share of the map's trees may be none (default: 0.1)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--trials", metavar="N", type=_number, default=200, help="so many in all (default: 200)"
+    )
+    parser.add_argument("--minutes", metavar="M", type=_minutes, default=0.0, help="stop after this time")
+    parser.add_argument(
+        "--workers", metavar="N", type=_number, default=1,
+        help="processes at once; with one the same input gives the same result (default: 1)",
+    )  # fmt: skip
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="TOML file for the best set")
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument(
+        "--journal", metavar="FILE", type=Path,
+        help="where each trial is kept; the same command goes on with it (default: beside --out)",
+    )  # fmt: skip
+    place.add_argument(
+        "--storage", metavar="ADDRESS", nargs="?", const="",
+        help="keep the trials in PostgreSQL, where several machines share them: "
+        "postgresql://name@host/database (without an address: that of STEMMAP_DATABASE)",
+    )  # fmt: skip
+    add_parameter_flags(parser)
+    add_run_flags(parser)
+    parser.epilog = "Ctrl-C ends the search and writes the best set so far; the same command goes on with it."
+
+
+@compiling_is_said()
+def run(arguments: argparse.Namespace) -> int:
+    """Search, and write the best set."""
+    from app.tuning.search import Search
+
+    plan = _plan(arguments)
+    search: Search | None = None
+    try:
+        search = Search(plan)
+        stopped, lost = _search(search, arguments.workers)
+        return _finish(search, arguments, stopped=stopped, lost=lost)
+    finally:
+        if search is not None:
+            search.close()
+
+
+def _plan(arguments: argparse.Namespace) -> Plan:
+    from app.robot.address import is_live
+    from app.tuning.goal import goal_of
+    from app.tuning.plan import Plan
+    from app.tuning.space import SENSIBLE, axes_of
+
+    for uri in (*arguments.runs, *arguments.held_out):
+        if is_live(uri):
+            raise ParameterError(
+                "a live run cannot be mapped again and again",
+                where=uri,
+                remedy="Record it, and name the recording",
+            )
+    goal = goal_of(arguments.goal, arguments.false_max)
+    preset_name, parameters = chosen_parameters(arguments, _suggested(arguments.runs[0]))
+    if not arguments.out.absolute().parent.is_dir():
+        raise StemmapError("there is no such folder to write to", where=str(arguments.out.absolute().parent))
+    return Plan(
+        runs=_planned(arguments),
+        axes=axes_of(arguments.over or SENSIBLE),
+        start=parameters.model_dump(),
+        storage=_storage(arguments),
+        preset=preset_name,
+        goal=goal.name,
+        false_max=goal.false_max,
+        seed=arguments.seed,
+        odometry=arguments.odometry,
+        trials=arguments.trials,
+        seconds=60.0 * arguments.minutes,
+    )
+
+
+def _suggested(uri: str) -> str:
+    """The preset that suits the first run."""
+    from contextlib import closing
+
+    from pipeline.sources import open_source
+    from pipeline.sources.clouds import is_cloud
+
+    if is_cloud(uri):
+        return "forest"
+    with closing(open_source(uri)) as opened:
+        return opened.description.preset
+
+
+def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
+    from app.tuning.plan import PlannedRun, TruthColumns
+    from pipeline.truth_table import read_truth_trees
+
+    uris = [*arguments.runs, *arguments.held_out]
+    files = files_of(uris, arguments.truths)
+    planned = []
+    for k, uri in enumerate(uris):
+        if uri in uris[:k]:
+            raise ParameterError("a run is named twice", where=uri, remedy="Name it once")
+        truth = None
+        if uri in files:
+            truth = TruthColumns.of(read_truth_trees(Path(files[uri]), dbh_unit=arguments.dbh_unit))
+        planned.append(PlannedRun(uri, truth, files.get(uri, ""), k >= len(arguments.runs)))
+    return tuple(planned)
+
+
+def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
+    """The file with the true trees of each run that one was named for.
+
+    Args:
+        uris: The runs in their order, those that are held out last.
+        truths: `FILE` or `RUN=FILE`, as they were given.
+
+    Raises:
+        ParameterError: It is not clear which run a file is of.
+    """
+    named: dict[str, str] = {}
+    bare = []
+    for text in truths:
+        # A run's own name may have = in it; the longest that fits is meant.
+        run = max((uri for uri in uris if text.startswith(f"{uri}=")), key=len, default=None)
+        if run is None:
+            bare.append(text)
+        elif run in named:
+            raise ParameterError("two truths are named for one run", where=run, remedy="Name one")
+        else:
+            named[run] = text.removeprefix(f"{run}=")
+    others = [uri for uri in uris if uri not in named]
+    if bare and len(bare) != len(others):
+        raise ParameterError(
+            f"{len(bare)} files of true trees for {len(others)} runs",
+            where=bare[0],
+            remedy="Say which run each is of: --truth RUN=FILE",
+        )
+    return {**named, **dict(zip(others, bare, strict=False))}
+
+
+def _storage(arguments: argparse.Namespace) -> str:
+    from app.settings import from_environment
+    from app.tuning.storage import is_server
+
+    if arguments.storage is None:
+        return str((arguments.journal or arguments.out.with_suffix(".journal")).absolute())
+    address = arguments.storage or from_environment().database
+    if not is_server(address):
+        raise ParameterError(
+            "this is no address of a PostgreSQL database" if address else "no database is named",
+            where=address,
+            remedy="Give postgresql://name@host/database, or set STEMMAP_DATABASE",
+        )
+    return str(address)
+
+
+def _search(search: Search, workers: int) -> tuple[bool, int]:
+    """Make the trials. Whether it was stopped before the last, and how many processes were lost."""
+    import time
+
+    from app.tuning.processes import Helpers
+
+    plan = search.plan
+    helpers: Helpers | None = None
+    bar = _Bar(plan)
+    since, before = time.monotonic(), 0
+    try:
+        bar.say(search.begin(), search)
+        helpers = Helpers(plan, workers - 1)
+        since, before = time.monotonic(), len(search.trials())
+        while not plan.seconds or time.monotonic() - since < plan.seconds:
+            helpers.watch()
+            trial = search.step()
+            bar.show(search)
+            if trial is None:
+                if not search.is_under_way:
+                    return False, helpers.lost
+                time.sleep(0.1)
+        return len(search.trials()) < plan.trials, helpers.lost
+    except KeyboardInterrupt:
+        if not search.trials():
+            raise
+        return True, helpers.lost if helpers else 0
+    finally:
+        if helpers is not None:
+            helpers.close()
+        bar.close(len(search.trials()) - before, time.monotonic() - since)
+
+
+def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool, lost: int) -> int:
+    from datetime import date
+
+    from app.tuning.result import lines_of, result_of, toml_of, warning_of
+    from app.words import count
+    from pipeline.files import write_beside
+
+    plan, result = search.plan, result_of(search)
+    text = toml_of(plan, result, date.today().isoformat())
+    try:
+        with write_beside(arguments.out) as file:
+            file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StemmapError(f"cannot write: {error.strerror}", where=str(arguments.out)) from None
+    for line in lines_of(plan, result):
+        print(line)
+    print(f"written to {arguments.out}; use it with --config {arguments.out}")
+    if lost:
+        print(
+            f"warning: {count(lost, 'process', 'processes')} ended in the middle and began again",
+            file=sys.stderr,
+        )
+    if warning := warning_of(result):
+        print(f"warning: {warning}", file=sys.stderr)
+    if stopped:
+        left = plan.trials - result.made
+        print(f"left out: {count(left, 'trial')}; the same command goes on with them", file=sys.stderr)
+        return STOPPED
+    return 0
+
+
+class _Bar:
+    """A progress bar on a terminal; each set that is better than all before is said in a line."""
+
+    def __init__(self, plan: Plan) -> None:
+        from tqdm import tqdm
+
+        self._tqdm = tqdm
+        self._goal = plan.aim
+        self._best: float | None = None
+        self._bar = tqdm(
+            total=plan.trials, unit="trial", desc="looking at the scans", file=sys.stderr,
+            disable=not sys.stderr.isatty(), leave=False,
+        )  # fmt: skip
+
+    def say(self, start: Trial, search: Search) -> None:
+        """The score to begin with, and how many trials stand there already."""
+        made = len(search.trials())
+        self._line(f"start: {self._goal.shown(start.loss or 0.0)}")
+        if made:
+            self._line(f"going on after {made} trials")
+        self._bar.set_description("searching", refresh=False)
+        self._bar.update(made)
+
+    def show(self, search: Search) -> None:
+        """How far it is."""
+        made, best = len(search.trials()), search.best()
+        self._bar.update(made - self._bar.n if not self._bar.disable else 0)
+        if best is None or best.loss is None or (self._best is not None and best.loss >= self._best):
+            return
+        self._best = best.loss
+        told = f"trial {best.number}: {self._goal.shown(best.loss)}"
+        if best.held_out:
+            from app.tuning.goal import pool
+
+            told += f"   held out: F1 {pool(best.held_out).f1:.3f}"
+        self._bar.set_postfix_str(self._goal.shown(best.loss), refresh=False)
+        self._line(told)
+
+    def close(self, made: int, seconds: float) -> None:
+        """No more will come; how many were made, and how fast."""
+        self._bar.close()
+        if made > 1:
+            self._line(f"{made:,} trials in {seconds:,.0f} s: {3600.0 * made / seconds:,.0f} an hour")
+
+    def _line(self, text: str) -> None:
+        self._tqdm.write(text, file=sys.stderr)
+        sys.stderr.flush()
+
+
+def _number(text: str) -> int:
+    if text.isascii() and text.isdigit() and 0 < int(text) < 1 << 20:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
+
+
+def _minutes(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < 1e6:
+        raise argparse.ArgumentTypeError(f"{text!r} is no time in minutes")
+    return value

@@ -1,0 +1,93 @@
+"""A run mapped again from its first scan, a few scans at a time, while the run itself stands or goes on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from app.history import Snapshots
+from app.story.history import TreeHistory
+from pipeline.parameters import Parameters
+from pipeline.records import Frame
+from pipeline.rerun import Recalled, Rerun
+
+_NS = 1_000_000_000
+
+
+@dataclass(slots=True)
+class Told:
+    """What is remembered of a run beside its map.
+
+    Attributes:
+        history: What each scan made of the trees.
+        confirmed_s: When each tree was first confirmed, by its number [s since the first scan].
+        time_s: Of the scan that was recorded last.
+    """
+
+    history: TreeHistory = field(default_factory=TreeHistory)
+    confirmed_s: dict[int, float] = field(default_factory=dict)
+    time_s: float = -math.inf
+
+    def record(self, frame: Frame | Recalled, start_ns: int) -> None:
+        """Take a scan of a run whose first one was at this time. What was known of this and later scans is
+        forgotten: the run went back."""
+        self.history.record(frame, start_ns)
+        time_s = (frame.stamp_ns - start_ns) / _NS
+        if time_s <= self.time_s:
+            self.confirmed_s = {n: at for n, at in self.confirmed_s.items() if at < time_s}
+        self.time_s = time_s
+        for number in frame.trees.number[frame.trees.confirmed].tolist():
+            self.confirmed_s.setdefault(number, time_s)
+
+    def before(self, scan: int, time_s: float) -> Told:
+        """Of its own, what was known before a scan of this time."""
+        earlier = {number: at for number, at in self.confirmed_s.items() if at < time_s}
+        return Told(self.history.before(scan), earlier, time_s)
+
+
+class Remapping:
+    """A run as other parameters map it from its first scan on.
+
+    Args:
+        rerun: At its beginning.
+        start_ns: Time of the run's first scan.
+        told: Of the scans that the rerun has passed over.
+        known: States of the mapper at some of these.
+
+    Attributes:
+        told: Of all scans that are mapped.
+    """
+
+    def __init__(
+        self, rerun: Rerun, start_ns: int, told: Told | None = None, known: dict[int, Any] | None = None
+    ) -> None:
+        self.rerun = rerun
+        known = {0: rerun.state()} if known is None else known
+        self.snapshots: Snapshots[Any] = Snapshots(known[0])
+        for scans, state in sorted(known.items()):
+            self.snapshots.offer(scans, state)
+        self.told = told or Told()
+        self._start_ns = start_ns
+
+    @property
+    def parameters(self) -> Parameters:
+        """With which the run is mapped."""
+        return self.rerun.mapper.parameters
+
+    def work(self, scans: int, until: int) -> bool:
+        """Map so many scans more, or go back, towards a map of `until` scans. Whether it is reached.
+
+        Raises:
+            StemmapError: A scan cannot be looked at again.
+        """
+        rerun = self.rerun
+        if rerun.done > until:  # the run went back meanwhile
+            rerun.go_back(*self.snapshots.newest(until))
+        for _ in range(scans):
+            if rerun.done == until:
+                return True
+            if self.snapshots.is_due(rerun.done) and (state := rerun.state()) is not None:
+                self.snapshots.offer(rerun.done, state)
+            self.told.record(next(rerun.frames(rerun.done + 1)), self._start_ns)
+        return rerun.done == until

@@ -1,0 +1,79 @@
+"""Expanding: decision trees that stand already learn from a few more examples.
+
+A forest that was grown from many examples keeps its questions, and goes on asking where the new ones
+contradict it: each leaf that new examples reach is grown on by them, and what the leaf said before stays as
+if so many examples more had said it (structure expansion; Segev, Harel, Mannor, Crammer, El-Yaniv,
+"Learn on source, refine on target: a model transfer learning framework with random forests", 2017).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from app.training.growing import PLANS, TREE, UPRIGHT, Plan, node_of
+from pipeline.gathering.features import NAMES, RAYS
+from pipeline.gathering.forest import CLASSES
+from pipeline.records import Float, Int
+
+PRIOR = 3.0  # things that a leaf's shares count as
+LEAST = 2.0  # things in a new leaf
+DEEPER = 4  # questions more at most
+
+
+def expanded(
+    trees: list[dict[str, Any]], kind: str, figures: Float, label: Int, thing: Int, seed: int
+) -> list[dict[str, Any]]:
+    """A forest that has learned from examples more.
+
+    Args:
+        trees: As the JSON holds them, for a kind of sensor.
+        kind: Of the sensor, a key of PLANS.
+        figures: shape (N, figures).
+        label: Place in CLASSES, shape (N,).
+        thing: What the example is one of, shape (N,): each thing counts once, however many examples it gave.
+        seed: Of the choices made at random.
+    """
+    plan = PLANS[kind]
+    _, of, number = np.unique(thing, return_inverse=True, return_counts=True)
+    weight = 1.0 / number[of]
+    weight[label == TREE] *= plan.tree
+    weight[np.isin(label, UPRIGHT)] *= plan.upright
+    draws = np.random.default_rng(seed).integers(0, 2**31, len(trees))
+    return [
+        _grown(tree, figures, label, weight, plan, draw)
+        for tree, draw in zip(trees, draws.tolist(), strict=True)
+    ]
+
+
+def _grown(
+    node: dict[str, Any], figures: Float, label: Int, weight: Float, plan: Plan, draw: int
+) -> dict[str, Any]:
+    if not len(label):
+        return node
+    if "share" in node:
+        return _leaf(np.array(node["share"], np.float64), figures, label, weight, plan, draw)
+    yes = figures[:, NAMES.index(node["figure"])] <= node["at_most"]
+    return {
+        **node,
+        "yes": _grown(node["yes"], figures[yes], label[yes], weight[yes], plan, draw),
+        "no": _grown(node["no"], figures[~yes], label[~yes], weight[~yes], plan, draw),
+    }
+
+
+def _leaf(share: Float, figures: Float, label: Int, weight: Float, plan: Plan, draw: int) -> dict[str, Any]:
+    from sklearn.tree import DecisionTreeClassifier
+
+    known = figures if plan.rays else figures[:, :RAYS]
+    tree = DecisionTreeClassifier(
+        max_depth=DEEPER,
+        min_weight_fraction_leaf=min(LEAST / weight.sum(), 0.5),
+        max_features=plan.figures,
+        random_state=draw,
+    ).fit(known.astype(np.float32), label == TREE, weight)
+    leaf = tree.apply(known.astype(np.float32))
+    said = np.zeros((tree.tree_.node_count, len(CLASSES)))
+    np.add.at(said, (leaf, label), weight)
+    mixed = (PRIOR * share + said) / (PRIOR * share.sum() + said.sum(axis=1, keepdims=True))
+    return node_of(tree.tree_, np.round(mixed, 2), 0)

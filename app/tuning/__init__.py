@@ -1,0 +1,1 @@
+"""The search for parameters: which ones, what for, over which runs, and what came of it."""

@@ -1,0 +1,71 @@
+// What a change acts on: the whole run, which is mapped again, or the scans from here on. And what that changed.
+
+import { put } from "./api.js";
+import { el, setText } from "./dom.js";
+import { count } from "./format.js";
+import { select } from "./live.js";
+import { changed, on, state } from "./state.js";
+import { attempt, isTuning } from "./tune.js";
+
+const MOST = 30;
+const SIGNS = { appeared: "+", vanished: "−", moved: "→" };
+let begun = null; // {share, at}: when the mapping was first heard of
+const progress = el("progress", { id: "tune-progress", max: "1", hidden: true, "aria-label": "The run is mapped again" });
+const told = el("p", { id: "tune-whole-told", class: "note dim", role: "status" });
+const list = el("ul", { id: "tune-changes" });
+const box = el("input", { id: "tune-whole", type: "checkbox", onchange: () => attempt(() => put("/api/parameters/reach", { whole: box.checked })) });
+export const wholeRun = el("section", { id: "tune-whole-run", "aria-label": "The whole run" },
+  el("label", { title: "Each change maps the run again from its first scan, so that the whole map and its score follow; else it acts from the scan that stands here" }, box, " map the whole run again"),
+  progress, told, list);
+
+function lead({ before, after, scans, changes }) {
+  const number = (kind) => changes.filter((change) => change.kind === kind).length;
+  const parts = Object.keys(SIGNS).map((kind) => number(kind) && `${number(kind)} ${kind}`).filter(Boolean);
+  return `${count(scans, "scan")} mapped again: ${before} → ${count(after, "tree")}${parts.length ? `, ${parts.join(", ")}` : ", all where they were"}.`;
+}
+
+// How long it takes yet [s], by how long it took so far; null while that tells nothing.
+function left(share) {
+  if (!begun || share < begun.share) begun = { share, at: performance.now() };
+  if (share - begun.share < 0.02) return null;
+  return ((performance.now() - begun.at) / 1000) * (1 - share) / (share - begun.share);
+}
+
+function progressTold(share, rough) {
+  const seconds = left(share);
+  const percent = `${Math.round(100 * share)} %${seconds === null ? "" : `, exact in about ${Math.ceil(seconds)} s`}`;
+  if (!rough) return `Mapping the run again: ${percent}`;
+  const f1 = rough.score?.f1 ?? null;
+  return `Rough answer, dashed in the map: ${count(rough.places.length, "tree")}${f1 === null ? "" : `, F1 ${f1.toFixed(3)}`}. Mapping the run again: ${percent}`;
+}
+
+function show() {
+  const share = state.status?.remapped ?? null;
+  const rough = share !== null && state.rough?.revision === state.parameters?.revision ? state.rough : null;
+  const newest = share === null && state.remapped?.revision !== state.parameters?.revision ? null : state.remapped; // else something was changed since
+  if (share === null) begun = null;
+  box.checked = state.parameters?.whole ?? true;
+  progress.hidden = share === null;
+  list.hidden = !newest?.changes.length;
+  if (share !== null) progress.value = share;
+  const ghost = isTuning() ? rough ?? newest : null;
+  if (state.ghost !== ghost) {
+    state.ghost = ghost;
+    changed("ghost");
+  }
+  if (share !== null) setText(told, progressTold(share, rough));
+  else setText(told, newest ? lead(newest) : box.checked ? "Change something: the whole map, its trees and its score follow." : "A change acts from the scan that stands here on.");
+}
+
+function showChanges() {
+  const changes = state.remapped?.changes ?? [];
+  list.replaceChildren(...changes.slice(0, MOST).map(({ kind, number, why }) => el("li", { "data-kind": kind }, el("b", { text: SIGNS[kind], "aria-hidden": "true" }),
+    kind === "vanished" ? el("span", { text: `Tree ${number} vanished` }) : el("button", { class: "link", type: "button", text: `Tree ${number} ${kind}`, onclick: () => select(number) }), el("small", { text: why }))),
+    changes.length > MOST ? el("li", { text: `and ${changes.length - MOST} more` }) : "");
+  show();
+}
+
+export function startWholeRun() {
+  on("status parameters tab rough", show);
+  on("remapped", showChanges);
+}

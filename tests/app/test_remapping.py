@@ -1,0 +1,267 @@
+"""A run that is mapped again is as if its parameters had been in force from its first scan on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+
+from app.map_changes import MapChanges
+from app.session import Session
+from app.worker import new_session
+from pipeline.errors import SourceError
+from pipeline.mapper import Mapper
+from pipeline.parameters import Parameters
+from pipeline.perception import Looked
+from pipeline.records import Frame, Step
+
+URI = "sim:paper?duration=4&odometry=poor"
+LAST = 39
+BASE = Parameters()
+FEWER = BASE.replace({"detection.e_max": 12.0, "slam.particles": 60})  # judged anew
+LATER = BASE.replace({"tracking.gate": 2.0, "gathering.tree_share": 0.3})  # tracked anew alone
+JUDGED = BASE.replace({"detection.radius_max": 0.2})  # from the first scan on that it touches
+WIDER = BASE.replace({"clustering.eps": 0.25})  # looked at anew
+
+
+def told(record: object) -> object:
+    """Everything that a record holds, bit by bit."""
+    if is_dataclass(record):
+        return tuple(told(getattr(record, f.name)) for f in fields(record))
+    if isinstance(record, np.ndarray):
+        return (record.dtype.str, record.shape, record.tobytes())
+    return repr(record)
+
+
+def settle(session: Session) -> None:
+    """Work until nothing is sought any more."""
+    while session.pace == "hurry":
+        session.work()
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    """A run that stands at its last scan but one."""
+    with closing(new_session()) as opened:
+        opened.open(URI, "auto", 3)
+        opened.set_parameters(BASE, 0)
+        opened.advance(LAST)
+        settle(opened)
+        yield opened
+
+
+def mapped_with(parameters: Parameters, last: int) -> tuple[object, object]:
+    """The scan and the path of a run that was mapped with some parameters from the start."""
+    with closing(new_session()) as opened:
+        opened.open(URI, "auto", 3)
+        opened.set_parameters(parameters, 0)
+        opened.advance(last + 1)
+        settle(opened)
+        return told(opened.frame), told(opened.path)
+
+
+def remapped(session: Session, scans: int = 7) -> tuple[Frame, MapChanges]:
+    """Map again until it is done."""
+    while session.is_remapping:
+        done = session.remap(scans)
+        if done is not None:
+            return done
+    raise AssertionError("it was given up")
+
+
+@pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER, JUDGED])
+def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters):
+    standing = session.status().scan_index
+    session.set_parameters(parameters, 1, whole=True)
+    assert session.is_remapping
+    frame, changes = remapped(session)
+    assert (told(frame), told(session.path)) == mapped_with(parameters, standing)
+    assert changes.revision == 1
+    assert changes.scans == standing + 1
+    assert session.status().remapped is None
+
+
+@pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER])
+def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parameters):
+    session.set_parameters(parameters, 1, whole=True)
+    remapped(session)
+    for index in (12, 25):
+        session.seek(0.1 * index)
+        settle(session)
+        assert (told(session.frame), told(session.path)) == mapped_with(parameters, index)
+
+
+def test_a_rough_answer_is_there_before_the_exact_one(session):
+    assert [session.rough] == [None]
+    session.set_parameters(FEWER, 1, whole=True)
+    assert [session.rough] == [None]  # other particles find other poses
+    session.set_parameters(BASE.replace({"detection.e_max": 12.0}), 2, whole=True)
+    rough = session.rough
+    assert rough is not None
+    frame, _ = remapped(session)
+    assert abs(int(frame.trees.confirmed.sum()) - len(rough.number)) <= 2
+    assert [session.rough] == [None]
+
+
+def test_a_newer_change_stops_an_older_one(session):
+    session.set_parameters(WIDER, 1, whole=True)
+    session.remap(5)
+    session.set_parameters(FEWER, 2, whole=True)
+    frame, _ = remapped(session)
+    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+
+
+def test_a_change_from_here_on_leaves_the_map_before_it(session):
+    session.set_parameters(WIDER, 1, whole=True)
+    session.remap(5)
+    session.set_parameters(FEWER, 2)
+    assert not session.is_remapping
+    assert session.status().remapped is None
+
+
+@pytest.mark.parametrize("done", [3, 30])
+def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done):
+    session.set_parameters(FEWER, 1, whole=True)
+    session.remap(done)
+    session.seek(1.5)
+    assert not session.is_remapping  # until it is there
+    settle(session)
+    frame, _ = remapped(session)
+    assert frame.index == 15
+    assert told(frame) == mapped_with(FEWER, 15)[0]
+
+
+def test_it_goes_on_while_the_run_plays(session):
+    session.seek(1.0)
+    settle(session)
+    session.set_parameters(FEWER, 1, whole=True)
+    session.play()
+    done = None
+    while done is None:
+        session.work()
+        done = session.remap(2)
+    frame, _ = done
+    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+    after = session.work()
+    assert told(after) == mapped_with(FEWER, frame.index + 1)[0]
+
+
+def test_what_is_no_part_of_the_map_begins_nothing(session):
+    session.set_parameters(BASE.replace({"evaluation.match_distance": 0.3}), 1, whole=True)
+    assert not session.is_remapping
+
+
+def test_what_cannot_be_read_again_leaves_the_map_and_says_so(session, monkeypatch):
+    run = session._run
+    before = told(session.frame)
+
+    def nothing() -> Iterator[object]:
+        raise SourceError("the disk is gone")
+
+    monkeypatch.setattr(run, "_reread", nothing)
+    session.set_parameters(WIDER, 1)
+    at_hand = told(session.frame)
+    session.set_parameters(WIDER, 2, whole=True)
+    assert session.remap(5) is None
+    assert not session.is_remapping
+    assert told(session.frame) == at_hand != before
+    assert any("was not mapped again" in w and "the disk is gone" in w for w in session.status().warnings)
+
+
+def test_it_tells_which_trees_came_and_went_and_why():
+    with closing(new_session()) as session:
+        session.open("sim:paper?duration=12", "auto", 3)
+        session.set_parameters(BASE, 0)
+        session.advance(120)
+        settle(session)
+        frame = session.frame
+        assert frame is not None
+        known = int(np.count_nonzero(frame.trees.confirmed))
+        assert known >= 2
+        # No column is ever a tree now; then all are back.
+        session.set_parameters(BASE.replace({"gathering.tree_share": 1.0}), 1, whole=True)
+        _, none = remapped(session)
+        session.set_parameters(BASE, 2, whole=True)
+        again, back = remapped(session)
+    assert (none.before, none.after) == (known, known - sum(c.kind == "vanished" for c in none.changes))
+    gone = [change for change in none.changes if change.kind == "vanished"]
+    assert gone
+    assert all("votes for a tree" in change.why or "does not confirm" in change.why for change in gone)
+    assert [(c.x, c.y) for c in back.changes if c.kind == "appeared"] == [(c.x, c.y) for c in gone]
+    assert back.after == known
+    assert told(again) == told(frame)
+    assert sorted(number for number, _ in back.confirmed) == sorted(frame.trees.number[frame.trees.confirmed])
+    assert all(0.0 <= time_s <= 12.0 for _, time_s in back.confirmed)
+
+
+@pytest.mark.parametrize("begun_before", [False, True])
+def test_a_change_on_the_way_to_another_scan_acts_on_the_whole_run_there(session, begun_before):
+    if begun_before:
+        session.set_parameters(WIDER, 1, whole=True)
+        session.remap(5)
+    session.seek(2.0)
+    session.set_parameters(FEWER, 2, whole=True)
+    assert not session.is_remapping
+    settle(session)
+    frame, changes = remapped(session)
+    assert changes.revision == 2
+    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+    session.play()
+    assert told(session.work()) == mapped_with(FEWER, frame.index + 1)[0]
+
+
+def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
+    session.set_parameters(FEWER, 1, whole=True)
+    session.remap(3)
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(session._run._remapping.rerun.mapper, "take", broken)
+    with pytest.raises(ZeroDivisionError):
+        session.remap(3)
+    assert not session.is_remapping
+    session.set_parameters(WIDER, 2, whole=True)
+    session.fail("the run stopped")
+    assert not session.is_remapping
+
+
+def test_what_was_kept_when_it_was_open_before_is_used_by_who_is_in_a_hurry(tmp_path, monkeypatch):
+    looked, mapped = [], []
+
+    def counted(self: Mapper, step: Step) -> Looked:
+        looked.append(step.index)
+        return look(self, step)
+
+    look = Mapper.look
+    monkeypatch.setattr(Mapper, "look", counted)
+    for _ in range(2):
+        looked.clear()
+        with closing(new_session(tmp_path)) as session:
+            session.open(URI, "auto", 3)
+            session.set_parameters(BASE, 0)
+            session.advance(11)
+            settle(session)
+            assert session.frame is not None
+            assert len(session.frame.raw)
+            mapped.append((told(session.frame), told(session.path)))
+            assert session.status().warnings == []
+    assert looked == [10]
+    assert mapped[0] == mapped[1]
+    assert [path.suffix for path in tmp_path.iterdir()] == [".scans"]
+
+
+def test_without_room_for_the_scans_they_are_read_once_more_and_that_is_said(monkeypatch):
+    monkeypatch.setattr("pipeline.rerun.kept.SPARE_BYTES", 1 << 62)
+    with closing(new_session()) as session:
+        session.open(URI, "auto", 3)
+        session.set_parameters(BASE, 0)
+        session.advance(8)
+        settle(session)
+        session.set_parameters(FEWER, 1, whole=True)
+        assert any("from scan 0 on nothing is kept" in warning for warning in session.status().warnings)
+        frame, _ = remapped(session)
+        assert told(frame) == mapped_with(FEWER, frame.index)[0]

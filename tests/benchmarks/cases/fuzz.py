@@ -1,0 +1,125 @@
+"""Thousands of damaged files of each kind: no crash, no hang, no flood of memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+
+from tests.benchmarks.process import ROOT, environment
+from tests.benchmarks.real_files import KINDS
+from tests.benchmarks.results import DATA
+from tests.benchmarks.table import Cell, Table, verdict
+
+NAME = "fuzz"
+LINE = "Damaged copies of real files of each kind, read to their end"
+
+COPIES = 5_000
+LONGEST_S, MOST_MIB = 2.0, 512.0
+#: No kind takes longer than this; the table says how many copies that were.
+BUDGET_S = float(os.environ.get("STEMMAP_FUZZ_SECONDS", "600"))
+_SILENT_S = 60.0  # of the wall clock: a busy machine is no hang
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What came of the copies of one kind."""
+
+    read: int = 0
+    refused: int = 0
+    faults: list[str] = field(default_factory=list)
+    crashes: int = 0
+    hangs: int = 0
+    longest_s: float = 0.0
+    peak_mib: float = 0.0
+
+    def row(self, kind: str) -> tuple[Cell, ...]:
+        """For the table."""
+        good = not (self.faults or self.crashes or self.hangs) and self.peak_mib < MOST_MIB
+        copies = self.read + self.refused + len(self.faults) + self.crashes
+        figures = (copies, self.refused, len(self.faults), self.crashes, self.hangs)
+        return (kind, *figures, 1000.0 * self.longest_s, self.peak_mib, verdict(good))
+
+
+def run() -> list[Table]:
+    """Read them all."""
+    rows, notes = [], []
+    for kind in KINDS:
+        outcome = attack(kind, COPIES)
+        rows.append(outcome.row(kind))
+        notes += [f"{kind}: {fault.strip().splitlines()[-1]}" for fault in outcome.faults[:3]]
+        print(f"{kind}: {outcome.row(kind)}", file=sys.stderr, flush=True)
+    return [
+        Table(
+            f"Up to {COPIES:,} damaged copies of each kind",
+            ("kind", "copies", "refused", "faults", "crashes", "hangs", "longest ms", "peak MiB", ""),
+            tuple(rows),
+            (
+                "Refused: one clear error; the others were read as far as they are whole, with what was left "
+                f"out counted. A hang is more than {LONGEST_S:g} s of one core. Asked for: no fault, no "
+                f"crash, no hang, less than {MOST_MIB:g} MiB (the whole process).",
+                f"At most {BUDGET_S:g} s of each kind (STEMMAP_FUZZ_SECONDS): a busy machine reads fewer.",
+                "All copies of a kind are read in one process: what a library does not give back adds up.",
+                *notes,
+            ),
+        )
+    ]
+
+
+def attack(kind: str, copies: int) -> Outcome:
+    """Read damaged copies in a child, and in another from the next on when that one dies or hangs."""
+    outcome, first = Outcome(), 0
+    until = time.monotonic() + BUDGET_S
+    while first < copies and time.monotonic() < until:
+        with tempfile.TemporaryDirectory() as folder:
+            words = [sys.executable, "-m", "tests.benchmarks.fuzzing", kind, str(DATA), folder]
+            child = subprocess.Popen(
+                [*words, str(first), str(copies)],
+                cwd=ROOT,
+                env=environment(),
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            first = _follow(child, outcome, first, until)
+            if first < copies:  # it died, or was ended, while it read this one
+                first += 1
+    return outcome
+
+
+def _follow(child: subprocess.Popen[str], outcome: Outcome, first: int, until: float) -> int:
+    """Count what a child tells until it ends; the copy that it would read next."""
+    assert child.stdout is not None
+    before = first
+    while True:
+        if time.monotonic() > until:
+            child.kill()
+            child.wait()
+            return first
+        if not select.select([child.stdout], [], [], _SILENT_S)[0]:
+            child.kill()
+            child.wait()
+            outcome.hangs += 1
+            return first
+        line = child.stdout.readline()
+        if not line:
+            if child.wait() != 0:
+                if first == before:
+                    raise RuntimeError("the child cannot begin")
+                outcome.crashes += 1
+            return first
+        number, refused, seconds, peak, fault = json.loads(line)
+        first = number + 1
+        outcome.longest_s = max(outcome.longest_s, seconds)
+        outcome.peak_mib = max(outcome.peak_mib, peak)
+        outcome.hangs += seconds > LONGEST_S
+        if fault:
+            outcome.faults.append(fault)
+        elif refused:
+            outcome.refused += 1
+        else:
+            outcome.read += 1

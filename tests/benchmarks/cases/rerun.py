@@ -1,0 +1,214 @@
+"""The whole run mapped again after a change of one parameter, against mapping it from its scans."""
+
+from __future__ import annotations
+
+import gc
+import time
+from contextlib import closing
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tests.benchmarks.table import Cell, Table, verdict
+
+if TYPE_CHECKING:
+    from pipeline.mapper import Mapper
+    from pipeline.parameters import Parameters
+    from pipeline.records import Step
+    from pipeline.rerun import Basis, KeptScans
+    from pipeline.sources.base import Source
+
+NAME = "rerun"
+LINE = "The whole run mapped again after a change, from what its scans showed"
+
+URI, SCANS = "sim:long", 6000
+READ_AGAIN = 1000  # scans that are held in memory, for changes that look at the points again
+ASKED_ROUGH = 0.2  # s
+STATES_EVERY = 150  # scans, as a run of this length keeps them
+ASKED_KEPT = 25.0  # kB a scan
+COPIED = 1 << 28  # bytes
+# What is changed, to what, and how long the whole run may take [s].
+JUDGED = (
+    ("detection.e_max", 40.0, 0.5),
+    ("gathering.tree_share", 0.7, 0.5),
+    ("tracking.gate", 2.5, 0.5),
+    ("detection.radius_max", 0.5, 0.5),
+    ("slam.particles", 50, 0.5),
+)
+LOOKED = (("clustering.eps", 0.2, 1.5), ("filters.voxel_size", 0.02, 2.5))
+
+
+def run() -> list[Table]:
+    """Preset forest, one core."""
+    from pipeline.parameters import preset
+    from pipeline.rerun import KeptScans
+    from pipeline.sources import open_source
+
+    base = preset("forest")
+    source = open_source(URI)
+    bandwidth = _bandwidth()
+    with closing(KeptScans(most=8 << 30)) as kept:
+        held, mapping, basis = _first_time(source, base, kept)
+        size = kept.nbytes / max(len(kept), 1)
+        scans = len(kept)
+        noted = sum(entry.nbytes for entry in basis.entries)
+        rows = [_whole("mapped from its scans, without reading them", scans, mapping, None, 0, bandwidth)]
+        roughly = []
+        for name, value, asked in JUDGED:
+            tried, words = base.replace({name: value}), f"{name} {_of(base, name)} → {value}"
+            begun, tracked = basis.begin(tried, kept.clusters)
+            wall = _again(source, tried, kept, scans, None, basis)
+            read = noted if tracked else round(kept.nbytes * (1 - begun / scans))
+            rows.append(_whole(words, scans, wall, asked, read, bandwidth, _from(begun, tracked)))
+            roughly.append(_rough(words, basis, kept, tried, bandwidth))
+        for name, value, asked in LOOKED:
+            wall = _again(source, base.replace({name: value}), kept, len(held), held)
+            scaled = asked * len(held) / scans
+            points = sum(step.scan.points.nbytes for step in held)
+            rows.append(
+                _whole(f"{name} {_of(base, name)} → {value}", len(held), wall, scaled, points, bandwidth)
+            )
+    return [
+        Table(
+            f"{URI}, preset forest, 100 particles, one core, warm",
+            ("change", "begun", "scans", "s", "ms a scan", "asked s", "MB read", "limit s", "reached"),
+            tuple(rows),
+            (
+                f"Kept on disk: {size / 1e3:.1f} kB a scan, {ASKED_KEPT:g} asked: "
+                f"{verdict(size <= 1e3 * ASKED_KEPT)}.",
+                f"Limit: the bytes to be read by the bandwidth of a copy, {bandwidth / 1e9:.1f} GB/s; "
+                "what is asked is for the 6,000 scans of the run; for the last rows, which hold fewer in "
+                "memory, in proportion.",
+                f"Kept in memory: {noted / scans / 1e3:.1f} kB a scan of what the stages made of it, and "
+                f"{kept.clusters.nbytes / scans / 1e3:.1f} kB of clusters.",
+                "A change of the tracking tracks the trees alone anew; one of a verdict begins at the first "
+                "scan whose detections differ, which often is one of the first.",
+            ),
+        ),
+        Table(
+            "Rough answer before the exact one",
+            ("change", "trees", "s", "asked s", "MB read", "limit s", "reached"),
+            tuple(roughly),
+            ("Kept clusters judged anew at the poses of the map before; it tells nothing of other poses.",),
+        ),
+    ]
+
+
+def _of(parameters: Parameters, name: str) -> object:
+    return parameters.flat()[name]
+
+
+def _from(begun: int, tracked: bool) -> str:
+    if tracked:
+        return "trees alone"
+    return f"at scan {begun:,}" if begun else "at the first scan"
+
+
+def _rough(
+    words: str, basis: Basis, kept: KeptScans, parameters: Parameters, bandwidth: float
+) -> tuple[Cell, ...]:
+    """The rough answer; once before for the kernels."""
+    from pipeline.rerun import rough_trees
+
+    trees, spent = None, 0.0
+    for _ in range(2):
+        start = time.perf_counter()
+        trees = rough_trees(basis, kept.clusters, parameters)
+        spent = time.perf_counter() - start
+    if trees is None:
+        return (words, "none", "", ASKED_ROUGH, "", "", "")
+    size = kept.clusters.nbytes
+    reached = verdict(spent <= ASKED_ROUGH)
+    return (words, len(trees.number), spent, ASKED_ROUGH, size / 1e6, size / bandwidth, reached)
+
+
+def _fresh(source: Source, parameters: Parameters) -> Mapper:
+    from pipeline.mapper import Mapper
+
+    known = source.description
+    return Mapper(parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=0)
+
+
+def _first_time(source: Source, parameters: Parameters, kept: KeptScans) -> tuple[list[Step], float, Basis]:
+    """Map the run, keep what it shows and what came of it, and hold its first scans; with the seconds of the
+    mapping alone."""
+    from pipeline.rerun import Basis, Journal, look_key
+    from pipeline.steps import steps
+
+    mapper, key = _fresh(source, parameters), look_key(parameters)
+    held: list[Step] = []
+    journal, states = Journal(), {}
+    mapper.note = lambda noted: journal.note(noted, parameters.slam)
+    spent = 0.0
+    for step in islice(steps(source.records()), SCANS):
+        if step.index % STATES_EVERY == 0:
+            states[step.index] = mapper.snapshot()
+        start = time.perf_counter()
+        looked = mapper.look(step)
+        mapper.take(step, looked)
+        spent += time.perf_counter() - start
+        kept.put(step, looked, key)
+        if len(held) < READ_AGAIN:
+            held.append(step)
+    states[len(kept)] = mapper.snapshot()
+    entries, path = journal.first(len(kept)), mapper.path
+    return held, spent, Basis(parameters, entries, states, path.stamp_ns, path.sigma_xy, mapper.motion)
+
+
+def _again(
+    source: Source,
+    parameters: Parameters,
+    kept: KeptScans,
+    scans: int,
+    held: list[Step] | None,
+    basis: Basis | None = None,
+) -> float:
+    """Seconds that a rerun takes; once before for the kernels, over a few scans."""
+    from pipeline.rerun import Rerun
+
+    spent, reread = 0.0, None if held is None else lambda: iter(held)
+    for most in (min(scans, 50), scans):
+        gc.collect()
+        start = time.perf_counter()
+        with closing(Rerun(_fresh(source, parameters), kept, reread, basis)) as rerun:
+            for _ in rerun.frames(most):
+                pass
+            spent = time.perf_counter() - start
+    return spent
+
+
+def _whole(
+    change: str,
+    scans: int,
+    seconds: float,
+    asked: float | None,
+    read: int,
+    bandwidth: float,
+    begun: str = "at the first scan",
+) -> tuple[Cell, ...]:
+    limit = read / bandwidth
+    reached = "" if asked is None else verdict(seconds <= asked)
+    return (
+        change,
+        begun,
+        scans,
+        seconds,
+        1e3 * seconds / scans,
+        "" if asked is None else asked,
+        read / 1e6 if read else "",
+        limit if read else "",
+        reached,
+    )
+
+
+def _bandwidth() -> float:
+    """Bytes a second that a core reads while it copies: the best of five."""
+    source = np.ones(COPIED, np.uint8)
+    into = np.empty_like(source)
+    best = float("inf")
+    for _ in range(5):
+        start = time.perf_counter()
+        np.copyto(into, source)
+        best = min(best, time.perf_counter() - start)
+    return COPIED / best

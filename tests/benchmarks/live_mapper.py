@@ -1,0 +1,103 @@
+"""Maps one robot as `stemmap map zenoh:...` does: `live_mapper.py PORT NAME [RECORDING]`.
+
+Says when it is ready; at a line on stdin it ends and tells what came, what was mapped and when, and what the
+recording cost.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from app.live_cursor import LiveCursor
+from app.odometry import with_odometry
+from app.robot.recording import Recording
+from app.robot.source import LiveSource, open_live
+from app.warming import warm_up
+from pipeline.mapper import Mapper
+from pipeline.parameters import preset
+from pipeline.sources.container import Message
+
+
+class Costs:
+    """Adds up what some methods of an object cost this thread."""
+
+    def __init__(self) -> None:
+        self.cpu_ns = 0
+
+    def watch(self, thing: Any, *names: str) -> None:
+        """Measure these methods from now on."""
+        for name in names:
+            setattr(thing, name, self._measured(getattr(thing, name)))
+
+    def _measured(self, method: Any) -> Any:
+        def measured(*arguments: Any, **named: Any) -> Any:
+            began = time.thread_time_ns()
+            try:
+                return method(*arguments, **named)
+            finally:
+                self.cpu_ns += time.thread_time_ns() - began
+
+        return measured
+
+
+def _stop_at_a_line(source: LiveSource) -> None:
+    sys.stdin.readline()
+    source.stop()
+
+
+def main(port: str, robot: str, place: str = "") -> None:
+    """Map until a line comes on stdin and nothing waits any more."""
+    warm_up()
+    costs = Costs()
+    recording = Recording(Path(place)) if place else None
+    if recording is not None:
+        # add and add_frame call flush_when_due, which is measured with them.
+        costs.watch(recording, "add", "add_frame", "add_parameters")
+    with closing(open_live(f"zenoh:tcp/127.0.0.1:{port}?robot={robot}")) as source:
+        source.use(recording, publish=False)
+        arrived: list[float] = []
+        put = source._inbox.put
+
+        def noted(message: Message, *, is_scan: bool) -> None:
+            put(message, is_scan=is_scan)
+            if is_scan:
+                arrived.append(time.monotonic())
+
+        source._inbox.put = noted  # type: ignore[method-assign]
+        print(json.dumps({"ready": True}), flush=True)
+        threading.Thread(target=_stop_at_a_line, args=(source,), daemon=True).start()
+        if not source.wait():
+            raise SystemExit("nothing was heard")
+        description = source.description
+        mapper = Mapper(
+            preset("forest"), sensor=description.sensor, T_base_lidar=description.T_base_lidar, seed=0
+        )
+        moving, chosen = with_odometry(source, "auto")
+        cursor, mapped = LiveCursor(source, chosen, moving), []
+        while not source._ending.is_set() or source.scans_waiting:
+            step = cursor.take()
+            if step is None:
+                time.sleep(0.005)  # as the worker waits
+                continue
+            frame = mapper.process(step)
+            source.mapped(frame, mapper.path)
+            mapped.append(time.monotonic())
+        told = {
+            "came": source.scans_come,
+            "mapped": len(mapped),
+            "losses": source.losses,
+            "latency_s": [done - at for at, done in zip(arrived, mapped, strict=False)],
+            "cpu_s": time.process_time(),
+            "recording_cpu_s": 1e-9 * costs.cpu_ns,
+        }
+    print(json.dumps(told), flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,74 @@
+"""Damaged copies of files, and readers that must bear them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import SourceError
+from pipeline.records import Scan
+from pipeline.sources import open_source
+from pipeline.sources.clouds import open_cloud
+
+
+def mutation(original: bytes, seed: int, number: int) -> bytes:
+    """A changed copy of a file: bits, zeros, cuts, insertions and numbers; the same for a seed."""
+    rng = np.random.default_rng([seed, number])
+    content = bytearray(original)
+    # Headers and indexes stand at the ends, where a change does most.
+    reach = (len(content), 512, 4096)[number % 3]
+    for _ in range(int(rng.integers(1, 6))):
+        at = int(rng.integers(0, min(reach, len(content)) or 1))
+        at = max(len(content) - 1 - at, 0) if number % 2 else at
+        run = int(rng.integers(1, 16))
+        match int(rng.integers(0, 6)):
+            case 0:
+                content[at : at + 1] = bytes([int(rng.integers(0, 256))])
+            case 1:
+                content[at : at + run] = bytes(run)
+            case 2:
+                content[at : at + run] = b"\xff" * run
+            case 3:
+                content[at:at] = rng.bytes(run)
+            case 4:
+                del content[at : at + run]
+            case _:
+                content[at : at + 4] = int(rng.integers(0, 2**32)).to_bytes(4, "little")
+    if number % 5 == 4:
+        del content[int(rng.integers(0, len(content) + 1)) :]
+    return bytes(content)
+
+
+def read_all(path: Path) -> str:
+    """Read a run to its end: "" or the text of its SourceError."""
+    try:
+        source = open_source(str(path))
+    except SourceError as error:
+        return str(error)
+    try:
+        last = -(2**63)
+        for record in source.records():
+            assert record.stamp_ns >= last
+            last = record.stamp_ns
+            if isinstance(record, Scan):
+                assert np.isfinite(record.points).all()
+        source.truth()
+        assert all(count > 0 for count in source.losses.values())
+    except SourceError as error:
+        return str(error)
+    finally:
+        source.close()
+    return ""
+
+
+def read_cloud(path: Path) -> str:
+    """Read a whole cloud to its end: "" or the text of its SourceError."""
+    try:
+        cloud = open_cloud(str(path))
+        for part in cloud.parts():
+            assert np.isfinite(part).all()
+    except SourceError as error:
+        return str(error)
+    assert all(count > 0 for count in cloud.losses.values())
+    return ""

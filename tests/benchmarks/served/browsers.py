@@ -1,0 +1,141 @@
+"""Browsers without a picture: each hears both websockets of the page, as fast as it can.
+
+`python -m tests.benchmarks.served.browsers PORT TOKEN`: a line of JSON goes in, one comes out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import sys
+import time
+from collections.abc import AsyncIterator
+from typing import Any
+
+import httpx
+import viser
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from tests.benchmarks.child import answers
+
+_CLOUD_BYTES = 10_000  # a message of viser with points of a scan has more, those of sliders less
+_LONGEST_S = 60.0
+
+
+class Browser:
+    """One page: when it heard of each scan, and when points came to its scene [s]."""
+
+    def __init__(self, port: int, token: str) -> None:
+        self._address, self._headers = f"ws://127.0.0.1:{port}", {"Authorization": f"Bearer {token}"}
+        self.maps: list[tuple[int, float]] = []
+        self.clouds: list[float] = []
+        self._tasks = [asyncio.create_task(self._page()), asyncio.create_task(self._scene())]
+
+    async def leave(self) -> None:
+        """Close the page."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _page(self) -> None:
+        async with self._open("/api/live") as live:
+            async for message in live:
+                if message[:13] == '{"type":"map"':
+                    self.maps.append((int(json.loads(message)["index"]), time.monotonic()))
+
+    async def _scene(self) -> None:
+        async with self._open("/viser/", Subprotocol(f"viser-v{viser.__version__}")) as scene:
+            async for message in scene:
+                if len(message) > _CLOUD_BYTES:
+                    self.clouds.append(time.monotonic())
+
+    @contextlib.asynccontextmanager
+    async def _open(self, path: str, *protocols: Subprotocol) -> AsyncIterator[ClientConnection]:
+        async with connect(
+            self._address + path,
+            subprotocols=protocols or None,
+            additional_headers=self._headers,
+            compression=None,
+            max_size=None,
+            proxy=None,
+        ) as connection:
+            yield connection
+
+
+class Browsers:
+    """All of them, and a person who does something."""
+
+    def __init__(self, port: int, token: str) -> None:
+        self._port, self._token = port, token
+        self._open: list[Browser] = []
+        self._web = httpx.AsyncClient(
+            base_url=f"http://127.0.0.1:{port}",
+            headers={"Authorization": f"Bearer {token}"},
+            timeout=_LONGEST_S,
+        )
+
+    async def answer(self, question: dict[str, Any]) -> dict[str, Any]:
+        """Do what is asked."""
+        match question:
+            case {"do": "browsers", "count": count}:
+                while len(self._open) > count:
+                    await self._open.pop().leave()
+                while len(self._open) < count:
+                    self._open.append(Browser(self._port, self._token))
+                return {}
+            case {"do": "heard"}:
+                told = [[browser.maps, browser.clouds] for browser in self._open]
+                for browser in self._open:
+                    browser.maps, browser.clouds = [], []
+                return {"browsers": told}
+            case {"do": "command", "command": command}:
+                (await self._web.post("/api/command", json=command)).raise_for_status()
+                return {}
+            case {"do": "status"}:
+                status: dict[str, Any] = (await self._web.get("/api/status")).json()
+                return status
+            case {"do": "change", "changes": changes}:
+                return await self._change(changes)
+            case {"do": "late"}:
+                return await self._late()
+        raise ValueError(question)
+
+    async def _change(self, changes: dict[str, float]) -> dict[str, Any]:
+        """Move a slider while the run stands; milliseconds until the first browser has the answer."""
+        (browser, *_) = self._open
+        browser.maps, browser.clouds = [], []
+        start = time.monotonic()
+        sending = asyncio.create_task(self._web.patch("/api/parameters", json={"changes": changes}))
+        await _until(lambda: bool(browser.maps and browser.clouds))
+        (await sending).raise_for_status()
+        return {"map": 1e3 * (browser.maps[0][1] - start), "scene": 1e3 * (browser.clouds[0] - start)}
+
+    async def _late(self) -> dict[str, Any]:
+        """Seconds until one that comes late has the map and the points of the scan."""
+        start = time.monotonic()
+        late = Browser(self._port, self._token)
+        await _until(lambda: bool(late.maps and late.clouds))
+        told = {"map": late.maps[0][1] - start, "scene": late.clouds[0] - start}
+        await late.leave()
+        return told
+
+
+async def _until(holds: Any) -> None:
+    async with asyncio.timeout(_LONGEST_S):
+        while not holds():
+            await asyncio.sleep(0.002)
+
+
+async def _main(port: int, token: str) -> None:
+    browsers = Browsers(port, token)
+    with answers() as pipe:
+        while line := await asyncio.to_thread(sys.stdin.readline):
+            pipe.write(json.dumps(await browsers.answer(json.loads(line))) + "\n")
+            pipe.flush()
+        await browsers.answer({"do": "browsers", "count": 0})
+
+
+if __name__ == "__main__":
+    asyncio.run(_main(int(sys.argv[1]), sys.argv[2]))

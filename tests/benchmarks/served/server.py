@@ -1,0 +1,119 @@
+"""The dashboard's server as `stemmap serve` runs it, which tells when it heard of each scan.
+
+`python -m tests.benchmarks.served.server SOURCE FOLDER`: a line of JSON goes in, one comes out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from app.dashboard import Dashboard
+from app.messages import Open
+from app.parameter_state import ParameterState
+from app.scene.scene import RENEW_AFTER, Scene
+from app.security import new_token
+from app.server import build
+from app.serving import bind, uvicorn_config
+from app.settings import Settings
+from app.worker_messages import FromWorker, Shown
+from app.worker_process import WorkerProcess
+from tests.benchmarks.child import answers
+
+# Of the messages that are still missing so many are sent before others get a turn.
+_AT_ONCE = 1_000
+_LEFT = 1_000  # messages to the renewal of the scene: the latest moment before it
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+class Served:
+    """A server in this process, and what is asked of it."""
+
+    def __init__(self, source: str, folder: Path) -> None:
+        self._heard: list[tuple[int, float, float]] = []
+        settings = Settings(port=0, folder=folder)
+        self._listening = bind(settings)
+        self._port, self._token = self._listening.getsockname()[1], new_token()
+        app = build(
+            settings,
+            port=self._port,
+            token=self._token,
+            source=Open(source),
+            parameter_state=ParameterState(),
+            make_worker=self._worker,
+        )
+        self._dashboard: Dashboard = app.state.dashboard
+        self._server = uvicorn.Server(uvicorn_config(app, settings))
+
+    async def run(self) -> None:
+        """Serve until the questions end."""
+        serving = asyncio.create_task(self._server.serve(sockets=[self._listening]))
+        with answers() as pipe:
+            while line := await asyncio.to_thread(sys.stdin.readline):
+                answer = await self._answer(json.loads(line))
+                pipe.write(json.dumps(answer) + "\n")
+                pipe.flush()
+        self._server.should_exit = True
+        await serving
+
+    def _worker(self, dashboard: Dashboard) -> WorkerProcess:
+        async def receive(message: FromWorker) -> None:
+            if isinstance(message, Shown):
+                self._heard.append((message.frame.index, time.monotonic(), time.time()))
+            await dashboard.receive(message)
+
+        return WorkerProcess(receive)
+
+    async def _answer(self, question: dict[str, Any]) -> dict[str, Any]:
+        match question["do"]:
+            case "link":
+                while not self._server.started:
+                    await asyncio.sleep(0.01)
+                return {"port": self._port, "token": self._token}
+            case "heard":
+                heard, self._heard = self._heard, []
+                return {"heard": heard}
+            case "cpu":
+                return {"web": _cpu_s(os.getpid()), "worker": _cpu_s(self._dashboard.worker.pid)}
+            case "messages":
+                return {"messages": self._scene.messages}
+            case "age":
+                return {"messages": await self._age()}
+        raise ValueError(question)
+
+    @property
+    def _scene(self) -> Scene:
+        assert isinstance(self._dashboard.scene, Scene)
+        return self._dashboard.scene
+
+    async def _age(self) -> int:
+        """Send so many messages to the scene that it is about to renew itself; how many it has had."""
+        from viser import _messages
+
+        scene = self._scene
+        node = scene._server.scene.add_frame("/traffic", visible=False)
+        while scene.messages < RENEW_AFTER - _LEFT:
+            with scene._server.atomic():
+                for k in range(_AT_ONCE):  # as the node itself would send it
+                    moved = _messages.SetPositionMessage(node.name, (0.0, 0.0, float(k)))
+                    scene._server._websock_server.queue_message(moved)
+            await asyncio.sleep(0.0)
+        node.remove()
+        return scene.messages
+
+
+def _cpu_s(pid: int | None) -> float:
+    """What a process has used of a core so far [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / _TICKS
+
+
+if __name__ == "__main__":
+    asyncio.run(Served(sys.argv[1], Path(sys.argv[2])).run())

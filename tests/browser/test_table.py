@@ -1,0 +1,191 @@
+"""The table of trees: sorted by each column, sifted by what is typed, and the files of all four results."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+from playwright.sync_api import Locator, Page, expect
+
+from tests.browser.dashboard import Dashboard
+
+
+@pytest.fixture(autouse=True)
+def _standing(dashboard: Dashboard):
+    dashboard.stand()
+    dashboard.tab("Trees")
+    dashboard.page.locator("#find").fill("")
+    expect(dashboard.page.locator("#trees tbody tr").first).to_be_visible()
+
+
+def trees(dashboard: Dashboard) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = dashboard.ask("/api/trees")["trees"]
+    return found
+
+
+def listed(page: Page) -> list[int]:
+    """The numbers in the table, from above."""
+    rows = page.locator("#trees tbody tr").evaluate_all("all => all.map(row => Number(row.dataset.tree))")
+    return [int(number) for number in rows]
+
+
+def sigma(tree: dict[str, Any]) -> float:
+    return float(max(tree["ellipse"][:2]))
+
+
+# What the server holds, by the column of the table.
+COLUMNS = {
+    "number": lambda tree: tree["number"],
+    "x": lambda tree: tree["x"],
+    "y": lambda tree: tree["y"],
+    "sigma": sigma,
+    "dbh": lambda tree: -1.0 if tree["dbh_cm"] is None else tree["dbh_cm"],
+    "e": lambda tree: tree["eccentricity"],
+    "seen": lambda tree: tree["observations"],
+}
+
+
+def test_every_column_sorts_both_ways_by_what_the_server_holds(dashboard: Dashboard):
+    page, held = dashboard.page, trees(dashboard)
+    assert len(held) > 10
+    assert page.locator("#trees th").count() == len(COLUMNS)
+    for key, value in reversed(COLUMNS.items()):  # back to the number in the end
+        header = page.locator(f"#trees th[data-key={key}]")
+        for order, sign in (("ascending", 1.0), ("descending", -1.0)):
+            while header.get_attribute("aria-sort") != order:
+                header.get_by_role("button").click()
+            rows = sorted(held, key=lambda tree: (sign * value(tree), tree["number"]))
+            assert listed(page) == [tree["number"] for tree in rows], (key, order)
+    page.locator("#trees th[data-key=number] button").click()
+
+
+def test_what_is_typed_sifts_the_trees(dashboard: Dashboard):
+    page, held = dashboard.page, trees(dashboard)
+    thick = sorted(tree["dbh_cm"] for tree in held if tree["dbh_cm"] is not None)
+    middle = thick[len(thick) // 2]
+    often = sorted(tree["observations"] for tree in held)[len(held) // 2]
+    wanted = {
+        f"dbh {middle:g}..{thick[-1]:g}": lambda t: t["dbh_cm"] is not None and t["dbh_cm"] >= middle,
+        f"DBH<{middle}": lambda t: t["dbh_cm"] is not None and t["dbh_cm"] < middle,
+        "dbh none": lambda t: t["dbh_cm"] is None,
+        f"seen >= {often} x > 0": lambda t: t["observations"] >= often and t["x"] > 0,
+        "y ..-1": lambda t: t["y"] <= -1,
+        "1": lambda t: str(t["number"]).startswith("1"),
+        "unjudged": lambda _: True,
+        "judged": lambda _: False,
+    }
+    for text, holds in wanted.items():
+        page.locator("#find").fill(text)
+        fits = [tree["number"] for tree in held if holds(tree)]
+        assert sorted(listed(page)) == sorted(fits), text
+        expect(page.locator("#tree-count")).to_have_text(f"{len(fits)} of {len(held)}")
+    expect(page.locator("#trees-empty")).to_contain_text("No tree fits “judged”")
+    page.locator("#find").fill("as thick as my leg")
+    expect(page.locator("#trees-empty")).to_contain_text("“as thick as my leg” is not understood")
+    expect(page.locator("#find")).to_have_attribute("aria-invalid", "true")
+
+
+def test_trees_are_sifted_by_what_truly_stands_there(dashboard: Dashboard):
+    page, held = dashboard.page, trees(dashboard)
+    found = dashboard.ask("/api/evaluation")["TA"]["count"]
+    numbers: list[int] = []
+    for kind in ("tree", "pole", "person", "bush", "other", "none"):
+        page.locator("#find").fill(kind)
+        numbers += listed(page)
+        if kind == "tree":
+            assert len(numbers) >= found > 5
+    assert sorted(numbers) == [tree["number"] for tree in held]  # each is one of them, and only one
+
+
+def saved(page: Page, button: Locator, folder: Path) -> Path:
+    with page.expect_download() as download:
+        button.click()
+    file = folder / download.value.suggested_filename
+    download.value.save_as(file)
+    return file
+
+
+def table(file: Path) -> list[list[str]]:
+    return list(csv.reader(io.StringIO(file.read_text(encoding="utf-8"))))
+
+
+def painted(file: Path) -> int:
+    """How many colours a picture has."""
+    with Image.open(file) as picture:
+        return len(picture.convert("RGB").getcolors(1 << 24) or [])
+
+
+def test_the_map_is_saved_as_a_picture_and_as_a_table(dashboard: Dashboard, tmp_path: Path):
+    page, held = dashboard.page, trees(dashboard)
+    picture = saved(page, page.locator("#map-png"), tmp_path)
+    assert picture.name == "map.png"
+    assert painted(picture) > 20
+    head, *rows = table(saved(page, page.locator("#map-csv"), tmp_path))
+    assert head == ["what", "number", "x_m", "y_m", "dbh_cm"]
+    drawn = {int(row[1]): (float(row[2]), float(row[3])) for row in rows if row[0] == "tree"}
+    assert drawn == {tree["number"]: (tree["x"], tree["y"]) for tree in held}
+    scan = dashboard.ask("/api/status")["scan_index"]
+    assert sum(row[0] == "path" for row in rows) == scan + 1
+    assert any(row[0] == "truth: tree" for row in rows)
+
+
+def test_the_table_is_saved_as_a_picture_and_as_a_table(dashboard: Dashboard, tmp_path: Path):
+    page, held = dashboard.page, trees(dashboard)
+    whole = saved(page, page.locator("#trees-png"), tmp_path)
+    with Image.open(whole) as picture:
+        assert picture.height == 2 * 24 * (len(held) + 1)
+    assert painted(whole) > 10
+    page.locator("#find").fill("x > 5")
+    fewer = len(listed(page))
+    assert 0 < fewer < len(held)
+    with Image.open(saved(page, page.locator("#trees-png"), tmp_path)) as picture:
+        assert picture.height == 2 * 24 * (fewer + 1)
+    head, *rows = table(saved(page, page.locator("#trees-csv"), tmp_path))
+    assert head[:3] == ["tree", "x_m", "y_m"]
+    assert [int(row[0]) for row in rows] == [tree["number"] for tree in held]
+
+
+@pytest.mark.parametrize(("kind", "held"), [("distance", "distance_m"), ("error", "error_percent")])
+def test_pairs_are_saved_as_a_picture_and_as_a_table(
+    dashboard: Dashboard, tmp_path: Path, kind: str, held: str
+):
+    page = dashboard.page
+    dashboard.tab("Plots")
+    page.locator("#plot-choice").select_option(kind)
+    expect(page.locator("#plot .hm").first).to_be_attached()
+    page.wait_for_function("kind => document.querySelector('#plot').dataset.kind === kind", arg=kind)
+    picture = saved(page, page.locator("#plot-png"), tmp_path)
+    assert picture.name == f"{kind}.png"
+    assert painted(picture) > 20
+    head, *rows = table(saved(page, page.locator("#plot-csv"), tmp_path))
+    pairs = dashboard.ask("/api/pairs")
+    assert head == ["tree", *map(str, pairs["numbers"])]
+    values = [[float(cell) if cell else None for cell in row[1:]] for row in rows]
+    assert values == pairs[held]
+    assert dashboard.errors == []
+
+
+TALL = """rows => import('/static/js/table_picture.js').then(async ({ pictureOf }) => {
+  const table = document.createElement('table');
+  for (let k = 0; k <= rows; k += 1) for (const text of [k, 'a', 'b']) {
+    (table.rows[k] ?? table.insertRow()).insertCell().textContent = text;
+  }
+  const canvas = pictureOf(table);
+  const blob = await new Promise(done => canvas.toBlob(done, 'image/png'));
+  return [canvas.width, canvas.height, blob?.size ?? 0];
+})"""
+
+
+def test_a_picture_of_a_stand_of_any_size_is_made(dashboard: Dashboard):
+    """Browsers make no picture of a canvas that is too tall, and the button did nothing then."""
+    dashboard.pause()
+    small, large, larger = (dashboard.page.evaluate(TALL, rows) for rows in (10, 580, 5000))
+    assert small[1] == 2 * 24 * 11
+    for width, height, size in (large, larger):
+        assert width > 30
+        assert 10_000 < height <= 16_000
+        assert size > 1000

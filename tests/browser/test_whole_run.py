@@ -1,0 +1,125 @@
+"""A slider is moved, and the whole map, its trees and its score follow; what changed is told and drawn."""
+
+from __future__ import annotations
+
+import re
+
+from playwright.sync_api import Locator, expect
+
+from tests.browser.dashboard import Dashboard
+
+STATE = "import('/static/js/state.js').then(({ state }) =>"
+
+
+def trees(dashboard: Dashboard) -> int:
+    return len(dashboard.ask("/api/trees")["trees"])
+
+
+def opened(dashboard: Dashboard) -> Locator:
+    """The value of a parameter that decides what is a tree, in a stage that is folded at first."""
+    dashboard.page.locator("#tune-find").fill("tree_share")
+    return dashboard.page.locator("[id='tune-gathering.tree_share']")
+
+
+def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
+    dashboard.stand()
+    dashboard.tab("Tune")
+    page = dashboard.page
+    told = page.locator("#tune-whole-told")
+    expect(page.locator("#tune-whole")).to_be_checked()
+    known = trees(dashboard)
+    assert known > 3
+    completeness = dashboard.ask("/api/evaluation")["TA"]["count"]
+    assert completeness > 0
+
+    share = opened(dashboard)
+    before = float(share.input_value())
+    share.fill("0.95")
+    share.press("Enter")
+    expect(told).to_contain_text(f"mapped again: {known} → ", timeout=60_000)
+    fewer = int(re.search(r"→ (\d+)", told.inner_text()).group(1))  # type: ignore[union-attr]
+    assert fewer < known
+    dashboard.until_server("/api/trees", f"it.trees.length === {fewer}")
+    dashboard.until_server("/api/evaluation", f"it.TA.count < {completeness}")
+    assert page.evaluate(f"{STATE} state.rough.places.length)") < known  # it came before
+    expect(page.locator("[data-figure=trees] dd")).to_have_text(str(fewer))
+    rows = page.locator("#tune-changes li[data-kind=vanished]")
+    assert rows.count() >= known - fewer
+    expect(rows.first).to_contain_text("votes for a tree")
+    assert page.evaluate(f"{STATE} state.ghost.ghost.length)") == known
+
+    # Back again: the same trees, which now appear; a click selects one of them everywhere.
+    share.fill(str(before))
+    share.press("Enter")
+    expect(told).to_contain_text(f"mapped again: {fewer} → {known}", timeout=60_000)
+    dashboard.until_server("/api/trees", f"it.trees.length === {known}")
+    dashboard.until_server("/api/evaluation", f"it.TA.count === {completeness}")
+    came = page.locator("#tune-changes li[data-kind=appeared] button").first
+    number = int(re.search(r"\d+", came.inner_text()).group())  # type: ignore[union-attr]
+    came.click()
+    dashboard.tab("Story")
+    expect(page.locator("#panel-story")).to_contain_text(f"Tree {number}")
+    # The ghost is of this tab alone.
+    dashboard.tab("Trees")
+    assert page.evaluate(f"{STATE} state.ghost)") is None
+    assert dashboard.errors == []
+
+
+def test_a_change_can_act_from_the_standing_scan_on(dashboard: Dashboard):
+    dashboard.stand()
+    dashboard.tab("Tune")
+    page = dashboard.page
+    known = trees(dashboard)
+    try:
+        page.locator("#tune-whole").uncheck()
+        dashboard.until_server("/api/parameters", "it.whole === false")
+        share = opened(dashboard)
+        share.fill("0.95")
+        share.press("Enter")
+        dashboard.until_server("/api/parameters", "it.changed.length === 1")
+        dashboard.until_server("/api/status", "it.revision > 0 && it.remapped === null")
+        assert trees(dashboard) == known
+        expect(page.locator("#tune-whole-told")).to_contain_text("from the scan that stands here on")
+    finally:
+        page.locator("#tune-whole").check()
+        dashboard.until_server("/api/parameters", "it.whole === true")
+    # Now the whole run is mapped with what was changed before.
+    dashboard.until_server("/api/trees", f"it.trees.length < {known}")
+
+
+POINTS = """() => import('/static/js/state.js').then(({ state, changed }) => {
+  const point = (value, f1) => ({
+    value, f1, TA: 10 * f1, TA_of: 10, false: 1, position_rmse_m: 0.02, mean_pair_error_percent: null });
+  const points = [point(0.4, 0.8), point(0, 0.5), point(1, 0), { value: 0.9, error: "it cannot be" }];
+  state.sensitivity = { name: "gathering.tree_share", of: 4, error: "", asked_with: {}, points };
+  changed("sensitivity");
+})"""
+
+
+def test_how_much_a_parameter_matters_is_drawn_and_a_click_sets_it(dashboard: Dashboard):
+    dashboard.stand()
+    dashboard.tab("Tune")
+    page = dashboard.page
+    share = opened(dashboard)
+    row = page.locator("[data-parameter='gathering.tree_share']")
+    row.hover()
+    row.locator(".matter").click()
+    section = page.locator(".sensitivity")
+    expect(section).to_contain_text(re.compile("of 1[0-9]|the value should be"))
+    # The run is scored in the background, at its leisure: points that were computed are put in here.
+    page.evaluate("() => fetch('/api/sensitivity', { method: 'DELETE' })")
+    expect(section).to_have_count(0)
+    page.evaluate(POINTS)
+    expect(section.locator("circle")).to_have_count(3)
+    picture = section.locator("svg")
+    expect(picture).to_have_attribute("aria-label", re.compile("F1, % from 0 to 80 over"))
+    expect(section).to_contain_text("0.9: it cannot be")
+    section.locator("select").select_option("position error, cm")
+    expect(picture).to_have_attribute("aria-label", re.compile("position error, cm from 2 to 2"))
+    expect(section).to_contain_text("does not hang on it")
+    box = picture.bounding_box()
+    assert box is not None
+    picture.click(position={"x": 0.9 * box["width"], "y": 0.5 * box["height"]})
+    dashboard.until_server("/api/parameters", "it.values['gathering.tree_share'] > 0.8")
+    expect(share).not_to_have_value("0.4")
+    assert dashboard.errors == []

@@ -1,0 +1,93 @@
+"""The rough answer: the trees of the map that comes, from what was kept alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.geometry import Pose2
+from pipeline.records import Verdict
+from pipeline.rerun import Rerun, rough_trees
+from pipeline.rerun.rough import MOST_PLACES, _gathered
+from tests.rerun.mapped import BASE, mapper
+
+
+def share_within(place: np.ndarray, other: np.ndarray, distance: float) -> float:
+    """Of some places, those near to another one."""
+    apart = np.hypot(*(place[:, None] - other[None]).transpose(2, 0, 1))
+    return float((apart.min(axis=1, initial=np.inf) < distance).mean())
+
+
+@pytest.mark.parametrize("change", [{}, {"gathering.tree_share": 0.6}, {"detection.e_max": 5.0}])
+def test_it_is_near_to_the_map_that_comes(change, known):
+    kept, basis = known
+    parameters = BASE.replace(change)
+    rough = rough_trees(basis, kept.clusters, parameters)
+    assert rough is not None
+    *_, frame = Rerun(mapper(parameters), kept).frames(len(kept))
+    exact = frame.trees.position[frame.trees.confirmed]
+    assert len(exact) > 3
+    assert share_within(exact, rough.position, 0.3) > 0.8
+    assert share_within(rough.position, exact, 0.3) > 0.8
+
+
+def test_without_votes_enough_nothing_that_was_gathered_is_a_tree(known):
+    kept, basis = known
+    columns = next(e.columns for e in reversed(basis.entries) if e.columns is not None)
+    assert (columns.verdict(0.4) == Verdict.TREE).any()
+    rough = rough_trees(basis, kept.clusters, BASE.replace({"gathering.tree_share": 1.0}))
+    assert rough is not None
+    trees = columns.place[columns.verdict(0.4) == Verdict.TREE]
+    assert share_within(trees, rough.position, 0.1) < 0.5
+
+
+def test_hits_are_the_clusters_that_are_trees(known):
+    kept, basis = known
+    ungathered = BASE.replace({"tracking.hits_to_confirm": 1, "tracking.distance_max": 0.4})
+    bare = replace(basis, entries=tuple(replace(e, columns=None) for e in basis.entries))
+    rough = rough_trees(bare, kept.clusters, ungathered)
+    assert rough is not None
+    found = sum(len(e.detections.cluster) for e in basis.entries if e.is_usual)
+    assert int(rough.observations.sum()) == found
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_what_was_seen_by_a_lost_robot_is_nowhere(lost, known):
+    kept, basis = known
+    entries = list(basis.entries)
+    for k in range(20, 40):
+        entries[k] = replace(entries[k], T_map_base=Pose2(500.0, 0.0, 0.0), is_usual=not lost)
+    rough = rough_trees(replace(basis, entries=tuple(entries)), kept.clusters, BASE)
+    assert rough is not None
+    assert (rough.position[:, 0] < 300.0).any()
+    assert (rough.position[:, 0] > 300.0).any() != lost
+
+
+@pytest.mark.parametrize(
+    ("seed", "reach", "most"), [(0, 0.05, MOST_PLACES), (1, 0.45, MOST_PLACES), (2, 9.0, 50), (3, 0.45, 5)]
+)
+def test_clusters_join_the_nearest_of_all_places(seed, reach, most):
+    rng = np.random.default_rng(seed)
+    centre, tree = rng.normal(0.0, 3.0, (300, 2)), rng.random(300) < 0.8
+    place: list[np.ndarray] = []
+    hits: list[int] = []
+    for x in centre[tree]:
+        apart = np.array([np.hypot(*(p - x)) for p in place])
+        if len(place) and apart.min() < reach:
+            at = int(apart.argmin())
+            hits[at] += 1
+            place[at] = place[at] + (x - place[at]) / hits[at]
+        elif len(place) < most:
+            place.append(x)
+            hits.append(1)
+    found, times = _gathered(centre, tree, np.array([0, 100, 300]), np.zeros((2, 5)), reach, most)
+    assert times.tolist() == hits
+    assert found == pytest.approx(np.array(place), abs=1e-9)
+
+
+@pytest.mark.parametrize("change", [{"clustering.eps": 0.2}, {"slam.gate": 3.0}, {"gathering.every": 2}])
+def test_nothing_is_told_of_clusters_or_poses_that_nobody_knows(change, known):
+    kept, basis = known
+    assert rough_trees(basis, kept.clusters, BASE.replace(change)) is None
