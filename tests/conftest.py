@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -19,6 +20,7 @@ settings.load_profile("stemmap")
 
 ROOT = Path(__file__).resolve().parents[1]
 _WORKERS = 2
+_WITH_OTHER_PROCESSES = {"app", "browser", "cli", "fleet", "robot", "sweeping", "tuning"}
 
 # The machine is shared: a test that takes every core slows the others down and proves nothing.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -32,6 +34,23 @@ if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """The whole suite runs on two cores, a part that somebody names in one process, which starts at once."""
     return _WORKERS if config.args_source is pytest.Config.ArgsSource.TESTPATHS else 0
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What hangs on other processes, sockets and browsers may be tried once more; the summary names it.
+
+    Laws, closed forms and oracles never are: the same input gives them the same answer.
+    """
+    for item in items:
+        if item.path.relative_to(ROOT / "tests").parts[0] in _WITH_OTHER_PROCESSES:
+            item.add_marker(pytest.mark.flaky(reruns=1))
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:  # noqa: ANN401 - pytest's own, without a public name
+    """Why the first try failed is told in full: a race that was met once is a race."""
+    for report in terminalreporter.stats.get("rerun", []):
+        terminalreporter.section(f"first try of {report.nodeid}")
+        terminalreporter.write_line(report.longreprtext)
 
 
 @pytest.fixture(scope="session", autouse=True)
