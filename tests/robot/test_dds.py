@@ -262,7 +262,8 @@ def test_a_writer_in_cdr_is_heard(drive: Path):
         assert source.losses == {}
         assert {len(scan.points) for scan in _scans(records)} == {POINTS}
         np.testing.assert_allclose(source.description.T_base_lidar.t, [0.2, 0.0, 0.9])
-        del writers, participant
+        writers.clear()
+        del participant
 
 
 def test_the_web_of_an_absent_network_is_said(monkeypatch: pytest.MonkeyPatch):
