@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.errors import SourceError
 from pipeline.sources.clouds import is_cloud, open_cloud
+from pipeline.sources.clouds.e57_pages import Pages, checksums
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
 
@@ -47,3 +48,21 @@ def test_a_cut_file_is_one_clear_error(keep: float, tmp_path: Path):
     (tmp_path / "plot.e57").write_bytes(whole[: int(keep * len(whole))])
     with pytest.raises(SourceError, match="E57"):
         list(open_cloud(str(tmp_path / "plot.e57")).parts())
+
+
+def test_the_sums_are_those_that_the_library_writes_and_name_the_station_that_is_damaged(tmp_path: Path):
+    path = tmp_path / "plot.e57"
+    write(path, stations=3)
+    pages, whole = Pages(path), path.read_bytes()
+    assert (pages.damage, len(pages.sections)) == ("", 3)
+    assert [pages.are_sound(station) for station in range(3)] == [True, True, True]
+    second = pages.sections[1] + 3000
+    path.write_bytes(whole[:second] + bytes([whole[second] ^ 1]) + whole[second + 1 :])
+    assert not Pages(path).are_sound(1)
+    assert Pages(path).are_sound(2)
+    cloud = open_cloud(str(path))
+    assert 0 < sum(len(part) for part in cloud.parts()) + sum(cloud.losses.values()) == 900
+    path.write_bytes(whole[:-5] + b"\0" + whole[-4:])
+    with pytest.raises(SourceError, match="E57 file is damaged: a checksum"):
+        open_cloud(str(path))
+    assert checksums(np.frombuffer(b"123456789", np.uint8)[None])[0] == 0xE3069283  # the sum of RFC 3720

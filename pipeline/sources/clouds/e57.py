@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.plot.cloud import CloudDescription
 from pipeline.records import Float, Float32
+from pipeline.sources.clouds.e57_pages import Pages
 from pipeline.sources.clouds.placing import is_place, offset_for
 from pipeline.sources.container import count_loss
 from pipeline.sources.digest import digest_of
@@ -90,6 +91,8 @@ class E57Cloud:
         wanted = [*axes, *(name for name in _INVALID if name in there)]
         R, t = self._guarded(lambda: _pose(header))
         arrays, buffers = self._guarded(lambda: file.make_buffers(wanted, PART))
+        if not self._pages.are_sound(station):
+            raise self._damaged("a checksum does not fit")
         reader = self._guarded(lambda: header.points.reader(buffers))
         try:
             while count := self._guarded(reader.read):
@@ -110,6 +113,9 @@ class E57Cloud:
             raise SourceError(
                 "E57 files need pye57", where=self._uri, remedy="Install it with: uv sync --extra e57"
             ) from None
+        self._pages = Pages(self._path)
+        if self._pages.damage:
+            raise self._damaged(self._pages.damage)
         return self._guarded(lambda: E57(str(self._path)))
 
     def _guarded(self, work: Any) -> Any:  # noqa: ANN401
@@ -118,7 +124,10 @@ class E57Cloud:
             return work()
         except Exception as error:
             reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-            raise SourceError(f"the E57 file is damaged: {reason}", where=self._uri, remedy=_REMEDY) from None
+            raise self._damaged(reason) from None
+
+    def _damaged(self, reason: str) -> SourceError:
+        return SourceError(f"the E57 file is damaged: {reason}", where=self._uri, remedy=_REMEDY)
 
 
 def _pose(header: Any) -> tuple[Float, Float]:  # noqa: ANN401
