@@ -24,6 +24,8 @@ PORT = 8765
 HOST = f"127.0.0.1:{PORT}"
 TOKEN = "a-token-for-the-tests-only"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
+#: A client that may do all, and what it talks to.
+Running = tuple[httpx.AsyncClient, Dashboard]
 COOKIE = {"Cookie": f"stemmap_{PORT}={session_value(TOKEN, PORT)}"}
 
 

@@ -24,9 +24,8 @@ from app.store.records import Annotation, Content
 from app.worker_messages import Shown
 from pipeline.truth_table import parse_truth_trees
 from tests.app.fakes import frame, opened, path, truth_trees
-from tests.app.server_for_tests import BEARER, TOKEN, running, served
+from tests.app.server_for_tests import BEARER, TOKEN, Running, running, served
 
-Running = tuple[httpx.AsyncClient, Dashboard]
 ANN = {"browser": "a" * 16, "who": "Ann"}
 BOB = {"browser": "b" * 16, "who": "Bob"}
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import io
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
-import pytest_asyncio
 from PIL import Image
 
 from app.camera import CameraPicture, camera_picture, has_camera
@@ -28,17 +26,8 @@ from pipeline.sources.camera import Picture
 from pipeline.sources.ros import RosSource
 from pipeline.sources.simulated import SimulatedSource
 from tests.app.fakes import FakeWorker, frame, opened, path
-from tests.app.server_for_tests import BEARER, running
+from tests.app.server_for_tests import Running
 from tests.app.test_tree_pictures import bomb, trees_at
-
-Running = tuple[httpx.AsyncClient, Dashboard]
-
-
-@pytest_asyncio.fixture
-async def both() -> AsyncIterator[Running]:
-    async with running() as (client, dashboard):
-        client.headers.update(BEARER)
-        yield client, dashboard
 
 
 @pytest.fixture(scope="module")

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 from math import radians
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
-import pytest_asyncio
 
 from app import inside
-from app.dashboard import Dashboard
 from app.messages import Open
 from app.opening import open_any, options_of
 from app.robot.ros_graph import Publisher
@@ -28,18 +24,10 @@ from pipeline.sources.base import Source, SourceOptions
 from pipeline.sources.rostypes import IMAGE, NAV_SAT_FIX, POINT_CLOUD
 from pipeline.steps import steps
 from tests.app.fakes import FakeMapper, FakeSource, FakeWorker
-from tests.app.server_for_tests import BEARER, running
+from tests.app.server_for_tests import BEARER, Running, running
 from tests.robot.conftest import clouds
 
-Running = tuple[httpx.AsyncClient, Dashboard]
 MOUNT = (0.1, 0.2, 0.9, 5.0, -3.0, 90.0)
-
-
-@pytest_asyncio.fixture
-async def both() -> AsyncIterator[Running]:
-    async with running() as (client, dashboard):
-        client.headers.update(BEARER)
-        yield client, dashboard
 
 
 @pytest.fixture(scope="module")

@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-
-import httpx
 import numpy as np
 import pytest
-import pytest_asyncio
 
 from app.cli.choices import chosen_parameters
-from app.dashboard import Dashboard
 from app.standing_scan import BeforeAfter, Counts, counts_of
 from app.worker_messages import Shown
 from pipeline.parameters import preset
 from tests.app.fakes import frame, opened, path, truth_trees
-from tests.app.server_for_tests import BEARER, running
-
-Running = tuple[httpx.AsyncClient, Dashboard]
-
-
-@pytest_asyncio.fixture
-async def both() -> AsyncIterator[Running]:
-    async with running() as (client, dashboard):
-        client.headers.update(BEARER)
-        yield client, dashboard
+from tests.app.server_for_tests import Running
 
 
 async def test_a_set_is_saved_used_downloaded_and_deleted(both: Running, tmp_path) -> None:

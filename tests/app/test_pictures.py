@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import json
 import queue
-from collections.abc import AsyncIterator
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
-import pytest_asyncio
 
-from app.dashboard import Dashboard
 from app.picture_payload import in_centimetres, packed, stages_payload
 from app.session import Session
 from app.worker import new_session
@@ -22,17 +18,8 @@ from pipeline.errors import StemmapError
 from pipeline.parameters import Parameters, preset
 from pipeline.records import Frame
 from tests.app.fakes import FakeSource, FakeWorker, frame, make_session, opened, path, truth_trees
-from tests.app.server_for_tests import BEARER, running
+from tests.app.server_for_tests import Running
 from tests.app.test_real_session import assert_same, stand_at
-
-Running = tuple[httpx.AsyncClient, Dashboard]
-
-
-@pytest_asyncio.fixture
-async def both() -> AsyncIterator[Running]:
-    async with running() as (client, dashboard):
-        client.headers.update(BEARER)
-        yield client, dashboard
 
 
 def unpacked(block: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

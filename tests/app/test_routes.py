@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import tomllib
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import msgspec
 import pytest
-import pytest_asyncio
 
 from app.dashboard import Dashboard
 from app.map_changes import MapChanges
@@ -22,17 +20,8 @@ from app.settings import Settings
 from app.worker_messages import Answer, AskCluster, Remapped, Report, Rough, Shown
 from pipeline.parameters import field_specs, preset
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
-from tests.app.server_for_tests import BEARER, running
+from tests.app.server_for_tests import BEARER, Running, running
 from tests.story.stories import cluster_story
-
-Running = tuple[httpx.AsyncClient, Dashboard]
-
-
-@pytest_asyncio.fixture
-async def both() -> AsyncIterator[Running]:
-    async with running() as (client, dashboard):
-        client.headers.update(BEARER)
-        yield client, dashboard
 
 
 def told(dashboard: Dashboard) -> list[Any]:

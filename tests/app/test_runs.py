@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-import pytest_asyncio
 
 from app import child, logbook
 from app.comparing import compare
@@ -21,17 +19,9 @@ from app.settings import Settings
 from app.worker_messages import Begin, Shown
 from pipeline.errors import SourceError, StemmapError
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
-from tests.app.server_for_tests import BEARER, running
+from tests.app.server_for_tests import BEARER, Running, running
 
-Running = tuple[httpx.AsyncClient, Dashboard]
 NAMED = {"Cookie": "stemmap_name=Ann%20B"}
-
-
-@pytest_asyncio.fixture
-async def both() -> AsyncIterator[Running]:
-    async with running() as (client, dashboard):
-        client.headers.update(BEARER)
-        yield client, dashboard
 
 
 async def play(

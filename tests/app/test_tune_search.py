@@ -8,12 +8,10 @@ import sys
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
-import httpx
 import msgspec
 import pytest
 import pytest_asyncio
 
-from app.dashboard import Dashboard
 from app.tune_search import TuneSearch
 from app.tuning.goal import RunScore
 from app.tuning.plan import Plan, PlannedRun
@@ -24,9 +22,8 @@ from app.tuning.trial import Trial
 from pipeline.errors import StemmapError
 from pipeline.parameters import preset
 from tests.app.fakes import opened, truth_trees
-from tests.app.server_for_tests import BEARER, running
+from tests.app.server_for_tests import BEARER, Running, running
 
-Running = tuple[httpx.AsyncClient, Dashboard]
 PLAN = Plan(
     runs=(PlannedRun("sim:stand?duration=1"),),
     axes=axes_of(["gathering.tree_share=0.1..0.9"]),
