@@ -1,7 +1,8 @@
 """The process that learns from annotations: `python -m app.learn`.
 
 One question comes as JSON on stdin; lines of JSON go to stdout: `progress` in words, and at the end
-`learned` or `error`. Recordings are read and trees are grown here, and not in the server.
+`learned` or `error`. Recordings are read and trees are grown here, and not in the server; when that is gone,
+nobody waits for them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 import msgspec
 
 from app.forests import Forests
+from app.parent import end_with
 from app.store.annotated import AnnotatedSource
 from app.training.annotated_runs import annotated_run
 from app.training.learning import Asked, Learned, learn, seen_by
@@ -24,13 +26,14 @@ from pipeline.parameters.stages import Gathering
 
 class Question(msgspec.Struct, frozen=True):
     """What to learn from: `gathering` names the forest in force and the votes that make a tree; the new one
-    is kept in `folder`, the data folder."""
+    is kept in `folder`, the data folder. `parent` asks, and it ends when that is gone; 0 for nobody."""
 
     sources: list[AnnotatedSource]
     gathering: dict[str, Any]
     folder: str
     date: str
     seed: int = 0
+    parent: int = 0
 
 
 def answer(question: Question, say: Any) -> dict[str, Any]:  # noqa: ANN401 - a function of one dict
@@ -73,7 +76,10 @@ def main() -> None:
         outgoing.flush()
 
     try:
-        say({"learned": answer(msgspec.json.decode(sys.stdin.buffer.read(), type=Question), say)})
+        question = msgspec.json.decode(sys.stdin.buffer.read(), type=Question)
+        if question.parent:
+            end_with(question.parent)
+        say({"learned": answer(question, say)})
     except StemmapError as error:
         say({"error": str(error)})
     except MemoryError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
 import sys
 import time
 from collections import Counter
@@ -111,6 +112,7 @@ class Learning:
             "sources": sources,
             "gathering": parameters.gathering.model_dump(),
             "folder": str(folder),
+            "parent": os.getpid(),
             "date": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
         }
         try:

@@ -21,6 +21,7 @@ from pipeline.obstacles import find_clearance
 from pipeline.parameters import Parameters
 from pipeline.parameters.stages import Detection
 from pipeline.records import Clusters, Detections, Float32, Int32, Sensor, Stems, Step, UInt16
+from pipeline.resolution import GROUND, POINT, rounded
 from pipeline.shape import describe
 from pipeline.shape.border import is_cut
 from pipeline.stems import take_stems
@@ -35,7 +36,8 @@ class Overview:
     """What is gathered of a scan.
 
     Attributes:
-        points: Of the box, float32, shape (N, 3) [m]; height: above the ground, float32, shape (N,) [m].
+        points: Of the box, float32, shape (N, 3) [m]; height: above the ground, float32, shape (N,) [m];
+            both, and the terrain, as fine as `pipeline.resolution` tells.
         steepest: Tangent of the steepest elevation seen by direction (see `steepest_by_direction`).
         depth: How far away the nearest return lies by direction and elevation (see `depth_image`).
         terrain: The ground under it, as `Terrain.height`.
@@ -171,7 +173,9 @@ def _at_points(step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, w
         overview=_overview(raw, boxed, height, terrain, sensor_offset, sensor)
         if p.gathering.method == "columns" and is_gathered(step.index, p.gathering.every)
         else None,
-        terrain=terrain if is_fused(step.index, p.gathering.every) else None,
+        terrain=replace(terrain, height=rounded(terrain.height, GROUND))
+        if terrain is not None and is_fused(step.index, p.gathering.every)
+        else None,
         warnings=(NO_GROUND,) if terrain is not None and len(raw) and not grounded else (),
         counts={
             **_returns(step, raw),
@@ -196,7 +200,13 @@ def _overview(
     if height is None or terrain is None:
         return None
     steepest = steepest_by_direction(raw, sensor_offset, sensor.rings > 0)
-    return Overview(boxed, height, steepest, depth_image(raw), terrain.height)
+    return Overview(
+        rounded(boxed, POINT),
+        rounded(height, POINT),
+        steepest,
+        depth_image(raw),
+        rounded(terrain.height, GROUND),
+    )
 
 
 def _returns(step: Step, raw: Float32) -> dict[str, int]:

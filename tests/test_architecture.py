@@ -33,6 +33,7 @@ FOUNDATION = (
     "terrain",
     "growing_path",
     "turns",
+    "resolution",
     "gyro",
     "watch",
 )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 
+from app.sweeping.checking import is_answer
 from app.sweeping.jobs import Answer
 from pipeline.errors import StemmapError
 from pipeline.files import write_beside
@@ -34,7 +35,7 @@ class KeptAnswers:
         try:
             if file.stat().st_size <= _LARGEST_FILE:
                 answer = msgspec.json.decode(file.read_bytes(), type=Answer)
-                if answer.scores is not None:
+                if answer.scores is not None and is_answer(answer):
                     return answer
         except FileNotFoundError:
             return None

@@ -18,6 +18,7 @@ from app.words import count
 from pipeline.files import write_beside
 
 MOST_LINES = 60
+_COMPUTED = ("=", "+", "-", "@", "\t", "\r")
 
 
 def lines(comparison: Comparison) -> list[str]:
@@ -121,10 +122,18 @@ def _csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(head)
     for row in rows:
-        table.writerow(
-            ["" if cell is None else str(cell).lower() if isinstance(cell, bool) else cell for cell in row]
-        )
+        table.writerow([_cell(cell) for cell in row])
     return text.getvalue()
+
+
+def _cell(cell: object) -> object:
+    """As it is written. A text that a spreadsheet would compute, as a file named `=1+1.mcap`, gets an
+    apostrophe, by which it stays one."""
+    if cell is None:
+        return ""
+    if isinstance(cell, bool):
+        return str(cell).lower()
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(_COMPUTED) else cell
 
 
 def _head(heading: str, unit: str) -> str:

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from app.finished import as_written
+from app.forests import kept_forests
 from app.history import Snapshots
 from app.mappers import mapper_of
 from app.odometry import Chosen, with_odometry
@@ -35,7 +36,7 @@ _DISK = FilePath("/var/tmp")  # noqa: S108 - the system's other place may be mem
 
 
 class NotHereError(StemmapError):
-    """The run cannot be had in this place; another worker may have it."""
+    """The run, or what it is mapped with, cannot be had in this place; another worker may have it."""
 
 
 class Scorer:
@@ -52,6 +53,7 @@ class Scorer:
         begun = time.perf_counter()
         try:
             parameters = validated(job.parameters)
+            _check_forest(parameters)
             if self._run is None or self._run.asked != job.run:
                 self.close()
                 self._run = _OpenRun(job.run)
@@ -71,6 +73,14 @@ class Scorer:
         if self._run is not None:
             self._run.close()
             self._run = None
+
+
+def _check_forest(parameters: Parameters) -> None:
+    """Learned decision trees lie in the data folder of each machine, and another worker may have them."""
+    try:
+        kept_forests().check(parameters)
+    except StemmapError as error:
+        raise NotHereError(error.what, where=error.where, remedy=error.remedy) from None
 
 
 def _failed(error: str, fault: Fault = "job") -> Answer:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
+from app.sweeping.checking import is_answer
 from app.sweeping.jobs import Answer, Job
 from app.sweeping.kept_answers import KeptAnswers
 from app.sweeping.workers import Done, Lost, Workers
@@ -136,6 +137,8 @@ class _Sweep:
         try:
             answer = msgspec.json.decode(event.answer, type=Answer)
         except msgspec.MsgspecError:
+            answer = Answer(None)
+        if not is_answer(answer):
             self._lost(number, "it answered something that is no answer")
             return
         if answer.fault in ("worker", "version"):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
-from app.tuning.storage import unwritable
+from app.tuning.storage import unreadable, unwritable
 
 _PART = 1 << 16
 
@@ -27,6 +27,17 @@ class Journal(JournalFileBackend):  # type: ignore[misc]
     def __init__(self, path: str) -> None:
         super().__init__(path, lock_obj=JournalFileOpenLock(path))
         self._file = Path(path)
+
+    def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:
+        """The lines from one on.
+
+        Raises:
+            StemmapError: They cannot be read, as of a file that somebody took away.
+        """
+        try:
+            yield from super().read_logs(log_number_from)
+        except OSError as error:
+            raise unreadable(str(self._file), error) from None
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
         """Add lines, all at once or none of them.
@@ -62,7 +73,8 @@ def _alone_with(path: Path) -> Iterator[IO[bytes]]:
         with path.open("a+b", buffering=0) as file:
             yield file
     finally:
-        lock.release()
+        with suppress(RuntimeError):  # somebody took the lock's file away
+            lock.release()
 
 
 def _is_whole(file: IO[bytes]) -> bool:

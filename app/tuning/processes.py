@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -59,7 +60,7 @@ class Helpers:
 
     def _started(self, k: int) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(
-            [*WORKER, str(k + 1)],
+            [*WORKER, str(k + 1), str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C is for the process that watches

@@ -70,7 +70,8 @@ def toml_of(plan: Plan, result: Result, date: str) -> str:
     TOML themselves (see `provenance_in`)."""
     parameters = best_parameters(plan, result)
     head, _, rest = file_of(plan.preset, parameters).partition("\n")
-    remarks = tomli_w.dumps(provenance(plan, result, date)).strip().splitlines()
+    # Not by splitlines: a name may hold U+2028 or the like, which ends no line of TOML.
+    remarks = tomli_w.dumps(provenance(plan, result, date)).strip().split("\n")
     return "\n".join([head, *(f"# {line}".rstrip() for line in remarks), rest])
 
 
@@ -117,7 +118,7 @@ def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
 
 def provenance_in(text: str) -> dict[str, Any]:
     """Where the set of a file comes from; empty where it does not say so."""
-    lines = text.splitlines()[1:]
+    lines = text.split("\n")[1:]
     remarks = []
     for line in lines:
         if not line.startswith("#"):

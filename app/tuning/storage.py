@@ -178,3 +178,9 @@ def unwritable(storage: str, error: OSError) -> StemmapError:
     """What a person is told of a disk that refuses."""
     reason = (error.strerror or str(error)).lower()
     return StemmapError(f"the trials cannot be kept: {reason}", where=storage)
+
+
+def unreadable(storage: str, error: OSError) -> StemmapError:
+    """What a person is told of trials that cannot be read again."""
+    reason = (error.strerror or str(error)).lower()
+    return StemmapError(f"the trials cannot be read: {reason}", where=storage)

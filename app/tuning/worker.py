@@ -1,4 +1,5 @@
-"""Another process that makes trials of a search: `python -m app.tuning.worker N`, the plan as JSON on stdin.
+"""Another process that makes trials of a search: `python -m app.tuning.worker N PARENT`, the plan as JSON on
+stdin.
 
 What it makes stands in the storage that all processes of the search share. It ends when no trial is left, or
 when the process that started it is gone.
@@ -11,6 +12,7 @@ import sys
 
 import msgspec
 
+from app.parent import is_gone
 from app.tuning.plan import Plan
 from app.tuning.search import Search, StoppedError
 from pipeline.errors import StemmapError
@@ -20,11 +22,11 @@ FAILED = 1
 
 def main() -> None:
     """Make trials until none is left."""
-    parent = os.getppid()
+    parent = int(sys.argv[2])
     plan = msgspec.json.decode(sys.stdin.buffer.read(), type=Plan)
     code = 0
     try:
-        search = Search(plan, worker=int(sys.argv[1]), stop=lambda: os.getppid() != parent)
+        search = Search(plan, worker=int(sys.argv[1]), stop=lambda: is_gone(parent))
         search.begin()
         while search.step() is not None:
             pass

@@ -29,7 +29,7 @@ ROW = np.dtype(
 )
 MOST_IN_FOLDER = 8 << 30
 SUFFIX = ".scans"
-_MAGIC = b"stemmap scans 1\n"
+_MAGIC = b"stemmap scans 2\n"
 BEGIN = len(_MAGIC) + 32
 
 OTHER = "what was kept of this recording is of another version or source: its scans are looked at again"

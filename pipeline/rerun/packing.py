@@ -1,7 +1,7 @@
 """What a scan showed as a row of numbers and a block of bytes, and back to the bit.
 
-The row says how many of everything there are; the block then holds the arrays one behind the other, each at
-a multiple of eight bytes, and what is said in words as JSON. Reading makes no copy.
+The row says how many of everything there are; the block, packed by Zstandard, holds what is said in words as
+JSON, and then the arrays one behind the other (see `pipeline.rerun.coding`).
 """
 
 from __future__ import annotations
@@ -10,15 +10,30 @@ import json
 import math
 from typing import Any
 
-import lz4.frame
 import numpy as np
-from numpy.typing import NDArray
+import zstandard
 
 from pipeline.gathering.memory import SLICE, SLICES
 from pipeline.gathering.sight import ELEVATIONS
 from pipeline.geometry import Pose2
 from pipeline.perception import Looked, Overview
-from pipeline.records import Clusters, Float32, Int32, PoseMeasurement, Scan, Step, Turn, UInt16, Verdict
+from pipeline.records import Clusters, Float32, Int32, PoseMeasurement, Scan, Step, Turn, Verdict
+from pipeline.rerun.coding import (
+    Cutter,
+    bits_from,
+    from_planes,
+    heights_coded,
+    heights_from,
+    image_coded,
+    image_from,
+    places_coded,
+    places_from,
+    planes,
+    row_coded,
+    row_from,
+)
+from pipeline.resolution import GROUND, POINT
+from pipeline.shape import eccentricity
 from pipeline.terrain import SECTORS, Terrain
 from pipeline.visibility import BINS
 
@@ -35,28 +50,29 @@ HEAD = np.dtype(
         ("clusters", "<i4"),
         ("heights", "<i4"),  # as many as clusters, or NONE
         ("points", "<i4"),  # of the overview, or NONE
-        ("depth", "<i4"),  # bytes of its depth image, packed: most of it is empty
         ("rings", "<i4"),  # of the overview's terrain
         ("fused_rings", "<i4"),  # of the terrain that goes into the height map, or NONE
         ("words", "<i4"),  # bytes of JSON
+        ("bytes", "<i4"),  # of the block before it was packed
     ]
 )
-_CLUSTERS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "size": ("<i8", ()),
-    "centroid": ("<f8", (3,)),
-    "eigenvalues": ("<f8", (3,)),
-    "eccentricity": ("<f8", ()),
-    "centre": ("<f8", (2,)),
-    "covariance": ("<f8", (2, 2)),
-    "radius": ("<f8", ()),
-    "radius_sigma": ("<f8", ()),
-    "radial_std": ("<f8", ()),
-    "arc": ("<f8", ()),
-    "extent": ("<f8", (3,)),
-    "hidden": ("?", ()),
-    "cut": ("?", ()),
+# Numbers of a cluster and how many of each there are; flags are apart, and so is the eccentricity, which
+# follows from the eigenvalues unless somebody else has told it.
+_CLUSTERS: dict[str, tuple[int, ...]] = {
+    "size": (),
+    "centroid": (3,),
+    "eigenvalues": (3,),
+    "centre": (2,),
+    "covariance": (2, 2),
+    "radius": (),
+    "radius_sigma": (),
+    "radial_std": (),
+    "arc": (),
+    "extent": (3,),
 }
-_ALIGN = 8
+_COLUMNS = sum(math.prod(rest) for rest in _CLUSTERS.values())
+_LARGEST = 1 << 28  # bytes of a block; the largest clouds that we know take a fiftieth
+_LEVEL = 1  # others take longer and make it smaller by a hundredth
 NO_POINTS: Float32 = np.zeros((0, 3), np.float32)
 NO_HEIGHT: Float32 = np.zeros(0, np.float32)
 NO_LABELS: Int32 = np.zeros(0, np.int32)
@@ -70,7 +86,6 @@ def pack(step: Step, looked: Looked) -> tuple[Any, bytes]:
     """
     over, fused = looked.overview, looked.terrain
     points, height = (NO_POINTS, NO_HEIGHT) if over is None else _remembered(over.points, over.height)
-    depth = np.zeros(0, np.uint8) if over is None else _packed(over.depth)
     words = _words(step, looked)
     head = np.zeros((), HEAD)
     head["index"], head["stamp_ns"] = step.index, step.scan.stamp_ns
@@ -80,57 +95,58 @@ def pack(step: Step, looked: Looked) -> tuple[Any, bytes]:
     head["clusters"] = len(looked.clusters.size)
     head["heights"] = NONE if looked.heights is None else len(looked.heights)
     head["points"] = NONE if over is None else len(points)
-    head["depth"] = len(depth)
     head["rings"] = NONE if over is None else over.terrain.shape[1]
     head["fused_rings"] = NONE if fused is None else fused.height.shape[1]
     head["words"] = len(words)
 
-    arrays: list[NDArray[Any]] = [
-        getattr(looked.clusters, name).astype(kind, copy=False) for name, (kind, _) in _CLUSTERS.items()
-    ]
+    parts = [words, *_clusters_coded(looked.clusters)]
     if looked.heights is not None:
-        arrays.append(looked.heights)
-    arrays.append(looked.free)
+        parts.append(planes(looked.heights[None]))
+    parts.append(row_coded(looked.free))
     if over is not None:
-        arrays += [points, height, over.steepest, depth, over.terrain]
+        parts += [places_coded(points, height, POINT), row_coded(over.steepest), image_coded(over.depth)]
+        parts.append(heights_coded(over.terrain, GROUND))
     if fused is not None:
-        arrays += [fused.height, fused.seen]
-    parts = [np.ascontiguousarray(array).tobytes() for array in arrays] + [words]
-    return head, b"".join(part + b"\0" * (-len(part) % _ALIGN) for part in parts)
+        parts += [heights_coded(fused.height, GROUND), np.packbits(fused.seen).tobytes()]
+    block = b"".join(parts)
+    head["bytes"] = len(block)
+    return head, zstandard.ZstdCompressor(level=_LEVEL).compress(block)
 
 
 def unpack(head: Any, block: bytearray) -> tuple[Step, Looked]:  # noqa: ANN401 - a row of HEAD
     """What `pack` was given, without the raw points.
 
-    The block is not copied. It is one that could be written to, because kernels are compiled for such arrays.
+    Its arrays can be written to, because kernels are compiled for such arrays.
 
     Raises:
         ValueError: The block does not hold what the row says.
     """
-    cut = _Cutter(block)
     clusters, points, rings, fused_rings = (
         int(head[name]) for name in ("clusters", "points", "rings", "fused_rings")
     )
-    columns = {name: cut(kind, (clusters, *rest)) for name, (kind, rest) in _CLUSTERS.items()}
-    heights = None if head["heights"] == NONE else cut("<f8", (clusters,))
-    free = cut("<f8", (BINS,))
+    cut = Cutter(_unpacked(block, int(head["bytes"])))
+    told = json.loads(cut("u1", int(head["words"])).tobytes())
+    found = _clusters_from(cut, clusters)
+    heights = None if head["heights"] == NONE else from_planes(cut, "<f8", 1, clusters)[0]
+    free = row_from(cut, BINS)
     overview = terrain = None
     if points != NONE:
+        places, height = places_from(cut, points, POINT)
         overview = Overview(
-            points=_in_space(cut("<f4", (points, 2))),
-            height=cut("<f4", (points,)),
-            steepest=cut("<f8", (BINS,)),
-            depth=_unpacked(cut("u1", (int(head["depth"]),))),
-            terrain=cut("<f8", (SECTORS, rings)),
+            points=places,
+            height=height,
+            steepest=row_from(cut, BINS),
+            depth=image_from(cut, BINS, ELEVATIONS),
+            terrain=heights_from(cut, SECTORS, rings, GROUND),
         )
     if fused_rings != NONE:
-        terrain = Terrain(cut("<f8", (SECTORS, fused_rings)), cut("?", (SECTORS, fused_rings)))
-    told = json.loads(cut("u1", (int(head["words"]),)).tobytes())
+        ground = heights_from(cut, SECTORS, fused_rings, GROUND)
+        terrain = Terrain(ground, bits_from(cut, ground.size).reshape(ground.shape))
     looked = Looked(
         raw=NO_POINTS,
         filtered=NO_POINTS,
         labels=NO_LABELS,
-        clusters=Clusters(**columns, verdict=np.full(clusters, Verdict.OTHER, np.int32)),
+        clusters=found,
         heights=heights,
         free=free,
         sensor_offset=np.array(head["offset"]),
@@ -153,40 +169,43 @@ def unpack(head: Any, block: bytearray) -> tuple[Step, Looked]:  # noqa: ANN401 
     return step, looked
 
 
-class _Cutter:
-    """Takes one array after the other from a block."""
-
-    def __init__(self, block: bytearray) -> None:
-        self._block = block
-        self._at = 0
-
-    def __call__(self, kind: str, shape: tuple[int, ...]) -> Any:  # noqa: ANN401 - of the kind
-        count = math.prod(shape)
-        array = np.frombuffer(self._block, kind, count, self._at)
-        length = count * array.itemsize
-        self._at += length + -length % _ALIGN
-        return array.reshape(shape)
-
-
 def _remembered(points: Float32, height: Float32) -> tuple[Float32, Float32]:
     """x, y and height of the points that `Gathering.add` does not leave out wherever they are."""
     low = (height > 0.0) & (height < HIGHEST)
     return points[low, :2], height[low]
 
 
-def _packed(depth: UInt16) -> NDArray[np.uint8]:
-    return np.frombuffer(lz4.frame.compress(depth.astype("<u2", copy=False).tobytes()), np.uint8)
+def _unpacked(block: bytearray, size: int) -> bytearray:
+    if not 0 <= size <= _LARGEST or zstandard.frame_content_size(block) != size:
+        raise ValueError("the block is not as long as the row says")
+    try:
+        return bytearray(zstandard.ZstdDecompressor().decompress(block))
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from None
 
 
-def _unpacked(packed: NDArray[np.uint8]) -> UInt16:
-    block = bytearray(lz4.frame.decompress(packed.tobytes()))
-    return np.frombuffer(block, "<u2", BINS * ELEVATIONS).reshape(BINS, ELEVATIONS)
+def _clusters_coded(clusters: Clusters) -> list[bytes]:
+    count = len(clusters.size)
+    columns = [getattr(clusters, name).astype("<f8", copy=False).reshape(count, -1).T for name in _CLUSTERS]
+    told = eccentricity(clusters.eigenvalues)
+    other = told.view(np.uint64) != clusters.eccentricity.view(np.uint64)
+    flags = [np.packbits(bits).tobytes() for bits in (clusters.hidden, clusters.cut, other)]
+    return [planes(np.concatenate(columns)), *flags, planes(clusters.eccentricity[None, other])]
 
 
-def _in_space(places: Float32) -> Float32:
-    points = np.zeros((len(places), 3), np.float32)
-    points[:, :2] = places
-    return points
+def _clusters_from(cut: Cutter, count: int) -> Clusters:
+    rows, at = from_planes(cut, "<f8", _COLUMNS, count), 0
+    columns: dict[str, Any] = {}
+    for name, rest in _CLUSTERS.items():
+        width = math.prod(rest)
+        columns[name] = np.ascontiguousarray(rows[at : at + width].T).reshape(count, *rest)
+        at += width
+    columns["size"] = columns["size"].astype(np.int64)
+    columns |= {name: bits_from(cut, count) for name in ("hidden", "cut")}
+    other = bits_from(cut, count)
+    columns["eccentricity"] = eccentricity(columns["eigenvalues"])
+    columns["eccentricity"][other] = from_planes(cut, "<f8", 1, int(np.count_nonzero(other)))[0]
+    return Clusters(**columns, verdict=np.full(count, Verdict.OTHER, np.int32))
 
 
 def _words(step: Step, looked: Looked) -> bytes:

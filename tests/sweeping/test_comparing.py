@@ -104,3 +104,12 @@ def test_the_page_stands_alone_and_texts_are_texts(comparison):
     assert "svg" in tags.tags
     assert "script" not in tags.tags
     assert tags.addresses == []
+
+
+def test_a_spreadsheet_computes_no_name(comparison, tmp_path):
+    runs = tuple(
+        replace(run, name=name) for run, name in zip(comparison.plan.runs, ("=1+1", "-2"), strict=True)
+    )
+    files(replace(comparison, plan=replace(comparison.plan, runs=runs)), tmp_path)
+    with (tmp_path / "results.csv").open() as file:
+        assert {row["source"] for row in csv.DictReader(file)} == {"'=1+1", "'-2"}

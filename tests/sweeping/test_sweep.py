@@ -129,6 +129,24 @@ def test_damaged_and_foreign_files_are_computed_again_and_failures_are_not_kept(
     assert sweep(jobs, InMemory(["a"], fine), KeptAnswers(tmp_path)).known == 2
 
 
+@pytest.mark.parametrize(
+    "harm", [{"TA": 3}, {"TA": {"count": None, "of": 4}}, {"f1": "0.5"}, {"f1": [1]}, {"scans": True}, None]
+)
+def test_an_answer_without_the_figures_is_none_wherever_it_comes_from(harm, tmp_path):
+    def odd(worker: str, asked: Job) -> Answer:
+        told = fine(worker, asked)
+        return told if worker == "b" else Answer({} if harm is None else {**(told.scores or {}), **harm})
+
+    outcome = sweep([job(0.1)], InMemory(["a", "b"], odd), NOTHING)
+    assert f1_of(outcome.answers) == [0.1]
+    assert outcome.lost == {"it answered something that is no answer": 1}
+    kept = KeptAnswers(tmp_path)
+    kept.put(job(0.1).key(), odd("a", job(0.1)))
+    outcome = sweep([job(0.1)], InMemory(["b"], fine), kept)
+    assert (outcome.known, f1_of(outcome.answers)) == (0, [0.1])
+    assert any("1 kept result could not be read" in warning for warning in outcome.warnings)
+
+
 def test_where_nothing_can_be_written_the_results_come_all_the_same(tmp_path):
     (tmp_path / "file").touch()
     outcome = sweep([job(0.1)], InMemory(["a"], fine), KeptAnswers(tmp_path / "file"))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from app.forests import Forests
-from app.tuning.journal import Journal, cut_half_line
+from app.tuning.journal import Journal, _alone_with, cut_half_line
 from app.tuning.search import Search
 from pipeline.errors import StemmapError
 from pipeline.gathering.forest import ALL_AROUND, FILE
@@ -54,6 +54,24 @@ def test_what_a_killed_process_wrote_in_part_is_cut_off_by_who_writes_next(tmp_p
     cut_half_line(path)
     assert entries(path) == [LINE, LINE, LINE]
     assert [file.name for file in tmp_path.iterdir()] == [path.name]  # no lock is left
+
+
+def test_a_journal_that_is_taken_away_is_told_in_a_line(tmp_path):
+    path = tmp_path / "a.journal"
+    journal = Journal(str(path))
+    journal.append_logs([LINE])
+    path.unlink()
+    with pytest.raises(StemmapError, match="the trials cannot be read: no such file"):
+        list(journal.read_logs(0))
+
+
+def test_a_lock_that_somebody_took_away_does_not_hide_what_was_written(tmp_path):
+    path = tmp_path / "a.journal"
+    journal = Journal(str(path))
+    with _alone_with(path):
+        Path(f"{path}.lock").unlink()
+    journal.append_logs([LINE])
+    assert entries(path) == [LINE]
 
 
 def test_a_file_of_one_half_line_is_empty_then(tmp_path):
