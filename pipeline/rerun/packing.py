@@ -186,7 +186,10 @@ def _unpacked(block: bytearray, size: int) -> bytearray:
 
 def _clusters_coded(clusters: Clusters) -> list[bytes]:
     count = len(clusters.size)
-    columns = [getattr(clusters, name).astype("<f8", copy=False).reshape(count, -1).T for name in _CLUSTERS]
+    columns = [
+        getattr(clusters, name).astype("<f8", copy=False).reshape(count, math.prod(rest)).T
+        for name, rest in _CLUSTERS.items()
+    ]
     told = eccentricity(clusters.eigenvalues)
     other = told.view(np.uint64) != clusters.eccentricity.view(np.uint64)
     flags = [np.packbits(bits).tobytes() for bits in (clusters.hidden, clusters.cut, other)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import CLASSES, Bool, Columns, Int, Verdict
+from pipeline.records import CLASSES, Bool, Columns, Int, Int32, Verdict
 from pipeline.tracking.observation import SECTORS
 from pipeline.tracking.table import TrackTable
 
@@ -21,6 +21,7 @@ ROUND = np.array([kind in (Verdict.TREE, Verdict.POLE, Verdict.PERSON) for kind 
 #: What the votes for all else count at a place that is round: so seldom is it anything else (docs/trunks.md).
 LEFT = 0.1
 TREE = CLASSES.index(Verdict.TREE)
+_KINDS = np.array(CLASSES, np.int64)
 
 
 def backed(columns: Columns, tracks: TrackTable, tree_share: float) -> Columns:
@@ -32,12 +33,11 @@ def backed(columns: Columns, tracks: TrackTable, tree_share: float) -> Columns:
         tracks: In the same frame.
         tree_share: See `Gathering`.
     """
-    voted = np.isin(columns.verdict, CLASSES) & (columns.verdict != Verdict.TREE)
-    share = columns.share[:, TREE] / np.maximum(columns.share @ np.where(ROUND, 1.0, LEFT), 1e-9)
-    leads = columns.share[:, TREE] >= columns.share[:, ROUND].max(axis=1)
-    doubtful = np.flatnonzero(voted & leads & (share >= tree_share))
     round_tracks = np.flatnonzero(tracks.radii >= FITS)
-    if not len(doubtful) or not len(round_tracks):
+    if not len(round_tracks):
+        return columns
+    doubtful = _doubtful(columns.share, columns.verdict, _KINDS, ROUND, tree_share)
+    if not len(doubtful):
         return columns
     found = _near_round(
         columns.axis[doubtful, :2], tracks.x[round_tracks, :2], tracks.sides[round_tracks], REACH, SIDES
@@ -45,6 +45,27 @@ def backed(columns: Columns, tracks: TrackTable, tree_share: float) -> Columns:
     verdict = columns.verdict.copy()
     verdict[doubtful[found]] = Verdict.TREE
     return replace(columns, verdict=verdict)
+
+
+@compiled
+def _doubtful(share: Float, verdict: Int32, kinds: Int, is_round: Bool, tree_share: float) -> Int:
+    """Rows of the columns that the votes alone refuse, and that would be trees were they round."""
+    rows, n = np.empty(verdict.shape[0], np.int64), 0
+    for c in range(verdict.shape[0]):
+        voted = False
+        for k in range(kinds.shape[0]):
+            voted = voted or (verdict[c] == kinds[k] and k != TREE)
+        if not voted:
+            continue
+        below, most = 0.0, 0.0
+        for k in range(kinds.shape[0]):
+            below += share[c, k] * (1.0 if is_round[k] else LEFT)
+            if is_round[k]:
+                most = max(most, share[c, k])
+        if share[c, TREE] >= most and share[c, TREE] / max(below, 1e-9) >= tree_share:
+            rows[n] = c
+            n += 1
+    return rows[:n].copy()
 
 
 @compiled

@@ -6,19 +6,32 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import Bool, Columns, Int, Verdict
+from pipeline.records import Bool, Columns, Int, Int32, Verdict
 from pipeline.tracking.table import TrackTable
 
+TREE, OTHER = int(Verdict.TREE), int(Verdict.OTHER)
 ONE_TREE = 0.5  # m; tree columns nearer to one another than this are one tree
 REACH = 0.45  # m; a track farther from a column than this is something else
 
 
 def tree_columns(columns: Columns) -> Int:
     """Rows of the columns that are trees; of those that are one tree the one with most votes."""
-    rows = np.flatnonzero(columns.verdict == Verdict.TREE)
-    rows = rows[np.argsort(-columns.share[rows, 0], kind="stable")]
-    one_each: Int = rows[_apart(columns.axis[rows, :2], ONE_TREE)]
-    return one_each
+    return _best_first(columns.axis, columns.share, columns.verdict)
+
+
+@compiled
+def _best_first(axis: Float, share: Float, verdict: Int32) -> Int:
+    rows, votes, n = np.empty(verdict.shape[0], np.int64), np.empty(verdict.shape[0]), 0
+    for c in range(verdict.shape[0]):
+        if verdict[c] == TREE:
+            rows[n], votes[n] = c, -share[c, 0]
+            n += 1
+    rows = rows[np.argsort(votes[:n], kind="mergesort")]
+    place = np.empty((rows.shape[0], 2))
+    for k in range(rows.shape[0]):
+        place[k, 0], place[k, 1] = axis[rows[k], 0], axis[rows[k], 1]
+    best: Int = rows[_apart(place, ONE_TREE)]
+    return best
 
 
 def assign_verdicts(tracks: TrackTable, columns: Columns, trees: Int, due: Bool) -> Int:
@@ -36,22 +49,35 @@ def assign_verdicts(tracks: TrackTable, columns: Columns, trees: Int, due: Bool)
     Returns:
         Places in `trees` of those without a track.
     """
-    is_tree = np.zeros(len(columns.verdict), np.bool_)
-    is_tree[trees] = True
-    nearest = nearest_other(tracks.x[:, :2], columns.axis[:, :2], REACH)
-    near = nearest >= 0
-    verdict = columns.verdict[nearest[near]].astype(np.int64)
-    verdict[verdict == Verdict.TREE] = Verdict.OTHER  # another track is that tree, unless told below
-    tracks.verdict[near] = verdict
-    tracks.verdict[~near & due & (tracks.verdict < 0)] = Verdict.OTHER
-    track_of = _track_of(columns.axis[trees, :2], tracks.x[:, :2], tracks.hits, REACH)
-    found = track_of >= 0
-    tracks.verdict[track_of[found]] = Verdict.TREE
-    # What no scan has measured stands where what was gathered stands.
-    at = np.flatnonzero(found)
-    at = at[tracks.hits[track_of[at]] == 0]
-    tracks.x[track_of[at], :2] = columns.axis[trees[at], :2]
-    return np.flatnonzero(~found)
+    return _assigned(
+        tracks.x, tracks.hits, tracks.verdict, columns.axis, columns.verdict, trees, due, REACH
+    )  # fmt: skip
+
+
+@compiled
+def _assigned(
+    x: Float, hits: Int, verdict: Int, axis: Float, of_column: Int32, trees: Int, due: Bool, reach: float
+) -> Int:
+    nearest = nearest_other(x, axis, reach)
+    for t in range(x.shape[0]):
+        if nearest[t] >= 0:
+            told = np.int64(of_column[nearest[t]])
+            # Another track is that tree, unless told below.
+            verdict[t] = OTHER if told == TREE else told
+        elif due[t] and verdict[t] < 0:
+            verdict[t] = OTHER
+    place = np.empty((trees.shape[0], 2))
+    for k in range(trees.shape[0]):
+        place[k, 0], place[k, 1] = axis[trees[k], 0], axis[trees[k], 1]
+    track_of = _track_of(place, x, hits, reach)
+    for k in range(trees.shape[0]):
+        t = track_of[k]
+        if t < 0:
+            continue
+        verdict[t] = TREE
+        if hits[t] == 0:  # what no scan has measured stands where what was gathered stands
+            x[t, 0], x[t, 1] = place[k, 0], place[k, 1]
+    return np.flatnonzero(track_of < 0)
 
 
 @compiled
@@ -70,28 +96,49 @@ def _apart(place: Float, distance: float) -> Bool:
 
 @compiled
 def nearest_other(place: Float, other: Float, reach: float) -> Int:
-    """The nearest other place to each, -1 where none is in reach, shape (N,)."""
+    """The nearest other place to each, the first of equals; -1 where none is in reach; shape (N,)."""
     nearest = np.full(place.shape[0], -1, np.int64)
+    order, along = _from_left(other)
     for a in range(place.shape[0]):
         best = reach * reach
-        for b in range(other.shape[0]):
+        for k in range(np.searchsorted(along, place[a, 0] - reach), along.shape[0]):
+            b = order[k]
             dx, dy = place[a, 0] - other[b, 0], place[a, 1] - other[b, 1]
-            if dx * dx + dy * dy < best:
-                best, nearest[a] = dx * dx + dy * dy, b
+            if -dx > reach:
+                break
+            d = dx * dx + dy * dy
+            if d < best or (d == best and b < nearest[a]):
+                best, nearest[a] = d, b
     return nearest
 
 
 @compiled
 def _track_of(place: Float, track: Float, hits: Int, reach: float) -> Int:
-    """The free track in reach of each place that has most hits, -1 for none; earlier places choose first."""
+    """The free track in reach of each place that has most hits, the first of equals, -1 for none; earlier
+    places choose first."""
     track_of = np.full(place.shape[0], -1, np.int64)
     taken = np.zeros(track.shape[0], np.bool_)
+    order, along = _from_left(track)
     for a in range(place.shape[0]):
         most = np.int64(-1)
-        for b in range(track.shape[0]):
+        for k in range(np.searchsorted(along, place[a, 0] - reach), along.shape[0]):
+            b = order[k]
             dx, dy = place[a, 0] - track[b, 0], place[a, 1] - track[b, 1]
-            if not taken[b] and hits[b] > most and dx * dx + dy * dy < reach * reach:
+            if -dx > reach:
+                break
+            more = hits[b] > most or (hits[b] == most and b < track_of[a])
+            if not taken[b] and more and dx * dx + dy * dy < reach * reach:
                 most, track_of[a] = hits[b], b
         if track_of[a] >= 0:
             taken[track_of[a]] = True
     return track_of
+
+
+@compiled
+def _from_left(place: Float) -> tuple[Int, Float]:
+    """Rows by their x, and these, so that only those near to a place are looked at."""
+    along = np.empty(place.shape[0])
+    for k in range(place.shape[0]):
+        along[k] = place[k, 0]
+    order = np.argsort(along)
+    return order, along[order]

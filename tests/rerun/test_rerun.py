@@ -162,6 +162,16 @@ def test_what_is_packed_comes_back_whole(store):
     assert store.key_of(11) == b"k" * 16
 
 
+def test_a_scan_that_shows_nothing_is_kept_too(store):
+    parts, d = run()
+    step = replace(parts[0], scan=Scan(parts[0].scan.stamp_ns, parts[0].scan.points[:0]))
+    looked = look(step, d.sensor, d.T_base_lidar, preset("forest"))
+    store.put(step, looked, b"k" * 16)
+    again = store.scan(0)[1]
+    assert len(looked.clusters.size) == 0
+    assert encode(again.clusters) == encode(looked.clusters)
+
+
 def test_a_scan_that_is_looked_at_again_takes_the_place_of_those_after_it(store):
     parts = run()[0][:8]
     put_all(store, preset("forest"), parts)
