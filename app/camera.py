@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
-
 import msgspec
 
+from app.robot.source import LiveSource
 from pipeline.errors import StemmapError
 from pipeline.sources.base import Source, SourceDescription
 from pipeline.sources.camera import Camera, Picture
+from pipeline.sources.pictures import WithPictures
 from pipeline.sources.rostypes import COMPRESSED_IMAGE, IMAGE
 from pipeline.sources.with_motion import WithMotion
-
-
-@runtime_checkable
-class WithCamera(Protocol):
-    """A source that may have pictures."""
-
-    def camera(self) -> tuple[Camera | None, str]: ...
-    def picture_near(self, stamp_ns: int) -> Picture | None: ...
 
 
 class CameraPicture(msgspec.Struct, frozen=True):
@@ -28,11 +20,13 @@ class CameraPicture(msgspec.Struct, frozen=True):
         picture: Not decoded.
         camera: None where nobody tells where things stand in it.
         why: There is none.
+        told: How many pictures came of a live run, in words; "" of a recording.
     """
 
     picture: Picture
     camera: Camera | None
     why: str
+    told: str = ""
 
 
 def has_camera(description: SourceDescription) -> bool:
@@ -47,9 +41,10 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
         StemmapError: There is none, and why.
     """
     origin: object = source.source if isinstance(source, WithMotion) else source
-    if source is None or not has_camera(source.description) or not isinstance(origin, WithCamera):
+    if source is None or not has_camera(source.description) or not isinstance(origin, WithPictures):
         raise StemmapError("this run has no camera", remedy="Record a camera's topic beside the LiDAR")
     picture = origin.picture_near(stamp_ns)
     if picture is None:
         raise StemmapError("no picture was taken at this time", remedy="Play on, or go to another scan")
-    return CameraPicture(picture, *origin.camera())
+    told = origin.pictures_told if isinstance(origin, LiveSource) else ""
+    return CameraPicture(picture, *origin.camera(), told)

@@ -69,4 +69,5 @@ class CameraDesk:
             "later_ms": round((picture.stamp_ns - frame.stamp_ns) / 1e6),
             "marks": [] if camera is None else await asyncio.to_thread(marks_of, frame, camera),
             "why": found.why,
+            "told": found.told,
         }

@@ -58,6 +58,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         "kind": str(record["source"].get("kind", ""))[:200],
         "source": str(record["source"].get("sha256") or "")[:200],
         "seed": run.seed,
+        "chosen": record.get("chosen"),
         "scans": int(record.get("scans") or 0),
         "time_s": float(record.get("duration_s") or 0.0),
         "distance_m": float(np.hypot(*np.diff(path_xy, axis=0).T).sum()) if len(path_xy) else 0.0,

@@ -8,7 +8,10 @@ from dataclasses import asdict
 from math import degrees
 from typing import Any
 
-from app.robot.source import open_live
+from app.robot.address import parse_address
+from app.robot.counting import CountingInbox, Heard, countable
+from app.robot.links import link_for
+from app.robot.ros_graph import Publisher
 from pipeline.errors import SourceError
 from pipeline.sources import open_source
 from pipeline.sources.base import RecordedTopic
@@ -17,10 +20,11 @@ from pipeline.sources.topics import TYPES_BY_ROLE
 
 #: A robot's topics are listened for so long, and so long after the last new one.
 LISTEN_S, SETTLE_S = 8.0, 1.5
+#: So long they are counted.
+COUNT_S = 3.0
 _LOOK_S = 0.05
 MOST_TOPICS = 500
-#: What can be chosen live: pictures are not listened to.
-_LIVE_ROLES = {kind: role for role, kinds in TYPES_BY_ROLE.items() if role != "camera" for kind in kinds}
+_ROLES = {kind: role for role, kinds in TYPES_BY_ROLE.items() for kind in kinds}
 
 
 def recorded(uri: str) -> dict[str, Any]:
@@ -48,25 +52,38 @@ def recorded(uri: str) -> dict[str, Any]:
 
 
 def heard(uri: str) -> dict[str, Any]:
-    """Of a robot that is there now; nothing is subscribed, so nobody counts its messages.
+    """Of a robot that is there now: its topics, and how often those come that something can be made of.
 
     Raises:
         SourceError: The address is none.
     """
-    with closing(open_live(uri)) as source:
+    address, inbox = parse_address(uri), CountingInbox()
+    make_link, _ = link_for(address)
+    with closing(make_link(address, inbox)) as link:
         begun = changed = time.monotonic()
-        known = source.publishers()
+        known = link.publishers()
         while (now := time.monotonic()) < begun + LISTEN_S and not (known and now > changed + SETTLE_S):
             time.sleep(_LOOK_S)
-            if (there := source.publishers()) != known:
+            if (there := link.publishers()) != known:
                 known, changed = there, now
-        found = [
-            RecordedTopic(each.topic, each.msgtype, 0, "", _LIVE_ROLES.get(each.msgtype, ""))
-            for each in known[:MOST_TOPICS]
-        ]
-        topics = [{**asdict(topic), "messages": None, "rate_hz": None} for topic in found]
+        listened = countable(known, MOST_TOPICS)
+        if listened:
+            link.subscribe(listened)
+            time.sleep(COUNT_S)
+        numbers = {channel.number for channel in listened}
+        topics = [_counted(each, inbox.heard(k), k in numbers) for k, each in enumerate(known[:MOST_TOPICS])]
         told = [] if topics else [f"no topic was announced within {LISTEN_S:.0f} s"]
         return {"kind": "live", "topics": topics, "mount": None, "warnings": told}
+
+
+def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, Any]:
+    """A topic for people."""
+    why = ""
+    if listened and not heard.messages and not publisher.topic.endswith("tf_static"):
+        why = f"silent for {COUNT_S:g} s"
+    topic = RecordedTopic(publisher.topic, publisher.msgtype, 0, "", _ROLES.get(publisher.msgtype, ""), why)
+    counted = heard.messages if listened else None
+    return {**asdict(topic), "messages": counted, "seconds": COUNT_S, "rate_hz": heard.rate_hz}
 
 
 def _rate(messages: int, seconds: float) -> float | None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.chosen import plain_of
 from app.keeper import Keeper
 from app.live_payload import trees_payload, truth_payload
 from app.messages import Open
@@ -95,7 +96,8 @@ class Logbook:
         if run is None:
             return
         name = FilePath(opened.uri.rstrip("/")).name or opened.uri
-        beginning = Beginning(run, name, opened.uri, opened.kind, source.odometry, source.seed)
+        chosen = plain_of(source)
+        beginning = Beginning(run, name, opened.uri, opened.kind, source.odometry, source.seed, chosen)
         self._page = _Page(beginning, opened.scans)
 
     def leave(self) -> None:

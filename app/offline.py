@@ -57,6 +57,7 @@ class OfflineRun:
         stop_after: So many scans.
         revisions: Other parameters, each from a scan on, in their order.
         on_frame: Told of each scan's results.
+        chosen: Topics and mounting that were asked for, see `app.chosen`.
     """
 
     source: Source
@@ -69,6 +70,7 @@ class OfflineRun:
     stop_after: int | None = None
     revisions: tuple[tuple[int, Parameters], ...] = ()
     on_frame: Callable[[Frame, Mapper], None] | None = None
+    chosen: dict[str, Any] | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -286,6 +288,7 @@ def _run_record(
         },
         "seed": plan.seed,
         "odometry": plan.odometry,
+        **({} if plan.chosen is None else {"chosen": plan.chosen}),
         "preset": plan.preset,
         "changed": changed_values(plan.preset, plan.parameters),
         "parameters": plan.parameters.model_dump(),

@@ -12,7 +12,7 @@ from pipeline.files import write_beside
 from pipeline.records import Bool, Int, Path, Trees
 from pipeline.sources.base import Source
 from pipeline.sources.camera import Camera, nearest
-from pipeline.sources.ros import RosSource
+from pipeline.sources.pictures import WithPictures
 from pipeline.sources.with_motion import WithMotion
 
 FOLDER = "pictures"
@@ -88,8 +88,8 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
         OSError: The folder cannot be written.
     """
     _clear(folder / FOLDER)
-    origin = source.source if isinstance(source, WithMotion) else source
-    if not isinstance(origin, RosSource):
+    origin: object = source.source if isinstance(source, WithMotion) else source
+    if not isinstance(origin, WithPictures):
         return 0, ""
     camera, why = origin.camera()
     if camera is None:

@@ -58,9 +58,19 @@ def told_of_frames(source: Source | LiveSource) -> Callable[[Frame, Mapper], Non
 
 @contextmanager
 def heard(
-    source: Source | LiveSource, recording: Recording | None = None, *, publish: bool = False
+    source: Source | LiveSource,
+    recording: Recording | None = None,
+    *,
+    publish: bool = False,
+    pictures: Path | None = None,
 ) -> Iterator[None]:
     """Of a live source: wait until it is heard; then Ctrl-C and SIGTERM end its records, and no more.
+
+    Args:
+        source: Live or not.
+        recording: Of what comes.
+        publish: Whether what comes of it is told to the robot's network.
+        pictures: On whose disk pictures for its trees are put aside.
 
     Raises:
         SourceError: It was stopped before anything was heard, or what it sends cannot be read.
@@ -77,6 +87,11 @@ def heard(
         source.stop()
 
     source.use(recording, publish=publish)
+    if pictures is not None:
+        try:
+            source.keep_pictures(pictures)
+        except OSError as error:
+            print(f"stemmap: there will be no pictures of trees: {error.strerror}", file=sys.stderr)
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     told = None
     try:

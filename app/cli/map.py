@@ -119,6 +119,7 @@ def _run_plot(arguments: argparse.Namespace) -> int:
 
 
 def _run_scans(arguments: argparse.Namespace) -> int:
+    from app.chosen import plain_of_options
     from app.cli.listening import begin_recording, heard, recording_of, told_of_frames
     from app.continuing import Continued
     from app.offline import OfflineRun, map_run
@@ -134,7 +135,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         arguments.seed = saved.seed if saved else 0
     with (
         closing(open_any(arguments.source, source_options(arguments))) as opened,
-        heard(opened, recording_of(arguments), publish=arguments.publish),
+        heard(opened, recording_of(arguments), publish=arguments.publish, pictures=arguments.out),
     ):
         revisions = () if saved or says_parameters(arguments) else recorded_parameters(opened.description)
         preset_name, parameters = chosen_parameters(
@@ -154,6 +155,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             stop_after=arguments.stop_after,
             revisions=revisions,
             on_frame=told_of_frames(opened),
+            chosen=plain_of_options(source_options(arguments)),
         )
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)

@@ -8,13 +8,27 @@ from dataclasses import dataclass
 from app.robot.address import ROOT
 from app.robot.ros_graph import Publisher
 from pipeline.errors import SourceError
+from pipeline.sources.camera import shared_parts
 from pipeline.sources.container import Channel
-from pipeline.sources.rostypes import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, TRANSFORMS, VELODYNE_SCAN
+from pipeline.sources.rostypes import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMU,
+    LASER_SCAN,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    TRANSFORMS,
+    VELODYNE_SCAN,
+)
 from pipeline.sources.topics import TYPES_BY_ROLE
 
-SCAN_TYPES = TYPES_BY_ROLE["scan"]
+SCAN_TYPES, PICTURE_TYPES = TYPES_BY_ROLE["scan"], TYPES_BY_ROLE["camera"]
+#: As `?camera=`: pictures stay on the robot, where the radio link is thin.
+NO_CAMERA = "none"
 #: What we publish ourselves is nobody's LiDAR and nobody's odometry.
 OWN = "stemmap"
+#: Pictures that show no scene to a person.
+_NO_SCENE = ("depth", "disparity", "confidence", "mask", "label")
 _DERIVED = ("camera", "depth", "image", "map", "ground", "cluster", "filtered", "voxel")
 
 
@@ -26,11 +40,14 @@ class Choice:
         robot: Its namespace, "" for none.
         channels: To subscribe to; their numbers count from 1.
         warnings: What else there was.
+        camera: The channel of pictures and that of their CameraInfo, as far as they are there; numbered after
+            the others, of which the map is made.
     """
 
     robot: str
     channels: tuple[Channel, ...]
     warnings: tuple[str, ...]
+    camera: tuple[Channel, ...] = ()
 
 
 def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], where: str) -> Choice | None:
@@ -58,27 +75,46 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
         return None
     scan = min(fitting, key=_scan_rank)
     mine = [p for p in there if p.robot in (scan.robot, "")]
-    odometry = _of_role(mine, topics, "odometry", ODOMETRY, _odometry_rank, where)
-    imu = _of_role(mine, topics, "imu", IMU, _imu_rank, where)
-    gnss = _of_role(mine, topics, "gnss", NAV_SAT_FIX, lambda p: (p.topic,), where)
+    odometry = _of_role(mine, topics, "odometry", (ODOMETRY,), _odometry_rank, where)
+    imu = _of_role(mine, topics, "imu", (IMU,), _imu_rank, where)
+    gnss = _of_role(mine, topics, "gnss", (NAV_SAT_FIX,), lambda p: (p.topic,), where)
     transforms = sorted({p.topic: p for p in mine if p.msgtype == TRANSFORMS}.values(), key=lambda p: p.topic)
     chosen = [p for p in (scan, odometry, imu, gnss, *transforms) if p is not None]
-    channels = tuple(Channel(k, p.topic, p.msgtype, "cdr", "", "", 0) for k, p in enumerate(chosen, 1))
-    return Choice(scan.robot, channels, tuple(_warnings(scans, scan, robot, named)))
+    camera = _camera(mine, topics, where)
+    channels = tuple(
+        Channel(k, p.topic, p.msgtype, "cdr", "", "", 0) for k, p in enumerate([*chosen, *camera], 1)
+    )
+    told = tuple(_warnings(scans, scan, robot, named))
+    return Choice(scan.robot, channels[: len(chosen)], told, channels[len(chosen) :])
+
+
+def _camera(there: list[Publisher], topics: dict[str, str], where: str) -> list[Publisher]:
+    """The pictures that are shown, and what tells where things stand in them; [] for none."""
+    if topics.get("camera") == NO_CAMERA:
+        return []
+    seen = there if "camera" in topics else [p for p in there if not _has_word(p, _NO_SCENE)]
+    pictures = _of_role(seen, topics, "camera", PICTURE_TYPES, _picture_rank, where)
+    if pictures is None:
+        return []
+    infos = sorted(
+        (p for p in there if p.msgtype == CAMERA_INFO),
+        key=lambda p: (-shared_parts(p.topic, pictures.topic), p.topic),
+    )
+    return [pictures, *infos[:1]]
 
 
 def _of_role(
     there: list[Publisher],
     topics: dict[str, str],
     role: str,
-    msgtype: str,
+    types: tuple[str, ...],
     rank: Callable[[Publisher], tuple[object, ...]],
     where: str,
 ) -> Publisher | None:
     named = topics.get(role)
-    fitting = [p for p in there if p.msgtype == msgtype and (named is None or p.topic == named)]
+    fitting = [p for p in there if p.msgtype in types and (named is None or p.topic == named)]
     if not fitting:
-        _refuse_wrong_type(there, topics, role, (msgtype,), where)
+        _refuse_wrong_type(there, topics, role, types, where)
         return None
     return min(fitting, key=rank)
 
@@ -97,7 +133,11 @@ def _refuse_wrong_type(
 
 def _derived(publisher: Publisher) -> bool:
     """Whether the name says that a cloud is no raw sweep of a LiDAR."""
-    return any(word in publisher.topic.lower() for word in _DERIVED)
+    return _has_word(publisher, _DERIVED)
+
+
+def _has_word(publisher: Publisher, words: tuple[str, ...]) -> bool:
+    return any(word in publisher.topic.lower() for word in words)
 
 
 def _scan_rank(publisher: Publisher) -> tuple[object, ...]:
@@ -113,6 +153,11 @@ def _odometry_rank(publisher: Publisher) -> tuple[object, ...]:
 
 def _imu_rank(publisher: Publisher) -> tuple[object, ...]:
     return "raw" in publisher.topic.lower(), publisher.topic  # raw ones come without an orientation
+
+
+def _picture_rank(publisher: Publisher) -> tuple[object, ...]:
+    """Compressed ones are a tenth of the others."""
+    return publisher.msgtype != COMPRESSED_IMAGE, publisher.topic
 
 
 def _warnings(scans: list[Publisher], scan: Publisher, robot: str, named: str | None) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from app.robot.address import DdsAddress
 from app.robot.arrival_times import ArrivalTimes
-from app.robot.choosing import SCAN_TYPES
+from app.robot.choosing import PICTURE_TYPES, SCAN_TYPES
 from app.robot.dds_discovery import DdsGraph, Offer
 from app.robot.dds_types import idl_type
 from app.robot.inbox import Inbox
@@ -20,9 +20,11 @@ from pipeline.sources.container import Channel, Message, count_loss
 
 _RETRY_S = 1.0
 _WAIT_NS = 50_000_000
-#: So many samples wait in CycloneDDS while Python is busy: two seconds of scans, of the rest far more.
-_SCAN_DEPTH, _DEPTH = 20, 5000
+#: So many samples wait in CycloneDDS while Python is busy: two seconds of scans, few of the large pictures
+#: (most of them are not wanted anyway), of the rest far more.
+_SCAN_DEPTH, _PICTURE_DEPTH, _DEPTH = 20, 4, 5000
 OVERRUN = "times that more messages came at once than CycloneDDS keeps"
+PICTURE_OVERRUN = "times that more pictures came at once than CycloneDDS keeps"
 OWN_CONFIGURATION = "CYCLONEDDS_URI"
 
 
@@ -174,15 +176,19 @@ class DdsLink:
 
     def _take(self, reader: _Reader) -> None:
         payloads = reader.take()
-        is_scan = reader.channel.msgtype in SCAN_TYPES
+        is_scan, is_picture = (reader.channel.msgtype in types for types in (SCAN_TYPES, PICTURE_TYPES))
         with self._lock:
             if len(payloads) >= reader.depth:
-                count_loss(self.losses, OVERRUN)
+                count_loss(self.losses, PICTURE_OVERRUN if is_picture else OVERRUN)
             if payloads and is_scan:
                 self._heard_s = time.monotonic()
                 self.scans += len(payloads)
         for payload in payloads:
-            self._inbox.put(Message(reader.channel.number, self._times.next_ns(), payload), is_scan=is_scan)
+            message = Message(reader.channel.number, self._times.next_ns(), payload)
+            if not is_picture:
+                self._inbox.put(message, is_scan=is_scan)
+            elif self._inbox.wants_picture(message.log_ns, len(payload)):
+                self._inbox.put_picture(message)
 
 
 def _offer(found: Any) -> Offer | None:  # noqa: ANN401
@@ -229,7 +235,9 @@ class _Reader:
         from cyclonedds.util import duration
 
         self.channel, self.asked = channel, asked
-        self.depth = _SCAN_DEPTH if channel.msgtype in SCAN_TYPES else _DEPTH
+        self.depth = _DEPTH
+        if channel.msgtype in (*SCAN_TYPES, *PICTURE_TYPES):
+            self.depth = _SCAN_DEPTH if channel.msgtype in SCAN_TYPES else _PICTURE_DEPTH
         policies = [
             Policy.Reliability.Reliable(duration(milliseconds=100))
             if asked.reliable

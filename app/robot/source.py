@@ -4,54 +4,34 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
-from typing import Any, Protocol
+from pathlib import Path as FilePath
+from typing import Any
 
 from app.robot.address import ALL_ROBOTS, DdsAddress, VelodyneAddress, ZenohAddress, parse_address
 from app.robot.choosing import SCAN_TYPES, Choice, choose
-from app.robot.dds_link import DdsLink
-from app.robot.inbox import Inbox
+from app.robot.inbox import PICTURE_PAUSE_NS, PICTURES_DROPPED, PICTURES_TOO_LARGE, Inbox
+from app.robot.kept_pictures import KeptPictures
+from app.robot.links import KIND, Link, link_for
 from app.robot.recording import Recording
 from app.robot.ros_graph import Publisher
 from app.robot.ros_publisher import RosPublisher
-from app.robot.velodyne_link import VelodyneLink
 from app.robot.zenoh_link import ZenohLink
 from pipeline.errors import SourceError
 from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path, Record, Truth
 from pipeline.sources.arrivals import ArrivalReader
 from pipeline.sources.base import SourceDescription, SourceOptions
-from pipeline.sources.container import Channel
+from pipeline.sources.camera import Camera, Picture
+from pipeline.sources.live_camera import LiveCamera
+from pipeline.sources.live_recording import camera_topics
 
-KIND, VELODYNE_KIND, DDS_KIND = "ROS 2 over Zenoh", "Velodyne sensor", "ROS 2 over DDS"
 #: A robot's nodes come up one after another: so long after its LiDAR its topics are counted.
 _SETTLE_S = 1.0
 _POLL_S = 0.005
 #: Nothing for so long is worth a word; a LiDAR of 5 Hz pauses for 0.2 s.
 SILENT_S = 1.0
-
-
-class Link(Protocol):
-    """What a source needs of `ZenohLink`."""
-
-    problem: str
-    losses: dict[str, int]
-    scans: int
-    version: int
-
-    @property
-    def session(self) -> Any: ...  # noqa: ANN401
-    @property
-    def place(self) -> str: ...
-    @property
-    def nothing(self) -> str: ...
-    @property
-    def silence_s(self) -> float | None: ...
-    def publishers(self) -> list[Publisher]: ...
-    def robots(self) -> list[str]: ...
-    def subscribe(self, channels: Sequence[Channel]) -> None: ...
-    def close(self) -> None: ...
 
 
 class LiveSource:
@@ -88,6 +68,8 @@ class LiveSource:
         self._recording: Recording | None = None
         self._publishes = False
         self._publisher: RosPublisher | None = None
+        self._camera: LiveCamera | None = None
+        self._kept: KeptPictures | None = None
 
     # --- as a source -----------------------------------------------------------------------------
 
@@ -102,13 +84,17 @@ class LiveSource:
         if known is None or self._choice is None:
             raise SourceError("nothing was heard yet", where=self.uri, remedy="Look whether the robot sends.")
         digest = f"live:{self.uri}:{self._began_ns}"  # no other run is this one
-        return replace(known, digest=digest, warnings=(*known.warnings, *self._choice.warnings))
+        topics = (*known.topics, *camera_topics(self._choice.camera))
+        return replace(
+            known, digest=digest, topics=topics, warnings=(*known.warnings, *self._choice.warnings)
+        )
 
     @property
     def losses(self) -> dict[str, int]:
         """What was left out so far: on the way, in the queue, and what could not be read."""
         read = {} if self._reader is None else self._reader.losses
-        return {**self._link.losses, **self._inbox.losses, **read}
+        kept = {} if self._kept is None else self._kept.losses
+        return {**self._link.losses, **self._inbox.losses, **read, **kept}
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield records as they come, until `stop`; waits for them.
@@ -136,6 +122,45 @@ class LiveSource:
         self._link.close()
         if self._recording is not None:
             self._recording.close()
+        if self._kept is not None:
+            self._kept.close()
+
+    # --- its camera ------------------------------------------------------------------------------
+
+    def camera(self) -> tuple[Camera | None, str]:
+        """How the camera stands; None and why where nobody tells, or there is none ("")."""
+        return (None, "") if self._camera is None else self._camera.camera(self._base)
+
+    def picture_near(self, stamp_ns: int) -> Picture | None:
+        """The picture of the last seconds that is nearest to a time, None where it is too far from it."""
+        return None if self._camera is None else self._camera.near(stamp_ns, self._offset_ns)
+
+    def picture_stamps(self) -> list[int]:
+        """When the pictures were taken that were put aside, ascending [ns]."""
+        return [] if self._kept is None else self._kept.stamps()
+
+    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
+        """The pictures that were taken at some of `picture_stamps`, each once."""
+        return iter(()) if self._kept is None else self._kept.at(wanted_ns)
+
+    @property
+    def pictures_told(self) -> str:
+        """How many pictures came and were taken in, in words; "" where there is no camera."""
+        if self._camera is None:
+            return ""
+        lost = sum(self._inbox.losses.get(reason, 0) for reason in (PICTURES_DROPPED, PICTURES_TOO_LARGE))
+        return (
+            f"of {self._inbox.pictures_come:,} pictures {self._inbox.pictures_taken:,} were taken in, "
+            f"one every {PICTURE_PAUSE_NS / 1e9:g} s at most; {lost:,} were dropped"
+        )
+
+    def keep_pictures(self, folder: FilePath) -> None:
+        """Put pictures aside, from which those of trees are made at the end; on the disk of a folder.
+
+        Raises:
+            OSError: The file for them cannot be made.
+        """
+        self._kept = KeptPictures(folder)
 
     # --- as something live -----------------------------------------------------------------------
 
@@ -179,6 +204,10 @@ class LiveSource:
 
     def mapped(self, frame: Frame, path: Path) -> None:
         """What came of a scan."""
+        if self._camera is not None and self._kept is not None and self._kept.is_due(path):
+            picture = self.picture_near(frame.stamp_ns)
+            if picture is not None:
+                self._kept.add(picture, path)
         if self._publisher is not None:
             self._publisher.add(frame, path)
         if self._recording is not None:
@@ -228,6 +257,8 @@ class LiveSource:
         while (message := self._inbox.take()) is not None:
             if self._recording is not None:
                 self._recording.add(message)
+            if self._camera is not None and self._camera.add(message):
+                continue
             records = self._reader.add(message)
             if records:
                 return records
@@ -255,6 +286,14 @@ class LiveSource:
         return f"{since}: {reason}" if since else f"Waiting: {reason}"
 
     # --- inside ----------------------------------------------------------------------------------
+
+    @property
+    def _base(self) -> str:
+        return "" if self._reader is None else self._reader.base
+
+    @property
+    def _offset_ns(self) -> int:
+        return 0 if self._reader is None else self._reader.offset_ns
 
     def _name(self) -> str:
         return f"robot {self.robot}" if self.robot else "the robot"
@@ -289,12 +328,17 @@ class LiveSource:
         options = replace(self._options, topics=topics)
         self._reader = ArrivalReader(self.uri, self._kind, choice.channels, options)
         self._choice = choice
+        everything = (*choice.channels, *choice.camera)
+        if choice.camera:
+            fixed = [channel for channel in choice.channels if channel.topic.endswith("tf_static")]
+            self._camera = LiveCamera(choice.camera, fixed)
         if self._recording is not None:
-            told = {"uri": self.uri, "topics": [channel.topic for channel in choice.channels]}
-            self._recording.begin(choice.channels, told, choice.robot)
+            told = {"uri": self.uri, "topics": [channel.topic for channel in choice.channels],
+                    "camera": [channel.topic for channel in choice.camera]}  # fmt: skip
+            self._recording.begin(everything, told, choice.robot)
         if self._publishes and self._link.session is not None:
             self._publisher = RosPublisher(self._link.session, self._address.domain, choice.robot)
-        self._link.subscribe(choice.channels)
+        self._link.subscribe(everything)
 
 
 def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
@@ -304,10 +348,9 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
         SourceError: The address is none.
     """
     address, chosen = parse_address(uri), options or SourceOptions()
-    if isinstance(address, VelodyneAddress):
-        return LiveSource(address, chosen, VelodyneLink, VELODYNE_KIND)
-    if isinstance(address, DdsAddress):
-        return LiveSource(address, chosen, DdsLink, DDS_KIND)
+    make_link, kind = link_for(address)
+    if not isinstance(address, ZenohAddress):
+        return LiveSource(address, chosen, make_link, kind)
     if address.mapped_there:
         raise SourceError(
             "a map that a robot makes is watched, not made again",
@@ -320,4 +363,4 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
             where=uri,
             remedy="Name it, or show all of them with `stemmap serve`",
         )
-    return LiveSource(address, chosen)
+    return LiveSource(address, chosen, make_link, kind)

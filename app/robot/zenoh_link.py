@@ -12,7 +12,7 @@ from typing import Any
 
 from app.robot.address import ROOT, ZenohAddress
 from app.robot.arrival_times import ArrivalTimes
-from app.robot.choosing import SCAN_TYPES
+from app.robot.choosing import PICTURE_TYPES, SCAN_TYPES
 from app.robot.inbox import Inbox
 from app.robot.ros_graph import ADMIN, MOST_ENDPOINTS, Publisher, RosGraph, data_key
 from pipeline.sources.container import Channel, Message, count_loss
@@ -195,8 +195,11 @@ class ZenohLink:
             if size > MESSAGE_LIMIT:
                 count_loss(self.losses, TOO_LARGE)
                 return
-            message = Message(channel.number, self._times.next_ns(), payload.to_bytes())
-            self._inbox.put(message, is_scan=is_scan)
+            arrival_ns = self._times.next_ns()
+            if channel.msgtype not in PICTURE_TYPES:
+                self._inbox.put(Message(channel.number, arrival_ns, payload.to_bytes()), is_scan=is_scan)
+            elif self._inbox.wants_picture(arrival_ns, size):
+                self._inbox.put_picture(Message(channel.number, arrival_ns, payload.to_bytes()))
 
     def _count_gap(self, number: int, attachment: bytes) -> None:
         """rmw_zenoh numbers what a publisher sends; a hole in the numbers is what got lost."""

@@ -16,6 +16,7 @@ from msgspec import Meta
 from starlette.responses import Response
 
 from app.child import ask
+from app.chosen import Role, TopicName
 from app.messages import LONGEST_S, Advance, Open, Pause, Play, Seek, SetSpeed
 from app.replies import BadRequestError, body_of, error_reply, json_reply
 from app.routes.access import Dash
@@ -33,7 +34,6 @@ NOT_FROM_AFAR = "from another machine only scenarios and the recordings of the f
 _Command = Play | Pause | Advance | Seek | SetSpeed
 
 
-_Role = Literal["scan", "odometry", "imu", "gnss", "camera"]
 _Length = Annotated[float, Meta(ge=-100.0, le=100.0)]
 _Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
 
@@ -44,7 +44,7 @@ class OpenRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     uri: Annotated[str, Meta(min_length=1, max_length=_LONGEST_URI)]
     odometry: Literal["auto", "wheels", "kiss-icp", "static"] = "auto"
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
-    topics: dict[_Role, Annotated[str, Meta(max_length=256)]] = {}
+    topics: dict[Role, TopicName] = {}
     #: x, y, z [m], roll, pitch, yaw [degrees] of the LiDAR on the robot.
     mount: tuple[_Length, _Length, _Length, _Angle, _Angle, _Angle] | None = None
 

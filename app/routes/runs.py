@@ -12,6 +12,7 @@ from fastapi import APIRouter, Path, Query, Request
 from msgspec import Meta
 from starlette.responses import Response
 
+from app.chosen import chosen_again
 from app.comparing import compare
 from app.dashboard import Dashboard
 from app.finished_folders import finished_folders, read_folder
@@ -116,7 +117,7 @@ async def restore(number: _Number, dashboard: Dash) -> Response:
 
 @router.post("/{key}/replay")
 async def replay(key: _Key, request: Request, dashboard: Dash) -> Response:
-    """Open its source again, with the parameters that it ended with."""
+    """Open its source again, with its topics and mounting and the parameters that it ended with."""
     settings: Settings = request.app.state.settings
     try:
         run = await _whole(key, request, dashboard)
@@ -126,9 +127,8 @@ async def replay(key: _Key, request: Request, dashboard: Dash) -> Response:
     if uri is None:
         return error_reply(403, NOT_FROM_AFAR, where=run["uri"])
     # Odometry stands in records only; a finished folder was mapped with it or without, as run.json says.
-    await dashboard.replay(
-        Open(uri, run.get("odometry", "auto"), run["seed"]), run["preset"], run["parameters"]
-    )
+    wanted = chosen_again(Open(uri, run.get("odometry", "auto"), run["seed"]), run.get("chosen"))
+    await dashboard.replay(wanted, run["preset"], run["parameters"])
     return json_reply({}, 202)
 
 

@@ -22,7 +22,8 @@ _ONE_MOVE_NS = 3_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """How a run begins: number of its source in the store, and as in `Open` and `Opened`."""
+    """How a run begins: number of its source in the store, and as in `Open` and `Opened`; `chosen` as of
+    `app.chosen`."""
 
     run: int
     name: str
@@ -30,6 +31,7 @@ class Beginning:
     kind: str
     odometry: str
     seed: int
+    chosen: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +94,7 @@ class RunBook:
                 "kind": beginning.kind[:200],
                 "odometry": beginning.odometry,
                 "seed": beginning.seed,
+                "chosen": None if beginning.chosen is None else dict(beginning.chosen),
                 "begun_ns": now,
                 "changed_ns": now,
                 **_figures(standing),

@@ -10,7 +10,7 @@ from app.store.tables import metadata
 from pipeline.errors import StemmapError
 
 # Oldest first; the last is what `app.store.tables` says.
-REVISIONS = ("0001", "0002", "0003", "0004")
+REVISIONS = ("0001", "0002", "0003", "0004", "0005")
 _FOLDER = Path(__file__).parent / "migrations"
 # As alembic makes and reads it.
 _version = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))

@@ -26,8 +26,8 @@ OPENING_LIMIT = 4000
 _TRIES = 5
 
 
-class _Heard:
-    """The messages of the opening as a container."""
+class Heard:
+    """Some messages that came as a container."""
 
     damage: dict[str, int]
 
@@ -81,6 +81,7 @@ class ArrivalReader:
         self._fixed = {c.number for c in channels if c.topic.endswith("tf_static")}
         self._opening: list[Message] = []
         self._first_ns: int | None = None
+        self._scan_ns = 0
         self._heard = 0
         self._failures = 0
         self._source: RosSource | None = None
@@ -88,6 +89,17 @@ class ArrivalReader:
         self.description: SourceDescription | None = None
         self.losses: dict[str, int] = {}
         self.from_ns: int | None = None
+
+    @property
+    def offset_ns(self) -> int:
+        """Stamp minus arrival of the first scan [ns]; 0 before the description is known."""
+        known = self.description
+        return 0 if known is None or known.start_ns is None else known.start_ns - self._scan_ns
+
+    @property
+    def base(self) -> str:
+        """The name of the base frame, "" where nobody says it."""
+        return "" if self._source is None else self._source.base
 
     def add(self, message: Message) -> list[Record]:
         """Take the next message; the records that are known by it.
@@ -99,6 +111,7 @@ class ArrivalReader:
             return self._records_of(message)
         self._opening.append(message)
         if message.channel in self._scans:
+            self._scan_ns = self._scan_ns or message.log_ns
             self._heard += 1
             self._first_ns = message.log_ns if self._first_ns is None else self._first_ns
         if len(self._opening) > OPENING_LIMIT:
@@ -133,7 +146,7 @@ class ArrivalReader:
             clocks.append(SteppingClock(offsets_ns))
             return clocks[-1]
 
-        heard = _Heard(self._kind, self._channels, self._opening)
+        heard = Heard(self._kind, self._channels, self._opening)
         try:
             source = RosSource(self._uri, heard, [], self._options, make_clock, live=True)
         except SourceError:

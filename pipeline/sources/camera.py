@@ -85,7 +85,7 @@ def find_camera(
     topic = next(channels[number].topic for number in sorted(pictures))
     near = sorted(
         (channel for channel in channels.values() if channel.msgtype == CAMERA_INFO),
-        key=lambda channel: (-_shared(channel.topic, topic), channel.topic),
+        key=lambda channel: (-shared_parts(channel.topic, topic), channel.topic),
     )
     if not near:
         return None, f"no CameraInfo tells of {topic} where things stand in it"
@@ -108,7 +108,7 @@ def find_camera(
     return None, f"nothing sound is told in {near[0].topic}"
 
 
-def _shared(first: str, second: str) -> int:
+def shared_parts(first: str, second: str) -> int:
     """How many parts two topics share from the front."""
     parts = zip(first.split("/"), second.split("/"), strict=False)
     return next((k for k, (a, b) in enumerate(parts) if a != b), 99)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,14 @@ import msgspec
 from pipeline.errors import SourceError
 from pipeline.records import Record, Truth
 from pipeline.sources.arrivals import ArrivalReader
-from pipeline.sources.base import Revision, SourceDescription, SourceOptions
+from pipeline.sources.base import RecordedTopic, Revision, SourceDescription, SourceOptions
+from pipeline.sources.camera import Camera, Picture
 from pipeline.sources.container import Channel, count_loss
 from pipeline.sources.digest import digest_of
+from pipeline.sources.live_camera import placed
 from pipeline.sources.mcap_file import McapFile, open_mcap
-from pipeline.sources.rostypes import standard_types
+from pipeline.sources.pictures import RecordedPictures, time_beside
+from pipeline.sources.rostypes import MessageDecoder, standard_types
 from pipeline.sources.topics import TYPES_BY_ROLE
 
 NAME, PARAMETERS, VERSION = "stemmap_live.json", "/stemmap/parameters", 1
@@ -34,6 +37,7 @@ class Told(msgspec.Struct, frozen=True):
         uri: The robot's address.
         topics: That were read, in the order of their numbers; the first one is of the scans.
         seed, odometry, preset: As the run had them.
+        camera: Topics of pictures and of what tells of them, of which no map is made.
     """
 
     version: int
@@ -42,6 +46,7 @@ class Told(msgspec.Struct, frozen=True):
     seed: int = 0
     odometry: str = "auto"
     preset: str = "forest"
+    camera: list[str] = []
 
 
 def told_of(container: McapFile, where: str) -> Told | None:
@@ -57,7 +62,7 @@ def told_of(container: McapFile, where: str) -> Told | None:
         told = msgspec.json.decode(content, type=Told)
     except (msgspec.DecodeError, RecursionError) as error:
         raise SourceError(f"what the recorder said cannot be read: {error}", where=where) from error
-    if told.version != VERSION or not 0 < len(told.topics) <= _MOST_TOPICS:
+    if told.version != VERSION or not 0 < len(told.topics) + len(told.camera) <= _MOST_TOPICS:
         raise SourceError("the recording is of a newer version of stemmap", where=where)
     return told
 
@@ -81,7 +86,18 @@ class LiveRecording:
         self._options = replace(options, topics={"scan": told.topics[0], **options.topics})
         self._channels = _channels(container, told, uri)
         self._losses: dict[str, int] = {}
+        self._base, self._offset_ns = "", 0
+        camera = [c for c in container.channels if c.topic in told.camera]
+        self._camera = tuple(replace(c, definition="", definition_format="") for c in camera)
         self.description = self._describe(path)
+        self._recorded = RecordedPictures(
+            container,
+            MessageDecoder(self._camera),
+            {channel.number: channel for channel in self._camera},
+            frozenset(c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]),
+            lambda stamp_ns, message: time_beside(stamp_ns, message.log_ns, self._offset_ns),
+            self._offset_ns,
+        )
 
     @property
     def losses(self) -> dict[str, int]:
@@ -102,6 +118,25 @@ class LiveRecording:
         """Nobody knows."""
         return None
 
+    def camera(self) -> tuple[Camera | None, str]:
+        """How the camera stands; None and why where nobody tells, or there is none ("")."""
+        pictures = [c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
+        if not pictures:
+            return None, ""
+        return placed(self._container, MessageDecoder(()), pictures[0], self._base)
+
+    def picture_near(self, stamp_ns: int) -> Picture | None:
+        """The picture that was taken nearest to a time, None where that is too far from it."""
+        return self._recorded.near(stamp_ns)
+
+    def picture_stamps(self) -> list[int]:
+        """When the pictures were taken, ascending [ns]."""
+        return self._recorded.stamps()
+
+    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
+        """The pictures that were taken at some of `picture_stamps`, each once."""
+        return self._recorded.at(wanted_ns)
+
     def close(self) -> None:
         """Close the file."""
         self._container.close()
@@ -119,6 +154,7 @@ class LiveRecording:
         else:
             reader.finish()
         known = reader.description
+        self._base, self._offset_ns = reader.base, reader.offset_ns
         if known is None:
             raise SourceError("there is no scan in it", where=self._uri, remedy="Record the LiDAR's topic.")
         scans = {c.number: c.count for c in self._container.channels if c.topic == self._told.topics[0]}
@@ -136,6 +172,7 @@ class LiveRecording:
             preset=self._told.preset,
             warnings=(*known.warnings, *cut),
             revisions=tuple(self._revisions()),
+            topics=(*known.topics, *camera_topics(self._camera)),
         )
 
     def _revisions(self) -> Iterator[Revision]:
@@ -150,6 +187,11 @@ class LiveRecording:
                 yield msgspec.json.decode(text, type=Revision)
             except Exception:  # whatever the generated decoders of rosbags raise
                 count_loss(self._losses, "revisions of the parameters that cannot be read")
+
+
+def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
+    """The topics of a live run's camera, for people."""
+    return tuple(RecordedTopic(c.topic, c.msgtype, c.count, "camera", "") for c in channels)
 
 
 def _channels(container: McapFile, told: Told, where: str) -> list[Channel]:

@@ -15,13 +15,14 @@ from pipeline.geometry import Pose3
 from pipeline.records import Odometry, Record, Scan, Sensor, Truth
 from pipeline.sources import ros_messages
 from pipeline.sources.base import SourceDescription, SourceOptions
-from pipeline.sources.camera import SAME_TIME_NS, Camera, Picture, find_camera, picture_of
+from pipeline.sources.camera import Camera, Picture, find_camera
 from pipeline.sources.container import Channel, Container, Message, count_loss
 from pipeline.sources.digest import digest_of
 from pipeline.sources.first_stretch import align_fixes
 from pipeline.sources.live_stretch import LiveStretch
 from pipeline.sources.mounting import Mounting
 from pipeline.sources.ordering import WINDOW_NS, Stamped, by_stamp
+from pipeline.sources.pictures import RecordedPictures
 from pipeline.sources.ros_records import RecordDecoder
 from pipeline.sources.rostypes import LASER_SCAN, MessageDecoder
 from pipeline.sources.sensing import rings_descend, sensor_of
@@ -34,8 +35,6 @@ from pipeline.sources.velodyne import SENSORS
 
 #: How many scans may be unreadable at the start before the recording is refused.
 _TRIES = 20
-#: A picture may be written so long before a scan of its time is stamped, and so long after.
-_CAMERA_EARLY_NS, _CAMERA_LATE_NS = 300_000_000, 1_000_000_000
 
 
 class RosSource:
@@ -142,49 +141,33 @@ class RosSource:
 
     def picture_stamps(self) -> list[int]:
         """When the camera took a picture, ascending [ns]."""
-        topic = self._topics.camera
-        numbers = frozenset[int]() if topic is None else topic.numbers
-        found = [
-            arrival.stamp_ns
-            for message in (self._container.messages(numbers, None, {}) if numbers else ())
-            for arrival in self._stamped(replace(message, payload=plain_message(message.payload)), {})
-        ]
-        return sorted(found)
+        return self._pictures().stamps()
 
     def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
         """The pictures that were taken at some of `picture_stamps`, each once."""
-        topic, left = self._topics.camera, set(wanted_ns)
-        for message in self._container.messages(topic.numbers, None, {}) if topic and left else ():
-            plain = replace(message, payload=plain_message(message.payload))
-            for arrival in self._stamped(plain, {}):
-                if arrival.stamp_ns in left:
-                    left.discard(arrival.stamp_ns)
-                    picture = picture_of(plain, self._channels, self._decoder, arrival.stamp_ns)
-                    if picture is not None:
-                        yield picture
+        return self._pictures().at(wanted_ns)
 
     def picture_near(self, stamp_ns: int) -> Picture | None:
         """The picture that was taken nearest to a time, None where that is too far from it."""
-        topic = self._topics.camera
-        if topic is None:
-            return None
-        log_ns = stamp_ns - self._clock.offset_ns
-        best: tuple[int, int, Message] | None = None
-        for message in self._container.messages(topic.numbers, log_ns - _CAMERA_EARLY_NS, {}):
-            if message.log_ns > log_ns + _CAMERA_LATE_NS:
-                break
-            plain = replace(message, payload=plain_message(message.payload))
-            for arrival in self._stamped(plain, {}):
-                off_ns = abs(arrival.stamp_ns - stamp_ns)
-                if off_ns <= SAME_TIME_NS and (best is None or off_ns < best[0]):
-                    best = off_ns, arrival.stamp_ns, plain
-        return None if best is None else picture_of(best[2], self._channels, self._decoder, best[1])
+        return self._pictures().near(stamp_ns)
+
+    @property
+    def base(self) -> str:
+        """The name of the base frame, "" where nobody says it."""
+        return self._records.base
 
     def close(self) -> None:
         """Close the recording."""
         self._container.close()
 
     # --- reading ---------------------------------------------------------------------------------
+
+    def _pictures(self) -> RecordedPictures:
+        numbers = frozenset[int]() if self._topics.camera is None else self._topics.camera.numbers
+        clock = self._clock
+        return RecordedPictures(
+            self._container, self._decoder, self._channels, numbers, clock.time_of, clock.offset_ns
+        )
 
     def _arrivals(
         self, start_ns: int | None, losses: dict[str, int]

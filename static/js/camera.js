@@ -54,6 +54,7 @@ function empty(message) {
   byId("camera-frame").hidden = true;
   byId("over-camera").dataset.scan = "";
   setText(byId("camera-lead"), "");
+  setText(byId("camera-told"), "");
   setText(byId("camera-empty"), message.charAt(0).toUpperCase() + message.slice(1));
   byId("camera-empty").hidden = false;
 }
@@ -67,6 +68,7 @@ function draw() {
   const trees = marks.filter(({ kind }) => kind === "tree").length;
   setText(byId("camera-lead"), seen.why ? `Scan ${seen.index}${late}. Nothing can be marked: ${seen.why}.`
     : `Scan ${seen.index}${late}. Trees of the map in view: ${trees}; clusters: ${marks.length - trees}. Click one to read why.`);
+  setText(byId("camera-told"), seen.told && `Live: ${seen.told}.`);
   byId("over-camera").dataset.scan = String(seen.index);
   choose();
 }

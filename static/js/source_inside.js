@@ -10,7 +10,7 @@ let asked = ""; // what is being looked into
 
 const body = () => byId("inside-body");
 const uri = () => byId("source-uri").value.trim();
-const figures = ({ messages, rate_hz: rate }) => [messages === null ? "" : `${messages.toLocaleString("en")} messages`, rate === null ? "" : `${rate} Hz`].filter(Boolean).join(", ");
+const figures = ({ messages, rate_hz: rate, seconds }) => [messages === null ? "" : `${messages.toLocaleString("en")} messages${seconds ? ` in ${seconds} s` : ""}`, rate === null ? "" : `${rate} Hz`].filter(Boolean).join(", ");
 
 // What was chosen for an address; {} where nobody looked into it or changed anything.
 export function chosenFor(address) {
@@ -57,7 +57,7 @@ function show(address, { topics, mount, warnings }) {
 
 function roles(topics) {
   const rows = Object.entries(ROLES).map(([role, title]) => {
-    const fitting = topics.filter(({ fits, messages }) => fits === role && messages !== 0);
+    const fitting = topics.filter(({ fits, messages, seconds }) => fits === role && (messages !== 0 || seconds));
     if (!fitting.length) return [];
     const read = fitting.find(({ read_as: as }) => as === role);
     const list = el("select", { name: role, id: `inside-${role}` },

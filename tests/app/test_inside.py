@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import radians
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from app import inside
 from app.messages import Open
 from app.opening import open_any, options_of
+from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
 from app.session import Session
 from app.settings import Settings
@@ -21,6 +23,7 @@ from pipeline.parameters import Parameters
 from pipeline.recording import write_recording
 from pipeline.records import Sensor
 from pipeline.sources.base import Source, SourceOptions
+from pipeline.sources.container import Channel, Message
 from pipeline.sources.rostypes import IMAGE, NAV_SAT_FIX, POINT_CLOUD
 from pipeline.steps import steps
 from tests.app.fakes import FakeMapper, FakeSource, FakeWorker
@@ -60,31 +63,47 @@ def test_what_has_no_topics_says_so():
 
 
 class Announced:
-    """A robot whose topics come one after the other."""
+    """A robot whose topics come one after the other; it sends ten a second of what is listened to."""
 
-    def __init__(self, *topics: Publisher) -> None:
-        self._topics, self._asked = list(topics), 0
+    def __init__(self, inbox: Inbox, *topics: Publisher) -> None:
+        self._inbox, self._topics, self._asked = inbox, list(topics), 0
 
     def publishers(self) -> list[Publisher]:
         self._asked += 1
         return self._topics[: self._asked]
 
+    def subscribe(self, channels: Sequence[Channel]) -> None:
+        for channel in channels:
+            for k in range(0 if channel.msgtype == NAV_SAT_FIX else 21):
+                message = Message(channel.number, k * 100_000_000, b"")
+                if channel.msgtype != IMAGE:
+                    self._inbox.put(message, is_scan=True)
+                elif self._inbox.wants_picture(message.log_ns, 1 << 20):
+                    self._inbox.put_picture(message)
+
     def close(self) -> None:
         """Nothing is open."""
 
 
-def test_a_robot_tells_what_it_announces(monkeypatch: pytest.MonkeyPatch):
-    topics = Publisher("red", "/red/points", POINT_CLOUD), Publisher("red", "/red/fix", NAV_SAT_FIX)
-    picture = Publisher("red", "/red/image", IMAGE)
-    monkeypatch.setattr(inside, "open_live", lambda _uri: Announced(*topics, picture))
-    monkeypatch.setattr(inside, "SETTLE_S", 0.2)
+def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.MonkeyPatch):
+    names = [("points", POINT_CLOUD), ("fix", NAV_SAT_FIX), ("image", IMAGE), ("depth", "a/msg/Large")]
+    topics = [Publisher("red", f"/red/{name}", kind) for name, kind in names]
+    monkeypatch.setattr(inside, "link_for", lambda _address: (lambda _, inbox: Announced(inbox, *topics), ""))
+    monkeypatch.setattr(inside, "SETTLE_S", 0.3)
+    monkeypatch.setattr(inside, "COUNT_S", 0.01)
     told = inside.heard("zenoh:tcp/127.0.0.1:7447")
-    fits = {name: topic["fits"] for name, topic in by_name(told).items()}
-    assert fits == {"/red/points": "scan", "/red/fix": "gnss", "/red/image": ""}
+    found = {name: (t["fits"], t["messages"], t["rate_hz"]) for name, t in by_name(told).items()}
+    assert found == {
+        "/red/points": ("scan", 21, 10.0),
+        "/red/fix": ("gnss", 0, None),
+        "/red/image": ("camera", 21, 10.0),
+        "/red/depth": ("", None, None),
+    }
+    assert "silent" in by_name(told)["/red/fix"]["why_not"]
     assert (told["mount"], told["warnings"]) == (None, [])
-    monkeypatch.setattr(inside, "open_live", lambda _uri: Announced())
+    monkeypatch.setattr(inside, "link_for", lambda _address: (lambda _, inbox: Announced(inbox), ""))
     monkeypatch.setattr(inside, "LISTEN_S", 0.1)
-    assert "no topic was announced" in inside.heard("dds:")["warnings"][0]
+    assert "no topic was announced" in inside.heard("velodyne:127.0.0.1:2368")["warnings"][0]
 
 
 async def test_the_choice_goes_to_the_worker(both: Running) -> None:

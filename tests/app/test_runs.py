@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 
 from app import child, logbook
+from app.chosen import chosen_again, plain_of_options
 from app.comparing import compare
 from app.dashboard import Dashboard
 from app.logbook import MOST_PATH_POINTS, thinned
 from app.messages import Open
+from app.opening import options_of
 from app.settings import Settings
 from app.worker_messages import Begin, Shown
 from pipeline.errors import SourceError, StemmapError
+from pipeline.sources.base import SourceOptions
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
 
@@ -25,10 +28,15 @@ NAMED = {"Cookie": "stemmap_name=Ann%20B"}
 
 
 async def play(
-    dashboard: Dashboard, uri: str = "fake:", scan: int = 2, n_trees: int = 4, run: int = 1
+    dashboard: Dashboard,
+    uri: str = "fake:",
+    scan: int = 2,
+    n_trees: int = 4,
+    run: int = 1,
+    wanted: Open | None = None,
 ) -> None:
     """A run is opened and shown up to a scan; its record is written when this returns."""
-    await dashboard.open(Open(uri))
+    await dashboard.open(wanted or Open(uri))
     await dashboard.receive(opened(uri, truth=truth_trees(), run=run))
     await show(dashboard, scan, n_trees, run)
     async with asyncio.timeout(20):
@@ -163,6 +171,32 @@ async def test_a_run_is_played_again_with_its_parameters(both: Running) -> None:
     assert isinstance(begun, Begin)
     assert begun.values["clustering"]["eps"] == 0.4
     assert (dashboard.parameters.preset, begun.play) == ("forest", True)
+
+
+async def test_a_run_is_played_again_with_its_topics_and_mounting(both: Running) -> None:
+    client, dashboard = both
+    chosen = Open("fake:", topics={"scan": "/other"}, mount=(0.0, 0.1, 2.0, 0.0, 0.0, 0.5))
+    await play(dashboard, wanted=chosen)
+    await play(dashboard, "other:", run=2)
+    key = next(row["key"] for row in await runs(client) if row["uri"] == "fake:")
+    assert (await client.post(f"/api/runs/{key}/replay")).status_code == 202
+    worker = dashboard.worker
+    assert isinstance(worker, FakeWorker)
+    asked = [each for each in worker.commands if isinstance(each, Open)]
+    assert asked[-3:] == [chosen, Open("other:"), chosen]
+
+
+@pytest.mark.parametrize("kept", [None, 7, {"topics": {"lidar": "/x"}}, {"mount": [1]}, {"mount": ["a"] * 6}])
+def test_a_damaged_choice_was_none(kept: object):
+    assert chosen_again(Open("fake:", seed=3), kept) == Open("fake:", seed=3)
+
+
+def test_the_choice_of_a_run_without_a_browser_is_kept_as_well():
+    wanted = Open("", topics={"imu": "/imu"}, mount=(1.0, 2.0, 3.0, 0.1, -0.2, 0.3))
+    again = chosen_again(Open(""), plain_of_options(options_of(wanted)))
+    assert again.topics == wanted.topics
+    np.testing.assert_allclose(again.mount or (), wanted.mount or ())
+    assert plain_of_options(SourceOptions(seed=5)) is None
 
 
 async def test_from_afar_a_run_of_a_hidden_file_is_not_opened() -> None:

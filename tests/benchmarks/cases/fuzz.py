@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from tests.benchmarks.process import ROOT, environment
 from tests.benchmarks.real_files import KINDS
@@ -23,7 +24,8 @@ COPIES = 5_000
 LONGEST_S, MOST_MIB = 2.0, 512.0
 #: No kind takes longer than this; the table says how many copies that were.
 BUDGET_S = float(os.environ.get("STEMMAP_FUZZ_SECONDS", "600"))
-_SILENT_S = 60.0  # of the wall clock: a busy machine is no hang
+#: A child that says nothing for so long (by the clock) hangs if it used so much of a core meanwhile.
+_SILENT_S, _HANGS_S = 10.0, 20.0
 
 
 @dataclass(slots=True)
@@ -91,6 +93,12 @@ def attack(kind: str, copies: int) -> Outcome:
     return outcome
 
 
+def _processor_s(pid: int) -> float:
+    """Seconds of a core that a process used so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def _follow(child: subprocess.Popen[str], outcome: Outcome, first: int, until: float) -> int:
     """Count what a child tells until it ends; the copy that it would read next."""
     assert child.stdout is not None
@@ -100,11 +108,13 @@ def _follow(child: subprocess.Popen[str], outcome: Outcome, first: int, until: f
             child.kill()
             child.wait()
             return first
-        if not select.select([child.stdout], [], [], _SILENT_S)[0]:
-            child.kill()
-            child.wait()
-            outcome.hangs += 1
-            return first
+        used_s = _processor_s(child.pid)
+        while not select.select([child.stdout], [], [], _SILENT_S)[0]:
+            if time.monotonic() > until or _processor_s(child.pid) > used_s + _HANGS_S:
+                outcome.hangs += time.monotonic() <= until
+                child.kill()
+                child.wait()
+                return first
         line = child.stdout.readline()
         if not line:
             if child.wait() != 0:
