@@ -41,6 +41,8 @@ from pipeline.sources.rostypes import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POIN
 from pipeline.sources.simulated import SimulatedSource
 from tests.app.test_tree_pictures import trees_at
 from tests.robot.conftest import Robot, until
+from tests.robot.test_dds import DOMAIN
+from tests.robot.test_dds import _messages as messages_of
 from tests.robot.test_live_session import FakeLink
 
 SECOND = 1_000_000_000
@@ -246,6 +248,41 @@ def test_the_pictures_of_an_independent_robot_are_seen(router: int, run: Path):
             np.testing.assert_allclose(camera.K, CAMERA.K)
     finally:
         robot.kill()
+
+
+@pytest.mark.slow
+def test_pictures_come_over_plain_dds(run: Path):
+    pytest.importorskip("cyclonedds", reason="cyclonedds, an extra, is not installed")
+    from cyclonedds.core import Policy, Qos
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    from app.robot.dds_types import idl_type
+
+    with closing(open_live(f"dds:?domain={DOMAIN}")) as source:
+        participant, writers = DomainParticipant(DOMAIN), dict[str, Any]()
+        for topic, msgtype, _ in messages_of(run, one_each=True):
+            held = [Policy.Durability.TransientLocal] if topic.endswith("tf_static") else []
+            qos = Qos(Policy.Reliability.Reliable(10**9), Policy.History.KeepAll, *held)
+            written: Any = Topic(participant, f"rt{topic}", idl_type(msgtype))
+            writers[topic] = DataWriter(participant, written, qos)
+        until(lambda: source.listen() or all(w.get_matched_subscriptions() for w in writers.values()))
+        for topic, msgtype, payload in messages_of(run):
+            writers[topic].write(idl_type(msgtype).deserialize(payload))
+            source.take()
+
+        def known() -> bool:
+            source.take()
+            return source.ready and source.camera()[0] is not None
+
+        until(known, source.waiting_for)
+        camera, _ = source.camera()
+        assert camera is not None
+        np.testing.assert_allclose(camera.K, CAMERA.K)
+        until(lambda: "of 0 pictures" not in source.pictures_told, lambda: source.pictures_told)
+        writers.clear()
+        del participant
 
 
 def _has_picture(source: LiveSource, scan: Scan) -> bool:

@@ -51,11 +51,15 @@ class LasCloud:
                 low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
                 attributes = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
                 with np.errstate(over="ignore", invalid="ignore"):  # looked at below
-                    middle = self._xyz(reader.read_points(min(1000, self._there))).mean(axis=0)
+                    first = self._xyz(reader.read_points(min(1000, self._there)))
         except SourceError:
             raise
         except _all_that_damage_raises() as error:
             raise SourceError(f"the LAS file is damaged: {error}", where=uri, remedy=_REMEDY) from None
+        if not len(first):
+            raise SourceError("the LAS file is damaged: no point is whole", where=uri, remedy=_REMEDY)
+        with np.errstate(over="ignore", invalid="ignore"):
+            middle = first.mean(axis=0)
         if not is_place(middle[None]).all():
             raise SourceError("the coordinates of the cloud are no coordinates", where=uri, remedy=_REMEDY)
         self.description = CloudDescription(
