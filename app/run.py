@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+from app.ahead import looked_ahead
 from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
 from app.live_cursor import LiveCursor
@@ -216,7 +217,7 @@ class Run:
             return
         basis = self._basis()
         self._rough = None if basis is None else rough_trees(basis, self._kept.clusters, parameters)
-        rerun = Rerun(mapper, self._kept, self._reread, basis)
+        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead)
         if basis is None or not rerun.passed:
             self._remapping = Remapping(rerun, self.start_ns)
             return
@@ -233,7 +234,7 @@ class Run:
         if self._before is not None and self._before.path_length <= len(entries):
             states[self._before.path_length] = self._before
         path, motion = self._mapper.path, self._mapper.motion
-        return Basis(self._parameters.at(0), entries, states, path.stamp_ns, path.sigma_xy, motion)
+        return Basis.of(self._parameters.at(0), entries, states, path, motion)
 
     def stay(self) -> None:
         """Give up what `remap` began; the map stays as it is."""

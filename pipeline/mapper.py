@@ -140,6 +140,12 @@ class Mapper:
         """What a scan shows; nothing of it is taken into the map yet."""
         return look(step, self._sensor, self._T_base_lidar, self._parameters, self._watch)
 
+    def looker(self) -> Callable[[Step], Looked]:
+        """The same with the parameters of now, unwatched: it knows nothing of the mapper, so that it may look
+        at other scans meanwhile."""
+        sensor, T_base_lidar, parameters = self._sensor, self._T_base_lidar, self._parameters
+        return lambda step: look(step, sensor, T_base_lidar, parameters)
+
     def take(self, step: Step, looked: Looked) -> Frame:
         """Map a scan by what it shows: all of `process` that hangs on more than the scan itself. Of the
         step's scan only the time is asked."""

@@ -191,9 +191,7 @@ class _OpenRun:
     def _basis(self, mapper: Mapper, journal: Journal, states: Snapshots[MapperState | None]) -> Basis:
         path, last = mapper.path, self._scans - 1
         known = {scans: state for scans, state in states.first(last).items() if state is not None}
-        return Basis(
-            mapper.parameters, journal.first(last), known, path.stamp_ns, path.sigma_xy, mapper.motion
-        )
+        return Basis.of(mapper.parameters, journal.first(last), known, path, mapper.motion)
 
     def _forget(self, key: bytes) -> None:
         if key in self._seen:

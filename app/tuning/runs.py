@@ -166,7 +166,7 @@ class _Drive:
         at = states.first(len(entries))
         if len(entries) == number - 1:
             at[number - 1] = before_last
-        self._basis = Basis(mapper.parameters, entries, at, path.stamp_ns, path.sigma_xy, mapper.motion)
+        self._basis = Basis.of(mapper.parameters, entries, at, path, mapper.motion)
         self._scans, self._held = number, held
         return trees
 

@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from pipeline.geometry import Float
 from pipeline.mapper import MapperState
 from pipeline.parameters import Parameters
-from pipeline.records import Int
+from pipeline.records import Int, Path
 from pipeline.rerun.clusters import ClusterTable
 from pipeline.rerun.journal import Entry
 
-# What a stage gives hangs on these: nothing of the run before holds where one of them changes.
-WHOLE = ("acquisition", "filters", "ground", "clustering", "shape", "slam", "relocalisation")
+# What a scan shows hangs on these, and where it was taken on those: nothing of the run before holds to the
+# byte where one of them changes.
+LOOK = ("acquisition", "filters", "ground", "clustering", "shape")
+POSES = ("slam", "relocalisation")
 LATE = {"tree_share"}  # of the gathering: it only turns votes into verdicts
 
 
@@ -26,6 +30,8 @@ class Basis:
         entries: Of its scans, see `Journal`.
         states: Of its mapper by the number of scans they hold, that before the first among them.
         stamp_ns, sigma_xy, motion: Of its path, as `Mapper.load` takes them, as long as any state's.
+        path: x, y [m], yaw [rad] of the base in the map as it is known at the end, behind all loops, shape
+            (N, 3), as long as the entries.
     """
 
     parameters: Parameters
@@ -34,13 +40,32 @@ class Basis:
     stamp_ns: Int
     sigma_xy: Float
     motion: Float
+    path: Float
+
+    @classmethod
+    def of(
+        cls,
+        parameters: Parameters,
+        entries: tuple[Entry, ...],
+        states: Mapping[int, MapperState],
+        path: Path,
+        motion: Float,
+    ) -> Basis:
+        """With the path of the mapper, and its motion."""
+        poses = np.stack([path.x, path.y, path.yaw], axis=1)
+        return cls(parameters, entries, states, path.stamp_ns, path.sigma_xy, motion, poses)
+
+    def shows_as(self, parameters: Parameters) -> bool:
+        """Whether other parameters find the same clusters and gather in the same way."""
+        before, now = self.parameters, parameters
+        return all(getattr(before, stage) == getattr(now, stage) for stage in LOOK) and (
+            before.gathering.model_dump(exclude=LATE) == now.gathering.model_dump(exclude=LATE)
+        )
 
     def holds_for(self, parameters: Parameters) -> bool:
         """Whether other parameters find the same clusters, and ask for poses and gather in the same way."""
-        before, now = self.parameters, parameters
-        return all(getattr(before, stage) == getattr(now, stage) for stage in WHOLE) and (
-            before.gathering.model_dump(exclude=LATE) == now.gathering.model_dump(exclude=LATE)
-        )
+        same = all(getattr(self.parameters, stage) == getattr(parameters, stage) for stage in POSES)
+        return same and self.shows_as(parameters)
 
     def begin(self, parameters: Parameters, clusters: ClusterTable) -> tuple[int, bool]:
         """Where other parameters can begin: with the state of so many scans, and whether the trees of these

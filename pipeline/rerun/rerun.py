@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import dropwhile
 
 from pipeline.errors import StemmapError
 from pipeline.mapper import Mapper, MapperState
+from pipeline.perception import Looked
 from pipeline.records import Frame, Step
 from pipeline.rerun.basis import Basis
 from pipeline.rerun.journal import Journal
@@ -14,6 +16,12 @@ from pipeline.rerun.key import look_key
 from pipeline.rerun.tail import Recalled, Tail
 
 Reread = Callable[[], Iterator[Step]]
+Ahead = Callable[[Callable[[Step], Looked], Iterator[Step]], Iterator[tuple[Step, Looked]]]
+
+
+def one_by_one(look: Callable[[Step], Looked], steps: Iterator[Step]) -> Iterator[tuple[Step, Looked]]:
+    """Each step with what it shows."""
+    return ((step, look(step)) for step in steps)
 
 
 class Rerun:
@@ -29,6 +37,7 @@ class Rerun:
         kept: The scans. More may come while the rerun goes on.
         reread: The steps of the run from its first on; None where they come only once.
         basis: What is known of the run with other parameters; of the same seed and sensor.
+        ahead: How scans are looked at that are read once more: one by one, or ahead of the mapping.
 
     Attributes:
         journal: What the stages make of each scan.
@@ -36,7 +45,12 @@ class Rerun:
     """
 
     def __init__(
-        self, mapper: Mapper, kept: KeptScans, reread: Reread | None = None, basis: Basis | None = None
+        self,
+        mapper: Mapper,
+        kept: KeptScans,
+        reread: Reread | None = None,
+        basis: Basis | None = None,
+        ahead: Ahead = one_by_one,
     ) -> None:
         self.mapper = mapper
         self.journal = Journal()
@@ -44,8 +58,8 @@ class Rerun:
         self._kept = kept
         self._key = look_key(mapper.parameters)
         self._next = 0
-        self._reread = reread
-        self._steps: Iterator[Step] | None = None
+        self._reread, self._ahead = reread, ahead
+        self._steps: Iterator[tuple[Step, Looked]] | None = None
         self._fresh: KeptScans | None = None
         self._tail: Tail | None = None
         self._until = 0  # scans that are tracked anew alone
@@ -121,12 +135,11 @@ class Rerun:
                 if self._reread is None:
                     raise
                 kept.forget_from(self._next)
-        step = self._read_on()
-        looked = self.mapper.look(step)
+        step, looked = self._read_on()
         self.kept.put(step, looked, self._key)
         return self.mapper.take(step, looked)
 
-    def _read_on(self) -> Step:
+    def _read_on(self) -> tuple[Step, Looked]:
         if self._reread is None:
             raise StemmapError(
                 "the scans of a live run cannot be read once more, and what these parameters change has to "
@@ -134,12 +147,14 @@ class Rerun:
                 remedy="Open the recording of the run",
             )
         if self._steps is None:
-            self._steps = self._reread()
+            first = self._next
+            left = dropwhile(lambda step: step.index != first, self._reread())
+            self._steps = self._ahead(self.mapper.looker(), left)
             if self._fresh is None:
                 self._fresh = self._begun_anew()
-        for step in self._steps:
+        for step, looked in self._steps:
             if step.index == self._next:
-                return step
+                return step, looked
         raise StemmapError(f"the source does not give scan {self._next} again", remedy="Open it anew")
 
     def _begun_anew(self) -> KeptScans:

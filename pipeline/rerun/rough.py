@@ -1,7 +1,8 @@
 """A first answer before the run is mapped again: the kept clusters judged anew, at the poses of before.
 
-It knows of no gate, no miss and no merging, and holds each pose for true but those of a robot that is lost or
-looks for a loop; the map that follows is exact.
+It knows of no gate, no miss and no merging, and holds each pose for true, as it is known behind all loops,
+but those of a robot that is lost or looks for a loop. Other parameters of SLAM may find others; the map that
+follows is exact.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ def rough_trees(basis: Basis, clusters: ClusterTable, parameters: Parameters) ->
         parameters: That are tried.
 
     Returns:
-        None where the parameters look at a scan in another way, or find other poses.
+        None where the parameters look at a scan in another way, or gather it in another.
     """
     scans = min(len(basis.entries), len(clusters))
-    if scans == 0 or not basis.holds_for(parameters):
+    if scans == 0 or not basis.shows_as(parameters):
         return None
     entries, p = basis.entries[:scans], parameters
-    pose = np.array([[*e.T_map_base.as_array(), *e.offset[:2]] for e in entries])
+    pose = np.concatenate([basis.path[:scans], [e.offset[:2] for e in entries]], axis=1)
     tree = clusters.verdicts(p.detection, scans) == Verdict.TREE
     start = np.array(clusters.start[: scans + 1])
     tree &= np.repeat([e.is_usual for e in entries], np.diff(start))

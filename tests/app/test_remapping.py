@@ -96,8 +96,8 @@ def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parame
 
 def test_a_rough_answer_is_there_before_the_exact_one(session):
     assert [session.rough] == [None]
-    session.set_parameters(FEWER, 1, whole=True)
-    assert [session.rough] == [None]  # other particles find other poses
+    session.set_parameters(WIDER, 1, whole=True)
+    assert [session.rough] == [None]  # of other clusters nobody knows
     session.set_parameters(BASE.replace({"detection.e_max": 12.0}), 2, whole=True)
     rough = session.rough
     assert rough is not None

@@ -27,4 +27,4 @@ def known() -> Iterator[tuple[KeptScans, Basis]]:
         path = whole.path
         entries = journal.first(len(kept))
         assert len(entries) == len(kept)
-        yield kept, Basis(BASE, entries, states, path.stamp_ns, path.sigma_xy, whole.motion)
+        yield kept, Basis.of(BASE, entries, states, path, whole.motion)

@@ -39,7 +39,7 @@ def ring():
                 break
         states[len(kept)] = whole.snapshot()
         path, entries = whole.path, journal.first(len(kept))
-        yield kept, Basis(STEMS, entries, states, path.stamp_ns, path.sigma_xy, whole.motion), closed
+        yield kept, Basis.of(STEMS, entries, states, path, whole.motion), closed
 
 
 def finished(parameters: Parameters, kept: KeptScans, basis: Basis | None):

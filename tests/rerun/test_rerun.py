@@ -12,16 +12,18 @@ from functools import cache
 import numpy as np
 import pytest
 
+from app.ahead import AHEAD, looked_ahead
 from pipeline.errors import StemmapError
 from pipeline.geometry import Pose2
 from pipeline.mapper import Mapper
 from pipeline.parameters import FieldSpec, Parameters, field_specs, preset
 from pipeline.parameters.model import Value
-from pipeline.perception import look
+from pipeline.perception import Looked, look
 from pipeline.records import Frame, PoseMeasurement, Scan, Step, Turn
 from pipeline.rerun import KeptScans, Recalled, Rerun, look_key
 from pipeline.rerun.key import GATHERING, STAGES
 from pipeline.rerun.packing import HIGHEST
+from pipeline.rerun.rerun import one_by_one
 from pipeline.saving import encode
 from pipeline.sources import open_source
 from pipeline.steps import steps
@@ -181,8 +183,8 @@ def test_a_scan_that_is_looked_at_again_takes_the_place_of_those_after_it(store)
     assert [store.key_of(k) == look_key(preset("forest")) for k in range(6)] == [True] * 5 + [False]
 
 
-@pytest.mark.parametrize("readings", [1, 2])
-def test_what_shows_something_else_is_read_once_more_and_kept_beside(kept, readings):
+@pytest.mark.parametrize(("readings", "ahead"), [(1, one_by_one), (2, looked_ahead)])
+def test_what_shows_something_else_is_read_once_more_and_kept_beside(kept, readings, ahead):
     parts = run()[0][:20]
     wider = preset("forest").replace({"clustering.eps": 0.3, "ground.height_max": 2.5})
     whole, read = mapper(wider), []
@@ -191,7 +193,7 @@ def test_what_shows_something_else_is_read_once_more_and_kept_beside(kept, readi
         read.append(True)
         return iter(parts)
 
-    with closing(Rerun(mapper(wider), kept, reread)) as again:
+    with closing(Rerun(mapper(wider), kept, reread, ahead=ahead)) as again:
         state = again.mapper.snapshot()
         wanted = [told(whole.process(step)) for step in parts]
         for _ in range(readings):  # the second time what was kept beside is good
@@ -254,3 +256,24 @@ def test_where_nobody_may_write_nothing_is_kept_and_that_is_said(monkeypatch, tm
         put_all(store, preset("forest"), run()[0][:2])
         assert len(store) == 0
         assert "no folder can be written to" in store.refusal
+
+
+def test_who_looks_ahead_reads_in_order_stops_when_asked_and_tells_faults_in_their_turn():
+    read: list[int] = []
+    nothing = look(run()[0][0], run()[1].sensor, run()[1].T_base_lidar, preset("forest"))
+
+    def steps() -> Iterator[Step]:
+        for k in range(40):
+            read.append(k)
+            yield replace(run()[0][0], index=k)
+
+    def fails(step: Step) -> Looked:
+        if step.index == 3:
+            raise StemmapError("it cannot be looked at")
+        return nothing
+
+    given = looked_ahead(fails, steps())
+    assert [next(given)[0].index for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(StemmapError, match="cannot be looked at"):
+        next(given)
+    assert len(read) <= 4 + AHEAD

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.geometry import Pose2
 from pipeline.records import Verdict
 from pipeline.rerun import Rerun, rough_trees
 from pipeline.rerun.rough import MOST_PLACES, _gathered
@@ -20,7 +19,9 @@ def share_within(place: np.ndarray, other: np.ndarray, distance: float) -> float
     return float((apart.min(axis=1, initial=np.inf) < distance).mean())
 
 
-@pytest.mark.parametrize("change", [{}, {"gathering.tree_share": 0.6}, {"detection.e_max": 5.0}])
+@pytest.mark.parametrize(
+    "change", [{}, {"gathering.tree_share": 0.6}, {"detection.e_max": 5.0}, {"slam.particles": 40}]
+)
 def test_it_is_near_to_the_map_that_comes(change, known):
     kept, basis = known
     parameters = BASE.replace(change)
@@ -56,10 +57,10 @@ def test_hits_are_the_clusters_that_are_trees(known):
 @pytest.mark.parametrize("lost", [True, False])
 def test_what_was_seen_by_a_lost_robot_is_nowhere(lost, known):
     kept, basis = known
-    entries = list(basis.entries)
+    entries, path = list(basis.entries), basis.path.copy()
     for k in range(20, 40):
-        entries[k] = replace(entries[k], T_map_base=Pose2(500.0, 0.0, 0.0), is_usual=not lost)
-    rough = rough_trees(replace(basis, entries=tuple(entries)), kept.clusters, BASE)
+        entries[k], path[k] = replace(entries[k], is_usual=not lost), (500.0, 0.0, 0.0)
+    rough = rough_trees(replace(basis, entries=tuple(entries), path=path), kept.clusters, BASE)
     assert rough is not None
     assert (rough.position[:, 0] < 300.0).any()
     assert (rough.position[:, 0] > 300.0).any() != lost
@@ -87,7 +88,7 @@ def test_clusters_join_the_nearest_of_all_places(seed, reach, most):
     assert found == pytest.approx(np.array(place), abs=1e-9)
 
 
-@pytest.mark.parametrize("change", [{"clustering.eps": 0.2}, {"slam.gate": 3.0}, {"gathering.every": 2}])
-def test_nothing_is_told_of_clusters_or_poses_that_nobody_knows(change, known):
+@pytest.mark.parametrize("change", [{"clustering.eps": 0.2}, {"gathering.every": 2}])
+def test_nothing_is_told_of_clusters_that_nobody_knows(change, known):
     kept, basis = known
     assert rough_trees(basis, kept.clusters, BASE.replace(change)) is None
