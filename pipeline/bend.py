@@ -10,6 +10,7 @@ from pipeline.geometry import Float, wrap_angle
 from pipeline.records import Int
 
 TILE = 4.0  # m; what stands in one tile moves as one piece, so that no trunk is torn
+NEAR = 20.0  # m driven before and after a tree was seen first; what was driven there later may bend otherwise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +47,33 @@ class Bend:
         dx, dy = (place[moves] - before[:, :2]).T
         out[moves] = after[:, :2] + np.column_stack([c * dx - s * dy, s * dx + c * dy])
         return out
+
+    def of_trees(self, place: Float, scan: Int) -> tuple[Float, Float]:
+        """Where trees are now, shape (N, 2) [m], and by how much they are turned, shape (N,) [rad].
+
+        A tree moves with the scan nearest to it of those driven when it was seen first: a path that went
+        astray may have led past it later, as it seemed, and bends otherwise there.
+
+        Args:
+            place: Where they were, shape (N, 2) [m]; scan: int64, shape (N,), that each was seen in first.
+        """
+        out, turn = place.copy(), np.zeros(len(place))
+        moves = np.flatnonzero(scan > self.first)
+        if not len(moves) or self.last <= self.first:
+            return out, turn
+        step = np.hypot(*np.diff(self.before[:, :2], axis=0, prepend=self.before[:1, :2]).T)
+        way = np.cumsum(step)
+        at = way[np.minimum(scan[moves], self.last)]
+        low = np.maximum(np.searchsorted(way, at - NEAR), self.first + 1)
+        high = np.minimum(np.searchsorted(way, at + NEAR, side="right"), self.last + 1)
+        for k, i, j in zip(moves.tolist(), low.tolist(), high.tolist(), strict=True):
+            row = i + int(np.argmin(np.hypot(*(self.before[i:j, :2] - place[k]).T)))
+            was, now = self.before[row], self.after[row]
+            turn[k] = wrap_angle(now[2] - was[2])
+            c, s = np.cos(turn[k]), np.sin(turn[k])
+            dx, dy = place[k] - was[:2]
+            out[k] = now[0] + c * dx - s * dy, now[1] + s * dx + c * dy
+        return out, turn
 
     def turned(self, place: Float, scan: Int) -> Float:
         """By how much what stands at places is turned, shape (N,) [rad]; see `moved`."""

@@ -51,6 +51,7 @@ class Mapped:
         estimate: Of the pose at the newest scan; noise: of the odometry.
         motion: By it to each scan from the one before, x, y [m], yaw [rad], shape (N, 3).
         placed: Scan; the path is driven since then, for the robot was put there.
+        closed: Scan at which the last loop was closed: until then the path has no drift left to find.
     """
 
     stamp_ns: Int
@@ -61,6 +62,7 @@ class Mapped:
     noise: Noise
     motion: Float
     placed: int
+    closed: int = 0
 
     def scan_of(self, stamp_ns: Int) -> Int:
         """The scans of times."""
@@ -124,8 +126,10 @@ def loop_to(
     """
     trees, path = mapped.trees(), mapped.path
     rows = np.flatnonzero(np.isin(trees.number, numbers))
-    # What was driven before the robot was put somewhere did not lead there, and no loop bends it.
-    first = max(_left(mapped.scan_of(trees.last_seen_ns[rows]), _way(path)), mapped.placed)
+    # What was driven before the robot was put somewhere did not lead there, and no loop bends it; and what a
+    # loop has bent has drifted no more: else trees that still stand twice would close it again, wrongly.
+    left = _left(mapped.scan_of(trees.last_seen_ns[rows]), _way(path))
+    first = max(left, mapped.placed, mapped.closed)
     if first >= last_mapped:
         return None
     gap = _gap(T_map_base, path[-1])

@@ -31,7 +31,8 @@ LOOP = "a loop is closed: path and map since the place was left are bent, so tha
 class MapperState:
     """An independent copy of all that the mapper knows between two scans.
 
-    `placed` is the scan since which the path is driven: no odometry leads to it, for the robot was put there.
+    `placed` is the scan since which the path is driven: no odometry leads to it, for the robot was put there;
+    `closed` the one at which the last loop was closed.
     """
 
     slam: BackEndState
@@ -42,6 +43,7 @@ class MapperState:
     odometry: Pose2 | None
     path_length: int
     placed: int = 0
+    closed: int = 0
     recovery: RecoveryState[MapperState] = field(default_factory=RecoveryState)
 
 
@@ -104,7 +106,7 @@ class Mapper:
         self._tracker = Tracker(parameters.tracking)
         self._odometry: Pose2 | None = None
         self._path = GrowingPath()
-        self._placed = 0
+        self._placed = self._closed = 0
         self._recovery: Recovery[MapperState] = Recovery(seed)
         self.note: Callable[[Noted], None] | None = None
         self._asked_trees = False
@@ -302,14 +304,17 @@ class Mapper:
             noise,
             motion,
             self._placed,
+            self._closed,
         )
 
     def _bend(self, index: int, loop: Loop) -> None:
         """Close a loop: path and map are bent."""
         bend = self._slam.close(index, loop)
         self._tracker.bend(bend, self._path.stamp_ns)
+        self._tracker.hold_to(self._slam.known(), bend, self._path.stamp_ns)
         self._gathering.bend(bend)
         self._ground.bend(bend)
+        self._closed = index
 
     def _put(self, index: int, T_map_base: Pose2, covariance: Float, first: int) -> None:
         """Put the base somewhere; `first`: the scan from which on the path goes on there."""
@@ -336,6 +341,7 @@ class Mapper:
             self._odometry,
             len(self._path),
             self._placed,
+            self._closed,
             self._recovery.state.copy(),
         )
 
@@ -365,7 +371,7 @@ class Mapper:
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
         self._path.cut(state.path_length)
-        self._placed = state.placed
+        self._placed, self._closed = state.placed, state.closed
         self._recovery.state = state.recovery.copy()
 
     def _take_back(self, before: MapperState) -> None:

@@ -89,6 +89,7 @@ def merge_maps(
         ),
         motion=np.concatenate([a.motion, b.motion]),
         placed=len(a.stamp_ns) + b.placed,
+        closed=len(a.stamp_ns) + b.closed,
     )
     return MergedMap(merged, number_of, distance)
 

@@ -262,6 +262,23 @@ class HeightMap:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """Trees as SLAM has them, in the frame of the map; columns of length L.
+
+    Attributes:
+        position: shape (L, 2) [m].
+        covariance: Of the views, shape (L, 2, 2); shared: of the poses that they were begun from.
+        hits: int64, how often each was recognised; scan: int64, that each was begun at.
+    """
+
+    position: Float
+    covariance: Float
+    shared: Float
+    hits: Int
+    scan: Int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
     """What SLAM believes after a scan.
 

@@ -49,6 +49,7 @@ class SavedMap:
     sigma_xy: Float
     motion: Float
     placed: int
+    closed: int
     search: Search | None = None
 
     @classmethod
@@ -70,6 +71,7 @@ class SavedMap:
             path.sigma_xy,
             mapper.motion,
             state.placed,
+            state.closed,
             None if lost.local is None else Search(lost.local, lost.driven, lost.since),
         )
 
@@ -83,7 +85,10 @@ class SavedMap:
         n = len(self.slam.genealogy)
         if not self.stamp_ns.shape == self.sigma_xy.shape == (n,) or np.any(np.diff(self.stamp_ns) <= 0):
             raise ValueError("the stamps are not those of the path")
-        if self.motion.shape != (n, 3) or not 0 <= self.placed <= n:
+        if (
+            self.motion.shape != (n, 3)
+            or not 0 <= min(self.placed, self.closed) <= max(self.placed, self.closed) <= n
+        ):
             raise ValueError("the odometry is not that of the path")
         _check_rows(self.tracks, TrackTable.empty())
         _check_rows(self.columns, no_columns())
@@ -96,7 +101,7 @@ class SavedMap:
         gathering = GatheringState(self.memory.checked(), (), self.columns)
         return MapperState(
             self.slam, gathering, self.ground.unpacked(), self.tracks, self.next_number, self.odometry, n,
-            self.placed, self._recovery(n),
+            self.placed, self.closed, self._recovery(n),
         )  # fmt: skip
 
     def _recovery(self, scans: int) -> RecoveryState[MapperState]:

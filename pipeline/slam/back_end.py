@@ -6,7 +6,7 @@ from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
 from pipeline.health import Health
 from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, PoseEstimate
+from pipeline.records import Detections, Landmarks, PoseEstimate
 from pipeline.slam.fastslam import FastSlam
 from pipeline.slam.loop import Loop
 from pipeline.slam.motion import Motion
@@ -90,6 +90,10 @@ class BackEnd:
     def begun_since(self, scan: int) -> tuple[Float, Float]:
         """See FastSlam.begun_since."""
         return self._slam.begun_since(scan)
+
+    def known(self) -> Landmarks:
+        """See FastSlam.known."""
+        return self._slam.known()
 
     def landmarks(self) -> tuple[Float, Float]:
         """Positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""

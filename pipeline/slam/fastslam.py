@@ -17,13 +17,14 @@ from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2, wrap_angle
 from pipeline.health import Health
 from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, PoseEstimate, PoseMeasurement
+from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
 from pipeline.slam.draws import draws
 from pipeline.slam.frame import FrameMemory
 from pipeline.slam.gaussian import rows_of
 from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.health import Recent, ScanTold, is_astray, judged, remembered, scan_of
+from pipeline.slam.leading import are_apart, heir, leader
 from pipeline.slam.loop import Loop, bent_landmarks, bent_path
 from pipeline.slam.maps import shared_map, take_ancestors
 from pipeline.slam.motion import Motion, accumulated, noise_of
@@ -68,6 +69,8 @@ class FastSlam:
             doubt = doubt or ("the trees contradict the odometry: corrected by them" if slipped else "")
         else:
             scan, weights = ScanTold(), normalised(state.log_weight)
+        if used:
+            state = replace(state, best=leader(weights, state.best, state.pose, p.distance_max))
         estimate, frame = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
         if used and len(detections.cluster):
             serial = state.detections - len(detections.cluster)
@@ -76,6 +79,7 @@ class FastSlam:
         if used and estimate.n_eff < p.resample_below * p.particles:
             ancestors = low_variance_ancestors(weights, offset)
             take_ancestors(ancestors, state.pose, state.maps)
+            state = replace(state, best=heir(state.best, ancestors, weights))
             state.log_weight[:] = 0.0
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
         self.state = replace(state, genealogy=genealogy, frame=frame)
@@ -150,6 +154,15 @@ class FastSlam:
         landmarks = self.state.map_of(self.state.best)
         return landmarks.mean, landmarks.covariance
 
+    def known(self) -> Landmarks:
+        """The well known landmarks of the best particle."""
+        known, frame = self.state.map_of(self.state.best), self.state.frame
+        rows = known.hits >= self.parameters.hits_to_weigh
+        birth, mean = known.birth[rows], known.mean[rows]
+        own = known.covariance[rows][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        hits = known.hits[rows].astype(np.int64)
+        return Landmarks(mean, own, frame.at_places(birth, mean), hits, frame.scan_of(birth))
+
     def begun_since(self, scan: int) -> tuple[Float, Float]:
         """The well known landmarks of the best particle that were begun at a scan or later: positions, shape
         (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]; they fit the end of its path."""
@@ -202,7 +215,6 @@ class FastSlam:
             motion_covariance=np.zeros((3, 3)),
             since_update=0.0,
             detections=state.detections + found,
-            best=int(state.log_weight.argmax()),
             recent=remembered(recent, scan, state.since_update),
         )
         return state, scan, weights, slipped
@@ -246,8 +258,10 @@ def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[
     covariance, frame = state.frame.told(
         mean, spread, n_eff, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
     )
+    # Of hypotheses that trees tell apart the mean is none: where one of them stands, its trees fit.
+    told = pose[state.best] if are_apart(pose, weights, p.distance_max) else mean
     return PoseEstimate(
-        T_map_base=Pose2(float(mean[0]), float(mean[1]), float(mean[2])),
+        T_map_base=Pose2(float(told[0]), float(told[1]), float(told[2])),
         covariance=covariance,
         particles=pose,
         weights=weights,

@@ -91,6 +91,21 @@ class FrameMemory:
         k = np.searchsorted(self.serial, birth, side="right") - 1
         return np.where(k >= 0, self.scan[np.maximum(k, 0)], 0)
 
+    def at_places(self, birth: Int, place: Float) -> Float:
+        """What landmarks share with the pose that they were begun from: covariance of the frame where they
+        stand, shape (L, 2, 2) [m^2].
+
+        Args:
+            birth: shape (L,); place: shape (L, 2) [m].
+        """
+        shared = np.zeros((len(birth), 2, 2))
+        mark = np.searchsorted(self.serial, birth, side="right") - 1
+        for j in np.flatnonzero(mark >= 0):
+            k = mark[j]
+            dx, dy = place[j] - self.pose[k, :2]
+            shared[j] = carried(self.covariance[k], float(dx), float(dy))[:2, :2]
+        return shared
+
     def bent(self, bend: Bend, covariance: Float) -> FrameMemory:
         """After a loop was closed: marks move with their scans, and what is known at both ends of a walk is
         known the better in between (a Brownian bridge, by the share of the marks).

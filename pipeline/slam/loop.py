@@ -25,8 +25,8 @@ SPACING, MOST_NODES = 1.0, 2000  # m between two nodes, more where there would b
 TIE_SIGMA = np.array([0.1, 0.1, 0.02])  # m, m, rad
 FLOOR = 1e-3  # m, rad; what stood still has no sigma
 ROUNDS, SETTLED = 20, 1e-6  # m, rad
-JUMP = 1.0  # m between a step of the path and that of the odometry
-TWICE = 0.5  # m; landmarks of before and after the loop that are nearer are one tree
+JUMP, JUMP_TURN = 1.0, 1.0  # m, rad between a step of the path and that of the odometry
+TWICE = 1.0  # m; landmarks of before and after the loop that are nearer are one tree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +86,9 @@ def without_jumps(path: Float, motion: Float) -> tuple[Float, int]:
             driven, however far it leads: scans may have been lost.
     """
     step = composed(inverse(path[:-1]), path[1:])
-    jumps = np.flatnonzero(np.hypot(*(step - motion[1:])[:, :2].T) > JUMP).tolist()
+    apart = step - motion[1:]
+    turned = np.abs(wrap_angle(apart[:, 2])) > JUMP_TURN  # a heading put right on the spot is no turn either
+    jumps = np.flatnonzero((np.hypot(*apart[:, :2].T) > JUMP) | turned).tolist()
     out = path.copy()
     for k in jumps:
         go_on = composed(out[k][None], motion[k + 1][None])
@@ -111,7 +113,7 @@ def drift_of(path: Float, first: int, noise: Noise) -> Float:
 def bent_landmarks(known: MapColumns, scan: Int, bend: Bend) -> MapColumns:
     """Landmarks moved with the scans that began them; two that were one tree all the time become the older
     one, one to one."""
-    mean, turn = bend.moved(known.mean, scan), bend.turned(known.mean, scan)
+    mean, turn = bend.of_trees(known.mean, scan)
     c, s = np.cos(turn), np.sin(turn)
     C = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
     flat = (C @ known.covariance[:, [[0, 1], [1, 2]]] @ C.transpose(0, 2, 1))[:, [0, 0, 1], [0, 1, 1]]

@@ -16,6 +16,7 @@ from pipeline.slam.draws import draws
 from pipeline.slam.fastslam import FastSlam, rules_of
 from pipeline.slam.frame import FrameMemory
 from pipeline.slam.health import RECOGNISED, TOLD, fading_distrust, remembered, scan_of
+from pipeline.slam.leading import are_apart, heir, leader
 from pipeline.slam.maps import Maps, take_ancestors
 from pipeline.slam.motion import UNKNOWN, Noise, advanced, noise_of
 from pipeline.slam.resampling import low_variance_ancestors, normalised
@@ -92,8 +93,8 @@ def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
         if told.used[t]:
             before = replace(recent, distrust=1.0) if told.slipped[t] else recent
             scan = scan_of(told.mean[t], told.odometry[t], int(found[t]))
-            recent, best = remembered(before, scan, told.driven[t]), int(told.best[t])
-        ancestors = told.ancestors[t] if told.ancestors[t, 0] >= 0 else None
+            recent = remembered(before, scan, told.driven[t])
+        ancestors, best = told.ancestors[t] if told.ancestors[t, 0] >= 0 else None, int(told.best[t])
         scans.append((told.particles[t], ancestors, best))
     slam.state = replace(
         state, maps=maps, motion=motion, motion_covariance=motion_covariance, since_update=since_update,
@@ -152,8 +153,8 @@ def _drive(
                 pose, log_weight, maps, motion, motion_covariance, normal[t], centre, R, clear_range,
                 detections, rules, nothing, no_covariance,
             )  # fmt: skip
-            best = int(log_weight.argmax())
-            told.used[t], told.driven[t], told.best[t] = True, since_update, best
+            told.used[t], told.driven[t] = True, since_update
+            best = leader(weights, best, pose, rules.distance_max)
             told.mean[t], told.odometry[t] = mean, odometry
             mapped = mapped or mean[RECOGNISED] > 0.5
             distrust = fading_distrust(distrust)
@@ -163,10 +164,14 @@ def _drive(
             weights = normalised(log_weight)
         now, told.pose[t], _spread, told.n_eff[t] = estimated(pose, weights, motion, motion_covariance)
         told.particles[t] = now
+        if are_apart(now, weights, rules.distance_max):
+            told.pose[t] = now[best]
         if used and told.n_eff[t] < resample_below * particles:
             told.ancestors[t] = low_variance_ancestors(weights, offset[t])
             take_ancestors(told.ancestors[t], pose, maps)
+            best = heir(best, told.ancestors[t], weights)
             log_weight[:] = 0.0
+        told.best[t] = best
     return maps, motion, motion_covariance, since_update, told
 
 

@@ -6,11 +6,11 @@ import numpy as np
 
 from pipeline.association import associate
 from pipeline.bend import Bend
-from pipeline.records import Int
+from pipeline.records import Bool, Int, Landmarks, Verdict
 from pipeline.tracking.merge import join
 from pipeline.tracking.table import TrackTable
 
-TWICE = 0.5  # m; trees of before and after a loop that are nearer are one
+TWICE = 1.0  # m; trees of before and after a loop that are nearer are one
 
 
 def bent(tracks: TrackTable, first: Int, bend: Bend) -> TrackTable:
@@ -22,8 +22,7 @@ def bent(tracks: TrackTable, first: Int, bend: Bend) -> TrackTable:
     """
     moved = tracks.copy()
     place = tracks.x[:, :2]
-    turn = bend.turned(place, first)
-    moved.x[:, :2] = bend.moved(place, first)
+    moved.x[:, :2], turn = bend.of_trees(place, first)
     c, s = np.cos(turn), np.sin(turn)
     C = np.zeros((len(tracks), 4, 4))
     C[:, 0, 0] = C[:, 1, 1] = C[:, 2, 2] = C[:, 3, 3] = c
@@ -40,3 +39,31 @@ def bent(tracks: TrackTable, first: Int, bend: Bend) -> TrackTable:
         join(moved, int(old[of[k]]), int(young[k]))
         standing[young[k]] = False
     return moved.take(standing)
+
+
+def held(tracks: TrackTable, young: Bool, known: Landmarks, distance_max: float) -> tuple[TrackTable, Int]:
+    """The trees held to SLAM's landmarks, and the rows of the landmarks without a tree, shape (K,).
+
+    A young tree whose place was never known as well as trees are told apart stands at its landmark; without
+    one it is what a wrong hypothesis left behind, and goes, unless what was gathered says that it is a tree.
+
+    Args:
+        tracks: Copied; young: shape (T,), which of them are of the way that was bent.
+        distance_max: How far from a tree its detection may lie [m].
+    """
+    t = tracks.copy()
+    own = t.P[:, [0, 0, 1], [0, 1, 1]]
+    total = known.covariance + known.shared
+    landmark_of, _ = associate(t.x[:, :2], own, known.position, total[:, [0, 0, 1], [0, 1, 1]], np.inf, TWICE)
+    doubtful = young & (np.sqrt(0.5 * (own[:, 0] + own[:, 2])) > distance_max)
+    moved = np.flatnonzero(doubtful & (landmark_of >= 0))
+    at = landmark_of[moved]
+    t.x[moved, :2], t.shared[moved] = known.position[at], known.shared[at]
+    t.P[moved, :2, :2] = total[at]
+    t.P[moved, :2, 2:] = 0.0
+    t.P[moved, 2:, :2] = 0.0
+    near = np.zeros(len(known.position), np.bool_)
+    near[landmark_of[landmark_of >= 0]] = True
+    gone = doubtful & (landmark_of < 0) & (t.verdict != Verdict.TREE)
+    left: Int = np.flatnonzero(~near)
+    return t.take(~gone), left

@@ -7,11 +7,12 @@ import numpy as np
 from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Gathering, Tracking
-from pipeline.records import Columns, Detections, Int, Trees, Verdict
+from pipeline.records import Columns, Detections, Int, Landmarks, Trees, Verdict
 from pipeline.tracking.anchor import anchor
 from pipeline.tracking.assignment import assign, in_map
 from pipeline.tracking.backing import backed
-from pipeline.tracking.bending import bent
+from pipeline.tracking.bending import bent, held
+from pipeline.tracking.doubt import beyond_doubt
 from pipeline.tracking.judging import assign_verdicts, tree_columns
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.merge import merge_near
@@ -67,6 +68,8 @@ class Tracker:
         p, t = self.parameters, self.tracks
         self._at, self._pose_covariance = T_map_base, pose_covariance
         self._relative = pose_covariance if relative is None else relative
+        spared = beyond_doubt(t, T_map_base, pose_covariance, p.distance_max, view_range)
+        score = t.score if spared is None else t.score.copy()
         row_of, touched, position, R, B = assign(
             detections.centre,
             detections.covariance,
@@ -87,6 +90,8 @@ class Tracker:
             p.distance_max,
             1.0 / p.misses_per_hit,
         )
+        if spared is not None:
+            t.score[spared] = score[spared]
         fresh = np.flatnonzero(row_of < 0)
         if len(fresh):
             old = np.flatnonzero(row_of >= 0)
@@ -104,16 +109,36 @@ class Tracker:
     def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
         """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.anchor`)."""
         p = self.parameters
+        spared = beyond_doubt(self.tracks, T_map_base, self._pose_covariance, p.distance_max, reach)
+        score = self.tracks.score if spared is None else self.tracks.score.copy()
         anchor(
             self.tracks, landmarks, covariance, T_map_base, self._pose_covariance, self._relative, reach,
             p.distance_max, 1.0 / p.misses_per_hit,
         )  # fmt: skip
+        if spared is not None:
+            self.tracks.score[spared] = score[spared]
         touched = np.ones(len(self.tracks), np.bool_)
         self.tracks = merge_near(self.tracks, touched, p.proximity_radius).with_score()
 
     def bend(self, bend: Bend, stamps_ns: Int) -> None:
         """Move the trees with a path that was bent; `stamps_ns`: of its scans, ascending."""
         self.tracks = bent(self.tracks, np.searchsorted(stamps_ns, self.tracks.first_ns), bend)
+
+    def hold_to(self, known: Landmarks, bend: Bend, stamps_ns: Int) -> None:
+        """After `bend`: trees that were put on the map from a doubtful place stand where SLAM's landmarks do
+        or nowhere, and a landmark without a tree, for it was given up meanwhile, begins one.
+
+        Args:
+            known: The well known landmarks, after the bend; bend, stamps_ns: as in `bend`.
+        """
+        first = np.searchsorted(stamps_ns, self.tracks.first_ns)
+        self.tracks, left = held(self.tracks, first > bend.first, known, self.parameters.distance_max)
+        rows = len(self.tracks) + np.arange(len(left))
+        self._begin(0, known.position[left], known.covariance[left], known.shared[left])
+        t = self.tracks
+        t.first_ns[rows] = t.stamp_ns[rows] = stamps_ns[known.scan[left]]
+        t.hits[rows] = known.hits[left]
+        t.score[rows] = np.minimum(known.hits[left], SCORE_STANDING)
 
     def judge(self, stamp_ns: int, columns: Columns, parameters: Gathering) -> Columns:
         """Take the verdicts of what was gathered: a track is confirmed by them alone, and a tree that no

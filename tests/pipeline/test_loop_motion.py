@@ -3,6 +3,8 @@ place where the robot was put."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,6 +17,7 @@ from pipeline.records import PoseEstimate, Trees
 from pipeline.slam.frame import FrameMemory
 from pipeline.slam.loop import bent_landmarks, bent_path, without_jumps
 from pipeline.slam.maps import MapColumns
+from pipeline.slam.poses import composed
 from tests.pipeline.strategies import FEW, seeds
 from tests.pipeline.test_loops import NOISE, SURE, circle, driven, loop
 
@@ -65,6 +68,18 @@ def test_a_jump_that_a_correction_made_is_no_motion():
     np.testing.assert_allclose(straight, path, atol=1e-9)
     assert jumps == 1
     assert without_jumps(path, driven(path))[0].tobytes() == path.tobytes()
+
+
+def test_a_heading_that_a_correction_turned_on_the_spot_is_no_turn():
+    path = line()
+    flipped = path.copy()
+    flipped[40:] = composed(np.tile([path[40, 0], 0.0, np.pi], (len(path) - 40, 1)), path[40:] - path[40])
+    straight, jumps = without_jumps(flipped, driven(path))
+    np.testing.assert_allclose(straight, path, atol=1e-9)
+    assert jumps == 1
+    around = path.copy()
+    around[40:] = flipped[40:]
+    assert without_jumps(around, driven(around))[1] == 0, "the wheels told of the turn"
 
 
 @FEW
@@ -155,6 +170,17 @@ def test_a_small_gap_behind_a_jump_that_no_drift_explains_is_no_loop():
     assert loop_to(run, known.number, at, SURE, len(path) - 1) is None
 
 
+@pytest.mark.parametrize(("closed", "is_loop"), [(0, True), (280, False), (299, False)])
+def test_what_a_loop_has_bent_has_drifted_no_more(closed, is_loop):
+    """Trees that still stand twice lie as far apart as the path had drifted; they close no loop again."""
+    path = circle()
+    place = np.array([[1.0, 3.0], [2.0, -3.0], [3.0, 2.0], [0.0, -4.0], [1.0, -2.0]])
+    known = trees(place, [0] * 5, [10] * 5)
+    run = replace(mapped(path, driven(path), known), closed=closed)
+    at = Pose2(*(path[-1] + [3.0, -2.0, 0.05]))
+    assert (loop_to(run, known.number, at, SURE, 299) is not None) == is_loop
+
+
 @FEW
 @given(seeds)
 def test_a_scan_is_tied_to_the_earliest_one_of_its_place(seed):
@@ -173,6 +199,26 @@ def test_a_scan_is_tied_to_the_earliest_one_of_its_place(seed):
     for early, late in found.ties.tolist():
         near = np.hypot(*(path[nodes, :2] - path[late, :2]).T) <= TIE_NEAR
         assert early == nodes[near & (way[late] - way[nodes] > TIE_APART)].min()
+
+
+@FEW
+@given(seeds)
+def test_trees_seen_at_different_times_move_with_their_own_scans(seed):
+    """The path went astray and led past the first trees again, as it seemed."""
+    random = np.random.default_rng(seed)
+    before = np.concatenate([line(60.0), line(60.0) + np.array([0.0, 1.0, 0.0])])
+    after = before.copy()
+    n = len(before) // 2
+    after[n:, :2] += [30.0, -40.0]
+    place = random.uniform([2.0, -3.0], [58.0, 4.0], (12, 2))
+    scan = np.minimum(1 + (place[:, 0] / 0.4).astype(np.int64), n - 60)
+    scan[6:] += n
+    moved, turn = Bend(before, after, 0, len(before) - 1).of_trees(place, scan)
+    np.testing.assert_allclose(moved[:6], place[:6], atol=1e-9)
+    np.testing.assert_allclose(moved[6:], place[6:] + np.array([30.0, -40.0]), atol=1e-9)
+    assert not turn.any()
+    same, _ = Bend(before, after, len(before), len(before) - 1).of_trees(place, scan)
+    assert same.tobytes() == place.tobytes()
 
 
 # --- landmarks ------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
 from pipeline.health import Health
 from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, PoseEstimate
+from pipeline.records import Detections, Landmarks, PoseEstimate
 from pipeline.slam import slip
 from pipeline.slam.gaussian import rows_of
 from pipeline.slam.health import Recent, ScanTold, is_astray, judged
@@ -122,6 +122,16 @@ class GraphSlam:
         """All landmarks: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""
         known = self.state.landmarks
         return known.mean, known.covariance.reshape(-1, 4)[:, [0, 1, 3]]
+
+    def known(self) -> Landmarks:
+        """See FastSlam.known; what landmarks share with the frame is taken as that of the newest pose."""
+        s = self.state
+        rows = s.landmarks.hits >= self.parameters.hits_to_weigh
+        known = s.landmarks.take(rows)
+        scan = np.minimum(np.searchsorted(s.keyframe_of, known.begun), len(s.keyframe_of) - 1)
+        shared = np.tile(s.covariance[:2, :2], (len(known.hits), 1, 1))
+        hits = known.hits.astype(np.int64)
+        return Landmarks(known.mean, known.covariance, shared, hits, (len(s.past) + scan).astype(np.int64))
 
     def begun_since(self, scan: int) -> tuple[Float, Float]:
         """See FastSlam.begun_since."""

@@ -34,16 +34,16 @@ def _methods(recorded: Recorded) -> Table:
     """The methods beside one another: three seeds, which differ in the odometry too."""
     import tempfile
 
-    from tests.benchmarks.slam_runs import METHOD_SEEDS, methods
+    from tests.benchmarks.slam_runs import METHOD_SEEDS, METHODS
     from tests.benchmarks.tree_manager_folder import write_states
 
     with tempfile.TemporaryDirectory(prefix="stemmap-oxford-") as folder:
         write_states(recorded, Path(folder), 1)
         rows = []
-        for method in methods():
+        for method in METHODS:
             for seed in METHOD_SEEDS:
                 begin = time.thread_time()
-                row = _mapped(recorded, Path(folder), seed, method)
+                row = mapped_folder(recorded, Path(folder), seed, method)
                 rows.append((method, *row, time.thread_time() - begin))
     return Table("Oxford Evo by `slam.method`", ("method", *COLUMNS, "s"), tuple(rows), ("s: CPU time.",))
 
@@ -59,14 +59,14 @@ def _table(recorded: Recorded, every: int) -> Table:
         write_states(recorded, Path(folder), every)
         rows = []
         for seed in SEEDS:
-            rows.append(_mapped(recorded, Path(folder), seed))
+            rows.append(mapped_folder(recorded, Path(folder), seed))
             print(f"every {every}, seed {seed}: {rows[-1][2]:.3f} m", file=sys.stderr, flush=True)
     rms = [row[2] for row in rows]
     said = f"RMS over {len(rows)} seeds: median {np.median(rms):.3f} m, worst {max(rms):.3f} m"
     return Table(f"{LINE}: every {every}", COLUMNS, tuple(rows), (said,))
 
 
-def _mapped(
+def mapped_folder(
     recorded: Recorded, folder: Path, seed: int, method: str | None = None
 ) -> tuple[int, float, float, float, float, int]:
     """The folder with a seed's odometry through source and mapper, as `stemmap map FOLDER` does it."""
