@@ -11,6 +11,10 @@ from pipeline.records import Bool, Int, Verdict
 SECTORS = 36  # of 10 degrees around a trunk, kept as bits: which sides were seen
 DBH_OBSERVATIONS = 3  # fewer radii are no diameter yet
 TAPER = 0.005  # of the radius per metre of height; stems of pine and spruce lose 0.3 to 0.7 cm a metre
+# Below breast height stems swell to their roots: in two scanned plots radii grow by 1.5 to 2 cm a metre
+# (docs/trunks.md), others do not swell at all, and half of it is right or wrong by as much for both.
+BUTT = 0.01
+HALF = 0.5  # m; so far above or below breast height a view counts half: no stem tapers as another
 # What more scans do not average out of a radius: how far the edges of a trunk are known, a fifth of half a
 # beam's width; how far a round trunk and an even taper are none, in m and as a part of the radius.
 EDGE, UNEVEN, OUT_OF_ROUND = 0.0003, 0.0005, 0.01
@@ -47,7 +51,8 @@ def add_observations(
 
     A radius weighs by its variance and by the square of the distance: what a fit does not know of, as the
     width of a beam, errs in proportion to the distance and the same way in every scan, so that a hundred
-    views from afar must not outvote a few from near by.
+    views from afar must not outvote a few from near by. For the same reason it weighs by its height: how
+    much a stem tapers, nobody knows.
     """
     for d in range(rows.shape[0]):
         t = rows[d]
@@ -57,9 +62,10 @@ def add_observations(
             eccentricities[t] += 1
         if np.isfinite(radius[d]):
             reach = max(np.hypot(pose[0] - place[d, 0], pose[1] - place[d, 1]), NEAREST)
-            weight = 1.0 / (radius_sigma[d] * reach) ** 2
             # A band of heights sees the thicker foot of a near tree, and its mean lies below breast height.
-            lost = TAPER * above_breast[d] if np.isfinite(above_breast[d]) else 0.0
+            above = above_breast[d] if np.isfinite(above_breast[d]) else 0.0
+            weight = 1.0 / ((radius_sigma[d] * reach) ** 2 * (1.0 + (above / HALF) ** 2))
+            lost = (TAPER if above >= 0.0 else BUTT) * above
             radius_sum[t] += weight * (radius[d] + lost)
             radius_weight[t] += weight
             radius_reach[t] += weight * reach

@@ -21,7 +21,7 @@ class TrackTable:
         stamp_ns: int64, of `x` and of the last observation; first_ns: of the first.
         hits: int64, observations; score: hits less misses.
         eccentricity: Sum over the observations with a finite one; eccentricities: their number.
-        radius: Sum of weights times radii; radius_weight: sum of weights, 1 / (sigma distance)^2 [1/m^4];
+        radius: Sum of weights times radii; radius_weight: sum of weights (see `add_observations`) [1/m^4];
             radius_reach: sum of weights times distances; radii: number of them.
         sides: int64: bit k is set when the sector k around the trunk was seen.
         verdict: int64: what was gathered says of it, see Verdict; -1 for nothing.

@@ -244,7 +244,8 @@ def test_a_diameter_is_told_for_breast_height(breast_height):
     seen = detections([[5.0, 0.0]], radius=0.2)
     for k, height in enumerate((0.7, 1.0, 1.6, np.nan)):
         t.process(k * 100_000_000, Pose2(), SURE, seen, NOTHING_SEEN, 15.0, np.array([height]))
-    lost = 0.005 * np.mean([0.7 - breast_height, 1.0 - breast_height, 1.6 - breast_height, 0.0])
+    above = np.array([0.7, 1.0, 1.6, breast_height]) - breast_height
+    lost = np.average(np.where(above < 0.0, 0.01, 0.005) * above, weights=1.0 / (1.0 + (above / 0.5) ** 2))
     assert t.trees().dbh[0] == pytest.approx(2.0 * (0.2 + lost))
 
 
