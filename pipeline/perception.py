@@ -22,7 +22,7 @@ from pipeline.parameters import Parameters
 from pipeline.parameters.stages import Detection
 from pipeline.records import Clusters, Detections, Float32, Int32, Sensor, Stems, Step, UInt16
 from pipeline.resolution import GROUND, POINT, rounded
-from pipeline.shape import describe
+from pipeline.shape import describe_stems
 from pipeline.shape.border import is_cut
 from pipeline.stems import take_stems
 from pipeline.terrain import NO_GROUND, Terrain, height_above, heights_of_places, shows_ground
@@ -146,7 +146,7 @@ def _at_points(step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, w
         labels = cluster(filtered, sensor, p.clustering)
 
     with watch("shape"):
-        described = describe(filtered, labels, sensor, p.shape)
+        labels, described = describe_stems(filtered, labels, sensor, p.shape)
         cut = is_cut(filtered, labels, raw, sensor, p.filters, p.acquisition)
         described = replace(described, cut=cut)
 

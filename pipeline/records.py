@@ -77,7 +77,8 @@ class Labels:
     """Which cluster each point belongs to.
 
     Attributes:
-        label: int32, shape (N,): 0..clusters-1 in the order of their first point, -1 for noise.
+        label: int32, shape (N,): 0..clusters-1 in the order of their first point, -1 for noise. What was
+            joined to a trunk and taken off (see `pipeline.shape.parts`) comes after all others.
         clusters: Number of clusters.
         hidden: shape (clusters,): whether something nearer hides an edge of the cluster.
     """

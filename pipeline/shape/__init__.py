@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 
 from pipeline.compiled import compiled
@@ -9,10 +11,39 @@ from pipeline.geometry import Float
 from pipeline.parameters.stages import Shape
 from pipeline.records import Clusters, Float32, Int, Labels, Sensor, Verdict
 from pipeline.shape.moments import gather, moments, planar_eigenvalues, spread_about, take_rows
+from pipeline.shape.parts import take_apart
 from pipeline.shape.stem import COLUMNS, fit_stems
 
 CENTROID_BIAS = 0.18  # m; measured on trunks of 8 to 35 cm radius at 2 to 10 m
 FLAT = 1e-12  # m^2; rounding of 32-bit coordinates leaves such a variance to what has none
+
+
+def describe_stems(
+    points: Float32, labels: Labels, sensor: Sensor, parameters: Shape
+) -> tuple[Labels, Clusters]:
+    """The figures of each cluster, as `describe`, after a trunk was taken out of those in which something
+    else is joined to it; and the labels, in which that is a cluster of its own."""
+    whole = describe(points, labels, sensor, parameters)
+    if parameters.slices == 0 or parameters.centre != "circle":
+        return labels, whole
+    parted, changed = take_apart(points, labels, whole, sensor, parameters.slices)
+    if not len(changed):
+        return labels, whole
+    number = np.full(parted.clusters + 1, -1, np.int32)  # the last entry serves noise, -1
+    number[changed] = np.arange(len(changed), dtype=np.int32)
+    some = Labels(number[parted.label], len(changed), parted.hidden[changed])
+    return parted, _with_rows(whole, describe(points, some, sensor, parameters), changed)
+
+
+def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
+    """The clusters, in these ascending rows the others; rows beyond the last are added."""
+    columns = []
+    for column in fields(Clusters):
+        old, new = getattr(clusters, column.name), getattr(others, column.name)
+        joined = np.concatenate([old, new[rows >= len(old)]])
+        joined[rows] = new
+        columns.append(joined)
+    return Clusters(*columns)
 
 
 def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape) -> Clusters:

@@ -1,4 +1,4 @@
-"""How far single scans show trunks: `python -m tests.benchmarks.ranges [--set clustering.stem_area=0]`.
+"""How far single scans show trunks: `python -m tests.benchmarks.ranges [--set shape.slices=0]`.
 
 Of the trees of simulated scenes that return at least four points in the height band: for how many the scan
 has a cluster, and a detection, within 0.4 m; and detections that are no tree, by distance.
@@ -21,7 +21,7 @@ from pipeline.detection import detections, judge
 from pipeline.geometry import Pose2, Pose3
 from pipeline.parameters import Parameters, preset
 from pipeline.records import Float, Float32, Sensor, Step
-from pipeline.shape import describe
+from pipeline.shape import describe_stems
 from pipeline.sources import open_source
 from pipeline.steps import steps
 from pipeline.terrain import height_above
@@ -81,7 +81,7 @@ def _count(place: Place, parameters: Parameters) -> np.ndarray[tuple[int, int], 
     boxed = filters.pass_through(raw, p.filters)
     height = height_above(boxed, ground.find_terrain(raw, p.ground))
     points = filters.voxel_grid(ground.in_band(boxed, height, p.ground), p.filters)
-    described = describe(points, cluster(points, sensor, p.clustering), sensor, p.shape)
+    _, described = describe_stems(points, cluster(points, sensor, p.clustering), sensor, p.shape)
     found = detections(judge(described, p.detection), offset, p.detection).centre
     here = _in_base_frame(trees, step.T_odom_base or Pose2())
     reach, away = np.hypot(*here.T), np.hypot(*found.T)

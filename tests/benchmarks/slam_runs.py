@@ -17,7 +17,7 @@ from pipeline.evaluation import path_error
 from pipeline.geometry import Pose2
 from pipeline.parameters import Parameters, preset
 from pipeline.records import Detections, Float, Path, Trees, Truth
-from pipeline.shape import describe
+from pipeline.shape import describe_stems
 from pipeline.slam import BackEnd
 from pipeline.sources import open_source
 from pipeline.steps import steps
@@ -73,7 +73,8 @@ def seen_in(uri: str, parameters: Parameters | None = None) -> tuple[list[Seen],
             height = ground.height_above(band, ground.find_terrain(raw, p.ground))
             band = ground.in_band(band, height, p.ground)
         filtered = filters.voxel_grid(band, p.filters)
-        described = describe(filtered, cluster(filtered, known.sensor, p.clustering), known.sensor, p.shape)
+        labels = cluster(filtered, known.sensor, p.clustering)
+        _, described = describe_stems(filtered, labels, known.sensor, p.shape)
         found = detections(judge(described, p.detection), offset, p.detection)
         odometry = step.T_odom_base or Pose2()
         rows.append(Seen(step.scan.stamp_ns, odometry, found, clear_range(raw, filtered, offset)))

@@ -119,6 +119,14 @@ class Shape(Stage):
     centre: Literal["centroid", "circle"] = choice(
         "circle", "Centre of a trunk", "The centroid of the visible arc, as in the paper, or a fitted circle."
     )
+    slices: int = count(
+        4,
+        "Slices that agree",
+        "",
+        0,
+        8,
+        "A trunk is taken out of a cluster that fits none when so many slices of 0.2 m show it; 0 is off.",
+    )
 
 
 class Detection(Stage):
