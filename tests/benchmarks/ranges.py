@@ -1,4 +1,4 @@
-"""How far single scans show trunks: `python -m tests.benchmarks.ranges [--set shape.slices=0]`.
+"""How far single scans show trunks: `python -m tests.benchmarks.ranges [--set shape.slices=4]`.
 
 Of the trees of simulated scenes that return at least four points in the height band: for how many the scan
 has a cluster, and a detection, within 0.4 m; and detections that are no tree, by distance.
@@ -7,6 +7,7 @@ has a cluster, and a detection, within 0.4 m; and detections that are no tree, b
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator
 from contextlib import closing
 from itertools import pairwise
@@ -36,7 +37,9 @@ def main() -> None:
     """Print a line for each kind of sensor and distance."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--set", action="append", default=[], metavar="STAGE.NAME=VALUE")
-    changes = {name: float(value) for name, value in (text.split("=") for text in parser.parse_args().set)}
+    changes = {
+        name: json.loads(value) for name, value in (text.split("=") for text in parser.parse_args().set)
+    }
     parameters = preset("forest").replace(changes)
     kinds = {"VLP-16": _stands(), "64 rings": _streets(one_way=False), "one way": _streets(one_way=True)}
     for kind, places in kinds.items():

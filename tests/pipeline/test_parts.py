@@ -15,7 +15,8 @@ from pipeline.records import Clusters, Labels, Verdict
 from pipeline.shape import describe, describe_stems
 from tests.pipeline.strategies import LAW, SENSOR, one_cluster
 
-FOREST, DETECTION = preset("forest").shape, preset("forest").detection
+FOREST = preset("forest").shape.model_copy(update={"slices": 4})
+DETECTION = preset("forest").detection
 SHARP = replace(SENSOR, range_sigma=0.01)
 HEIGHTS = np.arange(-1.3, 0.4, 0.05)  # of rings at a trunk, below a sensor that stands 1.6 m high
 STEP = SENSOR.azimuth_step

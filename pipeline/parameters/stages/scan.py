@@ -120,7 +120,7 @@ class Shape(Stage):
         "circle", "Centre of a trunk", "The centroid of the visible arc, as in the paper, or a fitted circle."
     )
     slices: int = count(
-        4,
+        0,
         "Slices that agree",
         "",
         0,
