@@ -9,10 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-
 from app.keeper import Keeper
-from app.store.records import Annotation, Content, StaleError
+from app.store.records import Annotation, StaleError
+from app.truths import SAME_THING, Against, contradicting, counted, truth_of
 from pipeline.errors import StemmapError
 from pipeline.records import TruthTrees
 
@@ -22,9 +21,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _log = logging.getLogger(__name__)
-
-# So near to an annotation, what the source says to stand there is the same thing [m].
-SAME_THING = 0.5
 
 
 class Annotating:
@@ -36,7 +32,8 @@ class Annotating:
     Attributes:
         run: Number of the run in the store, None while none is open.
         rows: The annotations of the run.
-        truth: What stands there: what the source knows, and over it what was annotated.
+        truth: What the map is scored against.
+        against: Which of the source's truth and the annotations that is, see `truth_of`.
         problem: Why nothing can be annotated, empty when all is well.
         changed: Called when something else stands.
         edited: Called with who edited and how many annotations, after an edit.
@@ -47,6 +44,7 @@ class Annotating:
         self.run: int | None = None
         self.rows: list[Annotation] = []
         self.truth: TruthTrees | None = None
+        self.against: Against = "both"
         self.problem = ""
         self.serial = 0
         self.changed: Callable[[], None] = lambda: None
@@ -67,7 +65,7 @@ class Annotating:
         def work(store: Store) -> tuple[int, list[Annotation], TruthTrees | None]:
             run = store.open_run(source, uri, Path(uri).name[:200] or uri[:200])
             rows = store.annotations(run)
-            return run, rows, laid_over(own, rows)
+            return run, rows, truth_of(own, rows, "both")
 
         self._own = self.truth = own
         try:
@@ -80,7 +78,13 @@ class Annotating:
 
     def leave(self) -> None:
         """No run is open."""
-        self.run, self.rows, self.truth, self._own = None, [], None, None
+        self.run, self.rows, self.truth, self._own, self.against = None, [], None, None, "both"
+
+    def score_against(self, against: Against) -> None:
+        """Choose what the map is scored against; neither the source's truth nor an annotation is changed."""
+        self.against = against
+        self.truth = truth_of(self._own, self.rows, against)
+        self.changed()
 
     async def edit(self, run: int, function: Callable[[Store], T]) -> T:
         """Let something be done to the store, and tell what stands afterwards.
@@ -99,7 +103,7 @@ class Annotating:
             raise StaleError(
                 "another run was opened", remedy="Your edit was not made; look at what stands now"
             )
-        own = self._own
+        own, against = self._own, self.against
 
         def work(store: Store) -> tuple[T | StaleError, list[Annotation], TruthTrees | None]:
             done: T | StaleError
@@ -108,12 +112,13 @@ class Annotating:
             except StaleError as error:  # then what stands is news
                 done = error
             rows = store.annotations(run)
-            return done, rows, laid_over(own, rows)
+            return done, rows, truth_of(own, rows, against)
 
         done, rows, truth = await self._keeper.ask(work)
         if run == self.run:
             who, number = _edits(self.rows, rows)
-            self.rows, self.truth = rows, truth
+            self.rows = rows
+            self.truth = truth if against == self.against else truth_of(own, rows, self.against)
             self.serial += 1
             self.changed()
             if number:
@@ -131,14 +136,14 @@ class Annotating:
 
     def as_plain(self) -> dict[str, Any]:
         """For the browsers."""
-        own = self._own is not None
         return {
             "run": self.run,
             "serial": self.serial,
             "problem": self.problem,
-            "used": {(False, False): "none", (True, False): "source", (False, True): "annotations"}.get(
-                (own, bool(self.rows)), "both"
-            ),
+            "used": counted(self._own, self.rows, self.against),
+            "against": self.against,
+            "own": None if self._own is None else len(self._own.x),
+            "contradicting": contradicting(self._own, self.rows),
             "same_thing_m": SAME_THING,
             "trees": [row_payload(row) for row in self.rows],
         }
@@ -166,31 +171,3 @@ def row_payload(row: Annotation) -> dict[str, Any]:
         "at_s": row.at_ns // 1_000_000_000,
         "version": row.version,
     }
-
-
-def contents_of(truth: TruthTrees) -> list[Content]:
-    """The rows of a table of trees."""
-    columns = zip(truth.x.tolist(), truth.y.tolist(), truth.kind, truth.dbh.tolist(), strict=True)
-    return [Content(x, y, kind, dbh if dbh == dbh else None) for x, y, kind, dbh in columns]
-
-
-def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees | None:
-    """What the source knows, and in its place what was annotated within SAME_THING of it."""
-    if not rows:
-        return own
-    contents = [row.content for row in rows]
-    x, y = np.array([c.x for c in contents]), np.array([c.y for c in contents])
-    dbh = np.array([np.nan if c.dbh is None else c.dbh for c in contents])
-    kind = tuple(c.kind for c in contents)
-    if own is None or not len(own.x):
-        return TruthTrees(x, y, dbh, kind)
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(np.column_stack([x, y])).query(np.column_stack([own.x, own.y]))
-    keep = np.flatnonzero(distance > SAME_THING)
-    return TruthTrees(
-        np.concatenate([own.x[keep], x]),
-        np.concatenate([own.y[keep], y]),
-        np.concatenate([own.dbh[keep], dbh]),
-        (*(own.kind[k] for k in keep), *kind),
-    )

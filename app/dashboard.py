@@ -284,7 +284,7 @@ class Dashboard:
     def _remapped(self, changes: MapChanges) -> None:
         """The run was mapped again: the map has other trees, and other numbers."""
         self.live.tell("remapped", msgspec.to_builtins(changes))
-        self.events.remapped(changes.confirmed)
+        self.events.remapped(changes.confirmed, changes.time_s)
         self._tell_events()
         self.selecting.renamed(dict(changes.renamed))
 
@@ -354,7 +354,7 @@ class Dashboard:
         payload = map_payload(shown)
         payload["layers"] |= self.scene.counts
         self.live.show({**payload, **counts}, self.path_xy)
-        if self.events.shown(shown.frame, shown.time_s):
+        if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
             self._tell_events()
         self.logbook.shown(self._glance(shown))
         self._score()

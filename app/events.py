@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from pipeline.parameters.model import Value
-from pipeline.records import Frame
+from pipeline.records import Float, Frame
 
 Kind = Literal["tree", "warning", "change", "health", "annotation"]
 
+_OF_THE_MAP = ("tree", "health")  # come anew when the run is mapped with other parameters
 _MOST = 400
 _LONGEST = 300
 
@@ -31,10 +35,15 @@ class Event:
 
 
 class Events:
-    """The events of a run, at most 400; of more the oldest are forgotten."""
+    """The events of a run, at most 400; of more the oldest are forgotten.
+
+    What came later in the run than the scan at which parameters were changed stays as it was, told to be of
+    before the change, until the run gets there again.
+    """
 
     def __init__(self) -> None:
         self._events: dict[str, Event] = {}
+        self._before: dict[str, Event] = {}
         self._confirmed: set[int] = set()
         self._warnings: frozenset[str] = frozenset()
         self._health = "good"
@@ -44,37 +53,49 @@ class Events:
     def forget(self) -> None:
         """Another run begins."""
         self._events.clear()
+        self._before.clear()
         self._confirmed.clear()
         self._warnings, self._health, self._base = frozenset(), "good", None
         self._edits = ("", 0)
 
-    def shown(self, frame: Frame, time_s: float) -> bool:
+    def shown(self, frame: Frame, time_s: float, confirmed_s: Float | None = None) -> bool:
         """Take a scan's results; returns whether anything happened. A tree that is confirmed again after the
-        run went back has its mark where it was confirmed first."""
+        run went back has its mark where it was confirmed first.
+
+        Args:
+            frame: The picture; on the way to a sought scan not every one is shown.
+            time_s: Of the picture.
+            confirmed_s: When each of its trees was confirmed, NaN where that is not known; None knows none.
+        """
         known = set(self._events)
+        passed = {key for key, event in self._before.items() if event.time_s <= time_s}
+        self._before = {key: event for key, event in self._before.items() if key not in passed}
         # Not those whose marks are there: of more trees than marks the forgotten ones would come again.
         confirmed = set(frame.trees.number[frame.trees.confirmed].tolist())
+        at = {} if confirmed_s is None else self._times(frame, confirmed_s)
         for number in sorted(confirmed - self._confirmed):
-            self._note(f"tree {number}", Event(time_s, "tree", f"Tree {number} confirmed"))
+            self._note(f"tree {number}", Event(at.get(number, time_s), "tree", f"Tree {number} confirmed"))
         self._confirmed |= confirmed
         health = frame.health
         if health.state != self._health:
             self._health = health.state
             text = f"SLAM {health.state}: {health.reason}" if health.reason else f"SLAM {health.state}"
             self._note(f"health {frame.index}", Event(time_s, "health", text))
-        return self._events.keys() != known
+        return self._events.keys() != known or bool(passed)
 
-    def remapped(self, confirmed: list[tuple[int, float]]) -> None:
+    def remapped(self, confirmed: list[tuple[int, float]], time_s: float) -> None:
         """The map is another one.
 
         Args:
             confirmed: Number of each of its trees, and when it was confirmed [s].
+            time_s: Of the standing scan, up to which it was mapped again.
         """
-        self._events = {k: e for k, e in self._events.items() if e.kind not in ("tree", "health")}
+        self._set_aside(lambda event: event.time_s > time_s)
+        self._events = {k: e for k, e in self._events.items() if e.kind not in _OF_THE_MAP}
         self._confirmed = {number for number, _ in confirmed}
         self._health = "good"
-        for number, time_s in confirmed:
-            self._note(f"tree {number}", Event(time_s, "tree", f"Tree {number} confirmed"))
+        for number, at in confirmed:
+            self._note(f"tree {number}", Event(at, "tree", f"Tree {number} confirmed"))
 
     def warned(self, warnings: list[str], time_s: float) -> bool:
         """Take the warnings that stand; returns whether there is a new one."""
@@ -92,12 +113,7 @@ class Events:
             before, after: All values by dotted name.
             time_s: Of the standing scan.
         """
-        undone = {
-            key
-            for key, event in self._events.items()
-            if event.time_s > time_s and event.kind not in ("change", "warning", "annotation")
-        }
-        self._events = {key: event for key, event in self._events.items() if key not in undone}
+        undone = self._set_aside(lambda event: event.time_s > time_s)
         self._confirmed = {number for number in self._confirmed if f"tree {number}" not in undone}
         key = f"change {time_s:.1f}"
         if self._base is None or self._base[0] != key:
@@ -125,9 +141,28 @@ class Events:
         self._note(key, Event(time_s, "annotation", f"{who or 'Somebody'} edited {edits}"[:_LONGEST]))
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers, in the order of time."""
-        ordered = sorted(self._events.values(), key=lambda event: event.time_s)
-        return {"events": [{"t": round(e.time_s, 2), "kind": e.kind, "text": e.text} for e in ordered]}
+        """For the browsers, in the order of time; `before` marks what is of before a change."""
+        room = _MOST - len(self._events)
+        marks = [(event, False) for event in self._events.values()]
+        marks += [(event, True) for event in list(self._before.values())[:room]]
+        marks.sort(key=lambda mark: mark[0].time_s)
+        return {
+            "events": [
+                {"t": round(e.time_s, 2), "kind": e.kind, "text": e.text, **({"before": True} if old else {})}
+                for e, old in marks
+            ]
+        }
+
+    def _set_aside(self, which: Callable[[Event], bool]) -> set[str]:
+        """Of what the map told, some events are of before a change from now on; gives their keys."""
+        keys = {k for k, event in self._events.items() if event.kind in _OF_THE_MAP and which(event)}
+        self._before |= {key: self._events.pop(key) for key in sorted(keys)}
+        return keys
+
+    @staticmethod
+    def _times(frame: Frame, confirmed_s: Float) -> dict[int, float]:
+        rows = np.flatnonzero(frame.trees.confirmed & np.isfinite(confirmed_s))
+        return dict(zip(frame.trees.number[rows].tolist(), confirmed_s[rows].tolist(), strict=True))
 
     def _note(self, key: str, event: Event) -> None:
         self._events.setdefault(key, event)

@@ -40,6 +40,7 @@ class MapChanges(msgspec.Struct, frozen=True):
     Attributes:
         revision: Of the parameters.
         scans: Scans that were mapped again.
+        time_s: Of the last of them, since the run's first one.
         before, after: Number of trees.
         ghost: x, y [m] and DBH [m] (None where it is not known) of every tree before.
         renamed: Old and new number of each tree that stayed.
@@ -49,6 +50,7 @@ class MapChanges(msgspec.Struct, frozen=True):
 
     revision: int
     scans: int
+    time_s: float
     before: int
     after: int
     ghost: list[tuple[float, float, float | None]]
@@ -58,13 +60,14 @@ class MapChanges(msgspec.Struct, frozen=True):
 
 
 def changes_between(
-    before: Frame, after: Frame, revision: int, confirmed_s: Mapping[int, float]
+    before: Frame, after: Frame, revision: int, time_s: float, confirmed_s: Mapping[int, float]
 ) -> MapChanges:
     """Compare two maps of the same scans.
 
     Args:
         before, after: The last scan of each.
         revision: Of the parameters of `after`.
+        time_s: Of both frames, since the run's first scan.
         confirmed_s: When trees of `after` were confirmed.
     """
     old, new = np.flatnonzero(before.trees.confirmed), np.flatnonzero(after.trees.confirmed)
@@ -85,6 +88,7 @@ def changes_between(
     return MapChanges(
         revision=revision,
         scans=after.index + 1,
+        time_s=time_s,
         before=len(old),
         after=len(new),
         ghost=[

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+import numpy as np
+
 from app.ahead import looked_ahead
 from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
@@ -20,7 +22,7 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
 from pipeline.perception import Looked
-from pipeline.records import Frame, Path, Step, Trees
+from pipeline.records import Float, Frame, Path, Step, Trees
 from pipeline.rerun import (
     Basis,
     DamagedError,
@@ -110,6 +112,11 @@ class Run:
     def history(self) -> TreeHistory:
         """What each scan made of the trees."""
         return self._told.history
+
+    def confirmed_s(self, trees: Trees) -> Float:
+        """When each of the trees was first confirmed [s since the first scan], NaN where it was not: (T,)."""
+        known = self._told.confirmed_s
+        return np.array([known.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
 
     @property
     def start_ns(self) -> int:

@@ -10,21 +10,19 @@ from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Literal
 
-from app.cursor import Cursor, Synchroniser
+from app.beginning import Beginning, MakeSynchroniser
 from app.keeping import Keep, keep_without_name
-from app.live_cursor import LiveCursor
-from app.map_changes import MapChanges, changes_between
+from app.map_changes import MapChanges
 from app.messages import LONGEST_S, State, Status
-from app.odometry import with_odometry
 from app.robot.recording import Recording
 from app.robot.source import LiveSource
 from app.run import MakeMapper, Run
 from app.session_status import Said, describe, opened_of
-from app.stopwatch import Stopwatch
 from app.story import of_run
 from app.story.records import ClusterStory, TreeStory
 from app.story.telling import make_ready
 from app.way import Way
+from app.whole_run import WholeRun
 from app.worker_messages import Opened
 from pipeline.errors import SourceError, StemmapError
 from pipeline.parameters import Parameters
@@ -32,7 +30,6 @@ from pipeline.records import Frame, Path, Trees
 from pipeline.sources.base import Source, SourceOptions
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
-MakeSynchroniser = Callable[[str], Synchroniser]
 Pace = Literal["idle", "replay", "hurry", "live"]
 
 _NS = 1_000_000_000
@@ -62,9 +59,8 @@ class Session:
         keep: Keep = keep_without_name,
     ) -> None:
         self._open_source = open_source
-        self._make_mapper = make_mapper
-        self._make_synchroniser = make_synchroniser
-        self._parameters, self._keep = parameters, keep
+        self._begun = Beginning(make_mapper, make_synchroniser, keep)
+        self._parameters = parameters
         self._revision = 0
         self._asked: tuple[str, str, int] | None = None
         self._open_again: Callable[[], Opened | None] = lambda: None
@@ -73,7 +69,7 @@ class Session:
         self._state: State = "starting"
         self._detail = ""
         self._way = Way()
-        self._remap_there = False  # once the sought scan is reached
+        self._whole = WholeRun()
         self._warnings: dict[str, None] = {}
 
     @property
@@ -161,27 +157,9 @@ class Session:
         return self._begin(self._robot, *self._asked[1:])
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
-        try:
-            moving, chosen = with_odometry(source, odometry)
-        except SourceError:
-            source.close()
-            raise
-        stopwatch, synchronise = Stopwatch(), self._make_synchroniser(chosen.steps)
-        self._run = Run(
-            moving,
-            self._make_mapper(moving, self._parameters, seed, stopwatch),
-            LiveCursor(source, chosen, moving)
-            if isinstance(source, LiveSource)
-            else Cursor(moving, synchronise),
-            self._parameters,
-            stopwatch,
-            chosen.words,
-            remake=lambda parameters: self._make_mapper(moving, parameters, seed, stopwatch),
-            reread=None if isinstance(source, LiveSource) else lambda: synchronise(moving.records(None)),
-            kept=self._keep(source, chosen.words, seed),
-        )
+        self._run, warnings = self._begun(source, odometry, seed, self._parameters)
         self._state, self._detail = "paused", ""
-        self._warn((*source.description.warnings, *([chosen.warning] if chosen.warning else [])))
+        self._warn(warnings)
         return opened_of(self._run)
 
     def prepare(self) -> None:
@@ -274,7 +252,7 @@ class Session:
             return None
         run.stay()
         if self._way.sought:  # see `_arrive`
-            self._remap_there = whole
+            self._whole.wanted_there = whole
             return None
         stands = self._state != "playing" and run.standing >= 0
         from_scan = run.standing + (0 if stands else 1)
@@ -298,21 +276,16 @@ class Session:
     def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
         """Map so many scans of the run again. Once all are, the map is another one: gives the standing scan
         with it, and what it changes."""
-        run = self._run
-        if run is None or run.frame is None:
+        if self._run is None:
             return None
-        before = run.frame
         try:
-            done = run.remap_on(scans)
+            done = self._whole.work(self._run, scans, self._revision, self.time_s)
         except StemmapError as error:
             self._warn([f"the run was not mapped again, its map is as before: {error}"])
             return None
-        if done is None:
-            return None
-        frame, confirmed_s = done
-        if self._robot is not None:
-            self._robot.use_parameters(self._revision, 0, run.parameters_at(0))
-        return frame, changes_between(before, frame, self._revision, confirmed_s)
+        if done is not None and self._robot is not None:
+            self._robot.use_parameters(self._revision, 0, self._run.parameters_at(0))
+        return done
 
     def cluster_story(self, frame: Frame, cluster: int) -> ClusterStory:
         """The story of a cluster of a frame of this run, which may have lost its raw points.
@@ -379,16 +352,14 @@ class Session:
         self._way.forget()
         changed = run.use(self._parameters, run.standing)
         frame = run.map_again() if changed or run.is_bare else run.frame
-        there, self._remap_there = self._remap_there, False
-        if there:
-            run.remap(self._parameters)
+        self._whole.arrived(run, self._parameters)
         return frame
 
     def _leave(self) -> None:
         owner = self._run or self._robot
         if owner is not None:
             owner.close()
-        self._run, self._robot, self._remap_there = None, None, False
+        self._run, self._robot, self._whole = None, None, WholeRun()
         self._warnings.clear()
         self._way.forget()
 

@@ -17,19 +17,14 @@ from typing import TypeVar
 
 import msgspec
 
-from app.camera import camera_picture
+from app.answering import Answering
 from app.messages import Advance, Command, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
 from app.opening import options_of
 from app.pacer import Pacer
-from app.picture import for_comparison
 from app.session import Session
 from app.story.recent import Recent
 from app.words import COMPILING
 from app.worker_messages import (
-    Answer,
-    AskCamera,
-    AskCompare,
-    AskTree,
     Begin,
     FromWorker,
     Opened,
@@ -84,6 +79,7 @@ class Driver:
         self._put = put
         self._clock = clock
         self._recent = recent or Recent()
+        self._answering = Answering(session, self._recent)
         self._taken: deque[ToWorker | None] = deque()
         self._pacer = Pacer()
         self._run, self._asked = 0, ""
@@ -107,7 +103,7 @@ class Driver:
                 self._session.close()
                 return
             if isinstance(command, Question):
-                self._put(self._answer(command))  # nobody who asks changes how the run goes
+                self._put(self._answering.answer(command, self._run))
                 if self._says_compiling:  # an answer may need other code than the run
                     self._report()
             else:
@@ -237,33 +233,6 @@ class Driver:
             case Begin():
                 self._begin(command)
 
-    def _answer(self, question: Question) -> Answer:
-        ticket = question.ticket
-        try:
-            if question.run != self._run:
-                raise StemmapError("the run was left")
-            if isinstance(question, AskCompare):
-                sets = [validated(values) for values in question.sets]
-                return Answer(ticket, frames=[for_comparison(f) for f in self._session.compare(sets)])
-            if isinstance(question, AskCamera):
-                run = self._session.run
-                source = None if run is None else run.source
-                return Answer(ticket, camera=camera_picture(source, question.stamp_ns))
-            if isinstance(question, AskTree):
-                return Answer(ticket, tree=self._session.tree_story(question.tree))
-            frame = self._recent.find(question.run, question.scan)
-            if frame is None:
-                raise StemmapError(
-                    f"scan {question.scan} was shown too long ago", remedy="Click a cluster of the newest one"
-                )
-            return Answer(ticket, cluster=self._session.cluster_story(frame, question.cluster))
-        except StemmapError as error:
-            return Answer(ticket, missing=str(error))
-        except Exception as error:  # an answer that fails must not stop the run
-            traceback.print_exc(file=sys.stderr)
-            fault = f"this is a fault in stemmap: {type(error).__name__}: {error}"
-            return Answer(ticket, missing=f"{fault}. The terminal shows where")
-
     def _open(self, command: Open) -> None:
         self._run, self._asked = self._run + 1, command.uri
         opening = f"Opening {command.uri}"
@@ -329,9 +298,10 @@ class Driver:
         return self._reported is not None and self._reported[0].detail == _COMPILING
 
     def _show(self, frame: Frame | None) -> None:
-        path = self._session.path
-        if frame is not None and path is not None:
-            self._put(Shown(self._run, self._session.time_s, frame, 0, path))
+        run, path = self._session.run, self._session.path
+        if frame is not None and run is not None and path is not None:
+            confirmed_s = run.confirmed_s(frame.trees)
+            self._put(Shown(self._run, self._session.time_s, frame, 0, path, confirmed_s))
 
     def _report(self) -> None:
         now = self._clock()

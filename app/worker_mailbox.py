@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import BinaryIO
 
 import numpy as np
+from msgspec import structs
 
 from app.picture import picture_of
 from app.story.recent import Recent
@@ -126,7 +127,7 @@ class Mailbox:
         else:
             self._sent_ground = picture.ground
         self._sent_run = shown.run
-        return Shown(shown.run, shown.time_s, picture, start, rows_from(shown.path, start))
+        return structs.replace(shown, frame=picture, path_start=start, path=rows_from(shown.path, start))
 
 
 def rows_in_common(old: Path, new: Path) -> int:

@@ -11,7 +11,7 @@ from app.camera import CameraPicture
 from app.map_changes import MapChanges
 from app.messages import Command, Status
 from app.story.records import ClusterStory, TreeStory
-from pipeline.records import Frame, Path, Trees, TruthTrees
+from pipeline.records import Float, Frame, Path, Trees, TruthTrees
 
 
 class Opened(msgspec.Struct, frozen=True, tag="opened"):
@@ -50,6 +50,8 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         frame: All that came of the scan.
         path_start: How many rows of the path sent before still hold.
         path: The rows from there on.
+        confirmed_s: When each tree of the frame was confirmed, NaN where that is not known; None knows none.
+            Not every scan is shown, so a picture alone does not tell it.
     """
 
     run: int
@@ -57,6 +59,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     frame: Frame
     path_start: int
     path: Path
+    confirmed_s: Float | None = None
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):

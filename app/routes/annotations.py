@@ -11,12 +11,13 @@ from fastapi import APIRouter, Path, Request
 from msgspec import Meta
 from starlette.responses import Response
 
-from app.annotating import contents_of, row_payload
+from app.annotating import row_payload
 from app.dashboard import Dashboard
 from app.hands import NAME
 from app.replies import BadRequestError, body_of, failure_reply, json_reply, table_reply
 from app.routes.access import Dash
 from app.store.records import MOST_ANNOTATIONS, Author, Content, UnknownError, moment
+from app.truths import Against, contents_of
 from pipeline.errors import SourceError
 
 router = APIRouter(prefix="/api")
@@ -156,6 +157,20 @@ async def import_table(request: Request, dashboard: Dash) -> Response:
     if new:
         await dashboard.annotating.edit(wanted.run, lambda store: store.add(wanted.run, wanted.author, new))
     return await _done(dashboard, wanted, {"added": len(new), "left_out": len(contents) - len(new)})
+
+
+class _Choice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the map is scored against."""
+
+    against: Against
+
+
+@router.put("/annotations/against")
+async def score_against(request: Request, dashboard: Dash) -> Response:
+    """Choose what the map is scored against; nothing of it is changed."""
+    wanted: _Choice = await body_of(request, _Choice)
+    dashboard.annotating.score_against(wanted.against)
+    return json_reply(dashboard.annotating.as_plain())
 
 
 @router.get("/annotations.csv")

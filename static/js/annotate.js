@@ -1,6 +1,6 @@
 // What a person says of the trees: goes to the server one edit after the other, and comes back to all browsers.
 
-import { get, request } from "./api.js";
+import { get, put, request } from "./api.js";
 import { recall, remember } from "./dom.js";
 import { percent } from "./format.js";
 import { select } from "./live.js";
@@ -216,11 +216,20 @@ export async function settle() {
 export function truthInWords() {
   const number = rows().length;
   return {
-    source: "Scored against the truth that this run brings.",
+    source: `Scored against the truth that this run brings${number ? "; annotations do not count" : ""}.`,
     annotations: "Scored against what was annotated. A found tree that nobody has judged counts as wrong until somebody does.",
     both: `Scored against the truth that this run brings, with ${number} ${number === 1 ? "annotation" : "annotations"} laid over it.`,
   }[state.annotations?.used] ?? "";
 }
+
+// Where a run brings its own truth, annotations stand beside it: who says otherwise is told so, and chooses what counts.
+export function warnedInWords() {
+  const { contradicting = 0, used } = state.annotations ?? {};
+  if (!contradicting || used !== "both") return "";
+  return `${contradicting === 1 ? "One annotation says" : `${contradicting} annotations say`} otherwise than the truth that this run brings, and ${contradicting === 1 ? "counts" : "count"} in its place.`;
+}
+
+export const scoreAgainst = (against) => put("/api/annotations/against", { against }).catch((error) => { draft.error = error.message; news(); });
 
 async function count() {
   const told = await request(`/api/annotations?browser=${me}`).catch(() => null);

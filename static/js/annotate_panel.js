@@ -1,12 +1,13 @@
 // The tab Annotate: how much is judged, what can be done, and the list of annotations.
 
-import { callMe, change, choose, doubtInWords, draft, importTable, judge, KINDS, myName, NAME, next, redo, remove, rows, toggleAdding, truthInWords, undo, unjudged } from "./annotate.js";
+import { callMe, change, choose, doubtInWords, draft, importTable, judge, KINDS, myName, NAME, next, redo, remove, rows, scoreAgainst, toggleAdding, truthInWords, undo, unjudged, warnedInWords } from "./annotate.js";
 import { byId, el, setText } from "./dom.js";
 import { count, figure, fixed } from "./format.js";
 import { learnSection, startLearning } from "./learn.js";
 import { on, state } from "./state.js";
 import { visible } from "./tabs.js";
 
+const AGAINST = { both: "its truth and annotations", own: "its truth alone", annotations: "annotations alone" };
 const EVERY = 300; // [ms] between two fillings
 let planned = 0, filledAt = 0;
 const lines = new Map(); // rows of the table by the annotation's id
@@ -40,6 +41,10 @@ function build() {
       button("annotate-no", "Is no tree", "The selected found tree is something else (n)", () => judge(draft.kind)), el("label", { class: "annotate-as" }, "it is ", kind)),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
     el("p", { id: "annotate-hint", class: "note dim" }),
+    el("div", { id: "annotate-truth", class: "annotate-truth", hidden: true },
+      el("label", { title: "This run brings its own truth, which annotations never change: what they agree with stays exact, what they say otherwise stands beside it" }, "Score against ",
+        el("select", { id: "annotate-against", onchange: (event) => scoreAgainst(event.target.value) }, ...Object.entries(AGAINST).map(([value, text]) => el("option", { value, text })))),
+      el("p", { id: "annotate-warned", class: "note warned", role: "status" })),
     el("div", { class: "annotate-list" },
       el("table", { id: "annotations", class: "plain" }, el("thead", {}, el("tr", {},
         ...[["class"], ["DBH cm"], ["x m"], ["y m"], ["by"], [""]].map(([text]) => el("th", { scope: "col", text })))), el("tbody"))),
@@ -116,6 +121,9 @@ function fill() {
   byId("annotate-error").hidden = !(draft.error || problem);
   setText(byId("annotate-error"), problem || draft.error);
   setText(byId("annotate-hint"), hint());
+  byId("annotate-truth").hidden = state.annotations?.own == null;
+  byId("annotate-against").value = state.annotations?.against ?? "both";
+  setText(byId("annotate-warned"), warnedInWords());
   fillTable();
 }
 

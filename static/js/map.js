@@ -15,7 +15,7 @@ import { colour } from "./theme.js";
 
 const NAMES = ["tree", "pole", "person", "bush", "other", "uncertain", "truth", "path", "odometry", "robot", "selection", "text", "surface", "grid", "axis", "font", "set-a", "set-b"];
 const canvas = byId("map");
-const view = new MapView();
+const view = Object.assign(new MapView(), { top: 42 });
 const pointers = new Map(); // fingers and mouse that are down
 let colours = {}, planned = false, travelled = 0;
 
@@ -42,6 +42,7 @@ function bounds() {
   };
   for (const [x, y] of state.path) take(x, y);
   for (const tree of state.map?.trees ?? []) take(tree.x, tree.y);
+  if (!Number.isFinite(box[0])) for (const truth of state.truth ?? []) take(truth.x, truth.y); // nothing is mapped yet
   return Number.isFinite(box[0]) ? box : [-3, -3, 3, 3];
 }
 

@@ -1,5 +1,6 @@
 // Paints the 2D map of Fig. 5: path grey, robot a red triangle, trees as circles with their number.
 
+import { drawNumbers } from "./map_labels.js";
 import { measuredText } from "./measure.js";
 import { verdictOf } from "./verdicts.js";
 
@@ -19,7 +20,11 @@ export function drawMap(pen, view, state, colours) {
   drawClusters(pen, view, state.map?.clusters, colours);
   for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected, colours);
   state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0, colours));
-  drawNumbers(pen, view, trees, state.selected, colours);
+  const before = new Map((state.ghost?.renamed ?? []).filter(([old, now]) => old !== now).map(([old, now]) => [now, old]));
+  drawNumbers(pen, view, trees, state.selected, colours, {
+    radiusOf: symbolRadius, first: new Set(before.keys()), robot: state.map && view.toScreen(...state.map.pose),
+    words: ({ number }) => (before.has(number) ? `${number} (was ${before.get(number)})` : String(number)),
+  });
   if (state.selectedCluster) drawRing(pen, view, state.selectedCluster, colours);
   if (state.map) drawRobot(pen, view, state.map, colours);
   if (state.measure?.to) drawMeasure(pen, view, state.measure, colours);
@@ -179,22 +184,6 @@ export function drawTree(pen, view, tree, selected, colours) {
     pen.beginPath();
     pen.arc(px, py, symbolRadius(tree, view.scale) + 5, 0, TURN);
     pen.stroke();
-  }
-}
-
-// Numbers that would cover one another are left out; zooming brings them back.
-export function drawNumbers(pen, view, trees, selected, colours) {
-  const taken = new Set();
-  Object.assign(pen, { fillStyle: colours.text, strokeStyle: colours.surface, lineWidth: 3, textAlign: "left" });
-  for (const tree of [...trees].sort((a, b) => (b.number === selected) - (a.number === selected))) {
-    const [px, py] = view.toScreen(tree.x, tree.y);
-    const at = [px + symbolRadius(tree, view.scale) + 3, py + 4];
-    const place = `${Math.round(at[0] / 22)},${Math.round(at[1] / 13)}`;
-    if (taken.has(place) && tree.number !== selected) continue;
-    taken.add(place);
-    pen.font = `${tree.number === selected ? "bold 13px" : "11px"} ${colours.font}`;
-    pen.strokeText(tree.number, ...at);
-    pen.fillText(tree.number, ...at);
   }
 }
 

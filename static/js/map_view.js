@@ -8,6 +8,7 @@ export class MapView {
   y = 0;
   width = 1;
   height = 1;
+  top = 0; // pixels at the upper edge in which buttons lie: nothing that is fitted is put there
   moved = false; // a person chose the part that is seen
 
   toScreen = (x, y) => [this.width / 2 + (x - this.x) * this.scale, this.height / 2 - (y - this.y) * this.scale];
@@ -17,13 +18,15 @@ export class MapView {
   fit([x0, y0, x1, y1], always = false) {
     const [left, top] = this.toScreen(x0, y1);
     const [right, bottom] = this.toScreen(x1, y0);
-    const holds = left > 26 && top > 26 && right < this.width - 12 && bottom < this.height - 26;
+    const holds = left > 26 && top > Math.max(26, this.top - 1) && right < this.width - 12 && bottom < this.height - 26;
     const fills = right - left > 0.35 * this.width || bottom - top > 0.35 * this.height;
     if (holds && fills && !always) return;
     const room = 1 - 2 * SLACK;
-    this.scale = Math.min((room * this.width) / Math.max(x1 - x0, 6), (room * this.height) / Math.max(y1 - y0, 6));
+    const height = Math.max(room * this.height - Math.max(0, this.top - SLACK * this.height), 0.4 * this.height);
+    this.scale = Math.min((room * this.width) / Math.max(x1 - x0, 6), height / Math.max(y1 - y0, 6));
     this.x = (x0 + x1) / 2;
-    this.y = (y0 + y1) / 2;
+    const above = Math.max(0, this.top - SLACK * this.height); // the middle moves down by half of what is taken there
+    this.y = (y0 + y1) / 2 + above / 2 / this.scale;
   }
 
   zoom(factor, px, py) {

@@ -12,11 +12,11 @@ function showMarks() {
   const end = state.status?.end_s;
   const lane = byId("marks");
   const events = end > 0 ? (state.events ?? []) : [];
-  const key = `${end} ${events.length} ${events.at(-1)?.text} ${events.map((event) => event.t).join()}`;
+  const key = `${end} ${events.length} ${events.at(-1)?.text} ${events.map((event) => `${event.t}${event.before ? "b" : ""}`).join()}`;
   if (lane.dataset.shown === key) return;
   lane.dataset.shown = key;
-  lane.replaceChildren(...(end > 0 ? [loopBar()] : []), ...events.map(({ t, kind, text }) => el("button", {
-    class: `mark ${kind}`, tabindex: "-1", title: `${clock(t)} ${NAMES[kind]}: ${text}`, "aria-label": `${clock(t)} ${text}`,
+  lane.replaceChildren(...(end > 0 ? [loopBar()] : []), ...events.map(({ t, kind, text, before }) => el("button", {
+    class: `mark ${kind}${before ? " before" : ""}`, tabindex: "-1", title: `${clock(t)} ${NAMES[kind]}: ${text}${before ? " (before the change; it comes anew when the run gets there)" : ""}`, "aria-label": `${clock(t)} ${text}`,
     style: { left: `${(100 * t) / end}%` }, onclick: () => command("seek", { time_s: t }).catch(() => {}),
   })));
 }

@@ -1,6 +1,6 @@
 // The map against the ground truth: rates never without their counts.
 
-import { truthInWords } from "./annotate.js";
+import { truthInWords, warnedInWords } from "./annotate.js";
 import { byId, el } from "./dom.js";
 import { figure, NONE, percent } from "./format.js";
 import { openSources } from "./sources.js";
@@ -33,7 +33,7 @@ const LINES = [
 function show() {
   if (!visible("scores")) return;
   const score = state.evaluation;
-  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: truthInWords() }), rates(score), lines(score)] : [nothing()]));
+  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthInWords(), warnedInWords()].filter(Boolean).join(" ") }), rates(score), lines(score)] : [nothing()]));
 }
 
 function rates(score) {

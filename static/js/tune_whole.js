@@ -18,10 +18,16 @@ export const wholeRun = el("section", { id: "tune-whole-run", "aria-label": "The
   el("label", { title: "Each change maps the run again from its first scan, so that the whole map and its score follow; else it acts from the scan that stands here" }, box, " map the whole run again"),
   progress, told, list);
 
-function lead({ before, after, scans, changes }) {
+// Trees that stayed and are called otherwise now, as [before, now]: numbers are those of the new run, as its files have them.
+const renumbered = ({ renamed }) => renamed.filter(([before, now]) => before !== now);
+
+function lead(told) {
+  const { before, after, scans, changes } = told;
   const number = (kind) => changes.filter((change) => change.kind === kind).length;
   const parts = Object.keys(SIGNS).map((kind) => number(kind) && `${number(kind)} ${kind}`).filter(Boolean);
-  return `${count(scans, "scan")} mapped again: ${before} → ${count(after, "tree")}${parts.length ? `, ${parts.join(", ")}` : ", all where they were"}.`;
+  const others = renumbered(told).length;
+  const numbers = others ? ` Numbers follow the new run: ${others === 1 ? "one tree that stayed has" : `${others} trees that stayed have`} another one.` : "";
+  return `${count(scans, "scan")} mapped again: ${before} → ${count(after, "tree")}${parts.length ? `, ${parts.join(", ")}` : ", all where they were"}.${numbers}`;
 }
 
 // How long it takes yet [s], by how long it took so far; null while that tells nothing.
@@ -46,7 +52,7 @@ function show() {
   if (share === null) begun = null;
   box.checked = state.parameters?.whole ?? true;
   progress.hidden = share === null;
-  list.hidden = !newest?.changes.length;
+  list.hidden = !newest || (!newest.changes.length && !renumbered(newest).length);
   if (share !== null) progress.value = share;
   const ghost = isTuning() ? rough ?? newest : null;
   if (state.ghost !== ghost) {
@@ -57,11 +63,15 @@ function show() {
   else setText(told, newest ? lead(newest) : box.checked ? "Change something: the whole map, its trees and its score follow." : "A change acts from the scan that stands here on.");
 }
 
+const lineOf = (kind, sign, node, why) => el("li", { "data-kind": kind }, el("b", { text: sign, "aria-hidden": "true" }), node, el("small", { text: why }));
+const treeLink = (number, words) => el("button", { class: "link", type: "button", text: `Tree ${number}${words}`, onclick: () => select(number) });
+
 function showChanges() {
-  const changes = state.remapped?.changes ?? [];
-  list.replaceChildren(...changes.slice(0, MOST).map(({ kind, number, why }) => el("li", { "data-kind": kind }, el("b", { text: SIGNS[kind], "aria-hidden": "true" }),
-    kind === "vanished" ? el("span", { text: `Tree ${number} vanished` }) : el("button", { class: "link", type: "button", text: `Tree ${number} ${kind}`, onclick: () => select(number) }), el("small", { text: why }))),
-    changes.length > MOST ? el("li", { text: `and ${changes.length - MOST} more` }) : "");
+  const { changes = [], renamed = [] } = state.remapped ?? {};
+  const lines = [
+    ...changes.map(({ kind, number, why }) => lineOf(kind, SIGNS[kind], kind === "vanished" ? el("span", { text: `Tree ${number} vanished` }) : treeLink(number, ` ${kind}`), why)),
+    ...renumbered({ renamed }).map(([before, now]) => lineOf("renumbered", "#", treeLink(now, ""), `was tree ${before}`))];
+  list.replaceChildren(...lines.slice(0, MOST), lines.length > MOST ? el("li", { text: `and ${lines.length - MOST} more` }) : "");
   show();
 }
 

@@ -15,12 +15,13 @@ import pytest_asyncio
 from websockets.asyncio.client import connect
 from websockets.typing import Origin
 
-from app.annotating import Annotating, contents_of, laid_over
+from app.annotating import Annotating
 from app.dashboard import Dashboard
 from app.keeper import Keeper
 from app.security import session_value
 from app.settings import Settings
 from app.store.records import Annotation, Content
+from app.truths import contents_of, laid_over
 from app.worker_messages import Shown
 from pipeline.truth_table import parse_truth_trees
 from tests.app.fakes import frame, opened, path, truth_trees
@@ -235,6 +236,38 @@ async def test_annotations_lie_over_the_truth_of_the_source() -> None:
         assert dashboard.annotating.as_plain()["used"] == "both"
         await edit(client, "POST", "/undo")
         assert dashboard.truth.x.tolist() == [0.05, 2.0, 9.0]
+
+
+async def test_what_agrees_leaves_the_truth_of_the_source_exact_and_a_person_chooses_what_counts() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard, truth=True)
+        exact = dashboard.truth
+        assert exact is not None
+
+        async def choose(against: str) -> dict[str, Any]:
+            answer = await client.put("/api/annotations/against", json={"against": against})
+            assert answer.status_code == 200
+            told: dict[str, Any] = answer.json()
+            return told
+
+        await edit(client, "POST", x=2.2, y=0.1)  # the tree that was found there is one
+        assert dashboard.truth is not None
+        assert sorted(dashboard.truth.x.tolist()) == sorted(exact.x.tolist())
+        assert dashboard.annotating.as_plain()["contradicting"] == 0
+        await edit(client, "POST", x=0.1, y=0.0, kind="pole")
+        assert dashboard.annotating.as_plain()["contradicting"] == 1
+        told = await choose("own")
+        assert (told["used"], told["own"]) == ("source", len(exact.x))
+        assert dashboard.truth is exact
+        assert (await choose("annotations"))["used"] == "annotations"
+        assert sorted(dashboard.truth.x.tolist()) == [0.1, 2.2]
+        await edit(client, "POST", "/undo")
+        assert dashboard.truth.x.tolist() == [2.2]
+        await edit(client, "POST", "/undo")  # without any there is the source's truth alone
+        assert dashboard.truth is exact
+        refused = await client.put("/api/annotations/against", json={"against": "nothing"})
+        assert refused.status_code == 422
 
 
 def test_without_annotations_the_truth_is_that_of_the_source() -> None:

@@ -20,8 +20,9 @@ def seen(index: int, trees: int, health: Health | None = None):
     return replace(shot, trees=all_of_them, estimate=estimate)
 
 
-def marks(events: Events) -> list[tuple[float, str, str]]:
-    return [(e["t"], e["kind"], e["text"]) for e in events.as_plain()["events"]]
+def marks(events: Events, *, before: bool = False) -> list[tuple[float, str, str]]:
+    told = events.as_plain()["events"]
+    return [(e["t"], e["kind"], e["text"]) for e in told if e.get("before", False) == before]
 
 
 def test_a_tree_is_marked_where_it_was_confirmed_first():
@@ -57,6 +58,29 @@ def test_a_slider_that_moves_is_one_change_and_one_that_came_back_is_none():
     assert marks(events) == [(0.0, "tree", "Tree 1 confirmed"), (0.5, "change", "a: 1 → 2")]
     events.changed({"a": 2, "b": 2}, {"a": 1, "b": 2}, 0.5)
     assert [kind for _, kind, _ in marks(events)] == ["tree"]
+
+
+def test_after_a_rerun_the_marks_of_the_part_that_is_still_to_come_stay_until_it_comes():
+    events = Events()
+    for index, trees in [(0, 1), (9, 2), (20, 3)]:
+        events.shown(seen(index, trees), 0.1 * index)
+    events.changed({"a": 1}, {"a": 2}, 0.5)  # the run had gone back
+    later = [(0.9, "tree", "Tree 2 confirmed"), (2.0, "tree", "Tree 3 confirmed")]
+    assert marks(events, before=True) == later
+    events.remapped([(1, 0.2)], 0.5)
+    now = [(0.2, "tree", "Tree 1 confirmed"), (0.5, "change", "a: 1 → 2")]
+    assert (marks(events), marks(events, before=True)) == (now, later)
+    assert events.shown(seen(12, 2), 1.2)
+    assert marks(events) == [*now, (1.2, "tree", "Tree 2 confirmed")]
+    assert marks(events, before=True) == later[1:]
+    assert events.shown(seen(20, 2), 2.0)  # a mark that is none any more
+    assert marks(events, before=True) == []
+
+
+def test_what_was_passed_over_is_marked_where_it_was_and_not_where_it_was_shown():
+    events = Events()
+    events.shown(seen(30, 2), 3.0, np.array([0.4, np.nan]))
+    assert marks(events) == [(0.4, "tree", "Tree 1 confirmed"), (3.0, "tree", "Tree 2 confirmed")]
 
 
 def test_edits_at_one_time_are_one_mark_that_counts_them_and_stay_when_parameters_change():

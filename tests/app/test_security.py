@@ -87,6 +87,7 @@ ROUTES = [
     ("POST", "/api/annotations/undo"),
     ("POST", "/api/annotations/redo"),
     ("POST", "/api/annotations/import"),
+    ("PUT", "/api/annotations/against"),
     ("GET", "/api/annotations.csv"),
     ("GET", "/api/annotations.geojson"),
     ("GET", "/no/such/route"),

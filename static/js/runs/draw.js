@@ -1,13 +1,14 @@
 // Paints one finished map, or two laid upon one another.
 
 import { figure } from "../format.js";
-import { drawLine, drawNumbers, drawTree, drawTruth, symbolRadius } from "../map_draw.js";
+import { drawLine, drawTree, drawTruth, symbolRadius } from "../map_draw.js";
+import { drawNumbers } from "../map_labels.js";
 
 export function paintRun(pen, view, { path, truth, trees }, colours) {
   drawLine(pen, view, path, colours.path, 2);
   for (const each of truth ?? []) drawTruth(pen, view, each, colours);
   for (const tree of trees) drawTree(pen, view, tree, false, colours);
-  drawNumbers(pen, view, trees, null, colours);
+  drawNumbers(pen, view, trees, null, colours, { radiusOf: symbolRadius });
 }
 
 export function paintTwo(pen, view, told, colours) {
@@ -23,7 +24,7 @@ export function paintTwo(pen, view, told, colours) {
   }
   for (const number of told.only_a) sign(pen, view, of_a.get(number), "×", colours.pole, colours);
   for (const number of told.only_b) sign(pen, view, of_b.get(number), "+", colours.selection, colours);
-  drawNumbers(pen, view, a.map.trees, null, colours);
+  drawNumbers(pen, view, a.map.trees, null, colours, { radiusOf: symbolRadius });
 }
 
 const byNumber = (trees) => new Map(trees.map((tree) => [tree.number, tree]));

@@ -13,9 +13,9 @@ export function picture({ label, legend, paint, bounds, describe }) {
   const tip = el("div", { class: "tip", hidden: true });
   const view = new MapView();
   const fit = () => { view.moved = false; view.fit(bounds(), true); redraw(); };
-  const box = el("div", { class: "run-map" }, canvas, tip,
-    el("div", { class: "map-buttons" }, el("button", { class: "small", text: "Fit", title: "Show the whole map", onclick: fit })),
-    el("ul", { class: "legend", "aria-label": "Legend" }, ...legend.map(([name, text]) => el("li", { class: name, text }))));
+  const frame = el("div", { class: "map-frame" }, canvas, tip,
+    el("div", { class: "map-buttons" }, el("button", { class: "small", text: "Fit", title: "Show the whole map", onclick: fit })));
+  const box = el("div", { class: "run-map" }, frame, el("ul", { class: "legend", "aria-label": "Legend" }, ...legend.map(([name, text]) => el("li", { class: name, text }))));
   let from = null;
 
   function redraw() {
@@ -26,9 +26,9 @@ export function picture({ label, legend, paint, bounds, describe }) {
   }
 
   function resize() {
-    if (!box.clientWidth) return;
-    Object.assign(view, { width: box.clientWidth, height: box.clientHeight });
-    Object.assign(canvas, { width: box.clientWidth * devicePixelRatio, height: box.clientHeight * devicePixelRatio });
+    if (!frame.clientWidth) return;
+    Object.assign(view, { width: frame.clientWidth, height: frame.clientHeight });
+    Object.assign(canvas, { width: frame.clientWidth * devicePixelRatio, height: frame.clientHeight * devicePixelRatio });
     if (!view.moved) view.fit(bounds(), true);
     redraw();
   }
@@ -61,7 +61,7 @@ export function picture({ label, legend, paint, bounds, describe }) {
     step();
     redraw();
   });
-  new ResizeObserver(resize).observe(box);
+  new ResizeObserver(resize).observe(frame);
   return { box, canvas, redraw };
 }
 

@@ -1,0 +1,119 @@
+"""What the map is scored against: what the source knows to stand there, what people annotated, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.store.records import Annotation, Content
+from pipeline.records import TruthTrees
+
+Against = Literal["both", "own", "annotations"]
+Counted = Literal["none", "source", "annotations", "both"]
+
+# So near to an annotation, what the source says to stand there is the same thing [m].
+SAME_THING = 0.5
+
+
+def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> TruthTrees | None:
+    """The truth that counts.
+
+    Args:
+        own: What the source knows, if anything. It is never changed.
+        rows: The annotations.
+        against: "own" leaves annotations aside, "annotations" the source's truth, "both" neither.
+    """
+    used = counted(own, rows, against)
+    if used == "both":
+        return laid_over(own, rows)
+    return own if used in ("none", "source") else _as_truth([row.content for row in rows])
+
+
+def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> Counted:
+    """What counts, where one of the two may not be there."""
+    if own is None:
+        return "annotations" if rows else "none"
+    if not rows or against == "own":
+        return "source"
+    return against
+
+
+def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees | None:
+    """What the source knows, and over it what was annotated within SAME_THING: what says otherwise takes its
+    place; what agrees leaves the source's place and diameter (unless one was typed), for who confirms a tree
+    that was found did not measure where it stands.
+    """
+    if not rows:
+        return own
+    if own is None or not len(own.x):
+        return _as_truth([row.content for row in rows])
+    nearest = _nearest(own, rows)
+    contents = [_agreed(own, int(k), row.content) for k, row in zip(nearest, rows, strict=True)]
+    said = _as_truth(contents)
+    # Of what the source knows, all that stands near an annotation is told by it, or by its neighbour.
+    keep = np.flatnonzero(_gap_to_annotations(own, rows) > SAME_THING)
+    return TruthTrees(
+        np.concatenate([own.x[keep], said.x]),
+        np.concatenate([own.y[keep], said.y]),
+        np.concatenate([own.dbh[keep], said.dbh]),
+        (*(own.kind[k] for k in keep), *said.kind),
+    )
+
+
+def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
+    """How many annotations say of a thing that the source knows that it is something else."""
+    if own is None or not rows or not len(own.x):
+        return 0
+    near = zip(_nearest(own, rows), rows, strict=True)
+    return sum(k >= 0 and own.kind[k] != row.content.kind for k, row in near)
+
+
+def contents_of(truth: TruthTrees) -> list[Content]:
+    """The rows of a table of trees."""
+    columns = zip(truth.x.tolist(), truth.y.tolist(), truth.kind, truth.dbh.tolist(), strict=True)
+    return [Content(x, y, kind, dbh if dbh == dbh else None) for x, y, kind, dbh in columns]
+
+
+def _as_truth(contents: Sequence[Content]) -> TruthTrees:
+    return TruthTrees(
+        np.array([c.x for c in contents]),
+        np.array([c.y for c in contents]),
+        np.array([np.nan if c.dbh is None else c.dbh for c in contents]),
+        tuple(c.kind for c in contents),
+    )
+
+
+def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
+    """An annotation, at the place of what the source knows (row k, -1: nothing is near) if both agree."""
+    if k < 0 or own.kind[k] != content.kind:
+        return content
+    known = float(own.dbh[k])
+    dbh = content.dbh if content.dbh is not None or np.isnan(known) else known
+    return Content(float(own.x[k]), float(own.y[k]), content.kind, dbh)
+
+
+def _nearest(own: TruthTrees, rows: Sequence[Annotation]) -> NDArray[np.int64]:
+    """For each annotation the nearest thing that the source knows, where no other annotation is nearer to it;
+    -1 where there is none within SAME_THING: (A,)."""
+    from scipy.spatial import cKDTree
+
+    places = np.array([(row.content.x, row.content.y) for row in rows])
+    gap, nearest = cKDTree(np.column_stack([own.x, own.y])).query(places)
+    found = np.full(len(rows), -1, dtype=np.int64)
+    taken: set[int] = set()
+    for k in np.argsort(gap, kind="stable").tolist():
+        if gap[k] <= SAME_THING and int(nearest[k]) not in taken:
+            taken.add(int(nearest[k]))
+            found[k] = nearest[k]
+    return found
+
+
+def _gap_to_annotations(own: TruthTrees, rows: Sequence[Annotation]) -> NDArray[np.float64]:
+    from scipy.spatial import cKDTree
+
+    places = np.array([(row.content.x, row.content.y) for row in rows])
+    gap, _ = cKDTree(places).query(np.column_stack([own.x, own.y]))
+    return np.asarray(gap, dtype=np.float64)
