@@ -2,27 +2,23 @@
 
 import { edits } from "./access.js";
 import { annotating, judge, draft, next, redo as redoEdit, toggleAdding, undo as undoEdit } from "./annotate.js";
-import { post } from "./api.js";
 import { byId } from "./dom.js";
-import { toggleFollow, toggleLayer } from "./layers.js";
+import { toggleFollow } from "./layers.js";
 import { select } from "./live.js";
 import { setLoop } from "./marks.js";
 import { stopMeasuring, toggleMeasure } from "./measure.js";
 import { closeOver, openOver } from "./overlay.js";
 import { pressInScene } from "./scene.js";
 import { openSources } from "./sources.js";
-import { state } from "./state.js";
-import { openStory } from "./story.js";
-import { NAMES as TABS, openTab } from "./tabs.js";
+import { openTab } from "./tabs.js";
 import { advance, togglePlay } from "./timeline.js";
-import { isChanged, redo, reset, savedSets, shown, specOf, tuning, undo, use } from "./tune.js";
-import { openParameter, openSearch } from "./tune_panel.js";
+import { redo, reset, undo } from "./tune.js";
+import { openSearch } from "./tune_panel.js";
 
 const click = (id) => () => byId(id).click();
-const openDrawer = () => byId("side").classList.add("open");
-const toTab = (name) => () => { openDrawer(); openTab(name); byId(`tab-${name}`).focus(); };
+export const openDrawer = () => byId("side").classList.add("open");
+export const toTab = (name) => () => { openDrawer(); openTab(name); byId(`tab-${name}`).focus(); };
 const inAnnotate = (run) => edits(() => { if (!annotating()) toTab("annotate")(); run(); });
-const named = (name) => name[0].toUpperCase() + name.slice(1);
 
 export function showSheet() {
   byId("keys-dialog").showModal();
@@ -65,6 +61,9 @@ export const ACTIONS = [
   ["Light or dark", "", "", click("theme-button")],
   ["Open another run", "", "", edits(openSources)],
   ["All runs: look at them, compare two, play one again", "", "", click("runs-link")],
+  ["Share: links to this moment, and for looking only", "", "", click("share-button")],
+  ["Save the map as a picture (PNG)", "", "", click("map-png")], ["Save the map as a table (CSV)", "", "", click("map-csv")],
+  ["Save the table of trees as a picture (PNG)", "", "", () => { toTab("trees")(); byId("trees-png").click(); }],
   ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv")],
   ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],
   ["Annotate: add trees by clicks on the map", "", "", inAnnotate(() => toggleAdding(true))],
@@ -76,16 +75,3 @@ export const ACTIONS = [
   ["Select nothing; close what lies over the scene", "esc", "Escape", leave],
   ["Keyboard shortcuts", "?", "?", showSheet],
 ];
-
-// What depends on the run, as [title, keys, what it does].
-export function presentActions() {
-  const layers = (state.view?.layers ?? []).map(({ title, on: seen }, place) =>
-    [`Layer ${title}: ${seen ? "hide" : "show"}`, place < 10 ? String((place + 1) % 10) : "", edits(() => toggleLayer(place))]);
-  const tabs = TABS.map((name) => [`Tab ${named(name)}`, "", toTab(name)]);
-  const sets = [...tuning.presets.map(({ name }) => [`Use the preset ${name}`, "", edits(() => use(name))]), ...savedSets().map(({ name }) => [`Use the saved set ${name}`, "", edits(() => use(name))])];
-  const speeds = [...byId("speed").options].map(({ value, text }) => [`Speed ${text}`, "", edits(() => post("/api/command", { type: "set_speed", factor: Number(value) }))]);
-  const parameters = tuning.specs.map(({ name, stage, title }) =>
-    [`${stage}: ${title} (${shown(state.parameters?.values[name], specOf(name))}${isChanged(name) ? ", changed" : ""})`, "", () => openParameter(name)]);
-  const trees = (state.map?.trees ?? []).map(({ number }) => [`Tree ${number}`, "", () => { openDrawer(); openStory("tree"); select(number); }]);
-  return [...tabs, ...layers, ...sets, ...speeds, ...parameters, ...trees];
-}

@@ -11,22 +11,22 @@ const counts = {};
 let countedAt = 0;
 const newest = {}; // counts by layer, as the scan or a choice told them last
 
-const choose = (name, value) => patch("/api/view", { name, value }).catch(() => {});
+export const chooseView = (name, value) => patch("/api/view", { name, value }).catch(() => {});
 
 // Keys 1 to 9 and 0 switch the layers in their order.
 export function toggleLayer(place) {
   const layer = state.view?.layers[place];
-  if (layer) choose(layer.name, !layer.on);
+  if (layer) chooseView(layer.name, !layer.on);
 }
 
-export const toggleFollow = () => choose("follow", !state.view?.follow);
+export const toggleFollow = () => chooseView("follow", !state.view?.follow);
 
 function show() {
   const view = state.view;
   if (!view) return;
   byId("follow").setAttribute("aria-pressed", String(view.follow));
   const rows = view.layers.map(({ name, title, on: seen, colour }, place) => {
-    const box = el("input", { type: "checkbox", "data-layer": name, onchange: (event) => choose(name, event.target.checked) });
+    const box = el("input", { type: "checkbox", "data-layer": name, onchange: (event) => chooseView(name, event.target.checked) });
     box.checked = seen;
     counts[name] = el("span", { class: "count" });
     const key = place < 10 ? String((place + 1) % 10) : "";
@@ -34,7 +34,7 @@ function show() {
       el("i", { style: { background: colour ?? "linear-gradient(90deg, var(--tree), var(--pole), var(--selection))" } }), el("span", { text: title }), counts[name]);
   });
   const choices = Object.entries(TITLES).map(([name, title]) => {
-    const list = el("select", { "data-choice": name, onchange: (event) => choose(name, event.target.value) },
+    const list = el("select", { "data-choice": name, onchange: (event) => chooseView(name, event.target.value) },
       ...view[name].of.map((text) => el("option", { value: text, text })));
     list.value = view[name].value;
     return el("label", { class: "choice" }, el("span", { text: title }), list);

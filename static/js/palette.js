@@ -1,7 +1,8 @@
 // Ctrl+K: everything that can be done, found by typing.
 
 import { mayDo } from "./access.js";
-import { ACTIONS, presentActions } from "./actions.js";
+import { ACTIONS } from "./actions.js";
+import { presentActions } from "./actions_here.js";
 import { byId, el } from "./dom.js";
 
 const MOST = 60; // entries that are listed; nobody reads farther
@@ -16,13 +17,21 @@ export function openPalette() {
   sift();
 }
 
-// All words must occur; titles that begin with what was typed come first.
+// All words must occur, in the title or in what else an entry is found by. What the title begins with comes first, then titles that
+// have a word so, then other titles; of parameters their names and sentences count last.
 function search(text) {
   const words = text.toLowerCase().split(/\s+/).filter(Boolean);
   const all = [...ACTIONS.map(([title, keys, , run]) => [title, keys, run]), ...presentActions()].filter(([, , run]) => mayDo(run));
-  const fitting = all.filter(([title]) => words.every((word) => title.toLowerCase().includes(word)));
-  const rank = ([title]) => (/^Tree \d/.test(title) && !/\d/.test(text) ? 3 : title.toLowerCase().startsWith(words.join(" ")) ? 0 : title.toLowerCase().split(/\W+/).some((word) => words.length && word.startsWith(words[0])) ? 1 : 2);
-  return fitting.map((entry, place) => ({ entry, place, rank: rank(entry) })).sort((a, b) => a.rank - b.rank || a.place - b.place).map(({ entry }) => entry);
+  const fitting = all.filter(([title, , , more = ""]) => words.every((word) => `${title} ${more}`.toLowerCase().includes(word)));
+  return fitting.map((entry, place) => ({ entry, place, rank: rankOf(entry[0], words, text) })).sort((a, b) => a.rank - b.rank || a.place - b.place).map(({ entry }) => entry);
+}
+
+function rankOf(title, words, text) {
+  const low = title.toLowerCase();
+  if (!words.every((word) => low.includes(word))) return 4;
+  if (/^Tree \d/.test(title) && !/\d/.test(text)) return 3;
+  if (low.startsWith(words.join(" "))) return 0;
+  return low.split(/\W+/).some((word) => words.length && word.startsWith(words[0])) ? 1 : 2;
 }
 
 function sift() {

@@ -25,7 +25,7 @@ const told = el("p", { class: "note dim", role: "status" });
 const plot = el("div", { class: "sensitivity-plot" });
 const choice = el("select", { "aria-label": "What is drawn", class: "small", onchange: draw }, ...Object.entries(MEASURES).map(([name, { words }]) => el("option", { value: name, text: words })));
 const best = el("button", { class: "small", type: "button", hidden: true });
-const again = el("button", { class: "small", type: "button", text: "Again", title: "Compute it with the values as they are now", onclick: () => ask(specOf(state.sensitivity.name)) });
+const again = el("button", { class: "small", type: "button", text: "Again", title: "Compute it with the values as they are now", onclick: () => askHowMuch(specOf(state.sensitivity.name)) });
 const close = el("button", { class: "small", type: "button", text: "Close", onclick: () => attempt(() => request("/api/sensitivity", { method: "DELETE" })) });
 const section = el("section", { class: "sensitivity", "aria-label": "How much this matters" },
   el("div", { class: "sensitivity-head" }, choice, best, el("span", { class: "grow" }), again, close), plot, told);
@@ -39,13 +39,13 @@ export function valuesOf(spec, present) {
   return [...new Set([present, spec.default, ...places.map((place) => fromPlace(spec, place))])];
 }
 
-function ask(spec) {
+export function askHowMuch(spec) {
   toShow = spec.name;
   return attempt(() => post("/api/sensitivity", { name: spec.name, values: valuesOf(spec, valueOf(spec.name)) }));
 }
 
 export const matterButton = (spec) => el("button", { class: "quiet icon matter", type: "button", text: "∿", title: "How much does this matter? The score of the whole run over its range",
-  "aria-label": `How much does ${spec.title} matter?`, onclick: () => ask(spec) });
+  "aria-label": `How much does ${spec.title} matter?`, onclick: () => askHowMuch(spec) });
 
 const isNumber = (spec) => spec.kind === "int" || spec.kind === "float";
 const choicesOf = (spec) => (spec.kind === "bool" ? [false, true] : spec.choices);

@@ -144,7 +144,7 @@ async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: R
     client, dashboard = both
     await show(dashboard)
     await dashboard.select_tree(2)
-    changes = MapChanges(1, 3, 4, 2, [(0.0, 1.0, None)], [(1, 1), (2, 5)], [], [(1, 0.1), (5, 0.2)])
+    changes = MapChanges(1, 3, 0.2, 4, 2, [(0.0, 1.0, None)], [(1, 1), (2, 5)], [], [(1, 0.1), (5, 0.2)])
     frame = dashboard.shown.frame if dashboard.shown else None
     assert frame is not None
     await dashboard.receive(Rough(7, 1, frame.trees))  # of a run that was left
