@@ -37,5 +37,5 @@ export async function startAccess() {
   end.prepend(el("span", { id: "looks-only", class: "looks-only", text: "View only", title: "This link is for looking only. Ask who runs stemmap for the link that may change things" }));
   // The panel of sliders in the scene belongs to viser; a veil over it says that it cannot be moved.
   document.querySelector(".scene")?.append(el("div", { class: "veil", title: "View only: parameters cannot be changed" }));
-  if (byId("welcome-open")) byId("welcome-open").hidden = true;
+  for (const id of ["welcome-open", "welcome-robot"]) if (byId(id)) byId(id).hidden = true;
 }

@@ -17,10 +17,11 @@ const sides = {};
 let data = null, planned = false;
 
 const nameOf = (side) => sides[side].list.value;
+const asked = () => JSON.stringify([nameOf("a"), nameOf("b")]);
 
 function build() {
   for (const [k, side] of ["a", "b"].entries()) {
-    const list = el("select", { "aria-label": `Set ${side.toUpperCase()}`, "data-set": side, onchange: refresh });
+    const list = el("select", { "aria-label": `Set ${side.toUpperCase()}`, "data-set": side, onchange: chosen });
     const canvas = el("canvas", { tabindex: "0", role: "img", "aria-label": `Clusters by set ${side.toUpperCase()}` });
     const take = el("button", { "data-edit": true, class: "small", text: "Use", title: "Take this set for the run", onclick: () => use(nameOf(side)) });
     sides[side] = { k, list, canvas, take, picture: new PointPicture(canvas, eye, redraw) };
@@ -28,7 +29,7 @@ function build() {
   }
   byId("compare-swap").addEventListener("click", () => {
     [sides.a.list.value, sides.b.list.value] = [nameOf("b"), nameOf("a")];
-    refresh();
+    chosen();
   });
   new ResizeObserver(redraw).observe(byId("compare-pictures"));
 }
@@ -72,6 +73,13 @@ function draw(side) {
   canvas.setAttribute("aria-label", `Set ${side.toUpperCase()}, ${list.selectedOptions[0]?.text}: ${verdicts.tree ?? 0} trees of ${clusters.x.length} clusters`);
 }
 
+// What stands there is of other sets until the answer comes.
+function chosen() {
+  byId("over-compare").classList.add("waits");
+  setText(byId("compare-lead"), "Mapping this scan with both sets …");
+  refresh();
+}
+
 const refresh = keepFresh(async () => {
   if (!shownOver("compare")) return;
   fillLists();
@@ -83,11 +91,16 @@ const refresh = keepFresh(async () => {
     return;
   }
   try {
-    data = unpack(await blockFor("/api/compare", { a: nameOf("a"), b: nameOf("b") }));
-    setText(lead, `Scan ${data.pictures[0].index}, mapped with both sets from the same state. On the map: left half A, right half B.`);
-    byId("over-compare").dataset.scan = String(data.pictures[0].index);
-    fillComparison(data, sides.a.list.selectedOptions[0]?.text, sides.b.list.selectedOptions[0]?.text);
+    const of = asked();
+    data = { ...unpack(await blockFor("/api/compare", { a: nameOf("a"), b: nameOf("b") })), asked: of };
+    if (data.asked === asked()) { // else another set was chosen meanwhile, and its answer is on the way
+      setText(lead, `Scan ${data.pictures[0].index}, mapped with both sets from the same state. On the map: left half A, right half B.`);
+      byId("over-compare").dataset.scan = String(data.pictures[0].index);
+      byId("over-compare").classList.remove("waits");
+      fillComparison(data, sides.a.list.selectedOptions[0]?.text, sides.b.list.selectedOptions[0]?.text);
+    }
   } catch (error) {
+    byId("over-compare").classList.remove("waits");
     setText(lead, error.message);
   }
   show();

@@ -58,6 +58,6 @@ export function startKeys() {
   document.addEventListener("keydown", (event) => act(event, false));
   onSceneLoad((inner) => inner.addEventListener("keydown", (event) => act(event, true), { capture: true }));
   byId("keys-button").addEventListener("click", showSheet);
-  byId("keys-list").replaceChildren(...sheet().flatMap(([keys, text]) =>
-    [el("dt", {}, ...keys.split(" ").map((key) => el("kbd", { text: key }))), el("dd", { text })]));
+  byId("keys-list").replaceChildren(...sheet().map(([keys, text]) =>
+    el("div", {}, el("dt", {}, ...keys.split(" ").map((key) => el("kbd", { text: key }))), el("dd", { text: text[0].toUpperCase() + text.slice(1) }))));
 }

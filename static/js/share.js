@@ -8,7 +8,13 @@ import { on, state } from "./state.js";
 
 const PATIENCE = 120_000; // [ms] for a run to open
 const frame = byId("scene");
-const controls = () => frame.contentWindow?.__viserMutable?.cameraControl ?? null;
+const controls = () => {
+  try {
+    return frame.contentWindow?.__viserMutable?.cameraControl ?? null;
+  } catch {
+    return null; // the scene could not be loaded: what stands in its frame is the browser's own page
+  }
+};
 const rounded = (values) => values.map((value) => value.toFixed(2)).join(",");
 
 function camera() {

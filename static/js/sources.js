@@ -10,10 +10,13 @@ const dialog = byId("source-dialog");
 let asked = null; // the address that was asked for and is not there yet
 let left = null; // the status that stood before
 
-export async function openSources() {
+// `begin` is what an address begins with, for who has to type the rest.
+export async function openSources(begin = "") {
   say("");
   if (!dialog.open) dialog.showModal();
-  byId("source-uri").focus();
+  const address = byId("source-uri");
+  if (typeof begin === "string" && begin) address.value = begin;
+  address.focus();
   try {
     list(await get("/api/sources"));
   } catch (error) {
@@ -71,8 +74,7 @@ function say(text) {
 }
 
 export function startSources() {
-  byId("source-button").addEventListener("click", openSources);
-  byId("notice-open").addEventListener("click", openSources);
+  for (const id of ["source-button", "notice-open"]) byId(id).addEventListener("click", () => openSources());
   byId("source-close").addEventListener("click", () => { asked = null; dialog.close(); setText(byId("source-open"), "Open"); });
   byId("source-form").addEventListener("submit", (event) => {
     event.preventDefault();

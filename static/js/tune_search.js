@@ -22,7 +22,7 @@ const list = el("ul", { id: "search-axes", "aria-label": "Searched over" });
 const more = el("select", { id: "search-more", "aria-label": "Search over another parameter", onchange: () => { if (more.value) addAxis(more.value); more.value = ""; } });
 const form = el("form", { id: "search-form", hidden: true, onsubmit: start },
   el("p", { class: "note dim", text: "The whole run is mapped again and again with other values, begun at those in force, and judged by its true trees." }),
-  el("label", { class: "search-goal" }, "Goal ", goal), list, more,
+  el("label", { class: "search-goal" }, "Goal ", goal), el("div", { class: "search-names dim", "aria-hidden": "true" }, ...["Searched over", "from", "to", ""].map((text) => el("span", { text }))), list, more,
   el("div", { class: "search-limits" }, number("search-trials", "Trials", 200, 5000), number("search-minutes", "Minutes at most", 10, 1440)),
   el("div", { class: "search-buttons" }, el("button", { id: "search-start", class: "small primary", text: "Search" }), button("search-cancel", "Cancel", "Close, and search for nothing", () => openForm(false))));
 const told = el("p", { id: "search-told", class: "note", role: "status" });

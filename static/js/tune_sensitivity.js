@@ -72,7 +72,9 @@ function draw() {
   const measure = MEASURES[choice.value];
   const points = asked.points.filter((point) => !point.error).map((point) => ({ ...point, y: measure.of(point), x: share(spec, point.value) }))
     .filter(({ y }) => y !== null).sort((a, b) => a.x - b.x);
-  plot.replaceChildren(...(points.length ? [curve(spec, points, measure)] : []));
+  if (points.length) plot.replaceChildren(curve(spec, points, measure));
+  else if (asked.error || asked.points.length) plot.replaceChildren();
+  else if (!plot.querySelector("progress")) plot.replaceChildren(el("progress", { "aria-label": "The run is mapped for the first value" }));
   tell(asked, spec, points, measure);
   if (toShow !== asked.name) return;
   toShow = "";

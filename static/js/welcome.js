@@ -4,10 +4,13 @@ import { byId, recall, remember, setText } from "./dom.js";
 import { openSources } from "./sources.js";
 import { on } from "./state.js";
 
+const ROBOT = "zenoh:tcp/"; // the router's address follows
+
 export function startWelcome() {
   const card = byId("welcome");
   card.addEventListener("close", () => remember("welcomed", "yes"));
-  byId("welcome-open").addEventListener("click", () => card.addEventListener("close", openSources, { once: true }));
+  byId("welcome-open").addEventListener("click", () => card.addEventListener("close", () => openSources(), { once: true }));
+  byId("welcome-robot").addEventListener("click", () => card.addEventListener("close", () => openSources(ROBOT), { once: true }));
   let asked = false;
   on("status", ({ status }) => {
     if (asked || recall("welcomed") !== null) return;

@@ -98,6 +98,14 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     expect(page.locator("[data-rate=FA] small")).to_have_text(f"1 of {before['FA']['of'] + 1}")
     person.tab("Annotate")
 
+    # It contradicts what is known for certain: that is said, and whose word counts is chosen.
+    expect(page.locator("#annotate-warned")).to_contain_text("otherwise than the truth that this run brings")
+    page.locator("#annotate-against").select_option("own")
+    person.until_server("/api/evaluation", f"it.FA.count === {before['FA']['count']}")
+    expect(page.locator("#annotate-warned")).to_be_hidden()
+    page.locator("#annotate-against").select_option("both")
+    person.until_server("/api/evaluation", f"it.FA.count === {before['FA']['count'] + 1}")
+
     # A click beside a tree snaps to it, one in the open does not.
     tree = max(found, key=lambda each: each["observations"])
     canvas.press("a")

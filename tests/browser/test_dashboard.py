@@ -318,3 +318,31 @@ def test_light_and_dark_are_remembered(dashboard: Dashboard):
 
 def test_nothing_was_complained_about(dashboard: Dashboard):
     assert dashboard.errors == []
+
+
+# Draws numbers of trees that stand close together with a pen that remembers where; [boxes, what is named].
+NUMBERS = """() => import('/static/js/map_labels.js').then(({ drawNumbers }) => {
+  const boxes = [], radius = 6;
+  const pen = { measureText: (text) => ({ width: 7 * text.length }), strokeText: () => {},
+    fillText: (text, x, y) => boxes.push({ text, x, y: y - 9, width: 7 * text.length, height: 11 }) };
+  const view = { width: 400, height: 300, toScreen: (x, y) => [x, y] };
+  const trees = Array.from({ length: 60 }, (_, k) =>
+    ({ number: k + 1, x: 40 + (37 * k) % 300, y: 40 + (53 * k) % 190, observations: k }));
+  trees.push({ number: 99, x: 41, y: 41, observations: 0 });
+  drawNumbers(pen, view, trees, 99, {}, { radiusOf: () => radius });
+  const apart = (a, b) => a.x >= b.x + b.width || a.y >= b.y + b.height;
+  const meet = (a, b) => !apart(a, b) && !apart(b, a);
+  const size = { width: 2 * radius, height: 2 * radius };
+  const symbols = trees.map(({ x, y }) => ({ x: x - radius, y: y - radius, ...size }));
+  const others = boxes.filter(({ text }) => text !== '99');
+  const covered = others.filter((box) => [...boxes, ...symbols].some((b) => b !== box && meet(b, box)));
+  return [boxes.map(({ text }) => text), covered.map(({ text }) => text)];
+})"""
+
+
+def test_numbers_on_the_map_cover_neither_one_another_nor_a_symbol(dashboard: Dashboard):
+    named, covered = dashboard.page.evaluate(NUMBERS)
+    assert covered == []
+    assert named[0] == "99"  # what is selected comes first, and is named in any case
+    assert named[1] == "60"  # then what was seen most often
+    assert 10 < len(named) <= 61

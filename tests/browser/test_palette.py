@@ -8,6 +8,18 @@ from playwright.sync_api import expect
 
 from tests.browser.dashboard import Dashboard
 
+FOUND = {
+    "tree_share": "Votes for a tree",
+    "how much does radius eps": "How much does Radius eps matter?",
+    "tune for me": "Tune for me",
+    "learn grow": "Learn: grow",
+    "score against": "Score against",
+    "topics": "Topics and mounting",
+    "plot time": "Plot: Time of each stage",
+    "label dbh": "Label the scene with DBH",
+    "upload rec": "Upload a recording",
+}
+
 
 def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
     page = dashboard.page
@@ -40,6 +52,9 @@ def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
     expect(options.first).to_contain_text("show")
     options.first.click()
     page.keyboard.press("Control+k")
+    for words, first in FOUND.items():  # what stands in the panels, and parameters by their names
+        find.fill(words)
+        expect(options.first).to_contain_text(first)
     find.fill("no such thing")
     expect(page.locator("#palette-none")).to_be_visible()
     find.fill("preset forest")
