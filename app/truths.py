@@ -50,8 +50,8 @@ def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees 
         return own
     if own is None or not len(own.x):
         return _as_truth([row.content for row in rows])
-    nearest = _nearest(own, rows)
-    contents = [_agreed(own, int(k), row.content) for k, row in zip(nearest, rows, strict=True)]
+    nearest = _nearest(own, rows).tolist()
+    contents = [_agreed(own, k, row.content) for k, row in zip(nearest, rows, strict=True)]
     said = _as_truth(contents)
     # Of what the source knows, all that stands near an annotation is told by it, or by its neighbour.
     keep = np.flatnonzero(_gap_to_annotations(own, rows) > SAME_THING)
@@ -67,7 +67,7 @@ def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
     """How many annotations say of a thing that the source knows that it is something else."""
     if own is None or not rows or not len(own.x):
         return 0
-    near = zip(_nearest(own, rows), rows, strict=True)
+    near = zip(_nearest(own, rows).tolist(), rows, strict=True)
     return sum(k >= 0 and own.kind[k] != row.content.kind for k, row in near)
 
 

@@ -256,7 +256,9 @@ async def test_what_agrees_leaves_the_truth_of_the_source_exact_and_a_person_cho
         assert sorted(dashboard.truth.x.tolist()) == sorted(exact.x.tolist())
         assert dashboard.annotating.as_plain()["contradicting"] == 0
         await edit(client, "POST", x=0.1, y=0.0, kind="pole")
-        assert dashboard.annotating.as_plain()["contradicting"] == 1
+        await edit(client, "POST", x=30.0, y=0.0, kind="pole")  # nobody knew of it
+        assert (await client.get("/api/annotations")).json()["contradicting"] == 1
+        await edit(client, "POST", "/undo")
         told = await choose("own")
         assert (told["used"], told["own"]) == ("source", len(exact.x))
         assert dashboard.truth is exact
