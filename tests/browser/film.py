@@ -26,6 +26,7 @@ FILM_COLOURS = 64
 SHADES = 64  # of each colour in a picture: the files stay small, and no colour is lost as in a palette
 STEP_MS = 700
 _SHADE = 256 // SHADES
+_ROUNDS = 6
 
 
 class Camera:
@@ -47,7 +48,10 @@ class Camera:
             height = round(shot.height * FILM_WIDTH / shot.width)
             small = shot.resize((FILM_WIDTH, height), Image.Resampling.LANCZOS)
             self._film.append(
-                small.quantize(FILM_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+                # Refined, or a dark ground takes the tint of whatever colour is nearest.
+                small.quantize(
+                    FILM_COLOURS, Image.Quantize.MAXCOVERAGE, kmeans=_ROUNDS, dither=Image.Dither.NONE
+                )
             )
 
     def save_film(self) -> None:
