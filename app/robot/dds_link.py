@@ -166,6 +166,7 @@ class DdsLink:
                 continue
             if known is not None:
                 waiting.detach(known.ready)
+                self._take(known)
             readers[channel.number] = _Reader(participant, channel, asked, self._note_lost)
             waiting.attach(readers[channel.number].ready)
 

@@ -245,7 +245,8 @@ def test_a_writer_in_cdr_is_heard(drive: Path):
         writers: dict[str, Any] = {}
         for topic, msgtype, _ in _messages(drive, one_each=True):
             held = [Policy.Durability.TransientLocal] if topic.endswith("tf_static") else []
-            qos = Qos(Policy.Reliability.Reliable(10**9), Policy.History.KeepAll, *held)
+            # A writer waits so long for a reader that is behind, and fails then.
+            qos = Qos(Policy.Reliability.Reliable(60 * 10**9), Policy.History.KeepAll, *held)
             written: Any = Topic(participant, f"rt{topic}", idl_type(msgtype))
             writers[topic] = DataWriter(participant, written, qos)
         sent = [(topic, idl_type(kind).deserialize(cdr)) for topic, kind, cdr in _messages(drive)]
