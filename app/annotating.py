@@ -69,7 +69,9 @@ class Annotating:
 
         self._own = self.truth = own
         try:
-            self.run, self.rows, self.truth = await self._keeper.ask(work)
+            self.run, self.rows, truth = await self._keeper.ask(work)
+            # Somebody may have chosen meanwhile.
+            self.truth = truth if self.against == "both" else truth_of(own, self.rows, self.against)
             self.problem = ""
         except StemmapError as error:
             if str(error) != self.problem:

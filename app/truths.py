@@ -16,6 +16,8 @@ Counted = Literal["none", "source", "annotations", "both"]
 
 # So near to an annotation, what the source says to stand there is the same thing [m].
 SAME_THING = 0.5
+# So many things of the source are looked at for an annotation: no more stems stand within SAME_THING.
+_MOST_NEAR = 8
 
 
 def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> TruthTrees | None:
@@ -50,11 +52,11 @@ def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees 
         return own
     if own is None or not len(own.x):
         return _as_truth([row.content for row in rows])
-    nearest = _nearest(own, rows).tolist()
-    contents = [_agreed(own, k, row.content) for k, row in zip(nearest, rows, strict=True)]
+    nearest = _nearest(own, rows)
+    contents = [_agreed(own, k, row.content) for k, row in zip(nearest.tolist(), rows, strict=True)]
     said = _as_truth(contents)
-    # Of what the source knows, all that stands near an annotation is told by it, or by its neighbour.
-    keep = np.flatnonzero(_gap_to_annotations(own, rows) > SAME_THING)
+    # Only what an annotation is of: who confirms one stem says nothing of another that stands beside it.
+    keep = np.setdiff1d(np.arange(len(own.x)), nearest)
     return TruthTrees(
         np.concatenate([own.x[keep], said.x]),
         np.concatenate([own.y[keep], said.y]),
@@ -96,24 +98,21 @@ def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
 
 
 def _nearest(own: TruthTrees, rows: Sequence[Annotation]) -> NDArray[np.int64]:
-    """For each annotation the nearest thing that the source knows, where no other annotation is nearer to it;
-    -1 where there is none within SAME_THING: (A,)."""
+    """Which row of what the source knows each annotation is of, each of at most one, the nearest pairs first;
+    -1 where nothing that is left stands within SAME_THING: (A,)."""
     from scipy.spatial import cKDTree
 
     places = np.array([(row.content.x, row.content.y) for row in rows])
-    gap, nearest = cKDTree(np.column_stack([own.x, own.y])).query(places)
+    ranks = np.arange(1, min(_MOST_NEAR, len(own.x)) + 1)
+    gaps, near = cKDTree(np.column_stack([own.x, own.y])).query(places, ranks)
     found = np.full(len(rows), -1, dtype=np.int64)
     taken: set[int] = set()
-    for k in np.argsort(gap, kind="stable").tolist():
-        if gap[k] <= SAME_THING and int(nearest[k]) not in taken:
-            taken.add(int(nearest[k]))
-            found[k] = nearest[k]
+    for flat in np.argsort(gaps, axis=None, kind="stable").tolist():
+        a, rank = divmod(flat, len(ranks))
+        if gaps[a, rank] > SAME_THING:
+            break
+        k = int(near[a, rank])
+        if found[a] < 0 and k not in taken:
+            taken.add(k)
+            found[a] = k
     return found
-
-
-def _gap_to_annotations(own: TruthTrees, rows: Sequence[Annotation]) -> NDArray[np.float64]:
-    from scipy.spatial import cKDTree
-
-    places = np.array([(row.content.x, row.content.y) for row in rows])
-    gap, _ = cKDTree(places).query(np.column_stack([own.x, own.y]))
-    return np.asarray(gap, dtype=np.float64)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 import pytest_asyncio
 from websockets.asyncio.client import connect
@@ -23,6 +24,7 @@ from app.settings import Settings
 from app.store.records import Annotation, Content
 from app.truths import contents_of, laid_over
 from app.worker_messages import Shown
+from pipeline.records import TruthTrees
 from pipeline.truth_table import parse_truth_trees
 from tests.app.fakes import frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, TOKEN, Running, running, served
@@ -279,6 +281,18 @@ def test_without_annotations_the_truth_is_that_of_the_source() -> None:
     alone = laid_over(None, [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", 0, 1)])
     assert alone is not None
     assert (alone.x.tolist(), alone.dbh.tolist()) == ([1.0], [0.3])
+
+
+def test_who_confirms_one_stem_of_two_says_nothing_of_the_other() -> None:
+    own = TruthTrees(np.array([0.0, 0.4]), np.zeros(2), np.array([0.2, 0.3]), ("tree", "bush"))
+    one = Annotation(1, Content(0.05, 0.0, "tree", None), "Ann", 0, 1)
+    laid = laid_over(own, [one])
+    assert laid is not None
+    assert (laid.x.tolist(), laid.kind) == ([0.4, 0.0], ("bush", "tree"))
+    # The second is of what the first, which is nearer, leaves.
+    both = laid_over(own, [Annotation(2, Content(0.15, 0.0, "bush", None), "Ann", 0, 1), one])
+    assert both is not None
+    assert (both.x.tolist(), both.kind) == ([0.4, 0.0], ("bush", "tree"))
 
 
 async def test_every_browser_is_told() -> None:
