@@ -31,24 +31,30 @@ class CameraDesk:
         self._kept: OrderedDict[int, bytes] = OrderedDict()
         self._turn = asyncio.Lock()
         self._next_at = 0.0
+        # Runs may have pictures of the same time, as simulated ones do, also after a restart.
+        self._of = time.time_ns() // 1_000_000
 
     def forget(self) -> None:
         """Another run begins."""
         self._kept.clear()
+        self._of += 1
 
     def jpeg(self, stamp_ns: int) -> bytes | None:
         """A picture that was told of lately."""
         return self._kept.get(stamp_ns)
 
     async def look(self, frame: Frame) -> dict[str, Any]:
-        """What is to be seen at the time of a scan: the picture's stamp, its marks, and why there are none.
+        """What is to be seen at the time of a scan: the picture's stamp, its marks, why there are none, and
+        `of`, another number for each run.
 
         Raises:
             NoStoryError: There is no picture, and why.
         """
         async with self._turn:
+            of = self._of
             await asyncio.sleep(max(0.0, self._next_at - time.monotonic()))
             found = await self._asking.camera(frame.stamp_ns)
+            self._check(of)
             picture = found.picture
             if picture.stamp_ns not in self._kept:
                 told = {"encoding": picture.encoding, "width": picture.width, "height": picture.height,
@@ -58,6 +64,7 @@ class CameraDesk:
                     raise NoStoryError(
                         "this picture cannot be decoded", remedy="It is damaged, or of an unknown encoding"
                     )
+                self._check(of)
                 self._kept[picture.stamp_ns] = content
                 while len(self._kept) > _MOST_KEPT:
                     self._kept.popitem(last=False)
@@ -65,9 +72,15 @@ class CameraDesk:
         camera = found.camera
         return {
             "index": frame.index,
+            "of": of,
             "stamp_ns": str(picture.stamp_ns),  # more digits than a number of JavaScript has
             "later_ms": round((picture.stamp_ns - frame.stamp_ns) / 1e6),
             "marks": [] if camera is None else await asyncio.to_thread(marks_of, frame, camera),
             "why": found.why,
             "told": found.told,
         }
+
+    def _check(self, of: int) -> None:
+        """Raises: NoStoryError: Another run was opened since."""
+        if of != self._of:
+            raise NoStoryError("another run was opened", remedy="Its picture comes with its first scan")

@@ -12,7 +12,7 @@ import { verdictOf } from "./verdicts.js";
 const EVERY = 500; // [ms] between two pictures
 const AGAIN = 3000; // [ms] after which a picture that could not be had is asked for once more
 const LATE = 50; // [ms] beside the scan from which on it is said
-let seen = null, marks = [], shownStamp = "";
+let seen = null, marks = [], shown = "";
 
 const image = () => byId("camera-image");
 
@@ -24,9 +24,10 @@ const refresh = keepFresh(async () => {
   }
   try {
     seen = await get("/api/camera");
-    if (seen.stamp_ns !== shownStamp) {
-      await load(`/api/camera/${seen.stamp_ns}.jpg`);
-      shownStamp = seen.stamp_ns;
+    const address = `/api/camera/${seen.stamp_ns}.jpg?of=${seen.of}`; // another run may have a picture of the same time
+    if (address !== shown) {
+      await load(address);
+      shown = address;
     }
     draw();
   } catch (error) {

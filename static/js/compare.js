@@ -87,20 +87,22 @@ const refresh = keepFresh(async () => {
   for (const { take, list } of Object.values(sides)) take.disabled = list.value === "";
   if (!state.map) {
     data = null;
+    byId("over-compare").classList.remove("waits");
     setText(lead, "No scan yet. Press play, or open a run.");
     return;
   }
   try {
     const of = asked();
-    data = { ...unpack(await blockFor("/api/compare", { a: nameOf("a"), b: nameOf("b") })), asked: of };
-    if (data.asked === asked()) { // else another set was chosen meanwhile, and its answer is on the way
+    const told = unpack(await blockFor("/api/compare", { a: nameOf("a"), b: nameOf("b") }));
+    if (of === asked()) { // else another set was chosen meanwhile, and its answer is on the way
+      data = { ...told, asked: of };
       setText(lead, `Scan ${data.pictures[0].index}, mapped with both sets from the same state. On the map: left half A, right half B.`);
       byId("over-compare").dataset.scan = String(data.pictures[0].index);
       byId("over-compare").classList.remove("waits");
       fillComparison(data, sides.a.list.selectedOptions[0]?.text, sides.b.list.selectedOptions[0]?.text);
     }
   } catch (error) {
-    byId("over-compare").classList.remove("waits");
+    if (data?.asked === asked()) byId("over-compare").classList.remove("waits"); // else what stands there stays dim: it is of other sets
     setText(lead, error.message);
   }
   show();

@@ -149,7 +149,13 @@ async def test_the_page_asks_for_the_picture_and_its_marks(both: Running) -> Non
     damaged = Picture(5_260_000_000, "", 0, 0, 0, bomb())
     lost = CameraPicture(replace(raw, stamp_ns=5_270_000_000), None, "no CameraInfo")
     asked = answering(
-        dashboard, CameraPicture(raw, CAMERA, ""), CameraPicture(damaged, CAMERA, ""), lost, "no picture"
+        dashboard,
+        CameraPicture(raw, CAMERA, ""),
+        CameraPicture(damaged, CAMERA, ""),
+        lost,
+        "no picture",
+        lost,
+        lost,
     )
     seen = (await client.get("/api/camera")).json()
     assert asked == [5_200_000_000]
@@ -167,3 +173,15 @@ async def test_the_page_asks_for_the_picture_and_its_marks(both: Running) -> Non
     assert "no picture" in (await client.get("/api/camera")).text
     dashboard.camera.forget()
     assert (await client.get("/api/camera/5250000000.jpg")).status_code == 404
+    # Another run may have a picture of the same time.
+    assert (await client.get("/api/camera")).json()["of"] != unplaced["of"]
+    camera = dashboard.asking.camera
+
+    async def left_meanwhile(stamp_ns: int) -> CameraPicture:
+        found = await camera(stamp_ns)
+        dashboard.camera.forget()
+        return found
+
+    dashboard.asking.camera = left_meanwhile  # type: ignore[method-assign]
+    assert "another run was opened" in (await client.get("/api/camera")).text
+    assert (await client.get("/api/camera/5270000000.jpg")).status_code == 404

@@ -9,7 +9,7 @@ from playwright.sync_api import Browser, expect
 
 from tests.browser.conftest import opened
 from tests.browser.contrast import too_low
-from tests.browser.dashboard import Dashboard
+from tests.browser.dashboard import COMPILING_S, Dashboard
 from tests.browser.serving import Server
 
 TABS = ("Trees", "Clusters", "Story", "Tune", "Annotate", "Scores", "Plots")
@@ -20,7 +20,8 @@ SIZES = [(1440, 900), (390, 844)]
 @pytest.fixture(params=SIZES, ids=["desk", "phone"])
 def page_of_a_run(request: pytest.FixtureRequest, chromium: Browser, server: Server) -> Iterator[Dashboard]:
     with opened(chromium, server.link, *request.param) as dashboard:
-        dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
+        trees = "() => document.querySelectorAll('#trees tbody tr').length > 0"
+        dashboard.page.wait_for_function(trees, polling=200, timeout=1000 * COMPILING_S)
         # Without the 3D scene, which is viser's and would be loaded anew with each theme.
         dashboard.page.evaluate("() => document.querySelector('#scene').removeAttribute('src')")
         drawer = dashboard.page.locator("#drawer-button")
