@@ -15,7 +15,7 @@ import { colour } from "./theme.js";
 
 const NAMES = ["tree", "pole", "person", "bush", "other", "uncertain", "truth", "path", "odometry", "robot", "selection", "text", "surface", "grid", "axis", "font", "set-a", "set-b"];
 const canvas = byId("map");
-const view = Object.assign(new MapView(), { top: 42 });
+const view = Object.assign(new MapView(), { top: 54 });
 const pointers = new Map(); // fingers and mouse that are down
 let colours = {}, planned = false, travelled = 0;
 
