@@ -12,7 +12,7 @@ from pipeline.tracking.table import TrackTable
 
 # Of a table, all that a merged row is made of; numbers stay.
 _Columns = tuple[
-    Float, Float, Float, Int, Int, Int, Float, Float, Int, Float, Float, Float, Int, Int, Int
+    Float, Float, Float, Int, Int, Int, Float, Float, Int, Float, Float, Float, Float, Int, Int, Int
 ]  # fmt: skip
 
 
@@ -38,7 +38,7 @@ def join(tracks: TrackTable, old: int, young: int) -> None:
 def _columns(t: TrackTable) -> _Columns:
     return (
         t.x, t.P, t.shared, t.stamp_ns, t.first_ns, t.hits, t.score, t.eccentricity, t.eccentricities,
-        t.radius, t.radius_weight, t.radius_reach, t.radii, t.sides, t.verdict,
+        t.radius, t.radius_weight, t.radius_reach, t.radius_above, t.radii, t.sides, t.verdict,
     )  # fmt: skip
 
 
@@ -90,7 +90,7 @@ def _first_pair(x: Float, touched: Bool, alive: Bool, radius: float) -> tuple[in
 @compiled
 def _join(columns: _Columns, old: int, young: int) -> None:
     x, P, shared, stamp_ns, first_ns, hits, score, eccentricity, eccentricities = columns[:9]
-    radius, radius_weight, radius_reach, radii, sides, verdict = columns[9:]
+    radius, radius_weight, radius_reach, radius_above, radii, sides, verdict = columns[9:]
     # Two halves of one trunk in one scan; a tree that only its column tells of has no view to take off.
     if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
         hits[old] -= 1
@@ -113,6 +113,7 @@ def _join(columns: _Columns, old: int, young: int) -> None:
     radius[old] += radius[young]
     radius_weight[old] += radius_weight[young]
     radius_reach[old] += radius_reach[young]
+    radius_above[old] += radius_above[young]
     radii[old] += radii[young]
 
 

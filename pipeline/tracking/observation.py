@@ -16,8 +16,8 @@ TAPER = 0.005  # of the radius per metre of height; stems of pine and spruce los
 BUTT = 0.01
 HALF = 0.5  # m; so far above or below breast height a view counts half: no stem tapers as another
 # What more scans do not average out of a radius: how far the edges of a trunk are known, a fifth of half a
-# beam's width; how far a round trunk and an even taper are none, in m and as a part of the radius.
-EDGE, UNEVEN, OUT_OF_ROUND = 0.0003, 0.0005, 0.01
+# beam's width, and bark, in m; `Tracking` declares how far trunks are not round, and how they taper.
+EDGE, UNEVEN = 0.0003, 0.0005
 NEAREST = 1.0  # m; a trunk nearer than this counts no more
 
 
@@ -37,6 +37,7 @@ def add_observations(
     radius_sum: Float,
     radius_weight: Float,
     radius_reach: Float,
+    radius_above: Float,
     radii: Int,
     sides: Int,
 ) -> None:
@@ -47,7 +48,7 @@ def add_observations(
         place: Frame of the map, shape (D, 2) [m]; pose: of the robot, shape (3,).
         eccentricity, radius, radius_sigma, arc: See `Detections`, shape (D,).
         above_breast: How far above breast height the radius was measured, shape (D,) [m]; NaN where no
-            ground was seen: such a radius counts as it is.
+            ground was seen: such a radius counts as it is, and as half a metre off.
 
     A radius weighs by its variance and by the square of the distance: what a fit does not know of, as the
     width of a beam, errs in proportion to the distance and the same way in every scan, so that a hundred
@@ -63,12 +64,14 @@ def add_observations(
         if np.isfinite(radius[d]):
             reach = max(np.hypot(pose[0] - place[d, 0], pose[1] - place[d, 1]), NEAREST)
             # A band of heights sees the thicker foot of a near tree, and its mean lies below breast height.
-            above = above_breast[d] if np.isfinite(above_breast[d]) else 0.0
+            known = np.isfinite(above_breast[d])
+            above = above_breast[d] if known else 0.0
             weight = 1.0 / ((radius_sigma[d] * reach) ** 2 * (1.0 + (above / HALF) ** 2))
             lost = (TAPER if above >= 0.0 else BUTT) * above
             radius_sum[t] += weight * (radius[d] + lost)
             radius_weight[t] += weight
             radius_reach[t] += weight * reach
+            radius_above[t] += weight * (abs(above) if known else HALF)
             radii[t] += 1
         bearing = np.arctan2(pose[1] - place[d, 1], pose[0] - place[d, 0])
         sides[t] |= seen_sides(bearing, arc[d])
@@ -98,15 +101,25 @@ def table_figures(
     radius: Float,
     radius_weight: Float,
     radius_reach: Float,
+    radius_above: Float,
     eccentricity: Float,
     eccentricities: Int,
     verdict: Int,
     hits: Int,
     hits_to_confirm: int,
     dbh_arc_min: float,
+    out_of_round: float,
+    taper_sigma: float,
 ) -> tuple[Float, Float, Float, Float, Bool]:
     """Coverage [rad], DBH and its sigma [m], mean eccentricity, and which trees are confirmed, each of
-    shape (T,), from the columns of a `TrackTable`; NaN for what was not told."""
+    shape (T,), from the columns of a `TrackTable`; NaN for what was not told.
+
+    The sigma of a diameter D of n views at distances r, of a mean height |h| above or below breast height:
+
+        sigma^2 = 4 (sigma_views^2 / n + (EDGE r + UNEVEN)^2) + (out_of_round D)^2 + (taper_sigma |h|)^2
+
+    The last three do not shrink with n: all views of one tree share its edges, its shape and its butt.
+    """
     T = sides.shape[0]
     coverage, dbh, dbh_sigma, mean = np.empty(T), np.full(T, np.nan), np.full(T, np.nan), np.full(T, np.nan)
     confirmed = np.empty(T, np.bool_)
@@ -117,10 +130,12 @@ def table_figures(
             seen += 1
         coverage[t] = seen * (2.0 * np.pi / SECTORS)
         if radii[t] >= DBH_OBSERVATIONS and coverage[t] >= dbh_arc_min - 1e-9:
-            mean_radius, reach = radius[t] / radius_weight[t], radius_reach[t] / radius_weight[t]
-            shared = (EDGE * reach + UNEVEN) ** 2 + (OUT_OF_ROUND * mean_radius) ** 2
-            dbh[t] = 2.0 * mean_radius
-            dbh_sigma[t] = 2.0 * np.sqrt(1.0 / (radius_weight[t] * reach * reach) + shared)
+            weight = radius_weight[t]
+            reach, above = radius_reach[t] / weight, radius_above[t] / weight
+            dbh[t] = 2.0 * radius[t] / weight
+            views = 1.0 / (weight * reach * reach) + (EDGE * reach + UNEVEN) ** 2
+            stem = (out_of_round * dbh[t]) ** 2 + (taper_sigma * above) ** 2
+            dbh_sigma[t] = np.sqrt(4.0 * views + stem)
         if eccentricities[t] > 0:
             mean[t] = eccentricity[t] / eccentricities[t]
         confirmed[t] = verdict[t] == Verdict.TREE if verdict[t] >= 0 else hits[t] >= hits_to_confirm

@@ -22,7 +22,8 @@ class TrackTable:
         hits: int64, observations; score: hits less misses.
         eccentricity: Sum over the observations with a finite one; eccentricities: their number.
         radius: Sum of weights times radii; radius_weight: sum of weights (see `add_observations`) [1/m^4];
-            radius_reach: sum of weights times distances; radii: number of them.
+            radius_reach: sum of weights times distances; radius_above: of weights times how far
+            above or below breast height [m]; radii: number of them.
         sides: int64: bit k is set when the sector k around the trunk was seen.
         verdict: int64: what was gathered says of it, see Verdict; -1 for nothing.
     """
@@ -40,6 +41,7 @@ class TrackTable:
     radius: Float
     radius_weight: Float
     radius_reach: Float
+    radius_above: Float
     radii: Int
     sides: Int
     verdict: Int
@@ -62,6 +64,7 @@ class TrackTable:
             radius=floats.copy(),
             radius_weight=floats.copy(),
             radius_reach=floats.copy(),
+            radius_above=floats.copy(),
             radii=ints.copy(),
             sides=ints.copy(),
             verdict=np.full(rows, -1, np.int64),

@@ -201,12 +201,15 @@ class Tracker:
             t.radius,
             t.radius_weight,
             t.radius_reach,
+            t.radius_above,
             t.eccentricity,
             t.eccentricities,
             t.verdict,
             t.hits,
             p.hits_to_confirm,
             float(np.radians(p.dbh_arc_min)),
+            p.out_of_round,
+            p.taper_sigma,
         )
         return Trees(
             number=t.number.copy(),
@@ -244,6 +247,7 @@ def _gather(
         t.radius,
         t.radius_weight,
         t.radius_reach,
+        t.radius_above,
         t.radii,
         t.sides,
     )

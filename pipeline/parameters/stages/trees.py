@@ -95,6 +95,24 @@ class Tracking(Stage):
         0.05,
         "Height above the ground that a tree's diameter is told for.",
     )
+    out_of_round: float = number(
+        0.025,
+        "Out of round",
+        "",
+        0.0,
+        0.2,
+        0.005,
+        "How far stems are not round, as a part of the diameter; its sigma stays above this part.",
+    )
+    taper_sigma: float = number(
+        0.02,
+        "Taper sigma",
+        "m/m",
+        0.0,
+        0.1,
+        0.005,
+        "How differently stems swell or taper, of the diameter per metre that views lie off breast height.",
+    )
 
 
 class Evaluation(Stage):
