@@ -42,7 +42,8 @@ class KeptPictures:
 
     def __init__(self, folder: FilePath) -> None:
         there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.is_dir())
-        self._file = tempfile.TemporaryFile(dir=there)  # noqa: SIM115 - open until `close`
+        # Without a buffer: what a full disk refused would wait there, for who reads or closes to be refused.
+        self._file = tempfile.TemporaryFile(dir=there, buffering=0)  # noqa: SIM115 - open until `close`
         self._kept: dict[int, _Kept] = {}
         self._length = 0
         self._last: tuple[float, float, float] | None = None
@@ -70,9 +71,10 @@ class KeptPictures:
             return
         try:
             self._file.seek(self._length)
-            self._file.write(picture.data)
-            self._file.flush()
+            is_whole = self._file.write(picture.data) == size
         except OSError:
+            is_whole = False
+        if not is_whole:
             count_loss(self.losses, REFUSED)
             return
         told = Picture(picture.stamp_ns, picture.encoding, picture.width, picture.height, picture.step, b"")

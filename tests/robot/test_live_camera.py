@@ -21,7 +21,7 @@ from app.robot.inbox import (
     PICTURES_TOO_LARGE,
     Inbox,
 )
-from app.robot.kept_pictures import FULL, KeptPictures
+from app.robot.kept_pictures import FULL, REFUSED, KeptPictures
 from app.robot.recording import Recording
 from app.robot.ros_graph import Publisher
 from app.robot.source import LiveSource, open_live
@@ -180,6 +180,19 @@ def test_what_is_put_aside_is_bounded_and_counted(tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk here that is always full")
+def test_a_full_disk_costs_pictures_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(dir: Path, **how: Any) -> Any:
+        del dir
+        return Path("/dev/full").open("w+b", **how)
+
+    monkeypatch.setattr("app.robot.kept_pictures.tempfile.TemporaryFile", full)
+    with closing(KeptPictures(tmp_path)) as kept:
+        kept.add(Picture(1, "", 0, 0, 0, bytes(10)), way([1]))
+        assert kept.losses == {REFUSED: 1}
+        assert list(kept.at(kept.stamps())) == []
+
+
 def message(size: int, log_ns: int = 0) -> Message:
     return Message(9, log_ns, bytes(size))
 
@@ -264,7 +277,7 @@ def test_pictures_come_over_plain_dds(run: Path):
         participant, writers = DomainParticipant(DOMAIN), dict[str, Any]()
         for topic, msgtype, _ in messages_of(run, one_each=True):
             held = [Policy.Durability.TransientLocal] if topic.endswith("tf_static") else []
-            qos = Qos(Policy.Reliability.Reliable(10**9), Policy.History.KeepAll, *held)
+            qos = Qos(Policy.Reliability.Reliable(60 * 10**9), Policy.History.KeepAll, *held)
             written: Any = Topic(participant, f"rt{topic}", idl_type(msgtype))
             writers[topic] = DataWriter(participant, written, qos)
         until(lambda: source.listen() or all(w.get_matched_subscriptions() for w in writers.values()))
