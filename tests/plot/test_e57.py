@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.errors import SourceError
 from pipeline.sources.clouds import is_cloud, open_cloud
-from pipeline.sources.clouds.e57_pages import Pages, checksums
+from pipeline.sources.clouds.e57_pages import _HEADER, PAGE, Pages, checksums
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
 
@@ -66,3 +66,15 @@ def test_the_sums_are_those_that_the_library_writes_and_name_the_station_that_is
     with pytest.raises(SourceError, match="E57 file is damaged: a checksum"):
         open_cloud(str(path))
     assert checksums(np.frombuffer(b"123456789", np.uint8)[None])[0] == 0xE3069283  # the sum of RFC 3720
+
+
+def test_an_element_of_points_that_never_ends_is_passed_over_at_once(tmp_path: Path):
+    """Going through it once an attribute would take hours."""
+    xml = b"<points " + 100_000 * b'type="CompressedVector" '
+    pages = -(-(_HEADER.size + len(xml)) // (PAGE - 4))
+    head = _HEADER.pack(b"ASTM-E57", 1, 0, pages * PAGE, _HEADER.size, len(xml), PAGE)
+    rows = np.frombuffer((head + xml).ljust(pages * (PAGE - 4), b"\0"), np.uint8).reshape(pages, -1)
+    sums = checksums(rows).astype(">u4")[:, None].view(np.uint8)
+    (tmp_path / "endless.e57").write_bytes(np.hstack([rows, sums]).tobytes())
+    looked_at = Pages(tmp_path / "endless.e57")
+    assert (looked_at.damage, looked_at.sections) == ("", ())

@@ -27,7 +27,9 @@ MOST_XML = 64 << 20
 _PACKET = struct.Struct("<2xH")
 _AT_ONCE = 512  # pages
 _POLYNOMIAL = 0x82F63B78  # CRC-32C (Castagnoli), reflected
-_POINTS = re.compile(rb"""<points\b[^<>]*type\s*=\s*["']CompressedVector["'][^<>]*>""")
+# Element and attribute apart: in one expression a file without a ">" would be gone through once an attribute.
+_POINTS = re.compile(rb"<points\b[^<>]*>")
+_KIND = re.compile(rb"""\btype\s*=\s*["']CompressedVector["']""")
 _PLACE = re.compile(rb"""fileOffset\s*=\s*["'](\d{1,18})["']""")
 
 
@@ -79,7 +81,8 @@ class Pages:
         xml = self._read(file, xml_at, xml_length)
         if xml is None or self._read(file, 0, _HEADER.size) is None:
             return "a checksum does not fit"
-        places = [_PLACE.search(element) for element in _POINTS.findall(xml)]
+        points = [element for element in _POINTS.findall(xml) if _KIND.search(element)]
+        places = [_PLACE.search(element) for element in points]
         self.sections = tuple(int(found[1]) for found in places if found is not None)
         return ""
 
