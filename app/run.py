@@ -286,6 +286,7 @@ class Run:
         if not there:
             return None
         self._remapping = None
+        remapping.rerun.stop_reading()  # its mapper holds it as long as the run goes on
         if remapping.rerun.kept is not self._kept:
             self._kept.close()
             self._kept = remapping.rerun.kept

@@ -176,9 +176,9 @@ def _remembered(points: Float32, height: Float32) -> tuple[Float32, Float32]:
 
 
 def _unpacked(block: bytearray, size: int) -> bytearray:
-    if not 0 <= size <= _LARGEST or zstandard.frame_content_size(block) != size:
-        raise ValueError("the block is not as long as the row says")
     try:
+        if not 0 <= size <= _LARGEST or zstandard.frame_content_size(block) != size:
+            raise ValueError("the block is not as long as the row says")
         return bytearray(zstandard.ZstdDecompressor().decompress(block))
     except zstandard.ZstdError as error:
         raise ValueError(str(error)) from None

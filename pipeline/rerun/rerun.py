@@ -98,9 +98,13 @@ class Rerun:
         self._next, self._steps, self._tail = scans, None, None
         self.mapper.restore(state)
 
+    def stop_reading(self) -> None:
+        """Let go of the source, and of what was looked at ahead: no more scans are mapped."""
+        self._steps = None
+
     def close(self) -> None:
         """Forget what was kept beside."""
-        self._steps = None
+        self.stop_reading()
         if self._fresh is not None:
             self._fresh.close()
 

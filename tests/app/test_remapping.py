@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import fields, is_dataclass
@@ -82,6 +83,7 @@ def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters)
     assert changes.revision == 1
     assert changes.scans == standing + 1
     assert session.status().remapped is None
+    assert not any(thread.name.startswith("look") for thread in threading.enumerate()), "none is left"
 
 
 @pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER])

@@ -81,3 +81,11 @@ def test_what_is_cut_or_has_no_neighbour_is_refused():
         places_from(Cutter(bytearray(told[:-1] + b"\x7f")), 9, POINT)
     with pytest.raises(ValueError, match="first"):
         row_from(Cutter(bytearray(b"\0" * 9)), 5)
+
+
+@pytest.mark.parametrize("block", [b"", b"no Zstandard at all"])
+def test_a_block_that_is_not_packed_is_a_value_error(block):
+    from pipeline.rerun.packing import HEAD, unpack
+
+    with pytest.raises(ValueError, match=r"[Zz]standard|frame|content|size"):
+        unpack(np.zeros((), HEAD), bytearray(block))
