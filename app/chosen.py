@@ -10,7 +10,7 @@ from msgspec import Meta
 from app.messages import Open
 from pipeline.sources.base import SourceOptions
 
-Role = Literal["scan", "odometry", "imu", "gnss", "camera"]
+Role = Literal["scan", "odometry", "imu", "gnss", "pose", "camera"]
 TopicName = Annotated[str, Meta(max_length=256)]
 _Number = Annotated[float, Meta(ge=-1000.0, le=1000.0)]
 

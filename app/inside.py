@@ -24,7 +24,7 @@ LISTEN_S, SETTLE_S = 8.0, 1.5
 COUNT_S = 3.0
 _LOOK_S = 0.05
 MOST_TOPICS = 500
-_ROLES = {kind: role for role, kinds in TYPES_BY_ROLE.items() for kind in kinds}
+_ROLES = {kind: role for role, kinds in reversed(TYPES_BY_ROLE.items()) for kind in kinds}
 
 
 def recorded(uri: str) -> dict[str, Any]:

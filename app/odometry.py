@@ -64,6 +64,7 @@ def choose_odometry(known: SourceDescription, choice: str) -> Chosen:
         return Chosen("kiss-icp", f"scans laid over one another (kiss-icp){wheels}, as asked")
     if known.has_odometry:
         gnss = f"; GNSS {known.gnss}" if known.gnss else ""
+        gnss += f"; other SLAM: {known.other_slam}" if known.other_slam else ""
         return Chosen("source", f"the source's own{', as asked' if choice == 'wheels' else ''}{gnss}")
     if obstacle:
         told = f"the source has no odometry, and {obstacle}: the robot is mapped as standing still"

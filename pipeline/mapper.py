@@ -14,6 +14,7 @@ from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.growing_path import GrowingPath
 from pipeline.gyro import fused
 from pipeline.height_map import HeightMapper, HeightMapState
+from pipeline.innovation import REFUSED, within_gate
 from pipeline.parameters import Parameters
 from pipeline.perception import Looked, Seen, decide, look
 from pipeline.records import Columns, Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step, Trees
@@ -32,7 +33,7 @@ class MapperState:
     """An independent copy of all that the mapper knows between two scans.
 
     `placed` is the scan since which the path is driven: no odometry leads to it, for the robot was put there;
-    `closed` the one at which the last loop was closed.
+    `closed` the one at which the last loop was closed; `last` the pose after the last scan, and how sure.
     """
 
     slam: BackEndState
@@ -45,6 +46,7 @@ class MapperState:
     placed: int = 0
     closed: int = 0
     recovery: RecoveryState[MapperState] = field(default_factory=RecoveryState)
+    last: tuple[Pose2, Float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +109,7 @@ class Mapper:
         self._odometry: Pose2 | None = None
         self._path = GrowingPath()
         self._placed = self._closed = 0
+        self._last: tuple[Pose2, Float] | None = None
         self._recovery: Recovery[MapperState] = Recovery(seed)
         self.note: Callable[[Noted], None] | None = None
         self._asked_trees = False
@@ -157,7 +160,7 @@ class Mapper:
 
         with self._watch("slam"):
             motion, odometry = self._motion(step)
-            moved = self._with_gyro(step, motion)
+            moved, refused = self._gated(self._with_gyro(step, motion))
             estimate, told = self._recovery.locate(
                 step.index,
                 moved,
@@ -188,6 +191,7 @@ class Mapper:
         closed = self._close_loop(step.index, estimate)
         if closed is not None:
             estimate, told = closed, (*told, LOOP)
+        self._last = (estimate.T_map_base, estimate.covariance)
         trees = self._tracker.trees()
         if self.note is not None:
             self.note(self._noted(step, seen, estimate))
@@ -204,7 +208,7 @@ class Mapper:
             sensor_offset=looked.sensor_offset,
             trees=trees,
             counts=looked.counts,
-            warnings=(*step.warnings, *looked.warnings, *told),
+            warnings=(*step.warnings, *looked.warnings, *refused, *told),
             columns=self._gathering.columns if p.gathering.method == "columns" else None,
             ground=None if p.ground.method == "none" else self._ground.state.record,
             base_z=(self._ground.state.sensor_z or 0.0) - float(looked.sensor_offset[2])
@@ -238,6 +242,13 @@ class Mapper:
         sigma = math.sqrt(variance)
         turned, turn_sigma, slack, doubt = fused(motion, sigma, step.slack, step.turn)
         return moved._replace(step=turned, slack=slack, doubt=step.doubt or doubt, turn_sigma=turn_sigma)
+
+    def _gated(self, moved: Motion) -> tuple[Motion, tuple[str, ...]]:
+        """The motion without a measured pose that cannot be, and what to say of that."""
+        noise = noise_of(self._parameters.slam)
+        if self._last is None or within_gate(*self._last, moved, noise):
+            return moved, ()
+        return moved._replace(measured=None), (REFUSED,)
 
     def _track(self, stamp_ns: int, seen: Seen, estimate: PoseEstimate) -> None:
         """Each tree's own filter: section 3.5."""
@@ -319,7 +330,7 @@ class Mapper:
     def _put(self, index: int, T_map_base: Pose2, covariance: Float, first: int) -> None:
         """Put the base somewhere; `first`: the scan from which on the path goes on there."""
         self._slam.place(index, T_map_base, covariance)
-        self._placed = first
+        self._placed, self._last = first, (T_map_base, covariance)
 
     def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
         """The odometry's step since the last scan that had one, and its pose; without any the robot
@@ -343,6 +354,7 @@ class Mapper:
             self._placed,
             self._closed,
             self._recovery.state.copy(),
+            self._last,
         )
 
     def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float, motion: Float) -> None:
@@ -371,7 +383,7 @@ class Mapper:
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
         self._path.cut(state.path_length)
-        self._placed, self._closed = state.placed, state.closed
+        self._placed, self._closed, self._last = state.placed, state.closed, state.last
         self._recovery.state = state.recovery.copy()
 
     def _take_back(self, before: MapperState) -> None:

@@ -4,6 +4,7 @@ metres, angles radians.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,11 +77,14 @@ class PoseMeasurement:
         stamp_ns: Time of the pose.
         T_map_base: The pose.
         covariance: shape (3, 3) of x, y [m], yaw [rad]; a large variance says nothing of the heading.
+        gate: It is left out where the square of its distance from what is known, in sigmas, is larger: a
+            source may jump.
     """
 
     stamp_ns: int
     T_map_base: Pose2
     covariance: Float
+    gate: float = math.inf
 
     def is_sound(self) -> bool:
         """Whether all numbers are finite and the covariance is symmetric and positive definite."""

@@ -79,7 +79,8 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
         type=_topic,
         action="append",
         default=[],
-        help="topic of a recording for scan, odometry, imu, gnss or camera, in place of the fullest one",
+        help="topic of a recording for scan, odometry, imu, gnss, pose (another SLAM's) or camera, "
+        "in place of the fullest one",
     )
     parser.add_argument(
         "--mount",
@@ -152,9 +153,9 @@ def _odometry(text: str) -> str:
 
 def _topic(text: str) -> tuple[str, str]:
     role, equals, name = text.partition("=")
-    if not (equals and name and role in ("scan", "odometry", "imu", "gnss", "camera")):
+    if not (equals and name and role in ("scan", "odometry", "imu", "gnss", "pose", "camera")):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is not scan=NAME, odometry=NAME, imu=NAME, gnss=NAME or camera=NAME"
+            f"{text!r} is not scan=NAME, odometry=NAME, imu=NAME, gnss=NAME, pose=NAME or camera=NAME"
         )
     return role, name
 

@@ -88,6 +88,7 @@ def _lines(opened: Source) -> list[str]:
         ("odometry", "yes" if d.has_odometry else f"no; taken: {choose_odometry(d, 'auto').words}"),
         ("IMU", "yes" if d.has_imu else "no"),
         *([("GNSS", d.gnss)] if d.gnss else []),
+        *([("SLAM pose", d.other_slam)] if d.other_slam else []),
         ("truth", ", ".join(known) or "none; give trees with --truth trees.csv"),
         ("preset", f"{d.preset} suits it"),
         ("SHA-256", d.digest),

@@ -20,7 +20,7 @@ ROOT = "/"
 SCHEME, VELODYNE, DDS = "zenoh:", "velodyne:", "dds:"
 _ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):([0-9]{1,5})")
 _FILES = ("ca", "cert", "key")
-_TOPICS = ("scan", "odometry", "imu", "gnss", "camera")
+_TOPICS = ("scan", "odometry", "imu", "gnss", "pose", "camera")
 _OPTIONS = ("robot", "domain", "mapped", *_TOPICS, *_FILES)
 _DDS_OPTIONS = ("domain", "interface", "peer", "robot", *_TOPICS)
 #: An IPv4 address or name of a network interface, and hosts: nothing that could say more in a configuration.

@@ -75,17 +75,26 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
         return None
     scan = min(fitting, key=_scan_rank)
     mine = [p for p in there if p.robot in (scan.robot, "")]
-    odometry = _of_role(mine, topics, "odometry", (ODOMETRY,), _odometry_rank, where)
+    wheels = [p for p in mine if p.topic != topics.get("pose")]
+    odometry = _of_role(wheels, topics, "odometry", (ODOMETRY,), _odometry_rank, where)
     imu = _of_role(mine, topics, "imu", (IMU,), _imu_rank, where)
     gnss = _of_role(mine, topics, "gnss", (NAV_SAT_FIX,), lambda p: (p.topic,), where)
+    pose = _pose(mine, topics, where)
     transforms = sorted({p.topic: p for p in mine if p.msgtype == TRANSFORMS}.values(), key=lambda p: p.topic)
-    chosen = [p for p in (scan, odometry, imu, gnss, *transforms) if p is not None]
+    chosen = [p for p in (scan, odometry, imu, gnss, pose, *transforms) if p is not None]
     camera = _camera(mine, topics, where)
     channels = tuple(
         Channel(k, p.topic, p.msgtype, "cdr", "", "", 0) for k, p in enumerate([*chosen, *camera], 1)
     )
     told = tuple(_warnings(scans, scan, robot, named))
     return Choice(scan.robot, channels[: len(chosen)], told, channels[len(chosen) :])
+
+
+def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publisher | None:
+    """The poses of another SLAM, where they were named."""
+    if "pose" not in topics:
+        return None
+    return _of_role(there, topics, "pose", TYPES_BY_ROLE["pose"], lambda p: (p.topic,), where)
 
 
 def _camera(there: list[Publisher], topics: dict[str, str], where: str) -> list[Publisher]:

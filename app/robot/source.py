@@ -324,7 +324,9 @@ class LiveSource:
         self._seen_s = now if self._seen_s is None else self._seen_s
         if now - self._seen_s < _SETTLE_S:
             return
-        topics = {"scan": choice.channels[0].topic}
+        there = {channel.topic for channel in choice.channels}
+        named = {role: name for role, name in self._topics.items() if role == "pose" and name in there}
+        topics = {"scan": choice.channels[0].topic, **named}
         options = replace(self._options, topics=topics)
         self._reader = ArrivalReader(self.uri, self._kind, choice.channels, options)
         self._choice = choice

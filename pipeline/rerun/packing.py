@@ -218,7 +218,12 @@ def _words(step: Step, looked: Looked) -> bytes:
         "doubt": step.doubt,
         "measured": None
         if m is None
-        else [m.stamp_ns, m.T_map_base.as_array().tolist(), m.covariance.tolist()],
+        else [
+            m.stamp_ns,
+            m.T_map_base.as_array().tolist(),
+            m.covariance.tolist(),
+            *([m.gate] if math.isfinite(m.gate) else []),
+        ],
         "looked": looked.warnings,
         "counts": looked.counts,
     }
@@ -228,4 +233,4 @@ def _words(step: Step, looked: Looked) -> bytes:
 def _measured(told: Any) -> PoseMeasurement | None:  # noqa: ANN401 - JSON
     if told is None:
         return None
-    return PoseMeasurement(int(told[0]), Pose2(*told[1]), np.array(told[2]))
+    return PoseMeasurement(int(told[0]), Pose2(*told[1]), np.array(told[2]), *map(float, told[3:]))

@@ -17,7 +17,8 @@ class RecordedTopic:
     Attributes:
         name, type: e.g. "/velodyne_points" and "sensor_msgs/msg/PointCloud2".
         messages: How many.
-        read_as: What it is read as ("scan", "odometry", "imu", "gnss", "transforms"), "" when it is not read.
+        read_as: What it is read as ("scan", "odometry", "imu", "gnss", "pose", "transforms"), "" when it
+            is not read.
         fits: The role that it could be given with `--topic`, "" when none.
         why_not: Why it is not read, "" when it is.
     """
@@ -64,6 +65,7 @@ class SourceDescription:
         in_order_of_arrival: Whether records come as they came to a live run, not sorted by their time.
         revisions: The parameters that a recorded run was mapped with, in the order of their scans.
         gnss: How GNSS fixes are used, in words, "" when none are.
+        other_slam: Likewise of the poses of another SLAM.
     """
 
     uri: str
@@ -82,6 +84,7 @@ class SourceDescription:
     in_order_of_arrival: bool = False
     revisions: tuple[Revision, ...] = ()
     gnss: str = ""
+    other_slam: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,7 @@ class SourceOptions:
     """What the user may say about a source.
 
     Attributes:
-        topics: Chosen topic by role ("scan", "odometry", "imu", "gnss"); empty means found by type.
+        topics: Chosen topic by role ("scan", "odometry", "imu", "gnss", "pose"); empty means found by type.
         T_base_lidar: Mounting of the LiDAR; None means what the source says, else identity.
         seed: Of simulated runs.
     """

@@ -15,7 +15,7 @@ from pipeline.sources.ordering import Stamped
 from pipeline.sources.ros_records import RecordDecoder
 
 #: Small messages, but a recording may be of hours.
-_MOST_MESSAGES = 60_000
+MOST_MESSAGES = 60_000
 TimesOf = Callable[[Message, dict[str, int]], Iterator[Stamped[Message | Odometry]]]
 
 
@@ -41,7 +41,7 @@ def align_fixes(
     seen: list[Fix] = []
     way: list[tuple[int, Pose3]] = []
     frame = ""
-    for message in islice(container.messages(fixes | odometry, None, {}), _MOST_MESSAGES):
+    for message in islice(container.messages(fixes | odometry, None, {}), MOST_MESSAGES):
         for arrival in times_of(message, {}):
             try:
                 if message.channel in fixes and isinstance(arrival.content, Message):

@@ -18,8 +18,7 @@ from pipeline.sources.base import SourceDescription, SourceOptions
 from pipeline.sources.camera import Camera, Picture, find_camera
 from pipeline.sources.container import Channel, Container, Message, count_loss
 from pipeline.sources.digest import digest_of
-from pipeline.sources.first_stretch import align_fixes
-from pipeline.sources.live_stretch import LiveStretch
+from pipeline.sources.measured import MeasuredPoses
 from pipeline.sources.mounting import Mounting
 from pipeline.sources.ordering import WINDOW_NS, Stamped, by_stamp
 from pipeline.sources.pictures import RecordedPictures
@@ -78,18 +77,17 @@ class RosSource:
         self._clock = make_clock([self._clock_offset(topic) for topic in named])
         self._moving = self._moving_numbers()
         self._wanted = self._moving.union(*(topic.numbers for topic in named))
-        fixes = frozenset[int]() if self._topics.gnss is None else self._topics.gnss.numbers
         self._truth, sensor = self._read_truth()
         first, frame, product = self._first_scan()
         sensor = sensor or SENSORS.get(product) or sensor_of(first)
         self._top_ring = sensor.rings - 1 if rings_descend(first) else None
         self._description = self._describe(first, frame, sensor, decoder.refused, options)
         self._description = replace(self._description, digest=digest_of(paths))
-        self.notices: list[str] = []
-        self._fixes = fixes
-        self._stretch = self._live_stretch() if live else None
-        if fixes and not live:
-            self._use_fixes(fixes)
+        self._records.poses = frozenset() if self._topics.pose is None else self._topics.pose.numbers
+        odometry = self._moving if self._topics.odometry is None else self._topics.odometry.numbers
+        self._measured = MeasuredPoses(container, self._records, self._topics, odometry, self._times_of)
+        self._description = self._measured.begin(self._description, live=live)
+        self.notices = self._measured.notices
 
     @property
     def description(self) -> SourceDescription:
@@ -116,9 +114,9 @@ class RosSource:
     ) -> Iterator[Record]:
         """The records that one message gives, whenever it came, unless they lie before a time; what cannot be
         used is counted."""
-        if message.channel in self._wanted or (self._stretch is not None and message.channel in self._fixes):
+        if message.channel in self._wanted or message.channel in self._measured.numbers:
             for stamped in self._times_of(message, losses):
-                self._lay_over(stamped)
+                self._measured.add(stamped)
                 if from_ns is None or stamped.stamp_ns >= from_ns:
                     yield from self._decoded(stamped, losses)
 
@@ -174,7 +172,8 @@ class RosSource:
     ) -> Iterator[Stamped[Message | Odometry]]:
         """The messages that are read, with their time, in the order of writing."""
         log_start = None if start_ns is None else start_ns - self._clock.offset_ns - WINDOW_NS
-        for message in self._container.messages(self._wanted, log_start, losses):
+        wanted = self._wanted | self._measured.numbers
+        for message in self._container.messages(wanted, log_start, losses):
             for arrival in self._times_of(message, losses):
                 if start_ns is None or arrival.stamp_ns >= start_ns:
                     yield arrival
@@ -265,47 +264,6 @@ class RosSource:
     def _read_truth(self) -> tuple[Truth | None, Sensor | None]:
         content = self._container.attachment(ATTACHMENT, SIZE_LIMIT)
         return (None, None) if content is None else read_truth(content, self._uri)
-
-    def _use_fixes(self, fixes: frozenset[int]) -> None:
-        """Find how GNSS fixes lie in the map; from then on they are read, or it is said why not."""
-        odometry = self._moving if self._topics.odometry is None else self._topics.odometry.numbers
-        known = self._description
-        found, why = align_fixes(
-            self._container, self._records, self._times_of, fixes, odometry, known.start_ns or 0
-        )
-        if found is None:
-            told = f"GNSS fixes are not used: {why}"
-            self._description = replace(known, warnings=(*known.warnings, told))
-            return
-        self._records.alignment = found
-        self._wanted = self._wanted | fixes
-        self._description = replace(known, gnss=found.words)
-
-    def _live_stretch(self) -> LiveStretch | None:
-        """What lays fixes over the way while it is driven; None where there is nothing to lay."""
-        known = self._description
-        if not self._fixes:
-            return None
-        if not known.has_odometry:
-            why = "GNSS fixes are not used: without odometry nobody tells the direction of north"
-            self._description = replace(known, warnings=(*known.warnings, why))
-            return None
-        told = "fixes count when the robot drove far enough to tell the direction of north"
-        self._description = replace(known, gnss=told)
-        return LiveStretch(self._records, self._fixes, known.start_ns or 0)
-
-    def _lay_over(self, stamped: Stamped[Message | Odometry]) -> None:
-        if self._stretch is None:
-            return
-        found = self._stretch.add(stamped)
-        if found is not None:
-            self._records.alignment = found
-            self._wanted = self._wanted | self._fixes
-            self.notices.append(f"GNSS: {found.words}")
-            self._stretch = None
-        elif self._stretch.refused:
-            self.notices.append(f"GNSS fixes are not used: {self._stretch.refused}")
-            self._stretch = None
 
     def _said_base(self) -> str:
         """The base frame as the odometry topic names it, "" when it does not."""

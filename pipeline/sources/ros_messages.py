@@ -140,9 +140,16 @@ class Pose(Protocol):
 
 
 class PoseWithCovariance(Protocol):
-    """geometry_msgs/PoseWithCovariance."""
+    """geometry_msgs/PoseWithCovariance; about x, y, z and turns about them, row by row."""
 
     pose: Pose
+    covariance: NDArray[np.float64]
+
+
+class PoseWithCovarianceStamped(Stamped, Protocol):
+    """geometry_msgs/PoseWithCovarianceStamped."""
+
+    pose: PoseWithCovariance
 
 
 class Odometry(Stamped, Protocol):

@@ -13,6 +13,7 @@ from pipeline.sources import ros_messages
 from pipeline.sources.container import Channel, Message, count_loss
 from pipeline.sources.gnss import Alignment, Fix
 from pipeline.sources.laser_scan import decode_laser_scan
+from pipeline.sources.other_slam import NoPoseError, Placed, Relation
 from pipeline.sources.pointcloud2 import decode_cloud
 from pipeline.sources.rostypes import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, MessageDecoder
 from pipeline.sources.stamps import SECOND_NS
@@ -33,6 +34,7 @@ class RecordDecoder:
     Attributes:
         base: Name of the base frame, "" when there is none.
         alignment: How GNSS fixes lie in the map, None when that is not known: they are not used then.
+        relation: Likewise of the poses of another SLAM; poses: numbers of their channels.
     """
 
     def __init__(self, channels: Mapping[int, Channel], decoder: MessageDecoder, tree: TransformTree) -> None:
@@ -40,6 +42,8 @@ class RecordDecoder:
         self._packets = PacketDecoder()
         self.base = ""
         self.alignment: Alignment | None = None
+        self.relation: Relation | None = None
+        self.poses = frozenset[int]()
 
     def record(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
         """Decode a message; None when it cannot be used, which is counted in `losses`."""
@@ -47,6 +51,8 @@ class RecordDecoder:
         try:
             # Damaged numbers may be of any size; what comes of them is looked at afterwards.
             with np.errstate(all="ignore"):
+                if message.channel in self.poses:
+                    return self._placed(message, stamp_ns, losses)
                 if channel.msgtype == ODOMETRY:
                     return self._odometry(message, stamp_ns)
                 if channel.msgtype == IMU:
@@ -56,6 +62,8 @@ class RecordDecoder:
                 scan = self.scan(message, stamp_ns, losses)[0]
         except Exception:  # the one place that catches what the generated decoders of rosbags raise
             named = _NAMES.get(channel.msgtype, "scans")
+            if message.channel in self.poses:
+                named = "poses of another SLAM"
             count_loss(losses, f"{named} that cannot be read")
             return None
         if len(scan.points):
@@ -107,6 +115,21 @@ class RecordDecoder:
         kind = int(decoded.position_covariance_type)
         return Fix.of(stamp_ns, float(decoded.latitude), float(decoded.longitude), covariance, kind), frame
 
+    def placed(self, message: Message, stamp_ns: int) -> tuple[Placed, str]:
+        """A pose of another SLAM, and the name of its frame.
+
+        Raises:
+            NoPoseError: Its covariance is none.
+            Exception: Of many kinds, when the message is damaged.
+        """
+        decoded = cast(ros_messages.Odometry, self.message(message))  # the other type has the same parts
+        frame = frame_name(decoded.header.frame_id)
+        child = frame_name(getattr(decoded, "child_frame_id", ""))
+        linked = self._tree.find(child, self.base) if child and child != self.base else None
+        pose, covariance = decoded.pose.pose, decoded.pose.covariance
+        at = pose_of(pose.position, pose.orientation)
+        return Placed.of(stamp_ns, at, [float(number) for number in covariance], linked), frame
+
     def place_of(self, frame: str) -> Pose3 | None:
         """Where a frame stands on the robot, None when no fixed transform says it."""
         return self._tree.find(self.base, frame)
@@ -119,6 +142,14 @@ class RecordDecoder:
             count_loss(losses, "GNSS messages without a fix")
             return None
         return self.alignment.measured(fix)
+
+    def _placed(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
+        try:
+            placed, _ = self.placed(message, stamp_ns)
+        except NoPoseError as error:
+            count_loss(losses, f"poses of another SLAM: {error}")
+            return None
+        return None if self.relation is None else self.relation.measured(placed)
 
     def _odometry(self, message: Message, stamp_ns: int) -> Odometry:
         pose = cast(ros_messages.Odometry, self.message(message)).pose.pose

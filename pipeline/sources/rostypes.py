@@ -23,6 +23,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 IMU = "sensor_msgs/msg/Imu"
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
@@ -35,6 +36,7 @@ READ_TYPES = (
     ODOMETRY,
     IMU,
     NAV_SAT_FIX,
+    POSE_WITH_COVARIANCE,
     COMPRESSED_IMAGE,
     IMAGE,
     CAMERA_INFO,

@@ -17,6 +17,7 @@ from pipeline.sources.rostypes import (
     NAV_SAT_FIX,
     ODOMETRY,
     POINT_CLOUD,
+    POSE_WITH_COVARIANCE,
     ROS1_TRANSFORMS,
     TRANSFORMS,
     VELODYNE_SCAN,
@@ -27,9 +28,10 @@ TYPES_BY_ROLE = {
     "odometry": (ODOMETRY,),
     "imu": (IMU,),
     "gnss": (NAV_SAT_FIX,),
+    "pose": (POSE_WITH_COVARIANCE, ODOMETRY),
     "camera": (COMPRESSED_IMAGE, IMAGE),
 }
-ROLES = "scan, odometry, imu, gnss or camera"
+ROLES = "scan, odometry, imu, gnss, pose or camera"
 _READABLE = ("cdr", "ros1")
 
 
@@ -57,6 +59,7 @@ class Topics:
     odometry: Topic | None
     imu: Topic | None
     gnss: Topic | None
+    pose: Topic | None
     camera: Topic | None
     fixed: tuple[Topic, ...]
     moving: tuple[Topic, ...]
@@ -72,6 +75,7 @@ class Topics:
             "odometry": self.odometry,
             "imu": self.imu,
             "gnss": self.gnss,
+            "pose": self.pose,
             "camera": self.camera,
         }
         reading.update({topic: role for role, topic in chosen.items() if topic is not None})
@@ -93,7 +97,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
 
     Args:
         channels: Of the recording.
-        wanted: Topic by role ("scan", "odometry", "imu") as the user said; others are found by type.
+        wanted: Topic by role ("scan", "odometry", "imu", "pose") as the user said; others are found by type.
         where: The recording, for errors.
 
     Raises:
@@ -104,7 +108,9 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
     unknown = sorted(wanted.keys() - TYPES_BY_ROLE.keys())
     if unknown:
         raise SourceError(f"there is no role {unknown[0]!r} for a topic", where=where, remedy=f"Use {ROLES}.")
-    chosen = {role: _choose(topics, role, wanted.get(role), where) for role in TYPES_BY_ROLE}
+    chosen = {
+        role: _choose(_free(topics, role, wanted), role, wanted.get(role), where) for role in TYPES_BY_ROLE
+    }
     scan = chosen["scan"]
     if scan is None:
         types = " or ".join(TYPES_BY_ROLE["scan"])
@@ -121,6 +127,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
         chosen["odometry"],
         chosen["imu"],
         chosen["gnss"],
+        chosen["pose"],
         chosen["camera"],
         fixed,
         moving,
@@ -132,8 +139,16 @@ def _role_of(topic: Topic) -> str:
     return next((role for role, types in TYPES_BY_ROLE.items() if topic.msgtype in types), "")
 
 
+def _free(topics: list[Topic], role: str, wanted: Mapping[str, str]) -> list[Topic]:
+    """The topics that may be given a role: what was named as the pose of another SLAM is no odometry."""
+    taken = wanted.get("pose") if role == "odometry" else None
+    return [topic for topic in topics if topic.name != taken]
+
+
 def _why_not(topic: Topic, chosen: Topic | None) -> str:
     """Why a topic is not read, for people."""
+    if chosen is None and topic.count and topic.msgtype == POSE_WITH_COVARIANCE:
+        return "it counts when it is named as pose"
     if chosen is None:
         return "no message in it" if _role_of(topic) else "nothing is made of this type"
     if topic.count == 0:
@@ -168,6 +183,8 @@ def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Top
         raise SourceError(
             f"{reason}; {_listing(topics)}", where=where, remedy=f"Name one with --topic {role}=NAME."
         )
+    if role == "pose" and name is None:  # whether another program is better than we are, a person knows
+        return None
     filled = [topic for topic in fitting if topic.count > 0] or (fitting if name is not None else [])
     # Of equally many messages the decoded cloud is preferred to the raw packets it was made of.
     # A laser that sees in one plane is the robot's bumper where there is a LiDAR too.

@@ -3,7 +3,7 @@
 import { post } from "./api.js";
 import { byId, el } from "./dom.js";
 
-const ROLES = { scan: "LiDAR", odometry: "Odometry", imu: "IMU", gnss: "GNSS", camera: "Camera" };
+const ROLES = { scan: "LiDAR", odometry: "Odometry", imu: "IMU", gnss: "GNSS", pose: "Other SLAM", camera: "Camera" };
 const MOUNT = [["x", "m"], ["y", "m"], ["z", "m"], ["roll", "°"], ["pitch", "°"], ["yaw", "°"]];
 let looked = null; // {uri, mount} of what is shown
 let asked = ""; // what is being looked into
@@ -57,7 +57,7 @@ function show(address, { topics, mount, warnings }) {
 
 function roles(topics) {
   const rows = Object.entries(ROLES).map(([role, title]) => {
-    const fitting = topics.filter(({ fits, messages, seconds }) => fits === role && (messages !== 0 || seconds));
+    const fitting = topics.filter(({ fits, messages, seconds, read_as: as }) => (fits === role || (role === "pose" && fits === "odometry" && as === "")) && (messages !== 0 || seconds));
     if (!fitting.length) return [];
     const read = fitting.find(({ read_as: as }) => as === role);
     const list = el("select", { name: role, id: `inside-${role}` },

@@ -137,7 +137,7 @@ def test_any_plane_is_found_again(yaw: float, latitude: float, longitude: float,
         assert found is None
         return
     assert found is not None, why
-    assert found.residual < 0.02
+    assert found.laid.residual < 0.02
     for wanted, fix_ in zip(way, fixes, strict=True):
         pose = found.measured(fix_).T_map_base
         assert isinstance(pose, Pose2)
