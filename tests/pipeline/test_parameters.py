@@ -24,7 +24,7 @@ from tests.pipeline.strategies import LAW
 
 SPECS = field_specs()
 NUMBERS = [spec for spec in SPECS if spec.kind in ("float", "int")]
-UNITS = {"", "m", "m/s", "m/s²", "m/√m", "deg", "deg/√m", "deg/√rad", "sigma", "m²"}
+UNITS = {"", "m", "m/m", "m/s", "m/s²", "m/√m", "deg", "deg/√m", "deg/√rad", "sigma", "m²"}
 
 
 def replaced(name: str, value: object) -> Parameters | str:
