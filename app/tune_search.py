@@ -1,24 +1,30 @@
 """The search for parameters that people ask for on the page: its process, and what is told of it.
 
-It works on the run that is open, with the truth and the parameters of that moment, in a process of its own.
-When the run is left or stemmap ends, the process ends.
+It works on the run that is open and others of the list, with the truth and the parameters of that moment, in
+a process of its own. What was stopped can go on from its journal. When the run is left, another search begins
+or stemmap ends, the process and the journal go.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import shutil
 import sys
+import weakref
 from collections.abc import Callable, Sequence
 from datetime import date
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any, Literal
 
 import msgspec
 
-from app.tuning.goal import RunScore, pool
+from app.tune_plan import SearchAsked, check_same
+from app.tune_told import told_of
 from app.tuning.plan import Plan
 from app.tuning.result import Result, best_parameters, toml_of
-from app.tuning.said import Said
+from app.tuning.said import FOLDER, Said
 from app.tuning.trial import Trial
 from pipeline.errors import StemmapError
 from pipeline.parameters import Parameters
@@ -28,7 +34,6 @@ SERVED = (sys.executable, "-P", "-m", "app.tuning.served")
 State = Literal["none", "looking", "searching", "stopping", "done", "failed"]
 
 _LONGEST_LINE = 16 << 20
-_MOST_SHOWN = 400  # points of the picture
 _GRACE_S = 3.0
 
 
@@ -49,29 +54,61 @@ class TuneSearch:
         self._error = ""
         self.plan: Plan | None = None
         self.result: Result | None = None
+        self.asked: SearchAsked | None = None
         self._start: Trial | None = None
-        self._trials: list[Trial] = []
+        self._trials: dict[int, Trial] = {}
+        # Takes the journal away, at the latest when this process ends.
+        self._folder: weakref.finalize[..., TuneSearch] | None = None
+        self._began = False  # the process that runs has scored what it begins with
 
     @property
     def is_under_way(self) -> bool:
         """Whether there is a process."""
         return self._task is not None and not self._task.done()
 
-    async def start(self, plan: Plan) -> None:
-        """Begin a search.
+    @property
+    def can_go_on(self) -> bool:
+        """Whether a search ended before it had made all that it was to make."""
+        made = len(self._trials)
+        return self._folder is not None and not self.is_under_way and bool(self.plan) and made < self._wanted
+
+    @property
+    def _wanted(self) -> int:
+        return 0 if self.plan is None else self.plan.trials
+
+    async def start(self, plan: Plan, asked: SearchAsked | None = None) -> None:
+        """Begin a search; one that was stopped is forgotten.
+
+        Args:
+            plan: What is searched for; its storage is chosen here.
+            asked: Of which the plan was made.
 
         Raises:
             StemmapError: One is under way, or no process can be started.
         """
-        if self.is_under_way or self._turn.locked():
-            raise StemmapError("a search is under way", remedy="Stop it first")
+        self._check_idle()
         async with self._turn:
             self._forget()
-            process = self._process = await self._process_of_a_search()
-            self.plan, self._state = plan, "looking"
-            self._task = asyncio.create_task(self._listen(process), name="search")
-        await self._write(process, msgspec.json.encode(plan) + b"\n")
-        self.show()
+            folder = _folder()
+            self._folder = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+            plan = msgspec.structs.replace(plan, storage=str(folder / "journal"))
+            await self._run(plan, asked)
+
+    async def go_on(self, now: Plan) -> None:
+        """Go on with the search that was stopped, from its journal.
+
+        Args:
+            now: The plan that the same choices make now.
+
+        Raises:
+            StemmapError: There is none, or truth or parameters have changed since it began.
+        """
+        self._check_idle()
+        if self.plan is None or not self.can_go_on:
+            raise StemmapError("there is no stopped search", remedy="Search")
+        check_same(self.plan, now)
+        async with self._turn:
+            await self._run(self.plan, self.asked)
 
     async def stop(self) -> None:
         """End the search; what it found stays."""
@@ -91,6 +128,18 @@ class TuneSearch:
             self._forget()
         self.show()
 
+    def _check_idle(self) -> None:
+        if self.is_under_way or self._turn.locked():
+            raise StemmapError("a search is under way", remedy="Stop it first")
+
+    async def _run(self, plan: Plan, asked: SearchAsked | None) -> None:
+        process = self._process = await self._process_of_a_search()
+        self.plan, self.asked, self._state, self._error = plan, asked, "looking", ""
+        self._began = False
+        self._task = asyncio.create_task(self._listen(process), name="search")
+        await self._write(process, msgspec.json.encode(plan) + b"\n")
+        self.show()
+
     def found(self) -> tuple[str, Parameters, str]:
         """The preset, the values and the file of the best set.
 
@@ -108,37 +157,25 @@ class TuneSearch:
 
     def as_plain(self) -> dict[str, Any]:
         """For the browsers."""
-        plan, result = self.plan, self.result
-        if plan is None:
+        if self.plan is None:
             return {"state": "none"}
-        goal = plan.aim
-        points = [(t.number, _shown(goal.name, t.loss)) for t in self._trials if goal.is_kept(t.loss or 0.0)]
-        every = -(-len(points) // _MOST_SHOWN) or 1
         return {
             "state": self._state,
             "error": self._error,
-            "goal": goal.words,
-            "label": goal.label,
-            "unit": {"position": "cm", "pairs": "%"}.get(goal.name, ""),
-            "over": [axis.words for axis in plan.axes],
-            "wanted": plan.trials,
-            "made": len(self._trials),
-            "start": _told(plan, self._start),
-            "best": _told(plan, self._best()),
-            "points": points[::every],
-            "importance": dict(list(result.importance.items())) if result else {},
-            "better": bool(result and result.better),
-            "changes": _changes(plan, result) if result else [],
+            "go_on": self.can_go_on,
+            **told_of(self.plan, self._made(), self._start, self.result),
         }
 
     def _forget(self) -> None:
         self._state, self._error = "none", ""
-        self.plan = self.result = self._start = None
-        self._trials = []
+        self.plan = self.result = self._start = self.asked = None
+        self._trials = {}
+        if self._folder is not None:
+            self._folder()
+            self._folder = None
 
-    def _best(self) -> Trial | None:
-        made = [t for t in (*self._trials, *([self._start] if self._start else [])) if t.loss is not None]
-        return min(made, key=lambda t: (t.loss, t.number), default=None)
+    def _made(self) -> list[Trial]:
+        return [self._trials[number] for number in sorted(self._trials)]
 
     async def _process_of_a_search(self) -> asyncio.subprocess.Process:
         try:
@@ -167,9 +204,9 @@ class TuneSearch:
         self.show()
 
     def _take(self, said: Said) -> None:
-        self._trials += said.trials
+        self._trials |= {trial.number: trial for trial in said.trials}
         if said.start is not None:
-            self._start = said.start
+            self._start, self._began = said.start, True
             if self._state == "looking":
                 self._state = "searching"
         if said.result is not None:
@@ -177,8 +214,9 @@ class TuneSearch:
         elif said.error is not None:
             what, where, remedy = said.error
             self._fail(str(StemmapError(what, where=where, remedy=remedy)))
-        elif said == Said() and self._state == "stopping" and self._start is None:
-            self._forget()
+        elif said == Said() and self._state == "stopping" and not self._began:
+            if self._start is None:  # nothing was found, now or before
+                self._forget()
             self._state = "done"
 
     def _fail(self, why: str) -> None:
@@ -203,25 +241,9 @@ async def _ended(process: asyncio.subprocess.Process) -> None:
         await process.wait()
 
 
-def _told(plan: Plan, trial: Trial | None) -> dict[str, Any] | None:
-    if trial is None:
-        return None
-    return {"number": trial.number, "shown": plan.aim.shown(trial.loss or 0.0), **_figures(trial.training)}
-
-
-def _figures(scores: tuple[RunScore, ...]) -> dict[str, Any]:
-    pooled = pool(scores)
-    return {"f1": pooled.f1, "TA": pooled.ta, "false_share": pooled.false_share}
-
-
-def _shown(goal: str, loss: float | None) -> float | None:
-    """A loss as the figure that is drawn; None of a set that cannot be mapped with."""
-    if loss is None:
-        return None
-    return 1.0 - loss if goal in ("f1", "ta") else 100.0 * loss if goal == "position" else loss
-
-
-def _changes(plan: Plan, result: Result) -> list[list[Any]]:
-    """Name, value before and value found."""
-    before = plan.parameters.flat()
-    return [[name, before[name], value] for name, value in result.best.values.items()]
+def _folder() -> Path:
+    """A new folder for a journal."""
+    try:
+        return Path(mkdtemp(prefix=FOLDER))
+    except OSError as error:
+        raise StemmapError(f"the trials cannot be kept: {error.strerror}") from None

@@ -1,8 +1,9 @@
-"""The search for parameters on the page: start, stop, use and save what it found."""
+"""The search for parameters on the page: start, stop, go on, use and save what it found."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import asyncio
+from typing import Annotated
 
 import msgspec
 from fastapi import APIRouter, Request
@@ -12,28 +13,17 @@ from starlette.responses import Response
 from app.dashboard import Dashboard
 from app.hands import NAME
 from app.replies import body_of, json_reply
-from app.robot.address import is_live
 from app.routes.access import Dash
 from app.routes.parameter_sets import SET_NAME
-from app.tuning.goal import GOALS, goal_of
-from app.tuning.plan import Plan, PlannedRun, TruthColumns
-from app.tuning.space import SENSIBLE, axes_of, check
+from app.routes.run import what_may_be_opened
+from app.settings import Settings
+from app.tune_plan import MOST_OTHERS, OtherRun, SearchAsked, other_runs, plan_of
+from app.tuning.goal import GOALS
+from app.tuning.plan import Plan
+from app.tuning.space import SENSIBLE
 from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api/search")
-
-_MOST_TRIALS = 5000
-_LONGEST_MINUTES = 24 * 60.0
-
-
-class _Start(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A search: `over` as after `stemmap tune --over`."""
-
-    over: Annotated[list[Annotated[str, Meta(max_length=200)]], Meta(min_length=1, max_length=30)]
-    goal: Literal["f1", "ta", "position", "pairs"] = "f1"
-    false_max: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.1
-    trials: Annotated[int, Meta(ge=1, le=_MOST_TRIALS)] = 200
-    minutes: Annotated[float, Meta(gt=0.0, le=_LONGEST_MINUTES)] = 10.0
 
 
 class _Save(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,17 +32,26 @@ class _Save(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @router.get("")
-async def read(dashboard: Dash) -> Response:
-    """How the search goes, and what can be searched for."""
-    choices = {"sensible": SENSIBLE, "goals": [{"name": n, "words": words} for n, words in GOALS.items()]}
+async def read(request: Request, dashboard: Dash) -> Response:
+    """How the search goes, what can be searched for, and over which other runs."""
+    try:
+        runs = [run.as_plain() for run in await _others(request, dashboard)]
+    except StemmapError:  # the run that is open can be searched over all the same
+        runs = []
+    choices = {
+        "sensible": SENSIBLE,
+        "goals": [{"name": n, "words": words} for n, words in GOALS.items()],
+        "runs": runs,
+        "most_runs": MOST_OTHERS,
+    }
     return json_reply({**dashboard.search.as_plain(), **choices})
 
 
 @router.post("")
 async def start(request: Request, dashboard: Dash) -> Response:
-    """Search over the run that is open, from its first scan to its last."""
-    wanted: _Start = await body_of(request, _Start)
-    await dashboard.search.start(_plan(dashboard, wanted))
+    """Search over the run that is open, from its first scan to its last, and over others of the list."""
+    wanted: SearchAsked = await body_of(request, SearchAsked)
+    await dashboard.search.start(await _plan(request, dashboard, wanted), wanted)
     return json_reply(dashboard.search.as_plain(), 202)
 
 
@@ -61,6 +60,16 @@ async def stop(dashboard: Dash) -> Response:
     """End the search; what it found stays."""
     await dashboard.search.stop()
     return json_reply(dashboard.search.as_plain(), 202)
+
+
+@router.post("/go-on")
+async def go_on(request: Request, dashboard: Dash) -> Response:
+    """Go on with the search that was stopped, with the same choices."""
+    search = dashboard.search
+    if search.asked is None:
+        raise StemmapError("there is no stopped search", remedy="Search")
+    await search.go_on(await _plan(request, dashboard, search.asked))
+    return json_reply(search.as_plain(), 202)
 
 
 @router.post("/use")
@@ -80,28 +89,18 @@ async def save(request: Request, dashboard: Dash) -> Response:
     return json_reply(dashboard.sets.as_plain(), 201)
 
 
-def _plan(dashboard: Dashboard, wanted: _Start) -> Plan:
-    source, truth, state = dashboard.source, dashboard.truth, dashboard.parameters
-    if not dashboard.digest:
-        raise StemmapError("no run is open", remedy="Open one")
-    if is_live(source.uri):
-        raise StemmapError(
-            "a live run cannot be mapped again and again", where=source.uri, remedy="Open its recording"
-        )
-    if truth is None or "tree" not in truth.kind:
-        raise StemmapError("no true trees are known of this run", remedy="Annotate some in the tab Annotate")
-    axes, goal = axes_of(wanted.over), goal_of(wanted.goal, wanted.false_max)
-    check(axes, state.parameters)
-    return Plan(
-        runs=(PlannedRun(source.uri, TruthColumns.of(truth), "annotations"),),
-        axes=axes,
-        start=state.parameters.model_dump(),
-        storage="",
-        preset=state.preset,
-        goal=goal.name,
-        false_max=goal.false_max,
-        seed=source.seed,
-        odometry=source.odometry,
-        trials=wanted.trials,
-        seconds=60.0 * wanted.minutes,
+async def _plan(request: Request, dashboard: Dashboard, wanted: SearchAsked) -> Plan:
+    others = await _others(request, dashboard) if wanted.also or wanted.held_out else []
+    state = dashboard.parameters
+    source, digest, truth = dashboard.source, dashboard.digest, dashboard.truth
+    return plan_of(wanted, source, digest, truth, state.parameters, state.preset, others)
+
+
+async def _others(request: Request, dashboard: Dashboard) -> list[OtherRun]:
+    """The other runs of the list; none where it cannot be read."""
+    settings: Settings = request.app.state.settings
+    rows, annotated = await dashboard.keeper.ask(lambda s: (s.book.listed(), s.annotated_sources()))
+    digest = dashboard.digest
+    return await asyncio.to_thread(
+        lambda: other_runs(rows, annotated, digest, lambda uri: what_may_be_opened(uri, settings))
     )

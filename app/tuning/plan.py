@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from app.messages import Open
 from app.tuning.goal import Goal, GoalName
 from app.tuning.space import Axis
 from app.version import version
@@ -45,12 +46,18 @@ class PlannedRun(msgspec.Struct, frozen=True):
     Attributes:
         truth: None takes the source's own.
         truth_name: The file that the truth was read from, for the provenance.
+        annotations: Of a run of the page's list: what people said of it, which lies over the source's own.
+        opened: How the page opened it; None for the plan's own seed and odometry.
+        digest: Of the source of which the annotations are; empty for any.
     """
 
     uri: str
     truth: TruthColumns | None = None
     truth_name: str = ""
     held_out: bool = False
+    annotations: TruthColumns | None = None
+    opened: Open | None = None
+    digest: str = ""
 
 
 class Plan(msgspec.Struct, frozen=True):
@@ -112,7 +119,8 @@ def identity(plan: Plan, digests: list[str]) -> dict[str, Any]:
     }
 
 
-def digest_with_truth(digest: str, truth: TruthTrees) -> str:
-    """One digest of a source and its truth."""
-    text = msgspec.json.encode([digest, TruthColumns.of(truth)])
+def digest_with_truth(digest: str, truth: TruthTrees, opened: Open | None = None) -> str:
+    """One digest of a source, its truth, and how it is opened where that is not the plan's own way."""
+    how = () if opened is None else ([opened.seed, opened.odometry, opened.topics, opened.mount],)
+    text = msgspec.json.encode([digest, TruthColumns.of(truth), *how])
     return hashlib.sha256(text).hexdigest()

@@ -13,8 +13,12 @@ from app.finished import as_written
 from app.forests import kept_forests
 from app.history import Snapshots
 from app.mappers import mapper_of
+from app.messages import Open
 from app.odometry import with_odometry
+from app.opening import options_of
+from app.store.records import Annotation
 from app.tally import far_truth
+from app.truths import contents_of, laid_over
 from app.tuning.goal import RunScore, score_of
 from app.tuning.plan import PlannedRun, digest_with_truth
 from app.words import count
@@ -24,7 +28,7 @@ from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
 from pipeline.records import Path, Step, Trees, TruthTrees
 from pipeline.rerun import Basis, Journal, KeptScans, Rerun, look_key
-from pipeline.sources import SourceOptions, open_source
+from pipeline.sources import open_source
 from pipeline.sources.clouds import is_cloud, open_cloud
 from pipeline.steps import steps
 
@@ -94,16 +98,19 @@ class _Drive:
 
     def __init__(self, planned: PlannedRun, seed: int, odometry: str) -> None:
         self.uri, self.held_out = planned.uri, planned.held_out
-        self._seed = seed
-        self._source = open_source(planned.uri, SourceOptions(seed=seed))
+        opened = planned.opened or Open(planned.uri, odometry, seed)
+        self._seed = opened.seed
+        self._source = open_source(planned.uri, options_of(opened))
         try:
             self._truth = _truth(planned, self._source.truth())
-            self._moving, self._chosen = with_odometry(self._source, odometry)
+            self._moving, self._chosen = with_odometry(self._source, opened.odometry)
+            digests = (self._source.description.digest, self._moving.description.digest)
+            _check_source(planned, digests)
         except BaseException:
             self._source.close()
             raise
-        self.source_digest = self._moving.description.digest
-        self.digest = digest_with_truth(self.source_digest, self._truth)
+        self.source_digest = digests[1]
+        self.digest = digest_with_truth(self.source_digest, self._truth, planned.opened)
         self._kept = KeptScans(_KEPT_IN if _KEPT_IN.is_dir() else None)
         self._held: list[Step] | None = None
         self._basis: Basis | None = None
@@ -183,6 +190,7 @@ class _Plot:
         self.uri, self.held_out = planned.uri, planned.held_out
         self._truth = _truth(planned, None)
         self.source_digest = open_cloud(planned.uri).description.digest
+        _check_source(planned, (self.source_digest,))
         self.digest = digest_with_truth(self.source_digest, self._truth)
 
     def evaluate(self, parameters: Parameters, tick: Tick) -> Evaluation:
@@ -208,6 +216,14 @@ _NO_PATH = Path(_NOTHING.astype(np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHIN
 def _truth(planned: PlannedRun, known: Any) -> TruthTrees:  # noqa: ANN401 - a Truth or None
     if planned.truth is not None:
         return planned.truth.as_record()
+    if planned.annotations is not None:
+        own = None if known is None else known.trees
+        contents = contents_of(planned.annotations.as_record())
+        truth = laid_over(own, [Annotation(k, content, "", 0, 1) for k, content in enumerate(contents)])
+        if truth is None:
+            remedy = "Open it and judge some in the tab Annotate, or leave it out"
+            raise SourceError("no true trees are known of this run", where=planned.uri, remedy=remedy)
+        return truth
     if known is None or known.trees is None:
         raise SourceError(
             "the run brings no true trees",
@@ -216,3 +232,17 @@ def _truth(planned: PlannedRun, known: Any) -> TruthTrees:  # noqa: ANN401 - a T
         )
     trees: TruthTrees = known.trees
     return trees
+
+
+def _check_source(planned: PlannedRun, digests: tuple[str, ...]) -> None:
+    """Annotations are of what was recorded, and not of whatever has its name now.
+
+    Raises:
+        SourceError: It is another recording.
+    """
+    if planned.digest and planned.digest not in digests:
+        raise SourceError(
+            "this is not what was mapped before: another recording has its name",
+            where=planned.uri,
+            remedy="Open it and annotate it, or leave it out",
+        )

@@ -1,7 +1,8 @@
 """The search that a dashboard asked for, in a process of its own: `python -m app.tuning.served`.
 
 The plan comes as a line of JSON on stdin; a second line ends the search, and so does the end of stdin, at
-once. What is known goes as lines of JSON to stdout: `Said` records.
+once. What is known goes as lines of JSON to stdout: `Said` records. The journal lies in a folder of its own,
+which belongs to who asked: it stays when the search was stopped, and goes when who asked is gone.
 """
 
 from __future__ import annotations
@@ -11,14 +12,15 @@ import shutil
 import sys
 import threading
 import time
-from tempfile import TemporaryDirectory
+from pathlib import Path
 
 import msgspec
 
 from app.tuning.plan import Plan
 from app.tuning.result import result_of
-from app.tuning.said import Said
+from app.tuning.said import FOLDER, Said
 from app.tuning.search import Search, StoppedError
+from app.tuning.storage import OtherSearchError
 from app.tuning.trial import Trial
 from pipeline.errors import StemmapError
 
@@ -31,20 +33,21 @@ class _Child:
         self._out = os.fdopen(os.dup(1), "wb")
         os.dup2(2, 1)  # a library may print
         self._stop = threading.Event()
-        self._folder = ""
+        self._folder = Path()
 
     def run(self) -> None:
         """Search and tell."""
         if hasattr(os, "nice"):
             os.nice(NICE)
         plan = msgspec.json.decode(sys.stdin.buffer.readline(), type=Plan)
+        self._folder = Path(plan.storage).parent
         threading.Thread(target=self._listen, daemon=True).start()
         try:
-            with TemporaryDirectory(prefix="stemmap-") as folder:
-                self._folder = folder
-                self._search(msgspec.structs.replace(plan, storage=f"{folder}/journal"))
+            self._search(plan)
         except StoppedError:  # before there was a score to begin with
             self._say(Said())
+        except OtherSearchError as error:
+            self._say(Said(error=(f"this is another search now: {error.differs}", "", "Search again")))
         except StemmapError as error:
             self._say(Said(error=(error.what, error.where, error.remedy)))
         except MemoryError:
@@ -53,7 +56,8 @@ class _Child:
     def _search(self, plan: Plan) -> None:
         search = Search(plan, stop=self._stop.is_set)
         try:
-            self._say(Said(start=search.begin()))
+            start = search.begin()
+            self._say(Said(start=start, trials=tuple(search.trials())))
             until = time.monotonic() + plan.seconds if plan.seconds else float("inf")
             self._make(search, until)
             search.stop = lambda: False
@@ -79,7 +83,7 @@ class _Child:
         if sys.stdin.buffer.readline():
             self._stop.set()
             sys.stdin.buffer.readline()
-        if self._folder:
+        if self._folder.name.startswith(FOLDER):
             shutil.rmtree(self._folder, ignore_errors=True)
         os._exit(1)  # who asked is gone
 

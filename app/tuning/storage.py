@@ -25,6 +25,20 @@ _MEANT = {
 _IDENTITY = "stemmap"
 
 
+class OtherSearchError(StemmapError):
+    """A journal of another search.
+
+    Args:
+        differs: In what, in words.
+        where: The journal.
+    """
+
+    def __init__(self, differs: str, where: str) -> None:
+        self.differs = differs
+        remedy = "Name another file with --journal, or delete this one to begin anew"
+        super().__init__(f"the journal is of another search: {differs}", where=where, remedy=remedy)
+
+
 def is_server(storage: str) -> bool:
     """Whether it is the address of a database, and not the path of a journal."""
     return storage.startswith(SERVER)
@@ -121,11 +135,7 @@ def _check_same(path: Path, storage: Any, identity: dict[str, Any]) -> None:  # 
         return
     theirs = before[-1]
     differs = dict.fromkeys(_MEANT[key] for key in _MEANT if theirs.get(key) != plain[key])
-    raise StemmapError(
-        f"the journal is of another search: {', '.join(differs)}",
-        where=str(path),
-        remedy="Name another file with --journal, or delete this one to begin anew",
-    )
+    raise OtherSearchError(", ".join(differs), str(path))
 
 
 def _server(address: str) -> Any:  # noqa: ANN401

@@ -21,7 +21,7 @@ export const state = {
   remapped: null,    // {revision, scans, before, after, ghost: [[x, y, dbh]], renamed, changes: [{kind, number, x, y, why}]}: the whole run was mapped again
   rough: null,       // {revision, places: [[x, y]], score, ghost, changes}: what mapping the run again will come to, roughly
   sensitivity: null, // {name, of, points: [{value, f1, TA, TA_of, false, …} or {value, error}], asked_with, error}: how much a parameter matters
-  search: null,      // {state, goal, made, wanted, start, best, points, importance, better, changes}: a search for parameters
+  search: null,      // {state, goal, made, wanted, go_on, start, best, points, held_out, scores, importance, better, changes}: a search for parameters
   loop: null,        // {from_s, to_s}: the part that is played again and again
   connected: false,
   lostAt: 0,         // when the connection was lost [ms], 0 if it stands

@@ -7,6 +7,7 @@ import { count } from "./format.js";
 import { on, state } from "./state.js";
 import { attempt, shown, specOf, tuning } from "./tune.js";
 import { importanceBars, scoresPicture } from "./tune_search_draw.js";
+import { otherRuns, runsWanted, scoresTable, showRuns } from "./tune_search_runs.js";
 
 const AT_WORK = ["looking", "searching", "stopping"];
 const NO_PART = ["evaluation.", "obstacles."]; // decide how a map is judged, or are no part of it
@@ -22,27 +23,30 @@ const list = el("ul", { id: "search-axes", "aria-label": "Searched over" });
 const more = el("select", { id: "search-more", "aria-label": "Search over another parameter", onchange: () => { if (more.value) addAxis(more.value); more.value = ""; } });
 const form = el("form", { id: "search-form", hidden: true, onsubmit: start },
   el("p", { class: "note dim", text: "The whole run is mapped again and again with other values, begun at those in force, and judged by its true trees." }),
-  el("label", { class: "search-goal" }, "Goal ", goal), el("div", { class: "search-names dim", "aria-hidden": "true" }, ...["Searched over", "from", "to", ""].map((text) => el("span", { text }))), list, more,
+  el("label", { class: "search-goal" }, "Goal ", goal), el("div", { class: "search-names dim", "aria-hidden": "true" }, ...["Searched over", "from", "to", ""].map((text) => el("span", { text }))), list, more, otherRuns,
   el("div", { class: "search-limits" }, number("search-trials", "Trials", 200, 5000), number("search-minutes", "Minutes at most", 10, 1440)),
   el("div", { class: "search-buttons" }, el("button", { id: "search-start", class: "small primary", text: "Search" }), button("search-cancel", "Cancel", "Close, and search for nothing", () => openForm(false))));
 const told = el("p", { id: "search-told", class: "note", role: "status" });
 const failed = el("p", { id: "search-error", class: "error", role: "alert", hidden: true });
 const progress = el("progress", { id: "search-progress", max: "1", hidden: true, "aria-label": "Trials made" });
+const warning = el("p", { id: "search-warning", class: "note", hidden: true });
 const drawn = el("div", { id: "search-drawn" });
 const stop = button("search-stop", "Stop", "End the search; the best set so far stays here", () => attempt(() => post("/api/search/stop", {})));
+const goOn = button("search-go-on", "Go on", "Make the trials that are left, with the same choices", () => attempt(() => post("/api/search/go-on", {})));
 const use = button("search-use", "Use these", "Take the values of the best set; Undo takes them back", () => attempt(() => post("/api/search/use", {})), "small primary");
 const save = button("search-save", "Save as set …", "Keep the best set under a name, with where it comes from", () => { naming.hidden = false; name.focus(); });
 const again = button("search-again", "Search again …", "Another search", () => openForm(true));
 const name = el("input", { id: "search-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set that was found", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && (naming.hidden = true) });
 const naming = el("form", { id: "search-name-form", class: "search-buttons", hidden: true, onsubmit: saveFound }, name, el("button", { class: "small primary", text: "Save" }));
 const changes = el("ul", { id: "search-changes", "aria-label": "What was found" });
-const outcome = el("div", { id: "search-outcome", hidden: true }, told, failed, progress, drawn, changes, el("div", { class: "search-buttons" }, stop, use, save, again), naming);
+const outcome = el("div", { id: "search-outcome", hidden: true }, told, failed, progress, drawn, warning, changes, el("div", { class: "search-buttons" }, stop, use, save, goOn, again), naming);
 export const searchPart = el("section", { id: "tune-search", "aria-label": "Search for parameters" }, opener, form, outcome);
 
 async function openForm(open) {
-  if (open && !asked) {
-    const known = await attempt(() => get("/api/search"));
-    if (!known) return;
+  const known = open && (await attempt(() => get("/api/search")));
+  if (open && !known) return;
+  if (known) showRuns(known.runs);
+  if (known && !asked) {
     asked = true;
     goals = known.goals;
     goal.replaceChildren(...goals.map(({ name: value, words }) => el("option", { value, text: words })));
@@ -79,7 +83,7 @@ function offer() {
 async function start(event) {
   event.preventDefault();
   const limits = ["trials", "minutes"].map((key) => [key, Number(byId(`search-${key}`).value)]);
-  const body = { over: [...axes.values()].map(({ text }) => text()), goal: goal.value, ...Object.fromEntries(limits) };
+  const body = { over: [...axes.values()].map(({ text }) => text()), goal: goal.value, ...Object.fromEntries(limits), ...runsWanted() };
   if (await attempt(() => post("/api/search", body))) form.hidden = true;
   show();
 }
@@ -90,13 +94,14 @@ async function saveFound(event) {
   if (await attempt(() => post("/api/search/save", { name: name.value.trim(), who: myName() }))) naming.hidden = true;
 }
 
-function words({ state: stage, made, wanted, start: first, best, better, goal: aim }) {
+function words({ state: stage, made, wanted, start: first, best, better, goal: aim, go_on: canGoOn }) {
   if (stage === "looking") return "Looking at the scans of the whole run once …";
   const now = first ? `, ${first.shown} with the values it began with` : "";
   if (stage === "searching") return `${made} of ${count(wanted, "trial")}: best ${best?.shown ?? "–"}${now}.`;
   if (stage === "stopping") return "Stopping …";
   if (!best) return "Stopped before anything was tried.";
-  return better ? `Found after ${count(made, "trial")}: ${best.shown} in place of ${first.shown}. Goal: ${aim}.` : `No set of ${count(made, "trial")} was better than the values it began with (${first.shown}).`;
+  const left = canGoOn ? ` ${count(wanted - made, "trial")} left.` : "";
+  return (better ? `Found after ${count(made, "trial")}: ${best.shown} in place of ${first.shown}. Goal: ${aim}.` : `No set of ${count(made, "trial")} was better than the values it began with (${first.shown}).`) + left;
 }
 
 function show() {
@@ -113,9 +118,12 @@ function show() {
   progress.hidden = !working;
   if (search.wanted && search.state !== "looking") progress.value = search.made / search.wanted;
   else progress.removeAttribute("value");
-  drawn.replaceChildren(...[scoresPicture(search), importanceBars(search, specOf)].filter(Boolean));
+  drawn.replaceChildren(...[scoresPicture(search), scoresTable(search), importanceBars(search, specOf)].filter(Boolean));
   changes.replaceChildren(...(search.better ? search.changes : []).map(([parameter, before, value]) => el("li", {}, el("span", { text: specOf(parameter)?.title ?? parameter }), el("b", { text: `${shown(before, null)} → ${shown(value, specOf(parameter))}` }))));
+  setText(warning, search.warning ? `Mind: ${search.warning}.` : "");
+  warning.hidden = !search.warning || working;
   stop.hidden = !working;
+  goOn.hidden = working || !search.go_on;
   stop.disabled = search.state === "stopping";
   use.hidden = save.hidden = working || !search.better;
   if (use.hidden) naming.hidden = true;

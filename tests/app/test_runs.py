@@ -20,10 +20,12 @@ from app.opening import options_of
 from app.settings import Settings
 from app.worker_messages import Begin, Shown
 from pipeline.errors import SourceError, StemmapError
+from pipeline.records import TruthTrees
 from pipeline.sources.base import SourceOptions
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
 
+TRUTH = truth_trees()
 NAMED = {"Cookie": "stemmap_name=Ann%20B"}
 
 
@@ -34,10 +36,11 @@ async def play(
     n_trees: int = 4,
     run: int = 1,
     wanted: Open | None = None,
+    truth: TruthTrees | None = TRUTH,
 ) -> None:
     """A run is opened and shown up to a scan; its record is written when this returns."""
     await dashboard.open(wanted or Open(uri))
-    await dashboard.receive(opened(uri, truth=truth_trees(), run=run))
+    await dashboard.receive(opened(uri, truth=truth, run=run))
     await show(dashboard, scan, n_trees, run)
     async with asyncio.timeout(20):
         while dashboard.logbook.record is None:

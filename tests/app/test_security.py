@@ -44,6 +44,7 @@ ROUTES = [
     ("GET", "/api/search"),
     ("POST", "/api/search"),
     ("POST", "/api/search/stop"),
+    ("POST", "/api/search/go-on"),
     ("POST", "/api/search/use"),
     ("POST", "/api/search/save"),
     ("GET", "/api/doubts"),

@@ -5,16 +5,19 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
+import tempfile
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 import pytest_asyncio
 
+from app.messages import Open
 from app.tune_search import TuneSearch
 from app.tuning.goal import RunScore
-from app.tuning.plan import Plan, PlannedRun
+from app.tuning.plan import Plan, PlannedRun, TruthColumns
 from app.tuning.result import Result, provenance_in
 from app.tuning.said import Said
 from app.tuning.space import axes_of
@@ -23,6 +26,7 @@ from pipeline.errors import StemmapError
 from pipeline.parameters import preset
 from tests.app.fakes import opened, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
+from tests.app.test_runs import play
 
 PLAN = Plan(
     runs=(PlannedRun("sim:stand?duration=1"),),
@@ -44,9 +48,13 @@ SAID = (Said(start=START), Said(trials=(msgspec.structs.replace(START, number=0)
 
 def says(*lines: Said, then: str = "") -> list[str]:
     """A process that says some lines when it was told a plan."""
-    texts = [msgspec.json.encode(line).decode() for line in lines]
+    texts = [_line(line) for line in lines]
     code = f"import sys, time, os\nsys.stdin.readline()\nfor t in {texts!r}: print(t, flush=True)\n{then}"
     return [sys.executable, "-c", code]
+
+
+def _line(said: Said) -> str:
+    return msgspec.json.encode(said).decode()
 
 
 async def until(holds: Callable[[], bool]) -> None:
@@ -142,13 +150,50 @@ async def test_a_run_that_is_left_while_its_search_is_being_started_has_none(mad
 
 
 async def test_what_a_search_had_on_disk_goes_with_it(tmp_path, monkeypatch):
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    search = TuneSearch(lambda _: None)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    search = TuneSearch(lambda _: None, says(then="sys.stdin.read()"))
     await search.start(PLAN)
-    async with asyncio.timeout(60):
-        await until(lambda: bool(list(tmp_path.glob("stemmap-*"))))
+    assert list(tmp_path.glob("stemmap-*"))
     await search.leave()
     assert not list(tmp_path.glob("stemmap-*"))
+
+
+async def test_a_stopped_search_goes_on_from_its_journal_and_only_with_what_it_began_with():
+    search = TuneSearch(lambda _told: None)
+    first = Said(trials=(msgspec.structs.replace(START, number=0),))
+    ended = Said(result=msgspec.structs.replace(RESULT, better=False, best=START, made=1))
+    search._command = says(SAID[0], first, then=f"sys.stdin.readline()\nprint({_line(ended)!r}, flush=True)")
+    await search.start(PLAN)
+    assert search.plan is not None
+    journal = Path(search.plan.storage)
+    with pytest.raises(StemmapError, match="under way"):
+        await search.go_on(PLAN)
+    await until(lambda: search.as_plain()["made"] == 1)
+    await search.stop()
+    await until(lambda: not search.is_under_way)
+    assert (search.as_plain()["state"], search.as_plain()["go_on"]) == ("done", True)
+    edited = msgspec.structs.replace(PLAN.runs[0], truth=TruthColumns.of(truth_trees()))
+    for changed, words in (
+        ({"start": preset("paper").model_dump()}, r"parameters were changed since .*\(.* and \d+ more"),
+        ({"runs": (edited,)}, "true trees were edited"),
+        ({"seed": 1}, "opened otherwise"),
+    ):
+        with pytest.raises(StemmapError, match=words):
+            await search.go_on(msgspec.structs.replace(PLAN, **changed))
+    # The journal knows the first trial, and what was made since.
+    news = Said(trials=(BEST, msgspec.structs.replace(START, number=2)))
+    search._command = says(msgspec.structs.replace(SAID[0], trials=first.trials), news, SAID[2])
+    assert journal.parent.is_dir()
+    await search.go_on(msgspec.structs.replace(PLAN, storage=""))
+    assert Path(search.plan.storage) == journal
+    await until(lambda: not search.is_under_way)
+    told = search.as_plain()
+    assert (told["state"], told["made"], told["better"], told["go_on"]) == ("done", 3, True, False)
+    assert [number for number, _ in told["points"]] == [0, 1, 2]
+    with pytest.raises(StemmapError, match="no stopped search"):
+        await search.go_on(PLAN)
+    await search.leave()
+    assert not journal.parent.exists()
 
 
 async def test_a_real_search_is_stopped_and_keeps_what_it_found():
@@ -226,3 +271,49 @@ async def test_without_truth_or_a_result_there_is_nothing_to_do(both: Running):
         409,
         "no true trees are known of this run",
     )
+
+
+async def test_runs_of_the_list_are_searched_over_or_held_out_where_they_can_be_judged(both: Running):
+    client, dashboard = both
+    for k, (uri, known) in enumerate(
+        (("sim:a", True), ("sim:b", True), ("sim:none", False), ("/no/such/run.mcap", True)), 1
+    ):
+        await play(dashboard, uri, run=k, truth=truth_trees() if known else None)
+    await dashboard.open(Open("fake:"))
+    await dashboard.receive(msgspec.structs.replace(opened(run=9), truth=truth_trees()))
+    listed = {run["name"]: run for run in (await client.get("/api/search")).json()["runs"]}
+    assert {name: run["why_not"] for name, run in listed.items()} == {
+        "sim:a": "",
+        "sim:b": "",
+        "sim:none": "no true trees are known of it",
+        "run.mcap": "its recording is not there any more",
+    }
+    a, b, none, gone = (listed[name]["record"] for name in ("sim:a", "sim:b", "sim:none", "run.mcap"))
+    for wanted, words in (
+        ({"also": [none]}, "no true trees are known of it"),
+        ({"held_out": [gone]}, "not there any more"),
+        ({"also": [a], "held_out": [a]}, "named twice"),
+        ({"also": [999]}, "no other run of the list"),
+    ):
+        answer = await client.post("/api/search", json={**BODY, **wanted})
+        assert (answer.status_code, words in answer.json()["error"]["what"]) == (409, True)
+    best = msgspec.structs.replace(BEST, held_out=(POOR,))
+    start = msgspec.structs.replace(START, held_out=(GOOD,))
+    sources = tuple((name, "ab", name == "b") for name in ("fake:", "a", "b"))
+    result = msgspec.structs.replace(RESULT, start=start, best=best, sources=sources)
+    dashboard.search._command = says(Said(start=start), Said(trials=(best,)), Said(result=result))
+    await client.post("/api/search", json={**BODY, "also": [a], "held_out": [b]})
+    await until(lambda: not dashboard.search.is_under_way)
+    assert dashboard.search.plan is not None
+    assert [(run.uri, run.held_out) for run in dashboard.search.plan.runs[1:]] == [
+        ("sim:a", False),
+        ("sim:b", True),
+    ]
+    told = dashboard.search.as_plain()
+    assert [(row["held_out"], row["runs"]) for row in told["scores"]] == [(False, 2), (True, 1)]
+    assert told["held_out"] == [(1, pytest.approx(2 / 3))]
+    assert "on held-out runs F1 fell" in told["warning"]
+    await client.post("/api/parameters/undo", json={})
+    await dashboard.change_parameters({"gathering.tree_share": 0.5})
+    answer = await client.post("/api/search/go-on", json={})
+    assert (answer.status_code, answer.json()["error"]["where"]) == (409, "gathering.tree_share")

@@ -44,6 +44,8 @@ def test_a_better_set_is_found_used_undone_and_saved(chromium: Browser, tmp_path
         expect(page.locator("#search-drawn .trial")).to_have_count(5)
         expect(page.locator("#search-changes li")).to_have_count(5)
 
+        expect(page.locator("#search-go-on")).to_be_hidden()  # nothing is left to be tried
+
         page.locator("#search-use").click()
         dashboard.until_server("/api/parameters", f"{SHARE} < 0.9 && it.undo")
         page.locator("#tune-undo").click()
