@@ -279,7 +279,9 @@ async def test_runs_of_the_list_are_searched_over_or_held_out_where_they_can_be_
         (("sim:a", True), ("sim:b", True), ("sim:none", False), ("/no/such/run.mcap", True)), 1
     ):
         await play(dashboard, uri, run=k, truth=truth_trees() if known else None)
+        await until(lambda known=known: not known or dashboard.scores.latest is not None)
     await dashboard.open(Open("fake:"))
+    await dashboard.logbook.close()
     await dashboard.receive(msgspec.structs.replace(opened(run=9), truth=truth_trees()))
     listed = {run["name"]: run for run in (await client.get("/api/search")).json()["runs"]}
     assert {name: run["why_not"] for name, run in listed.items()} == {
