@@ -137,6 +137,7 @@ class TuneSearch:
         self.plan, self.asked, self._state, self._error = plan, asked, "looking", ""
         self._began = False
         self._task = asyncio.create_task(self._listen(process), name="search")
+        self._task.add_done_callback(lambda _: self.show())  # only now it may go on
         await self._write(process, msgspec.json.encode(plan) + b"\n")
         self.show()
 
@@ -201,7 +202,6 @@ class TuneSearch:
             await _ended(process)
         if self._state not in ("done", "failed"):
             self._fail("the search ended in the middle. Start it again; the terminal may show why")
-        self.show()
 
     def _take(self, said: Said) -> None:
         self._trials |= {trial.number: trial for trial in said.trials}

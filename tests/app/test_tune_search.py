@@ -159,7 +159,8 @@ async def test_what_a_search_had_on_disk_goes_with_it(tmp_path, monkeypatch):
 
 
 async def test_a_stopped_search_goes_on_from_its_journal_and_only_with_what_it_began_with():
-    search = TuneSearch(lambda _told: None)
+    pages: list[dict[str, Any]] = []
+    search = TuneSearch(pages.append)
     first = Said(trials=(msgspec.structs.replace(START, number=0),))
     ended = Said(result=msgspec.structs.replace(RESULT, better=False, best=START, made=1))
     search._command = says(SAID[0], first, then=f"sys.stdin.readline()\nprint({_line(ended)!r}, flush=True)")
@@ -171,7 +172,8 @@ async def test_a_stopped_search_goes_on_from_its_journal_and_only_with_what_it_b
     await until(lambda: search.as_plain()["made"] == 1)
     await search.stop()
     await until(lambda: not search.is_under_way)
-    assert (search.as_plain()["state"], search.as_plain()["go_on"]) == ("done", True)
+    await until(lambda: pages[-1] == search.as_plain())
+    assert (pages[-1]["state"], pages[-1]["go_on"]) == ("done", True)
     edited = msgspec.structs.replace(PLAN.runs[0], truth=TruthColumns.of(truth_trees()))
     for changed, words in (
         ({"start": preset("paper").model_dump()}, r"parameters were changed since .*\(.* and \d+ more"),
@@ -279,7 +281,8 @@ async def test_runs_of_the_list_are_searched_over_or_held_out_where_they_can_be_
         (("sim:a", True), ("sim:b", True), ("sim:none", False), ("/no/such/run.mcap", True)), 1
     ):
         await play(dashboard, uri, run=k, truth=truth_trees() if known else None)
-        await until(lambda known=known: not known or dashboard.scores.latest is not None)
+        if known:
+            await until(lambda: dashboard.scores.latest is not None)
     await dashboard.open(Open("fake:"))
     await dashboard.logbook.close()
     await dashboard.receive(msgspec.structs.replace(opened(run=9), truth=truth_trees()))
