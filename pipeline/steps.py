@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.geometry import Pose2, Pose3, interpolate, wrap_angle
 from pipeline.gyro import Gyro
+from pipeline.measured_in_time import MeasuredInTime
 from pipeline.records import Imu, Learnt, Notice, Odometry, PoseMeasurement, Record, Scan, Step, Turn
 
 OdometryChoice = Literal["auto", "wheels", "static"]
@@ -22,11 +23,6 @@ STILL = (0.0, 0.0, 0.0)
 JUMP_SLACK = (0.2, 0.05)  # m, rad; what the robot may have moved while its odometry jumped
 WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion that no odometry told
 WALK_MOST = (3.0, 0.5)  # m, rad; beyond it the trees around are others
-SAME_TIME_NS = 50_000_000
-CARRIED_NS = 500_000_000  # a whole pose this old is carried on by the odometry, which errs by
-CARRIED = 0.05  # of the way and of the turn
-NO_HEADING = 1.0  # rad^2; who says no more of the heading than this says nothing
-MOST_POSES = 64
 STANDS = (0.005, 0.002)  # m, rad; a robot that stands stays within it
 SETTLES_NS = 300_000_000
 AHEAD_NS = 1_000_000_000
@@ -101,8 +97,7 @@ class Joiner:
         self._stepped: Pose2 | None = None  # the odometry of the step before
         self._turned_ns: int | None = None
         self._gyro_tilt = (0, 0.0, 0.0)  # when [ns], roll and pitch [rad]
-        self._places: deque[PoseMeasurement] = deque(maxlen=MOST_POSES)  # without a heading
-        self._poses: deque[PoseMeasurement] = deque(maxlen=MOST_POSES)
+        self._measured = MeasuredInTime()
         self._slack = (0.0, 0.0)
         self._doubt = ""
         self._stepped_ns: int | None = None
@@ -169,31 +164,12 @@ class Joiner:
     def _add_pose(self, pose: PoseMeasurement) -> None:
         if not pose.is_sound():
             self._leave_out("measured poses without finite numbers or a positive definite covariance")
-            return
-        kept = self._places if pose.covariance[2, 2] >= NO_HEADING else self._poses
-        if kept and pose.stamp_ns <= kept[-1].stamp_ns:
+        elif not self._measured.add(pose):
             self._leave_out("measured poses that were not later than the one before")
-        else:
-            kept.append(pose)
 
     def _suspect(self, why: str, slack: tuple[float, float]) -> None:
         self._doubt = why
         self._slack = (float(np.hypot(self._slack[0], slack[0])), float(np.hypot(self._slack[1], slack[1])))
-
-    def _pose_at(self, stamp_ns: int, T_odom_base: Pose2 | None) -> PoseMeasurement | None:
-        """The measured pose of a scan; a place alone that lies farther away in time is of another place, a
-        whole pose is carried on by the odometry, once."""
-        near = min(self._places, key=lambda pose: abs(pose.stamp_ns - stamp_ns), default=None)
-        if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS:
-            return near
-        latest = None
-        while self._poses and self._poses[0].stamp_ns <= stamp_ns:
-            latest = self._poses.popleft()
-        if latest is None or stamp_ns - latest.stamp_ns > CARRIED_NS:
-            return None
-        if T_odom_base is None or not self._odometry:
-            return latest if stamp_ns - latest.stamp_ns <= SAME_TIME_NS else None
-        return _carried(latest, self._odometry_at(latest.stamp_ns).inverse() @ T_odom_base, stamp_ns)
 
     def _odometry_at(self, stamp_ns: int) -> Pose2:
         before, after = _around(self._odometry, stamp_ns)
@@ -280,7 +256,7 @@ class Joiner:
             warnings=tuple(self._warnings),
             doubt=self._doubt,
             slack=self._slack,
-            measured=self._pose_at(scan.stamp_ns, pose),
+            measured=self._measured.at(scan.stamp_ns, pose, self._odometry_at if self._odometry else None),
             turn=turn if self._gyro.proven else None,
             turn_rate=self._gyro.rate(scan.stamp_ns) if self._gyro.proven or pose is None else None,
             learnt=replace(self._gyro.learnt(scan.stamp_ns), stands=self._stands, tilt=self._gyro_tilt),
@@ -355,16 +331,6 @@ def _around(readings: deque[_Reading], stamp_ns: int) -> tuple[_Reading, _Readin
     after = next((k for k, r in enumerate(readings) if r.stamp_ns >= stamp_ns), len(readings) - 1)
     after = max(after, min(1, len(readings) - 1))
     return readings[max(after - 1, 0)], readings[after]
-
-
-def _carried(pose: PoseMeasurement, step: Pose2, stamp_ns: int) -> PoseMeasurement:
-    """A measured pose, moved by a step of the odometry to a later time."""
-    error = CARRIED * float(np.hypot(step.x, step.y))
-    at = pose.T_map_base @ step
-    dx, dy = at.x - pose.T_map_base.x, at.y - pose.T_map_base.y
-    F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
-    Q = np.diag([error**2, error**2, (CARRIED * step.yaw) ** 2])
-    return replace(pose, stamp_ns=stamp_ns, T_map_base=at, covariance=F @ pose.covariance @ F.T + Q)
 
 
 def _tilt_between(before: _Reading, after: _Reading, fraction: float) -> tuple[float, float] | None:

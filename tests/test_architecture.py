@@ -35,6 +35,7 @@ FOUNDATION = (
     "turns",
     "resolution",
     "gyro",
+    "measured_in_time",
     "watch",
 )
 # One stage each: they never know one another.
