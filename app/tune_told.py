@@ -45,7 +45,7 @@ def told_of(
         "held_out": _held_points(goal, trials),
         "scores": _rows(plan, start, best),
         "warning": warning_of(result) if result else "",
-        "importance": dict(list(result.importance.items())) if result else {},
+        "importance": result.importance if result else {},
         "better": bool(result and result.better),
         "changes": _changes(plan, result) if result else [],
     }

@@ -97,7 +97,11 @@ async def _plan(request: Request, dashboard: Dashboard, wanted: SearchAsked) -> 
 
 
 async def _others(request: Request, dashboard: Dashboard) -> list[OtherRun]:
-    """The other runs of the list; none where it cannot be read."""
+    """The other runs of the list.
+
+    Raises:
+        StemmapError: It cannot be read.
+    """
     settings: Settings = request.app.state.settings
     rows, annotated = await dashboard.keeper.ask(lambda s: (s.book.listed(), s.annotated_sources()))
     digest = dashboard.digest

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -16,8 +17,34 @@ from pipeline.sources.ordering import Stamped
 from pipeline.sources.ros_records import RecordDecoder
 from pipeline.sources.topics import Topics
 
-_NORTH, _THEIRS = "the direction of north", "how their frame lies"
-_GNSS, _SLAM = ("GNSS", "GNSS fixes", _NORTH), ("other SLAM", "Poses of another SLAM", _THEIRS)
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """One source of measured poses.
+
+    Attributes:
+        numbers: Of its channels.
+        title, readings, reading: For people: what it is, and what it tells, in full and in a word.
+        kind: How its frame is found.
+        hold: Tells the decoder how its frame lies.
+        said: The field of `SourceDescription` that says so.
+        ahead: Of the time of the first scan: how the frame lies by a recording, or why that is not known;
+            None where a recording is gone through as a live run is.
+    """
+
+    numbers: frozenset[int]
+    title: str
+    readings: str
+    reading: str
+    kind: Kind[Any, Any]
+    hold: Callable[[Any], None]
+    said: str
+    ahead: Callable[[int], tuple[Any, str]] | None = None
+
+    def saying(self, known: SourceDescription, words: str) -> SourceDescription:
+        """What is known, with what is to be said of this source."""
+        told: dict[str, Any] = {self.said: words}
+        return replace(known, **told)
 
 
 class MeasuredPoses:
@@ -44,86 +71,85 @@ class MeasuredPoses:
     ) -> None:
         self._container, self._decoder, self._times_of = container, decoder, times_of
         self._odometry = odometry
-        self._fixes = frozenset[int]() if topics.gnss is None else topics.gnss.numbers
-        self._poses = frozenset[int]() if topics.pose is None else topics.pose.numbers
-        self._stretches: list[tuple[frozenset[int], tuple[str, str, str], LiveStretch[Any, Any]]] = []
+        self._sources = tuple(source for source in (self._gnss(topics), self._slam(topics)) if source.numbers)
+        self._stretches: list[tuple[_Source, LiveStretch[Any, Any]]] = []
         #: The channels whose messages count, or may yet.
-        self.numbers = self._fixes | self._poses
+        self.numbers = frozenset[int]().union(*(source.numbers for source in self._sources))
         self.notices: list[str] = []
 
     def begin(self, known: SourceDescription, *, live: bool) -> SourceDescription:
         """What is known of the source with what is found at its opening."""
         start_ns = known.start_ns or 0
-        for numbers, names in ((self._fixes, _GNSS), (self._poses, _SLAM)):
-            if not numbers:
-                continue
+        for source in self._sources:
+            unknown = source.kind.unknown
             if not (known.has_odometry if live else self._odometry):
-                known = self._refuse(known, numbers, names, f"without odometry nobody tells {names[2]}")
+                known = self._refuse(known, source, f"without odometry nobody tells {unknown}")
             elif live:
-                told = f"{'fixes' if names is _GNSS else 'poses'} count when the robot drove far enough"
-                known = _saying(known, names, f"{told} to tell {names[2]}")
-                self._stretches.append((numbers, names, self._stretch(names, numbers, start_ns)))
+                told = f"{source.reading} count when the robot drove far enough to tell {unknown}"
+                known = source.saying(known, told)
+                self._stretches.append((source, self._stretch(source, start_ns)))
             else:
-                found, why = self._ahead(names, numbers, start_ns)
+                found, why = source.ahead(start_ns) if source.ahead else self._ahead(source, start_ns)
                 if found is None:
-                    known = self._refuse(known, numbers, names, why)
+                    known = self._refuse(known, source, why)
                 else:
-                    self._hold(names, found)
-                    known = _saying(known, names, found.words)
+                    source.hold(found)
+                    known = source.saying(known, found.words)
         return known
 
     def add(self, stamped: Stamped[Message | Odometry]) -> None:
         """Take what came next of a live run, before it is made a record of."""
         for entry in tuple(self._stretches):
-            numbers, names, stretch = entry
+            source, stretch = entry
             found = stretch.add(stamped)
             if found is not None:
-                self._hold(names, found)
-                self.notices.append(f"{names[0]}: {found.words}")
+                source.hold(found)
+                self.notices.append(f"{source.title}: {found.words}")
             elif stretch.refused:
-                self.numbers -= numbers
-                self.notices.append(f"{names[1]} are not used: {stretch.refused}")
+                self.numbers -= source.numbers
+                self.notices.append(f"{source.readings} are not used: {stretch.refused}")
             else:
                 continue
             self._stretches.remove(entry)
 
-    def _hold(self, names: tuple[str, str, str], found: Any) -> None:  # noqa: ANN401 - of either kind
-        if names is _GNSS:
+    def _gnss(self, topics: Topics) -> _Source:
+        numbers = frozenset[int]() if topics.gnss is None else topics.gnss.numbers
+        north = "the direction of north"
+        kind: Kind[Any, Any] = Kind(self._decoder.fix, gnss.align, gnss.SHORTEST, gnss.LONGEST, north)
+
+        def hold(found: gnss.Alignment) -> None:
             self._decoder.alignment = found
-        else:
+
+        def ahead(start_ns: int) -> tuple[gnss.Alignment | None, str]:
+            parts = self._container, self._decoder, self._times_of
+            return align_fixes(*parts, numbers, self._odometry, start_ns)
+
+        return _Source(numbers, "GNSS", "GNSS fixes", "fixes", kind, hold, "gnss", ahead)
+
+    def _slam(self, topics: Topics) -> _Source:
+        numbers = frozenset[int]() if topics.pose is None else topics.pose.numbers
+        shortest, longest = other_slam.SHORTEST, other_slam.LONGEST
+        theirs = "how their frame lies"
+        kind: Kind[Any, Any] = Kind(self._decoder.placed, other_slam.relate, shortest, longest, theirs)
+
+        def hold(found: other_slam.Relation) -> None:
             self._decoder.relation = found
 
-    def _refuse(
-        self, known: SourceDescription, numbers: frozenset[int], names: tuple[str, str, str], why: str
-    ) -> SourceDescription:
-        self.numbers -= numbers
-        return replace(known, warnings=(*known.warnings, f"{names[1]} are not used: {why}"))
+        return _Source(numbers, "other SLAM", "Poses of another SLAM", "poses", kind, hold, "other_slam")
 
-    def _stretch(
-        self, names: tuple[str, str, str], numbers: frozenset[int], start_ns: int
-    ) -> LiveStretch[Any, Any]:
-        kind: Kind[Any, Any]
-        if names is _GNSS:
-            kind = Kind(self._decoder.fix, gnss.align, gnss.SHORTEST, gnss.LONGEST, _NORTH)
-        else:
-            longest = other_slam.LONGEST
-            kind = Kind(self._decoder.placed, other_slam.relate, other_slam.SHORTEST, longest, _THEIRS)
-        return LiveStretch(self._decoder, kind, numbers, self._odometry, start_ns)
+    def _refuse(self, known: SourceDescription, source: _Source, why: str) -> SourceDescription:
+        self.numbers -= source.numbers
+        return replace(known, warnings=(*known.warnings, f"{source.readings} are not used: {why}"))
 
-    def _ahead(self, names: tuple[str, str, str], numbers: frozenset[int], start_ns: int) -> tuple[Any, str]:
+    def _stretch(self, source: _Source, start_ns: int) -> LiveStretch[Any, Any]:
+        return LiveStretch(self._decoder, source.kind, source.numbers, self._odometry, start_ns)
+
+    def _ahead(self, source: _Source, start_ns: int) -> tuple[Any, str]:
         """As `LiveStretch.end`, by the first stretch of a recording."""
-        if names is _GNSS:
-            return align_fixes(
-                self._container, self._decoder, self._times_of, numbers, self._odometry, start_ns
-            )
-        stretch = self._stretch(names, numbers, start_ns)
-        for message in islice(self._container.messages(numbers | self._odometry, None, {}), MOST_MESSAGES):
+        stretch, wanted = self._stretch(source, start_ns), source.numbers | self._odometry
+        for message in islice(self._container.messages(wanted, None, {}), MOST_MESSAGES):
             for stamped in self._times_of(message, {}):
                 found = stretch.add(stamped)
                 if found is not None or stretch.refused:
                     return found, stretch.refused
         return stretch.end()
-
-
-def _saying(known: SourceDescription, names: tuple[str, str, str], words: str) -> SourceDescription:
-    return replace(known, gnss=words) if names is _GNSS else replace(known, other_slam=words)

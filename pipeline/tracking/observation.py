@@ -118,7 +118,8 @@ def table_figures(
 
         sigma^2 = 4 (sigma_views^2 / n + (EDGE r + UNEVEN)^2) + (out_of_round D)^2 + (taper_sigma |h|)^2
 
-    The last three do not shrink with n: all views of one tree share its edges, its shape and its butt.
+    The last three do not shrink with n: all views of one tree share its edges, its shape and its butt. What
+    the views weigh by their height widens sigma_views too, so that it is told rather too large.
     """
     T = sides.shape[0]
     coverage, dbh, dbh_sigma, mean = np.empty(T), np.full(T, np.nan), np.full(T, np.nan), np.full(T, np.nan)
