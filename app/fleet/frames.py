@@ -28,6 +28,7 @@ class Frames:
         self._how: dict[str, str] = {}
         self._of: dict[str, str] = {}  # digest of the run that the two above were found for
         self._tried: dict[str, int] = {}  # trees at the last try
+        self._few: set[str] = set()  # who had too few trees for a try
         self._first: tuple[str, str] | None = None
 
     def pose(self, name: str) -> Pose2 | None:
@@ -36,7 +37,8 @@ class Frames:
 
     def how(self, name: str) -> str:
         """How that is known, or why it is not, in words."""
-        return self._how.get(name, "its frame is not known yet: too few trees")
+        why = ": too few trees" if name in self._few else ""
+        return self._how.get(name, f"its frame is not known yet{why}")
 
     async def try_one(self, maps: dict[str, tuple[str, Map]]) -> bool:
         """Lay one more map if any is worth a try; whether one was tried.
@@ -45,6 +47,7 @@ class Frames:
             maps: The run's digest and the map (a list of trees as the page has them) by name.
         """
         self._forget(maps)
+        self._few = {name for name, (_, shown) in maps.items() if len(shown["trees"]) < LEAST_TREES}
         for name, (digest, shown) in maps.items():
             count = len(shown["trees"])
             if self._first is None and count >= LEAST_TREES:

@@ -61,6 +61,7 @@ async def test_the_same_recording_shares_its_frame_and_a_first_that_leaves_ends_
     assert not await frames.try_one({"a": ("other", shown(STEMS[:1])), "b": maps["b"]})
     assert frames.pose("a") is frames.pose("b") is None
     assert "too few trees" in frames.how("a")
+    assert frames.how("c") == "its frame is not known yet", "nobody has counted its trees"
 
 
 @pytest.mark.parametrize("trees", [1, 30])
