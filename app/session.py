@@ -48,6 +48,7 @@ class Session:
         make_synchroniser: From the choice of odometry.
         parameters: In force at the beginning.
         keep: Where what the scans show is kept.
+        compile_ahead: Compiles what is not compiled on this machine yet, faster than the first scan would.
     """
 
     def __init__(
@@ -57,8 +58,10 @@ class Session:
         make_synchroniser: MakeSynchroniser,
         parameters: Parameters,
         keep: Keep = keep_without_name,
+        compile_ahead: Callable[[], None] = lambda: None,
     ) -> None:
         self._open_source = open_source
+        self._compile_ahead = compile_ahead
         self._begun = Beginning(make_mapper, make_synchroniser, keep)
         self._parameters = parameters
         self._revision = 0
@@ -169,6 +172,7 @@ class Session:
             SourceError: There is no scan.
         """
         if self._run is not None:
+            self._compile_ahead()
             self._run.prepare()
             make_ready(self._run.source.description.sensor)
 

@@ -1,10 +1,22 @@
-"""Has the mapper's compiled code ready before the first scan of a robot comes, which would not wait."""
+"""Has the mapper's compiled code ready before it is needed: a robot's first scan would not wait for it.
+
+What looks at a scan and what makes a map of trees share hardly a kernel: two processes compile a half each.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from app.compiling_ahead import compile_ahead
 from app.forests import kept_forests
 from app.stopwatch import Stopwatch
 from pipeline.parameters import Parameters
+
+if TYPE_CHECKING:
+    from pipeline.records import Step
 
 _SCENE = "sim:stand?duration=1"
 
@@ -15,6 +27,7 @@ def warm_up(parameters: Parameters | None = None) -> None:
     from pipeline.sources import open_source
     from pipeline.steps import steps
 
+    compile_ahead()
     source = open_source(_SCENE)
     known = source.description
     mapper = Mapper(
@@ -27,3 +40,56 @@ def warm_up(parameters: Parameters | None = None) -> None:
     )
     for step in steps(source.records()):
         mapper.process(step)
+
+
+def warm_eyes() -> None:
+    """Look at the scans of that second, gather and judge what they show where odometry says that they were
+    taken: all of the mapper but SLAM and the trees' filters."""
+    from pipeline.gathering import Gathering, View
+    from pipeline.geometry import Pose2
+    from pipeline.height_map import HeightMapper
+    from pipeline.perception import decide, look
+    from pipeline.sources import open_source
+    from pipeline.steps import steps
+    from pipeline.tracking import Tracker
+
+    source = open_source(_SCENE)
+    known, parameters = source.description, Parameters()
+    gathering = Gathering(parameters.gathering, all_around=known.sensor.rings > 0, forests=kept_forests())
+    heights, tracker = HeightMapper(), Tracker(parameters.tracking)
+    for step in steps(source.records()):
+        looked = look(step, known.sensor, known.T_base_lidar, parameters)
+        decide(looked, parameters.detection)
+        pose, over = step.T_odom_base or Pose2(), looked.overview
+        if over is not None:
+            view = View(pose, looked.sensor_offset, looked.free, over.steepest, over.depth, over.terrain)
+            gathering.add(over.points, over.height, step.index, view)
+            tracker.judge(step.scan.stamp_ns, gathering.columns, parameters.gathering)
+        if looked.terrain is not None:
+            heights.add(looked.terrain, pose, looked.sensor_offset)
+
+
+def warm_map() -> None:
+    """Map stems that nobody had to look for: SLAM and the trees' filters."""
+    from pipeline.geometry import Pose3
+    from pipeline.mapper import Mapper
+    from pipeline.parameters import preset
+    from pipeline.records import Sensor
+
+    mapper = Mapper(preset("stems"), sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
+    for step in _stems():
+        mapper.process(step)
+
+
+def _stems() -> Iterator[Step]:
+    """A robot that drives half a metre a scan between trees three metres apart."""
+    from pipeline.geometry import Pose2
+    from pipeline.records import Scan, Stems, Step
+
+    x, y = np.meshgrid(np.arange(-6.0, 12.0, 3.0), np.array([-4.0, -1.5, 1.5, 4.0]))
+    for index in range(12):
+        along = 0.5 * index
+        places = np.column_stack([x.ravel() - along, y.ravel(), np.zeros(x.size)]).astype(np.float32)
+        upright = np.tile([0.0, 0.0, 1.0], (x.size, 1))
+        scan = Scan(100_000_000 * index, places, stems=Stems(upright, np.full(x.size, 0.3)))
+        yield Step(index, scan, Pose2(along, 0.0, 0.0))

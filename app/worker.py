@@ -40,6 +40,7 @@ def new_session(folder: Path | None = None) -> Session:
     Args:
         folder: Where what scans show is kept for the next opening of a recording; None keeps nothing.
     """
+    from app.compiling_ahead import compile_ahead
     from app.forests import kept_forests
     from app.opening import open_any
     from app.robot.source import LiveSource
@@ -73,6 +74,7 @@ def new_session(folder: Path | None = None) -> Session:
         make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
         parameters=Parameters(),
         keep=keep_without_name if folder is None else keep_in(folder),
+        compile_ahead=compile_ahead,
     )
 
 

@@ -69,6 +69,9 @@ def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
     return kernel
 
 
+_heard: list[Callable[[], None]] = []
+
+
 class _Compiling(event.Listener):  # type: ignore[misc]
     """Hears of every kernel that is compiled; one that is loaded from what is kept is none."""
 
@@ -87,15 +90,57 @@ class _Compiling(event.Listener):  # type: ignore[misc]
 @contextmanager
 def on_compiling(tell: Callable[[], None]) -> Iterator[None]:
     """Inside, `tell` is called before each kernel that this machine has to compile, in the thread that
-    waits for it. Kernels that are kept on disk need no compiling and are not told."""
-    with event.install_listener("numba:compile", _Compiling(tell)):
-        yield
+    waits for it, and when somebody else compiles for it (see `others_compile`). Kernels that are kept on disk
+    need no compiling and are not told."""
+    _heard.append(tell)
+    try:
+        with event.install_listener("numba:compile", _Compiling(tell)):
+            yield
+    finally:
+        _heard.remove(tell)
+
+
+def others_compile() -> None:
+    """Tell those who listen that this thread waits for kernels which other processes compile."""
+    for tell in tuple(_heard):
+        tell()
 
 
 def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
     """Let what is kept of a kernel be good only while no source that it may have taken in has changed."""
     file = kernel._cache._cache_file  # numba has no public place for this
     file._source_stamp = (file._source_stamp, sources_digest(module))
+    file.save = _saved_by_one(file)
+
+
+def _saved_by_one(file: Any) -> Callable[[Any, Any], None]:  # noqa: ANN401
+    """Let one process at a time write what is kept of a kernel: two that compile it for other types at once
+    would give both the same file, and the index would lead one of them to the other's machine code."""
+    save: Callable[[Any, Any], None] = type(file).save
+
+    def save_alone(key: Any, data: Any) -> None:  # noqa: ANN401
+        with locked(Path(file._index_path)):
+            save(file, key, data)
+
+    return save_alone
+
+
+@contextmanager
+def locked(beside: Path) -> Iterator[None]:
+    """Inside, no other process holds the lock of a file's folder, where the system has locks."""
+    try:
+        import fcntl
+    except ImportError:  # not on this system
+        yield
+        return
+    with (beside.parent / ".lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # let go with the file
+        yield
+
+
+def is_kept(kernel: Callable[..., Any]) -> bool:
+    """Whether machine code of a kernel is kept on this machine that was made from the sources as they are."""
+    return bool(kernel._cache._cache_file._load_index())  # type: ignore[attr-defined]
 
 
 def sources_digest(module: str) -> str:

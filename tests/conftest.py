@@ -26,9 +26,13 @@ _WITH_OTHER_PROCESSES = {"app", "browser", "cli", "fleet", "robot", "sweeping", 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-# Two processes that compile the same function for other types at once may spoil numba's index of its cache.
-if os.environ.get("PYTEST_XDIST_WORKER", "gw0") != "gw0":
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(ROOT / ".numba_cache" / os.environ["PYTEST_XDIST_WORKER"]))
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """The whole suite compiles the mapper once, on both cores, before its two processes would do so each."""
+    if getattr(session.config.option, "numprocesses", None):
+        from app.compiling_ahead import compile_ahead
+
+        compile_ahead()
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

@@ -121,6 +121,7 @@ def _run_plot(arguments: argparse.Namespace) -> int:
 def _run_scans(arguments: argparse.Namespace) -> int:
     from app.chosen import plain_of_options
     from app.cli.listening import begin_recording, heard, recording_of, told_of_frames
+    from app.compiling_ahead import compile_ahead
     from app.continuing import Continued
     from app.offline import OfflineRun, map_run
     from app.opening import open_any
@@ -144,6 +145,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             saved.chosen_parameters() if saved else revisions[0][1] if revisions else None,
         )
         begin_recording(opened, parameters)
+        compile_ahead()
         plan = OfflineRun(
             source=opened,
             preset=preset_name,

@@ -89,9 +89,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @compiling_is_said()
 def run(arguments: argparse.Namespace) -> int:
     """Search, and write the best set."""
+    from app.compiling_ahead import compile_ahead
     from app.tuning.search import Search
 
     plan = _plan(arguments)
+    compile_ahead()
     search: Search | None = None
     try:
         search = Search(plan)

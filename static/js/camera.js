@@ -3,6 +3,7 @@
 import { get } from "./api.js";
 import { byId, el, setText } from "./dom.js";
 import { select, selectCluster } from "./live.js";
+import { nothingYet } from "./nothing_yet.js";
 import { keepFresh, shownOver } from "./overlay.js";
 import { on, state } from "./state.js";
 import { openStory } from "./story.js";
@@ -19,7 +20,7 @@ const image = () => byId("camera-image");
 const refresh = keepFresh(async () => {
   if (!shownOver("camera")) return;
   if (!state.map) {
-    empty("No scan yet. Press play, or open a run.");
+    empty(nothingYet("No scan"));
     return;
   }
   try {

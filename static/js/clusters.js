@@ -3,6 +3,7 @@
 import { byId, el } from "./dom.js";
 import { count, figure, fixed } from "./format.js";
 import { selectCluster } from "./live.js";
+import { nothingYet } from "./nothing_yet.js";
 import { on, state } from "./state.js";
 import { openStory } from "./story.js";
 import { visible } from "./tabs.js";
@@ -21,7 +22,7 @@ function show() {
   if (!visible("clusters")) return;
   filledAt = performance.now();
   if (!state.map) {
-    panel().replaceChildren(el("p", { class: "empty", text: "No scan yet. Press play, or open a run." }));
+    panel().replaceChildren(el("p", { class: "empty", text: nothingYet("No scan") }));
     return;
   }
   const verdicts = Object.entries(state.map.verdicts ?? {}).sort((a, b) => (b[0] === "tree") - (a[0] === "tree") || b[1] - a[1]);
@@ -72,5 +73,5 @@ function points() {
 
 export function startClusters() {
   on("map", later);
-  on("tab selection", show);
+  on("tab selection phase", show);
 }

@@ -3,6 +3,7 @@
 import { blockFor } from "./api.js";
 import { byId, el, setText } from "./dom.js";
 import { fillComparison } from "./compare_tables.js";
+import { nothingYet } from "./nothing_yet.js";
 import { keepFresh, shownOver } from "./overlay.js";
 import { newEye, pixel, PointPicture, unpack } from "./points.js";
 import { changed, on, state } from "./state.js";
@@ -88,7 +89,7 @@ const refresh = keepFresh(async () => {
   if (!state.map) {
     data = null;
     byId("over-compare").classList.remove("waits");
-    setText(lead, "No scan yet. Press play, or open a run.");
+    setText(lead, nothingYet("No scan"));
     return;
   }
   try {

@@ -3,6 +3,7 @@
 import { truthInWords, warnedInWords } from "./annotate.js";
 import { byId, el } from "./dom.js";
 import { figure, NONE, percent } from "./format.js";
+import { nothingYet } from "./nothing_yet.js";
 import { openSources } from "./sources.js";
 import { on, state } from "./state.js";
 import { visible } from "./tabs.js";
@@ -49,12 +50,12 @@ function lines(score) {
 }
 
 function nothing() {
-  if (!state.map) return el("p", { class: "empty", text: "Nothing mapped yet. Press play, or open a run." });
+  if (!state.map) return el("p", { class: "empty", text: nothingYet() });
   return el("div", { class: "empty" },
     el("p", { text: "This run brings no ground truth, so there is nothing to score the map against. Annotate the trees, or open a simulated run." }),
     el("button", { text: "Open a simulated run", onclick: openSources }));
 }
 
 export function startScores() {
-  on("evaluation truth annotations tab", show);
+  on("evaluation truth annotations tab phase", show);
 }

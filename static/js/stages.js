@@ -3,6 +3,7 @@
 import { block } from "./api.js";
 import { byId, el, setText } from "./dom.js";
 import { count } from "./format.js";
+import { nothingYet } from "./nothing_yet.js";
 import { keepFresh, shownOver } from "./overlay.js";
 import { newEye, pixel, PointPicture, unpack } from "./points.js";
 import { on, state } from "./state.js";
@@ -63,7 +64,7 @@ const refresh = keepFresh(async () => {
   if (!shownOver("stages")) return;
   try {
     data = state.map ? unpack(await block("/api/stages")) : null;
-    setText(byId("stages-lead"), data ? `Scan ${data.index}. Drag to turn, shift and drag to move, wheel to zoom; all four move together.` : "No scan yet. Press play, or open a run.");
+    setText(byId("stages-lead"), data ? `Scan ${data.index}. Drag to turn, shift and drag to move, wheel to zoom; all four move together.` : nothingYet("No scan"));
     byId("over-stages").dataset.scan = data ? String(data.index) : "";
   } catch (error) {
     setText(byId("stages-lead"), error.message);

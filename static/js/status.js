@@ -2,7 +2,7 @@
 
 import { byId, el, setText } from "./dom.js";
 import { NONE, figure } from "./format.js";
-import { on, state } from "./state.js";
+import { changed, on, state } from "./state.js";
 
 const WORDS = {
   starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
@@ -92,7 +92,10 @@ function robotsTitle(status) {
 function showState() {
   const box = byId("state");
   const name = state.connected ? (state.status?.state ?? "starting") : "lost";
-  if (box.dataset.state !== name) box.dataset.state = name;
+  if (box.dataset.state !== name) {
+    box.dataset.state = name;
+    changed("phase");
+  }
   setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.lostAt ? "No connection" : "Connecting");
   box.title = robotsTitle(state.status);
   const recording = state.status?.recording ?? "";
@@ -130,6 +133,7 @@ function showNotice(quiet) {
   const failed = state.connected && status?.state === "failed";
   notice.classList.toggle("failed", failed);
   notice.classList.toggle("wait", !failed);
+  notice.classList.toggle("starting", status?.state === "starting");
   document.body.classList.toggle("failed", failed);
   setText(notice.querySelector("span"), sentence(text));
   byId("notice-open").hidden = !failed;

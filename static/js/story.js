@@ -2,6 +2,7 @@
 
 import { get } from "./api.js";
 import { byId, el } from "./dom.js";
+import { nothingYet } from "./nothing_yet.js";
 import { onSceneLoad } from "./scene.js";
 import { selectCluster } from "./live.js";
 import { on, state } from "./state.js";
@@ -71,7 +72,7 @@ function empty() {
   delete panel().dataset.story;
   body().replaceChildren(el("p", { class: "empty", text: state.map
     ? "Nothing is selected. Click a cluster or a tree in the 3D scene, on the map or in a table, and it tells why it was taken for what it is."
-    : "Nothing mapped yet. Press play, or open a run." }));
+    : nothingYet() }));
 }
 
 // A person here has chosen something: read about it, wherever it was chosen.

@@ -4,6 +4,7 @@ import { byId, el, setText } from "./dom.js";
 import { saveCanvas } from "./download.js";
 import { count, figure, fixed, NONE } from "./format.js";
 import { select } from "./live.js";
+import { nothingYet } from "./nothing_yet.js";
 import { on, state } from "./state.js";
 import { openStory } from "./story.js";
 import { filterOf, HELP, sigma } from "./table_filter.js";
@@ -99,7 +100,7 @@ function emptyText(all, wanted, refused) {
   if (all && refused) return `“${refused}” is not understood. ${HELP}`;
   if (all) return `No tree fits “${wanted}”.`;
   return state.map ? "No tree yet. A tree is listed when it was seen in enough scans; the tab Clusters tells what became of the clusters."
-    : "Nothing mapped yet. Press play, or open a run.";
+    : nothingYet();
 }
 
 function later() {
@@ -111,7 +112,7 @@ export function startTable() {
   byId("find").addEventListener("input", fill);
   byId("find").title = HELP;
   byId("trees-png").addEventListener("click", () => saveCanvas("trees.png", pictureOf(byId("trees"))));
-  on("map truth annotations", later);
+  on("map truth annotations phase", later);
   on("tab", fill);
   on("selection", () => {
     for (const [number, row] of rows) row.setAttribute("aria-selected", String(number === state.selected));

@@ -88,3 +88,24 @@ def test_compiling_is_told_and_taking_what_was_kept_is_not(tmp_path):
     (tmp_path / "wood" / "tree.py").write_text(CALLER)
     assert call(tmp_path, 2.0, 1.0, CALL_AND_LISTEN) == ["4.0", "True"]
     assert call(tmp_path, 2.0, 1.0, CALL_AND_LISTEN) == ["4.0", "False"]
+
+
+def test_processes_that_compile_a_kernel_for_other_types_at_once_keep_all_of_them(tmp_path):
+    (tmp_path / "wood").mkdir()
+    (tmp_path / "wood" / "__init__.py").touch()
+    (tmp_path / "wood" / "tree.py").write_text(CALLER)
+    (tmp_path / "wood" / "leaf.py").write_text(LEAF.format(factor=2.0, more=1.0))
+    environment = {"PYTHONPATH": f"{tmp_path}:{ROOT}", "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    values = ["1", "1.0", "numpy.ones(1)", "numpy.ones((1, 1))"]
+
+    def begun(*values: str) -> subprocess.Popen[str]:
+        calls = "".join(f"twice({value}); " for value in values)
+        program = f"import numpy; from wood.tree import twice; {calls}"
+        program += "print(sum(twice.stats.cache_hits.values()))"
+        return subprocess.Popen(
+            [sys.executable, "-c", program], cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True
+        )
+
+    first = [begun(value) for value in values]
+    assert [process.communicate(timeout=120)[0] for process in first] == ["0\n"] * 4
+    assert begun(*values).communicate(timeout=120)[0] == "4\n"

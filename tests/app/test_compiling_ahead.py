@@ -1,0 +1,86 @@
+"""Two processes compile what one mapper calls: no more, no less, and nobody waits when it is kept."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from app import compiling_ahead
+from pipeline.compiled import on_compiling
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# Which types the kernels of the package were called with, before and after a run is mapped.
+PROGRAM = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from app.warming import warm_eyes, warm_map, warm_up
+
+def seen():
+    return {
+        (kernel.__module__, kernel.__name__, str(signature))
+        for name, module in list(sys.modules.items()) if name.startswith("pipeline.")
+        for kernel in vars(module).values() if isinstance(kernel, Dispatcher)
+        for signature in kernel.signatures
+    }
+
+warm_eyes()
+warm_map()
+before = seen()
+assert len(before) > 20, before
+warm_up()
+print(*sorted(seen() - before), sep="\\n", end="")
+"""
+
+
+def test_the_halves_compile_what_the_mapper_calls():
+    run = [sys.executable, "-c", PROGRAM]
+    told = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)
+    assert not told.stdout
+
+
+def test_nobody_is_started_where_all_is_kept(monkeypatch):
+    monkeypatch.setattr(compiling_ahead, "is_compiled", lambda: True)
+    monkeypatch.setattr(compiling_ahead, "_started", lambda half: pytest.fail(half))
+    compiling_ahead.compile_ahead()
+
+
+def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
+    started = []
+
+    def start(half: str) -> subprocess.Popen[bytes]:
+        program = f"import time; time.sleep(0.5); open({str(tmp_path / half)!r}, 'w').close()"
+        started.append(subprocess.Popen([sys.executable, "-c", program]))
+        return started[-1]
+
+    monkeypatch.setattr(compiling_ahead, "is_compiled", lambda: False)
+    monkeypatch.setattr(compiling_ahead, "_started", start)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    told = []
+    with on_compiling(lambda: told.append(1)):
+        compiling_ahead.compile_ahead()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["warm_eyes", "warm_map"]
+    assert [process.returncode for process in started] == [0, 0]
+    assert told
+
+
+def test_a_person_who_waits_no_longer_leaves_none_behind(monkeypatch):
+    started = []
+
+    def start(half: str) -> subprocess.Popen[bytes]:
+        del half
+        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]))
+        return started[-1]
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(compiling_ahead, "is_compiled", lambda: False)
+    monkeypatch.setattr(compiling_ahead, "_started", start)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    with on_compiling(interrupt), pytest.raises(KeyboardInterrupt):
+        compiling_ahead.compile_ahead()
+    assert [process.poll() is None for process in started] == [False, False]
