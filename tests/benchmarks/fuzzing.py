@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.benchmarks.machine import peak_mib
 from tests.benchmarks.mutating import mutation
-from tests.benchmarks.real_files import KINDS, real_file
+from tests.benchmarks.real_files import AFTERWARDS, KINDS, real_file
 
 
 def main(kind: str, data: Path, folder: Path, first: int, last: int) -> None:
@@ -19,13 +19,13 @@ def main(kind: str, data: Path, folder: Path, first: int, last: int) -> None:
     name, read = KINDS[kind]
     original = real_file(kind, data, folder)
     damaged = folder / name
-    seed = zlib.crc32(kind.encode())
+    seed, afterwards = zlib.crc32(kind.encode()), AFTERWARDS.get(kind, bytes)
     damaged.write_bytes(original)
     said = read(damaged)
     if said:
         raise SystemExit(f"the file itself cannot be read: {said}")
     for number in range(first, last):
-        damaged.write_bytes(mutation(original, seed, number))
+        damaged.write_bytes(afterwards(mutation(original, seed, number)))
         begun, fault = time.process_time(), ""
         try:
             refused = read(damaged) != ""

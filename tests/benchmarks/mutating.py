@@ -10,6 +10,7 @@ from pipeline.errors import SourceError
 from pipeline.records import Scan
 from pipeline.sources import open_source
 from pipeline.sources.clouds import open_cloud
+from pipeline.sources.clouds.e57_pages import PAGE, checksums
 
 
 def mutation(original: bytes, seed: int, number: int) -> bytes:
@@ -38,6 +39,15 @@ def mutation(original: bytes, seed: int, number: int) -> bytes:
     if number % 5 == 4:
         del content[int(rng.integers(0, len(content) + 1)) :]
     return bytes(content)
+
+
+def with_sums(damaged: bytes) -> bytes:
+    """An E57 file with the right sum at the end of each of its pages, and as long as its header says."""
+    pages = np.frombuffer(damaged + bytes(-len(damaged) % PAGE), np.uint8).reshape(-1, PAGE).copy()
+    if len(pages):
+        pages[0, 16:24] = np.frombuffer(pages.size.to_bytes(8, "little"), np.uint8)
+        pages[:, -4:] = checksums(pages[:, :-4]).astype(">u4")[:, None].view(np.uint8)
+    return pages.tobytes()
 
 
 def read_all(path: Path) -> str:

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks.mutating import read_all, read_cloud
+from tests.benchmarks.cut_recordings import bag_of, plain_mcap_of
+from tests.benchmarks.mutating import read_all, read_cloud, with_sums
 
 #: Kinds, the name that a damaged copy gets in a folder of its own, and how it is read.
 KINDS: dict[str, tuple[str, Callable[[Path], str]]] = {
     "ROS 2 MCAP": ("run.mcap", read_all),
+    "MCAP, not packed": ("run.mcap", read_all),
     "ROS 2 db3": ("run.db3", read_all),
     "ROS 1 bag": ("run.bag", read_all),
+    "ROS 1 bag, not packed": ("run.bag", read_all),
     "Velodyne pcap": ("run.pcap", read_all),
     "KITTI bin": ("0.bin", read_all),
     "PCD binary": ("0.pcd", read_all),
@@ -22,6 +25,7 @@ KINDS: dict[str, tuple[str, Callable[[Path], str]]] = {
     "LAZ": ("plot.laz", read_cloud),
     "LAS": ("plot.las", read_cloud),
     "E57": ("plot.e57", read_cloud),
+    "E57, sums mended": ("plot.e57", read_cloud),
     "PLY": ("plot.ply", read_cloud),
     "NumPy npy": ("plot.npy", read_cloud),
     "NumPy npz": ("plot.npz", read_cloud),
@@ -30,6 +34,9 @@ KINDS: dict[str, tuple[str, Callable[[Path], str]]] = {
     "poses TUM": ("poses.txt", lambda path: read_all(path.parent)),
 }
 
+#: What is done to a damaged copy of a kind, so that its damage is not found by a checksum alone.
+AFTERWARDS: dict[str, Callable[[bytes], bytes]] = {"E57, sums mended": with_sums}
+
 
 def real_file(kind: str, data: Path, folder: Path) -> bytes:
     """The contents of a real file of a kind, or of the first part of one; others beside it go to `folder`."""
@@ -37,10 +44,12 @@ def real_file(kind: str, data: Path, folder: Path) -> bytes:
     match kind:
         case "ROS 2 MCAP":
             return (velodyne / "vlp16_ros2_mcap" / "vlp16_ros2_mcap.mcap").read_bytes()
+        case "MCAP, not packed":
+            return plain_mcap_of(velodyne / "vlp16_ros1.bag", folder / "cut.mcap")
         case "ROS 2 db3":
             return (velodyne / "vlp16_rosbag2" / "1673400471837873222_0.db3").read_bytes()
-        case "ROS 1 bag":
-            return (velodyne / "vlp16_ros1.bag").read_bytes()
+        case "ROS 1 bag" | "ROS 1 bag, not packed":
+            return bag_of(velodyne / "vlp16_ros1.bag", folder / "cut.bag", packed=kind == "ROS 1 bag")
         case "Velodyne pcap":
             return (velodyne / "vlp16.pcap").read_bytes()
         case "KITTI bin":

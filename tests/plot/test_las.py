@@ -114,6 +114,16 @@ def test_a_header_that_lies_is_one_line_and_takes_no_memory(tmp_path, points, na
         assert not (tmp_path / "out").exists()
 
 
+def test_items_longer_than_a_point_are_refused_before_the_decoder_takes_memory_for_them(tmp_path, points):
+    file = write_las(tmp_path / "plot.laz", points[:5000])
+    content = file.read_bytes()
+    items = content.index(b"laszip encoded") + 52 + 34  # each: kind, length, version
+    assert struct.unpack_from("<HHH", content, items)[:2] in ((6, 20), (10, 30))
+    file.write_bytes(damage(content, items + 2, struct.pack("<H", 65535)))
+    with pytest.raises(SourceError, match="contradicts itself"):
+        open_cloud(str(file))
+
+
 @pytest.mark.parametrize("name", ["plot.las", "plot.laz"])
 def test_a_file_cut_off_or_scrambled_never_crashes(tmp_path, points, name):
     whole = write_las(tmp_path / name, points[:20_000]).read_bytes()

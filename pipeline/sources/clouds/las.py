@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 PART = 1 << 19  # points
 MOST_POINTS = 2_000_000_000
 RECORD_LIMIT = 1024  # bytes of a point
-_COMPRESSED = 0xC0
+#: A variable length record: what it is (after who says it), how long it is (before what it is in words).
+_RECORD = struct.Struct("<18xHH32x")
+#: The one of LASzip lists the items of a point from that byte on: kind, length and version of each.
+_LASZIP, _ITEMS, _ITEM = 22204, 34, struct.Struct("<HHH")
 _REMEDY = "Copy the file again, or export it again"
 
 
@@ -175,12 +178,35 @@ def _check(path: Path, uri: str) -> tuple[int, int, bool, str]:
         if points and there == 0:
             raise SourceError("the LAS file ends before its first point", where=uri, remedy=_REMEDY)
         if compressed:
+            _check_items(file, header_size, first, records, length, uri)
             _check_chunks(file, first, size, uri)
     if points == 0:
         raise SourceError("the cloud has no points", where=uri)
     if points > MOST_POINTS or (compressed and points > 4000 * room):
         raise SourceError("the header of the LAS file promises too many points", where=uri, remedy=_REMEDY)
     return points, there, compressed, version
+
+
+def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, uri: str) -> None:
+    """The items that a point is packed in are together as long as a point (LASzip, `laszip.check`).
+
+    The decoder takes memory for what they say: 65,535 bytes a point, whatever the header promises.
+    """
+    for _ in range(records):
+        file.seek(at)
+        head = file.read(_RECORD.size)
+        if len(head) < _RECORD.size or at + _RECORD.size > end:
+            break
+        number, content = _RECORD.unpack(head)
+        at += _RECORD.size + content
+        if number != _LASZIP:
+            continue
+        told = file.read(content)
+        items = int.from_bytes(told[_ITEMS - 2 : _ITEMS], "little")
+        table = told[_ITEMS : _ITEMS + _ITEM.size * items]
+        table = table[: len(table) // _ITEM.size * _ITEM.size]
+        if sum(size for _, size, _ in _ITEM.iter_unpack(table)) != length:
+            raise SourceError("the header of the LAS file contradicts itself", where=uri, remedy=_REMEDY)
 
 
 def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:
