@@ -7,7 +7,7 @@ import msgspec
 from app.robot.source import LiveSource
 from pipeline.errors import StemmapError
 from pipeline.sources.base import Source, SourceDescription
-from pipeline.sources.camera import Camera, Picture
+from pipeline.sources.camera import SHOWN_NS, Camera, Picture
 from pipeline.sources.pictures import WithPictures
 from pipeline.sources.rostypes import COMPRESSED_IMAGE, IMAGE
 from pipeline.sources.with_motion import WithMotion
@@ -43,8 +43,11 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     origin: object = source.source if isinstance(source, WithMotion) else source
     if source is None or not has_camera(source.description) or not isinstance(origin, WithPictures):
         raise StemmapError("this run has no camera", remedy="Record a camera's topic beside the LiDAR")
-    picture = origin.picture_near(stamp_ns)
+    picture = origin.picture_near(stamp_ns, SHOWN_NS)
     if picture is None:
-        raise StemmapError("no picture was taken at this time", remedy="Play on, or go to another scan")
+        raise StemmapError(
+            f"no picture was taken within {SHOWN_NS / 1e9:g} s of this scan",
+            remedy="Play on, or go to another scan",
+        )
     told = origin.pictures_told if isinstance(origin, LiveSource) else ""
     return CameraPicture(picture, *origin.camera(), told)

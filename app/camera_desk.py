@@ -9,10 +9,11 @@ from collections import OrderedDict
 from typing import Any
 
 from app.camera_marks import marks_of
+from app.camera_motion import motion
 from app.drawing import drawn
 from app.story.asking import Asking
 from app.story.questions import NoStoryError
-from pipeline.records import Frame
+from pipeline.records import Frame, Path
 
 #: All browsers together get so many pictures a second at most.
 _PAUSE_S = 0.3
@@ -43,9 +44,13 @@ class CameraDesk:
         """A picture that was told of lately."""
         return self._kept.get(stamp_ns)
 
-    async def look(self, frame: Frame) -> dict[str, Any]:
+    async def look(self, frame: Frame, path: Path | None) -> dict[str, Any]:
         """What is to be seen at the time of a scan: the picture's stamp, its marks, why there are none, and
         `of`, another number for each run.
+
+        Args:
+            frame: Of the scan.
+            path: Of the run; it tells where the robot was when the picture was taken.
 
         Raises:
             NoStoryError: There is no picture, and why.
@@ -69,13 +74,13 @@ class CameraDesk:
                 while len(self._kept) > _MOST_KEPT:
                     self._kept.popitem(last=False)
             self._next_at = time.monotonic() + _PAUSE_S
-        camera = found.camera
+        camera, moved = found.camera, motion(path, frame.stamp_ns, picture.stamp_ns)
         return {
             "index": frame.index,
             "of": of,
             "stamp_ns": str(picture.stamp_ns),  # more digits than a number of JavaScript has
             "later_ms": round((picture.stamp_ns - frame.stamp_ns) / 1e6),
-            "marks": [] if camera is None else await asyncio.to_thread(marks_of, frame, camera),
+            "marks": [] if camera is None else await asyncio.to_thread(marks_of, frame, camera, moved),
             "why": found.why,
             "told": found.told,
         }

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from app.live_payload import clusters_payload
+from pipeline.geometry import Pose2
 from pipeline.records import Float, Frame
 from pipeline.sources.camera import Camera
 
@@ -15,21 +16,26 @@ FARTHEST, NEAREST, FROM_Z, TO_Z, THIN = 25.0, 0.5, 0.0, 2.0, 0.2
 MOST = 150
 
 
-def marks_of(frame: Frame, camera: Camera) -> list[dict[str, Any]]:
+def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
     """Boxes of clusters and of trees that are in view, the farthest of each first; the MOST nearest at most.
 
     The robot's tilt is not known here, so on a slope the boxes of trees stand a little high or low.
+
+    Args:
+        frame: Of the scan.
+        camera: Of the picture.
+        moved: T_scan_picture of the base, where the picture was taken at another time.
     """
-    found = [*_trees(frame, camera), *_clusters(frame, camera)]
+    found = [*_trees(frame, camera, moved), *_clusters(frame, camera, moved)]
     nearest = sorted(found, key=lambda mark: float(mark["distance_m"]))[:MOST]
     # What comes later lies on top and takes the click.
     return sorted(nearest, key=lambda mark: (mark["kind"] == "tree", -float(mark["distance_m"])))
 
 
-def _trees(frame: Frame, camera: Camera) -> list[dict[str, Any]]:
+def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
     trees = frame.trees
     marks = []
-    places = frame.estimate.T_map_base.inverse().apply(trees.position)
+    places = (frame.estimate.T_map_base @ moved).inverse().apply(trees.position)
     for row in np.flatnonzero(trees.confirmed):
         x, y = places[row]
         reach = float(np.hypot(x, y))
@@ -45,9 +51,10 @@ def _trees(frame: Frame, camera: Camera) -> list[dict[str, Any]]:
     return marks
 
 
-def _clusters(frame: Frame, camera: Camera) -> list[dict[str, Any]]:
+def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
     verdicts = clusters_payload(frame)["verdict"]
     points = frame.filtered.astype(np.float64) + frame.sensor_offset
+    points[:, :2] = moved.inverse().apply(points[:, :2])
     order = np.argsort(frame.labels, kind="stable")
     labels = frame.labels[order]
     marks = []

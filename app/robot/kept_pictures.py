@@ -9,6 +9,7 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 from pipeline.records import Path
+from pipeline.rerun.kept import SPARE_BYTES, room
 from pipeline.sources.camera import Picture
 from pipeline.sources.container import count_loss
 
@@ -17,6 +18,7 @@ STEP_M, TURN_RAD = 1.0, math.radians(22.5)
 MOST_BYTES, MOST_PICTURES = 1 << 30, 20_000
 FULL = "pictures not put aside for trees: 1 GB of them is there"
 REFUSED = "pictures not put aside for trees: the disk refuses"
+SPARED = f"pictures not put aside for trees: less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left"
 
 
 class _Kept(NamedTuple):
@@ -44,6 +46,7 @@ class KeptPictures:
         there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.is_dir())
         # Without a buffer: what a full disk refused would wait there, for who reads or closes to be refused.
         self._file = tempfile.TemporaryFile(dir=there, buffering=0)  # noqa: SIM115 - open until `close`
+        self._folder = there
         self._kept: dict[int, _Kept] = {}
         self._length = 0
         self._last: tuple[float, float, float] | None = None
@@ -70,6 +73,9 @@ class KeptPictures:
             count_loss(self.losses, FULL)
             return
         try:
+            if room(self._folder) < SPARE_BYTES + size:
+                count_loss(self.losses, SPARED)
+                return
             self._file.seek(self._length)
             is_whole = self._file.write(picture.data) == size
         except OSError:

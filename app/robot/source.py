@@ -23,7 +23,7 @@ from pipeline.parameters import Parameters
 from pipeline.records import Frame, Path, Record, Truth
 from pipeline.sources.arrivals import ArrivalReader
 from pipeline.sources.base import SourceDescription, SourceOptions
-from pipeline.sources.camera import Camera, Picture
+from pipeline.sources.camera import SAME_TIME_NS, Camera, Picture
 from pipeline.sources.live_camera import LiveCamera
 from pipeline.sources.live_recording import camera_topics
 
@@ -131,9 +131,9 @@ class LiveSource:
         """How the camera stands; None and why where nobody tells, or there is none ("")."""
         return (None, "") if self._camera is None else self._camera.camera(self._base)
 
-    def picture_near(self, stamp_ns: int) -> Picture | None:
-        """The picture of the last seconds that is nearest to a time, None where it is too far from it."""
-        return None if self._camera is None else self._camera.near(stamp_ns, self._offset_ns)
+    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The picture of the last seconds nearest to a time, None where it is farther than `within_ns`."""
+        return None if self._camera is None else self._camera.near(stamp_ns, self._offset_ns, within_ns)
 
     def picture_stamps(self) -> list[int]:
         """When the pictures were taken that were put aside, ascending [ns]."""

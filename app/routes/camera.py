@@ -16,7 +16,7 @@ async def camera(dashboard: Dash) -> Response:
     """Which picture it is, and where trees and clusters stand in it."""
     if dashboard.shown is None:
         return error_reply(409, "nothing is mapped yet", remedy="Press play, or open a run")
-    return json_reply(await dashboard.camera.look(dashboard.shown.frame))
+    return json_reply(await dashboard.camera.look(dashboard.shown.frame, dashboard.path))
 
 
 @router.get("/camera/{stamp_ns}.jpg")

@@ -18,7 +18,7 @@ from pipeline.perception import Looked
 from pipeline.records import Step
 from pipeline.rerun.clusters import ClusterTable
 from pipeline.rerun.named import BEGIN, CUT, ROW, Name, open_named, sealed
-from pipeline.rerun.packing import pack, unpack
+from pipeline.rerun.packing import TooLargeError, pack, unpack
 
 _FIRST_ROWS = 1024
 MOST_BYTES = 4 << 30
@@ -81,13 +81,17 @@ class KeptScans:
         if self.has(step.index, key) and self._rows["head"]["stamp_ns"][step.index] == step.scan.stamp_ns:
             self.clusters.put(step.index, looked.clusters)
             return
-        head, block = pack(step, looked)
+        try:
+            head, block = pack(step, looked)
+        except TooLargeError as error:
+            self._refuse(step.index, str(error))
+            return
         at = self._end(step.index) + ROW.itemsize
         if at + len(block) > self._most:
             self._refuse(step.index, f"more than {self._most / 1e9:.1f} GB would be kept")
             return
         try:
-            if step.index % _LOOK_AT_ROOM == 0 and _room(self.folder) < SPARE_BYTES + len(block):
+            if step.index % _LOOK_AT_ROOM == 0 and room(self.folder) < SPARE_BYTES + len(block):
                 self._refuse(step.index, f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
                 return
             row = np.array((at, len(block), zlib.crc32(block), np.void(key), head, 0), ROW)
@@ -175,7 +179,7 @@ def _without_name(folder: Path | None) -> _File:
     raise OSError(errno.EACCES, "no folder can be written to")
 
 
-def _room(folder: Path | None) -> int:
+def room(folder: Path | None) -> int:
     """Bytes that are free on a disk."""
     return shutil.disk_usage(folder if folder is not None and folder.is_dir() else gettempdir()).free
 

@@ -71,11 +71,15 @@ _CLUSTERS: dict[str, tuple[int, ...]] = {
     "extent": (3,),
 }
 _COLUMNS = sum(math.prod(rest) for rest in _CLUSTERS.values())
-_LARGEST = 1 << 28  # bytes of a block; the largest clouds that we know take a fiftieth
+LARGEST = 1 << 28  # bytes of a block; the largest clouds that we know take a fiftieth
 _LEVEL = 1  # others take longer and make it smaller by a hundredth
 NO_POINTS: Float32 = np.zeros((0, 3), np.float32)
 NO_HEIGHT: Float32 = np.zeros(0, np.float32)
 NO_LABELS: Int32 = np.zeros(0, np.int32)
+
+
+class TooLargeError(ValueError):
+    """A scan shows more than is kept of any."""
 
 
 def pack(step: Step, looked: Looked) -> tuple[Any, bytes]:
@@ -83,6 +87,9 @@ def pack(step: Step, looked: Looked) -> tuple[Any, bytes]:
 
     Of the scan only the time is kept, of the points only those of the overview that are low enough to be
     remembered; and of these not z, which nobody asks beside the height above the ground.
+
+    Raises:
+        TooLargeError: The block is larger than `unpack` takes.
     """
     over, fused = looked.overview, looked.terrain
     points, height = (NO_POINTS, NO_HEIGHT) if over is None else _remembered(over.points, over.height)
@@ -109,6 +116,8 @@ def pack(step: Step, looked: Looked) -> tuple[Any, bytes]:
     if fused is not None:
         parts += [heights_coded(fused.height, GROUND), np.packbits(fused.seen).tobytes()]
     block = b"".join(parts)
+    if len(block) > LARGEST:
+        raise TooLargeError(f"what it showed takes more than {LARGEST >> 20} MB")
     head["bytes"] = len(block)
     return head, zstandard.ZstdCompressor(level=_LEVEL).compress(block)
 
@@ -177,7 +186,7 @@ def _remembered(points: Float32, height: Float32) -> tuple[Float32, Float32]:
 
 def _unpacked(block: bytearray, size: int) -> bytearray:
     try:
-        if not 0 <= size <= _LARGEST or zstandard.frame_content_size(block) != size:
+        if not 0 <= size <= LARGEST or zstandard.frame_content_size(block) != size:
             raise ValueError("the block is not as long as the row says")
         return bytearray(zstandard.ZstdDecompressor().decompress(block))
     except zstandard.ZstdError as error:

@@ -134,8 +134,11 @@ def picture_of(
         return None
 
 
-#: A picture that is farther from a scan in time shows another place [ns].
+#: A picture that is farther from a scan in time is not taken for one of its place [ns].
 SAME_TIME_NS = 150_000_000
+#: One that is shown beside a scan may be so far from it [ns]: cameras of one picture a second, too, have a
+#: picture for each scan. How far it is is said, and things are marked as seen from where the robot was then.
+SHOWN_NS = 1_000_000_000
 
 
 def nearest(stamps: Int, wanted_ns: Int) -> tuple[Int, Bool]:

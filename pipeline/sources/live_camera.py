@@ -69,15 +69,17 @@ class LiveCamera:
             self._found = (base, *placed(heard, self._decoder, self._pictures_of.number, base))
         return self._found[1:]
 
-    def near(self, stamp_ns: int, offset_ns: int) -> Picture | None:
-        """The held picture that was taken nearest to a time, None where that is too far from it.
+    def near(self, stamp_ns: int, offset_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The held picture that was taken nearest to a time, None where that is farther from it.
 
         Args:
+            stamp_ns: The time.
             offset_ns: Stamp minus arrival of the run's first scan.
+            within_ns: So far from it at most.
         """
         times = [(time_beside(stamp, m.log_ns, offset_ns), k) for k, (stamp, m) in enumerate(self._held)]
         taken_ns, k = min(times, key=lambda each: abs(each[0] - stamp_ns), default=(0, -1))
-        if k < 0 or abs(taken_ns - stamp_ns) > SAME_TIME_NS:
+        if k < 0 or abs(taken_ns - stamp_ns) > within_ns:
             return None
         return picture_of(self._held[k][1], self._channels, self._decoder, taken_ns)
 

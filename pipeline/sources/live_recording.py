@@ -13,7 +13,7 @@ from pipeline.errors import SourceError
 from pipeline.records import Record, Truth
 from pipeline.sources.arrivals import ArrivalReader
 from pipeline.sources.base import RecordedTopic, Revision, SourceDescription, SourceOptions
-from pipeline.sources.camera import Camera, Picture
+from pipeline.sources.camera import SAME_TIME_NS, Camera, Picture
 from pipeline.sources.container import Channel, count_loss
 from pipeline.sources.digest import digest_of
 from pipeline.sources.live_camera import placed
@@ -87,6 +87,7 @@ class LiveRecording:
         self._channels = _channels(container, told, uri)
         self._losses: dict[str, int] = {}
         self._base, self._offset_ns = "", 0
+        self._placed: tuple[Camera | None, str] | None = None
         camera = [c for c in container.channels if c.topic in told.camera]
         self._camera = tuple(replace(c, definition="", definition_format="") for c in camera)
         self.description = self._describe(path)
@@ -120,14 +121,16 @@ class LiveRecording:
 
     def camera(self) -> tuple[Camera | None, str]:
         """How the camera stands; None and why where nobody tells, or there is none ("")."""
-        pictures = [c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
-        if not pictures:
-            return None, ""
-        return placed(self._container, MessageDecoder(()), pictures[0], self._base)
+        if self._placed is None:  # it is asked for with each picture
+            pictures = [c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
+            self._placed = None, ""
+            if pictures:
+                self._placed = placed(self._container, MessageDecoder(()), pictures[0], self._base)
+        return self._placed
 
-    def picture_near(self, stamp_ns: int) -> Picture | None:
-        """The picture that was taken nearest to a time, None where that is too far from it."""
-        return self._recorded.near(stamp_ns)
+    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The picture that was taken nearest to a time, None where none is within `within_ns` of it."""
+        return self._recorded.near(stamp_ns, within_ns)
 
     def picture_stamps(self) -> list[int]:
         """When the pictures were taken, ascending [ns]."""

@@ -25,8 +25,8 @@ class WithPictures(Protocol):
     def camera(self) -> tuple[Camera | None, str]:
         """How the camera stands; None and why where nobody tells, or there is none ("")."""
 
-    def picture_near(self, stamp_ns: int) -> Picture | None:
-        """The picture that was taken nearest to a time, None where that is too far from it."""
+    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The picture that was taken nearest to a time, None where none is within `within_ns` of it."""
 
     def picture_stamps(self) -> list[int]:
         """When pictures were taken that can still be had, ascending [ns]."""
@@ -85,17 +85,23 @@ class RecordedPictures:
                 if picture is not None:
                     yield picture
 
-    def near(self, stamp_ns: int) -> Picture | None:
-        """The one that was taken nearest to a time, None where that is too far from it."""
-        log_ns = stamp_ns - self._offset_ns
-        best: tuple[int, int, Message] | None = None
-        for taken_ns, message in self._stamped(log_ns - _EARLY_NS):
-            if message.log_ns > log_ns + _LATE_NS:
+    def near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The one that was taken nearest to a time, None where that is farther from it than `within_ns`."""
+        # Of a fast camera only the pictures around the time are read: they can be a megabyte each.
+        best = self._nearest(stamp_ns, min(within_ns, SAME_TIME_NS)) or self._nearest(stamp_ns, within_ns)
+        return None if best is None else picture_of(best[1], self._channels, self._decoder, best[0])
+
+    def _nearest(self, stamp_ns: int, within_ns: int) -> tuple[int, Message] | None:
+        """Time [ns] and message of the nearest picture within a time."""
+        log_ns, best = stamp_ns - self._offset_ns, None
+        wider_ns = within_ns - SAME_TIME_NS
+        for taken_ns, message in self._stamped(log_ns - _EARLY_NS - wider_ns):
+            if message.log_ns > log_ns + _LATE_NS + wider_ns:
                 break
             off_ns = abs(taken_ns - stamp_ns)
-            if off_ns <= SAME_TIME_NS and (best is None or off_ns < best[0]):
-                best = off_ns, taken_ns, message
-        return None if best is None else picture_of(best[2], self._channels, self._decoder, best[1])
+            if off_ns <= within_ns and (best is None or off_ns < abs(best[0] - stamp_ns)):
+                best = taken_ns, message
+        return best
 
     def _stamped(self, from_log_ns: int | None) -> Iterator[tuple[int, Message]]:
         """Messages with their times, in the order of writing."""

@@ -15,7 +15,7 @@ from pipeline.geometry import Pose3
 from pipeline.records import Odometry, Record, Scan, Sensor, Truth
 from pipeline.sources import ros_messages
 from pipeline.sources.base import SourceDescription, SourceOptions
-from pipeline.sources.camera import Camera, Picture, find_camera
+from pipeline.sources.camera import SAME_TIME_NS, Camera, Picture, find_camera
 from pipeline.sources.container import Channel, Container, Message, count_loss
 from pipeline.sources.digest import digest_of
 from pipeline.sources.measured import MeasuredPoses
@@ -73,6 +73,7 @@ class RosSource:
         self._mounting.read(self._topics.fixed, self._topics.moving)
         self._records = RecordDecoder(channels, decoder, self._mounting.tree)
         self._losses: dict[str, int] = {}
+        self._camera: tuple[Camera | None, str] | None = None
         named = [t for t in (self._topics.scan, self._topics.odometry, self._topics.imu) if t is not None]
         self._clock = make_clock([self._clock_offset(topic) for topic in named])
         self._moving = self._moving_numbers()
@@ -133,9 +134,11 @@ class RosSource:
         topic = self._topics.camera
         if topic is None:
             return None, ""
-        return find_camera(
-            self._container, self._decoder, self._mounting.tree, self._records.base, topic.numbers
-        )
+        if self._camera is None:  # it is asked for with each picture
+            self._camera = find_camera(
+                self._container, self._decoder, self._mounting.tree, self._records.base, topic.numbers
+            )
+        return self._camera
 
     def picture_stamps(self) -> list[int]:
         """When the camera took a picture, ascending [ns]."""
@@ -145,9 +148,9 @@ class RosSource:
         """The pictures that were taken at some of `picture_stamps`, each once."""
         return self._pictures().at(wanted_ns)
 
-    def picture_near(self, stamp_ns: int) -> Picture | None:
-        """The picture that was taken nearest to a time, None where that is too far from it."""
-        return self._pictures().near(stamp_ns)
+    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The picture that was taken nearest to a time, None where none is within `within_ns` of it."""
+        return self._pictures().near(stamp_ns, within_ns)
 
     @property
     def base(self) -> str:

@@ -13,6 +13,7 @@ import { verdictOf } from "./verdicts.js";
 const EVERY = 500; // [ms] between two pictures
 const AGAIN = 3000; // [ms] after which a picture that could not be had is asked for once more
 const LATE = 50; // [ms] beside the scan from which on it is said
+const SECOND = 1000; // [ms]
 let seen = null, marks = [], shown = "";
 
 const image = () => byId("camera-image");
@@ -66,7 +67,8 @@ function draw() {
   byId("camera-frame").hidden = false;
   marks = seen.marks;
   byId("camera-marks").replaceChildren(...marks.map(button));
-  const late = Math.abs(seen.later_ms) < LATE ? "" : `, taken ${Math.abs(seen.later_ms)} ms ${seen.later_ms > 0 ? "later" : "before"}`;
+  const off = Math.abs(seen.later_ms);
+  const late = off < LATE ? "" : `; its picture was taken ${(off / SECOND).toFixed(2)} s ${seen.later_ms > 0 ? "after" : "before"} it`;
   const trees = marks.filter(({ kind }) => kind === "tree").length;
   setText(byId("camera-lead"), seen.why ? `Scan ${seen.index}${late}. Nothing can be marked: ${seen.why}.`
     : `Scan ${seen.index}${late}. Trees of the map in view: ${trees}; clusters: ${marks.length - trees}. Click one to read why.`);

@@ -22,7 +22,7 @@ from pipeline.recording import write_recording
 from pipeline.recording.rendering import CAMERA, rendered, with_pictures
 from pipeline.records import Frame, Truth, TruthTrees
 from pipeline.sources import open_source
-from pipeline.sources.camera import Picture
+from pipeline.sources.camera import SHOWN_NS, Picture
 from pipeline.sources.ros import RosSource
 from pipeline.sources.simulated import SimulatedSource
 from tests.app.fakes import FakeWorker, frame, opened, path
@@ -59,7 +59,7 @@ def standing(*trees: tuple[float, float]) -> Frame:
 
 
 def test_marks_stand_where_the_things_are():
-    marks = marks_of(standing((5.0, 0.0), (8.0, 1.0), (-5.0, 0.0), (5.0, 40.0)), CAMERA)
+    marks = marks_of(standing((5.0, 0.0), (8.0, 1.0), (-5.0, 0.0), (5.0, 40.0)), CAMERA, Pose2())
     cluster, far, near = marks  # trees lie on top, the nearest last
     assert [(mark["kind"], mark["number"]) for mark in marks] == [("cluster", 0), ("tree", 2), ("tree", 1)]
     assert near["left"] + near["width"] / 2 == pytest.approx(0.5, abs=1e-3)
@@ -78,21 +78,42 @@ def test_the_box_of_a_tree_is_on_the_stem_that_was_rendered():
     truth = TruthTrees(np.array([5.0]), np.array([0.4]), np.array([0.3]), ("tree",))
     picture = np.asarray(Image.open(io.BytesIO(rendered(truth, (0.0, 0.0, 0.0)))).convert("RGB")).astype(int)
     brown = np.flatnonzero(np.abs(picture[150] - [104, 78, 52]).sum(axis=1) < 60)
-    mark = next(m for m in marks_of(standing((5.0, 0.4)), CAMERA) if m["kind"] == "tree")
+    mark = next(m for m in marks_of(standing((5.0, 0.4)), CAMERA, Pose2()) if m["kind"] == "tree")
     assert abs(brown[0] - mark["left"] * CAMERA.width) < 4
     assert abs(brown[-1] - (mark["left"] + mark["width"]) * CAMERA.width) < 4
 
 
-def test_the_picture_of_a_scans_time_is_found_and_none_of_another(source: RosSource):
+def test_marks_stand_as_seen_from_where_the_robot_was_when_the_picture_was_taken():
+    moved = Pose2(-0.5, 0.1, 0.2)
+    there = standing((5.0, 0.0), (8.0, 1.0))
+    # The same trees and points, told from the place of the picture.
+    pose = there.estimate.T_map_base @ moved
+    points = there.filtered.astype(np.float64) + there.sensor_offset
+    points[:, :2] = moved.inverse().apply(points[:, :2])
+    here = replace(
+        there, estimate=replace(there.estimate, T_map_base=pose),
+        filtered=(points - there.sensor_offset).astype(np.float32),
+    )  # fmt: skip
+    seen, wanted = marks_of(there, CAMERA, moved), marks_of(here, CAMERA, Pose2())
+    assert [mark["number"] for mark in seen] == [mark["number"] for mark in wanted] == [0, 2, 1]
+    for mark, same in zip(seen, wanted, strict=True):
+        for side in ("left", "top", "width", "height", "distance_m"):
+            assert mark[side] == pytest.approx(same[side], abs=2e-4)
+
+
+def test_the_picture_nearest_to_a_scan_is_found_within_a_second(source: RosSource):
     assert has_camera(source.description)
     stamps = source.picture_stamps()
     for stamp_ns in stamps:
-        for off_ns in (-100_000_000, 0, 100_000_000):
+        for off_ns in (-240_000_000, -100_000_000, 0, 100_000_000, 240_000_000):
             found = camera_picture(source, stamp_ns + off_ns)
             assert found.picture.stamp_ns == stamp_ns
             assert found.camera is not None
-    with pytest.raises(StemmapError, match="no picture was taken"):
-        camera_picture(source, stamps[0] + 250_000_000)
+    assert source.picture_near(stamps[0] + 240_000_000) is None, "of no other place where trees get pictures"
+    for edge_ns, beyond_ns in ((stamps[0] - SHOWN_NS, -1), (stamps[-1] + SHOWN_NS, 1)):
+        assert camera_picture(source, edge_ns).picture.stamp_ns in (stamps[0], stamps[-1])
+        with pytest.raises(StemmapError, match="no picture was taken within 1 s"):
+            camera_picture(source, edge_ns + beyond_ns)
     with pytest.raises(StemmapError, match="no camera"):
         camera_picture(None, stamps[0])
     with pytest.raises(StemmapError, match="no camera"):

@@ -7,7 +7,10 @@ are not packed it goes on to whoever reads the messages.
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
 
-POINTS = 1000
+POINTS, SCANS = 1000, 2
 _TYPE = "sensor_msgs/msg/PointCloud2"
 _CHUNK = 20_000  # bytes: two scans to each, so that there are several
 
@@ -58,6 +61,27 @@ def plain_mcap_of(recording: Path, out: Path) -> bytes:
             writer.add_message(channels[topic], log_ns, content, log_ns)
         writer.finish()
     return _taken(out)
+
+
+def short_db3(recording: Path, out: Path) -> bytes:
+    """The first messages of a db3 bag, left over by SQLite."""
+    shutil.copyfile(recording, out)
+    out.chmod(0o600)
+    with closing(sqlite3.connect(out, isolation_level=None)) as database:
+        database.execute(
+            "DELETE FROM messages WHERE rowid NOT IN (SELECT rowid FROM messages ORDER BY rowid LIMIT ?)",
+            (SCANS,),
+        )
+        database.execute("VACUUM")
+    return _taken(out)
+
+
+def short_pcap(capture: bytes, share: float) -> bytes:
+    """The first packets of a capture that is little endian, in whole packets."""
+    at = 24
+    while at + 16 <= share * len(capture):
+        at += 16 + int.from_bytes(capture[at + 8 : at + 12], "little")
+    return capture[:at]
 
 
 def _clouds(recording: Path) -> Iterator[tuple[str, int, Any]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks.cut_recordings import bag_of, plain_mcap_of
+from tests.benchmarks.cut_recordings import bag_of, plain_mcap_of, short_db3, short_pcap
 from tests.benchmarks.mutating import read_all, read_cloud, with_sums
 
 #: Kinds, the name that a damaged copy gets in a folder of its own, and how it is read.
@@ -47,11 +47,11 @@ def real_file(kind: str, data: Path, folder: Path) -> bytes:
         case "MCAP, not packed":
             return plain_mcap_of(velodyne / "vlp16_ros1.bag", folder / "cut.mcap")
         case "ROS 2 db3":
-            return (velodyne / "vlp16_rosbag2" / "1673400471837873222_0.db3").read_bytes()
+            return short_db3(velodyne / "vlp16_rosbag2" / "1673400471837873222_0.db3", folder / "cut.db3")
         case "ROS 1 bag" | "ROS 1 bag, not packed":
             return bag_of(velodyne / "vlp16_ros1.bag", folder / "cut.bag", packed=kind == "ROS 1 bag")
         case "Velodyne pcap":
-            return (velodyne / "vlp16.pcap").read_bytes()
+            return short_pcap((velodyne / "vlp16.pcap").read_bytes(), share=0.5)
         case "KITTI bin":
             return (data / "kitti" / "000000.bin").read_bytes()[: 16 * 5_000]
         case "PCD binary":

@@ -243,6 +243,14 @@ def test_without_room_on_disk_it_says_so(store):
     assert "No space left" in store.refusal
 
 
+def test_what_could_not_be_read_again_is_not_kept(store, monkeypatch):
+    put_all(store, preset("forest"), run()[0][:2])
+    monkeypatch.setattr("pipeline.rerun.packing.LARGEST", 1 << 10)
+    put_all(store, preset("forest"), run()[0][2:4])
+    assert len(store) == 2
+    assert "what it showed takes more than" in store.refusal
+
+
 def test_where_nobody_may_write_nothing_is_kept_and_that_is_said(monkeypatch, tmp_path):
     with closing(KeptScans(tmp_path / "missing")) as elsewhere:
         put_all(elsewhere, preset("forest"), run()[0][:2])

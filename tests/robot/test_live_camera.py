@@ -21,7 +21,7 @@ from app.robot.inbox import (
     PICTURES_TOO_LARGE,
     Inbox,
 )
-from app.robot.kept_pictures import FULL, REFUSED, KeptPictures
+from app.robot.kept_pictures import FULL, REFUSED, SPARED, KeptPictures
 from app.robot.recording import Recording
 from app.robot.ros_graph import Publisher
 from app.robot.source import LiveSource, open_live
@@ -31,8 +31,9 @@ from pipeline.recording import write_recording
 from pipeline.recording.rendering import CAMERA, with_pictures
 from pipeline.records import Path as Way
 from pipeline.records import Record, Scan, Truth
+from pipeline.rerun.kept import SPARE_BYTES
 from pipeline.sources import SourceOptions, open_source
-from pipeline.sources.camera import Picture
+from pipeline.sources.camera import SHOWN_NS, Picture
 from pipeline.sources.container import Message
 from pipeline.sources.live_recording import LiveRecording
 from pipeline.sources.mcap_file import McapFile
@@ -117,7 +118,9 @@ def test_the_picture_beside_a_live_scan_is_that_of_its_recordings(run: Path, tmp
             np.testing.assert_allclose(found.camera.T_base_camera.t, CAMERA.T_base_camera.t)
             assert found.told.startswith(f"of {len(stamps)} pictures {len(stamps)} were taken in")
         with pytest.raises(StemmapError, match="no picture was taken"):
-            camera_picture(live, stamps[-1] + SECOND)
+            camera_picture(live, stamps[-1] + SHOWN_NS + 1)
+        assert camera_picture(live, stamps[-1] + SHOWN_NS).picture.stamp_ns == stamps[-1]
+        assert live.picture_near(stamps[-1] + SHOWN_NS) is None
     with closing(open_source(str(recording.path))) as replay:
         assert isinstance(replay, LiveRecording)
         assert has_camera(replay.description)
@@ -178,6 +181,16 @@ def test_what_is_put_aside_is_bounded_and_counted(tmp_path: Path, monkeypatch: p
         assert kept.losses == {FULL: 2}
         assert [picture.data for picture in kept.at({2, 3})] == [bytes([2]) * 10]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_disk_keeps_its_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    free = [SPARE_BYTES + 10, SPARE_BYTES + 9]
+    monkeypatch.setattr("app.robot.kept_pictures.room", lambda _: free.pop(0))
+    with closing(KeptPictures(tmp_path)) as kept:
+        for stamp_ns in (1, 2):
+            kept.add(Picture(stamp_ns, "", 0, 0, 0, bytes(10)), way([1]))
+        assert kept.stamps() == [1]
+        assert kept.losses == {SPARED: 1}
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk here that is always full")
