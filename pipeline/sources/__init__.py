@@ -7,7 +7,15 @@ from pathlib import Path
 
 from pipeline.errors import SourceError, UsageError
 from pipeline.sources.base import Source, SourceDescription, SourceOptions
-from pipeline.sources.formats import READABLE, Opener, expected_format, file_format, folder_opener
+from pipeline.sources.formats import (
+    READABLE,
+    Opener,
+    expected_format,
+    file_format,
+    folder_opener,
+    named,
+    recordings_in,
+)
 
 __all__ = ["Source", "SourceDescription", "SourceOptions", "open_source"]
 
@@ -66,8 +74,11 @@ def _opener(path: Path, uri: str) -> Opener:
     if path.is_dir():
         opener = folder_opener(path)
         if opener is None:
+            inside = named(recordings_in(path))
             raise SourceError(
-                "nothing in the folder can be read", where=uri, remedy=f"Readable are: {READABLE}."
+                "the folder is no run" if inside else "nothing in the folder can be read",
+                where=uri,
+                remedy=f"Open what is in it: {inside}." if inside else f"Readable are: {READABLE}.",
             )
         return opener
     if not path.is_file():

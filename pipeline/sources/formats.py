@@ -126,6 +126,7 @@ FILES = (
     Format("KITTI .bin", (), (".bin",), _kitti),
 )
 
+_MOST_NAMED = 5
 READABLE = ", ".join(
     [kind.words for kind in FILES]
     + [
@@ -151,6 +152,17 @@ def file_format(path: Path, head: bytes) -> Format | None:
 def expected_format(path: Path) -> Format | None:
     """The format that a file's name promises."""
     return next((kind for kind in FILES if path.suffix.lower() in kind.suffixes), None)
+
+
+def recordings_in(folder: Path) -> list[str]:
+    """Names of the files in a folder that are runs or clouds by their names, each by itself."""
+    return sorted(path.name for path in folder.iterdir() if path.is_file() and expected_format(path))
+
+
+def named(names: list[str]) -> str:
+    """Some of them, for people."""
+    more = len(names) - _MOST_NAMED
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def folder_opener(folder: Path) -> Opener | None:

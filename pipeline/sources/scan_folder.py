@@ -15,6 +15,7 @@ from pipeline.records import Int, Odometry, Record, Scan, Sensor, Truth
 from pipeline.sources.base import SourceDescription, SourceOptions
 from pipeline.sources.container import count_loss
 from pipeline.sources.digest import digest_of
+from pipeline.sources.formats import named, recordings_in
 from pipeline.sources.pose_table import pose_at
 from pipeline.sources.poses_file import TextError, read_any_poses, read_times, seconds_ns
 
@@ -85,6 +86,9 @@ class ScanFolder:
         if by_time or len(np.unique(numbers)) < len(numbers) or (numbers < 0).any():
             numbers = np.arange(len(numbers), dtype=np.int64)
         folder = self._files[0].parent
+        others = [name for name in recordings_in(folder) if Path(name).suffix.lower() != form.suffix]
+        if others and not path.is_file():
+            self._warnings.append(f"not part of this run are {named(others)}: open each by its name")
         places = [] if path.is_file() else [folder, folder.parent]
         self._timed = False
         self._stamp = self._read_stamps(places, numbers)

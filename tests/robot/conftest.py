@@ -17,6 +17,7 @@ import pytest
 from pipeline.geometry import Pose3
 from pipeline.recording import write_recording
 from pipeline.records import Odometry, Record, Scan, Sensor
+from tests.robot.fast_dds import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
 SCANS, POINTS = 15, 30_000
@@ -132,3 +133,9 @@ def robots(router: int, drive: Path) -> Iterator[Callable[[str], Robot]]:
     yield start
     for robot in started:
         robot.kill()
+
+
+@pytest.fixture(scope="session")
+def fast_dds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The program of `tests.robot.fast_dds.Peer`."""
+    return compiled(tmp_path_factory.mktemp("fastdds"))

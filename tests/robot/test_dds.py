@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import shutil
-import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -19,14 +17,12 @@ from app.robot.ros_graph import Publisher
 from app.robot.source import LiveSource, open_live
 from pipeline.errors import SourceError
 from pipeline.records import Odometry, Record, Scan
-from pipeline.sources.container import Message
-from pipeline.sources.mcap_file import open_mcap
 from pipeline.sources.rostypes import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
 from tests.robot.conftest import POINTS, SCANS, until
+from tests.robot.fast_dds import Peer, messages_of
 
 #: A domain of this test process: others on the machine must not be heard.
 DOMAIN = 100 + os.getpid() % 100
-PEER = Path(__file__).parent / "fastdds" / "peer.cpp"
 
 
 # --- without a network ---------------------------------------------------------------------------
@@ -97,24 +93,12 @@ def test_the_types_are_those_that_recordings_are_written_with(drive: Path):
         package, _, name = msgtype.split("/")
         assert idl_type(msgtype).__idl_typename__ == f"{package}.msg.dds_.{name}_"
         assert issubclass(idl_type(msgtype), idl.IdlStruct)
-    for topic, msgtype, payload in _messages(drive, one_each=True):
+    for topic, msgtype, payload in messages_of(drive, one_each=True):
         message: Any = idl_type(msgtype).deserialize(payload)
         assert message.serialize() == payload, topic
 
 
 # --- with a peer ---------------------------------------------------------------------------------
-
-
-def _messages(run: Path, *, one_each: bool = False) -> Iterator[tuple[str, str, bytes]]:
-    """Topic, type and CDR of the messages of a recording."""
-    with closing(open_mcap(run)) as container:
-        channels = {c.number: c for c in container.channels}
-        left = set(channels)
-        message: Message
-        for message in container.messages(list(channels), None, {}):
-            if message.channel in left or not one_each:
-                left.discard(message.channel)
-                yield channels[message.channel].topic, channels[message.channel].msgtype, message.payload
 
 
 def _taken(source: LiveSource, records: list[Record], enough: Callable[[list[Record]], bool]) -> None:
@@ -129,80 +113,14 @@ def _scans(records: list[Record]) -> list[Scan]:
     return [record for record in records if isinstance(record, Scan)]
 
 
-class Peer:
-    """The publisher of Fast DDS: `tests/robot/fastdds/peer.cpp` says what its lines mean."""
-
-    def __init__(self, program: Path, run: Path) -> None:
-        self.messages = list(_messages(run))
-        self._numbers = {topic: k for k, topic in enumerate(dict.fromkeys(m[0] for m in self.messages))}
-        self._process = subprocess.Popen(
-            [str(program), str(DOMAIN)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-        )
-
-    def announce(self, *, reliable: bool, topics: tuple[str, ...] = ()) -> None:
-        """Make the writers of some topics, or of all."""
-        for topic, number in self._numbers.items():
-            msgtype = next(m[1] for m in self.messages if m[0] == topic)
-            package, _, name = msgtype.split("/")
-            latched = int(topic.endswith("tf_static"))
-            sure = int(reliable or latched)
-            if not topics or topic in topics:
-                self._say(f"W {number} rt{topic} {package}::msg::dds_::{name}_ {sure} {latched}\n".encode())
-        self.finish()
-
-    def withdraw(self, topic: str) -> None:
-        """Delete a writer."""
-        self._say(f"D {self._numbers[topic]}\n".encode())
-        self.finish()
-
-    def send(self, pause_us: int = 0) -> None:
-        """Send all messages."""
-        for topic, msgtype, payload in self.messages:
-            pause = pause_us if msgtype == POINT_CLOUD else 0
-            self._say(f"M {self._numbers[topic]} {len(payload)} {pause}\n".encode() + payload)
-        self.finish()
-
-    def matched(self, topic: str) -> None:
-        """Wait until somebody listens to a topic."""
-        self._say(f"A {self._numbers[topic]}\n".encode())
-        self.finish()
-
-    def finish(self) -> None:
-        """Wait until all that was said is done."""
-        self._say(b"P\n")
-        assert self._process.stdout is not None
-        assert self._process.stdout.readline() == b"done\n"
-
-    def close(self) -> None:
-        self._process.kill()
-        self._process.wait(30)
-        for stream in (self._process.stdin, self._process.stdout):
-            assert stream is not None
-            stream.close()
-
-    def _say(self, line: bytes) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(line)
-        self._process.stdin.flush()
-
-
-@pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The peer, compiled against Debian's libfastrtps-dev."""
-    compiler = shutil.which("c++")
-    if compiler is None or not Path("/usr/include/fastdds").is_dir():
-        pytest.skip("no C++ compiler, or Debian's libfastrtps-dev is not installed")
-    made = tmp_path_factory.mktemp("fastdds") / "peer"
-    words = [compiler, "-std=c++17", str(PEER), "-o", str(made), "-lfastrtps", "-lfastcdr", "-lpthread"]
-    subprocess.run(words, check=True)
-    return made
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("reliable", [True, False])
-def test_a_robot_of_fast_dds_is_found_heard_lost_and_found_again(program: Path, drive: Path, reliable: bool):
+def test_a_robot_of_fast_dds_is_found_heard_lost_and_found_again(fast_dds: Path, drive: Path, reliable: bool):
     pytest.importorskip("cyclonedds", reason="cyclonedds, an extra, is not installed")
-    with closing(Peer(program, drive)) as robot, closing(open_live(f"dds:?domain={DOMAIN}")) as source:
+    with (
+        closing(Peer(fast_dds, DOMAIN, drive)) as robot,
+        closing(open_live(f"dds:?domain={DOMAIN}")) as source,
+    ):
         until(lambda: not source.listen() and "no scans are announced" in source.waiting_for())
         robot.announce(reliable=reliable)
         until(lambda: source.listen() or "announced and silent" in source.waiting_for(), source.waiting_for)
@@ -243,13 +161,13 @@ def test_a_writer_in_cdr_is_heard(drive: Path):
         until(lambda: not source.listen() and "no scans are announced" in source.waiting_for())
         participant = DomainParticipant(DOMAIN)
         writers: dict[str, Any] = {}
-        for topic, msgtype, _ in _messages(drive, one_each=True):
+        for topic, msgtype, _ in messages_of(drive, one_each=True):
             held = [Policy.Durability.TransientLocal] if topic.endswith("tf_static") else []
             # A writer waits so long for a reader that is behind, and fails then.
             qos = Qos(Policy.Reliability.Reliable(60 * 10**9), Policy.History.KeepAll, *held)
             written: Any = Topic(participant, f"rt{topic}", idl_type(msgtype))
             writers[topic] = DataWriter(participant, written, qos)
-        sent = [(topic, idl_type(kind).deserialize(cdr)) for topic, kind, cdr in _messages(drive)]
+        sent = [(topic, idl_type(kind).deserialize(cdr)) for topic, kind, cdr in messages_of(drive)]
         # A writer that keeps no past writes for those only whom it has met.
         until(
             lambda: source.listen() or all(w.get_matched_subscriptions() for w in writers.values()),

@@ -42,8 +42,8 @@ from pipeline.sources.rostypes import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POIN
 from pipeline.sources.simulated import SimulatedSource
 from tests.app.test_tree_pictures import trees_at
 from tests.robot.conftest import Robot, until
+from tests.robot.fast_dds import Peer, messages_of
 from tests.robot.test_dds import DOMAIN
-from tests.robot.test_dds import _messages as messages_of
 from tests.robot.test_live_session import FakeLink
 
 SECOND = 1_000_000_000
@@ -309,6 +309,28 @@ def test_pictures_come_over_plain_dds(run: Path):
         until(lambda: "of 0 pictures" not in source.pictures_told, lambda: source.pictures_told)
         writers.clear()
         del participant
+
+
+@pytest.mark.slow
+def test_the_pictures_of_a_robot_of_fast_dds_are_seen(fast_dds: Path, run: Path):
+    pytest.importorskip("cyclonedds", reason="cyclonedds, an extra, is not installed")
+    with closing(Peer(fast_dds, DOMAIN, run)) as robot, closing(open_live(f"dds:?domain={DOMAIN}")) as source:
+        robot.announce(reliable=True)
+        until(lambda: source.listen() or "announced and silent" in source.waiting_for(), source.waiting_for)
+        for topic in dict.fromkeys(message[0] for message in robot.messages):
+            robot.matched(topic)
+        robot.send(100_000)
+        scans: list[Scan] = []
+
+        def seen() -> bool:
+            scans.extend(record for record in source.take() if isinstance(record, Scan))
+            return any(_has_picture(source, scan) for scan in scans) and source.camera()[0] is not None
+
+        until(seen, source.waiting_for)
+        camera, why = source.camera()
+        assert camera is not None, why
+        np.testing.assert_allclose(camera.K, CAMERA.K)
+        np.testing.assert_allclose(camera.T_base_camera.t, CAMERA.T_base_camera.t)
 
 
 def _has_picture(source: LiveSource, scan: Scan) -> bool:

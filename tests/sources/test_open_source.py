@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pipeline.errors import SourceError
 from pipeline.sources import open_source
+from tests.sources.conftest import Opened
 
 
 @pytest.mark.parametrize("uri", ["ros2:robot", "udp://0.0.0.0:2368"])
@@ -55,3 +57,20 @@ def test_errors_are_one_line(tmp_path: Path):
         open_source(str(path))
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+def test_a_folder_that_is_no_run_names_what_can_be_opened_in_it(tmp_path: Path):
+    for k in range(7):
+        (tmp_path / f"day{k}.bag").touch()
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(SourceError, match=r"no run.*day0.bag, .*day4.bag and 2 more"):
+        open_source(str(tmp_path))
+
+
+def test_recordings_beside_scans_are_said_to_be_left_aside(tmp_path: Path, opened: Opened):
+    np.ones((200, 4), "<f4").tofile(tmp_path / "000000.bin")
+    assert opened(tmp_path).description.warnings == ()
+    (tmp_path / "run.bag").touch()
+    assert opened(tmp_path).description.warnings == (
+        "not part of this run are run.bag: open each by its name",
+    )
