@@ -65,6 +65,10 @@ class Snapshots(Generic[S]):
         """Whether `offer` would keep a state of so many scans."""
         return scans % self._spacing == 0 and scans not in self._states
 
+    def next_due(self, scans: int, most: int) -> int:
+        """The first number of scans beyond this one that `offer` may keep a state of, `most` if none is."""
+        return min(scans - scans % self._spacing + self._spacing, most)
+
     def first(self, scans: int) -> dict[int, S]:
         """The states that hold at most so many scans."""
         return {known: state for known, state in self._states.items() if known <= scans}

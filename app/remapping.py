@@ -84,10 +84,10 @@ class Remapping:
         rerun = self.rerun
         if rerun.done > until:  # the run went back meanwhile
             rerun.go_back(*self.snapshots.newest(until))
-        for _ in range(scans):
-            if rerun.done == until:
-                return True
+        most = min(rerun.done + scans, until)
+        while rerun.done < most:
             if self.snapshots.is_due(rerun.done) and (state := rerun.state()) is not None:
                 self.snapshots.offer(rerun.done, state)
-            self.told.record(next(rerun.frames(rerun.done + 1)), self._start_ns)
+            for frame in rerun.frames(self.snapshots.next_due(rerun.done, most)):
+                self.told.record(frame, self._start_ns)
         return rerun.done == until

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from app.abreast import abreast
 from app.ahead import looked_ahead
 from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
@@ -224,7 +225,7 @@ class Run:
             return
         basis = self._basis()
         self._rough = None if basis is None else rough_trees(basis, self._kept.clusters, parameters)
-        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead)
+        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead, abreast)
         if basis is None or not rerun.passed:
             self._remapping = Remapping(rerun, self.start_ns)
             return

@@ -49,10 +49,11 @@ _GLIMPSE_S = 0.5
 _COMPILING = COMPILING.capitalize()
 # How often a robot is asked for what came: a little of a scan's time, and less than 1 % of a core.
 _LISTEN_S = 0.005
-# How long scans are mapped again between two looks at the commands, and how many scans of a run that plays
-# are mapped before it is done once, however late the run is.
+# About how long scans are mapped again between two looks at the commands, and how many scans of a run that
+# plays are mapped before it is done once, however late the run is.
 _REMAP_S = 0.02
 _SCANS_A_REMAP = 4
+_AT_ONCE = 8  # scans that are mapped again at least: two halves of the work begin and end apart
 
 
 class Driver:
@@ -180,9 +181,9 @@ class Driver:
     def _remap(self) -> None:
         """Use the time between two scans, or while the run stands, to map it again."""
         until = self._clock() + _REMAP_S
-        done = self._session.remap(1)
+        done = self._session.remap(_AT_ONCE)
         while done is None and self._session.is_remapping and self._clock() < until:
-            done = self._session.remap(1)
+            done = self._session.remap(_AT_ONCE)
         if done is None:
             self._report_when_due(self._clock())
             return

@@ -4,70 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline import loops
-from pipeline.gathering import ForestOf, Gathering, GatheringState, View, package_alone
+from pipeline.gathering import ForestOf, Gathering, View, package_alone
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.growing_path import GrowingPath
 from pipeline.gyro import fused
-from pipeline.height_map import HeightMapper, HeightMapState
+from pipeline.height_map import HeightMapper
 from pipeline.innovation import REFUSED, within_gate
+from pipeline.late import after
+from pipeline.mapper_records import Located, MapperState, Noted
 from pipeline.parameters import Parameters
-from pipeline.perception import Looked, Seen, decide, look
-from pipeline.records import Columns, Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step, Trees
+from pipeline.perception import Looked, decide, look
+from pipeline.records import Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step, Trees
 from pipeline.recovery import Mapped, Recovery, RecoveryState
-from pipeline.slam import BackEnd, BackEndState, Loop, Motion
+from pipeline.slam import BackEnd, Loop, Motion
 from pipeline.slam.motion import noise_of, step_variances
 from pipeline.tracking import Tracker
-from pipeline.tracking.table import TrackTable
 from pipeline.watch import Watch, no_watch
 
 LOOP = "a loop is closed: path and map since the place was left are bent, so that the trees there stand once"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapperState:
-    """An independent copy of all that the mapper knows between two scans.
-
-    `placed` is the scan since which the path is driven: no odometry leads to it, for the robot was put there;
-    `closed` the one at which the last loop was closed; `last` the pose after the last scan, and how sure.
-    """
-
-    slam: BackEndState
-    gathering: GatheringState
-    ground: HeightMapState
-    tracks: TrackTable
-    next_number: int
-    odometry: Pose2 | None
-    path_length: int
-    placed: int = 0
-    closed: int = 0
-    recovery: RecoveryState[MapperState] = field(default_factory=RecoveryState)
-    last: tuple[Pose2, Float] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Noted:
-    """What the stages made of one scan, for who wants to begin again at a later one of them.
-
-    Attributes:
-        seen: What the scan showed; estimate: where that was.
-        landmarks: Of SLAM after the scan: positions, shape (L, 2) [m], and covariances xx, xy, yy, (L, 3).
-        columns: What is gathered, where the scan was; else None.
-        is_usual: Whether neither the pose nor the map hung on the trees: the robot was not lost, and no loop
-            was looked for among them.
-    """
-
-    index: int
-    stamp_ns: int
-    seen: Seen
-    estimate: PoseEstimate
-    landmarks: tuple[Float, Float]
-    columns: Columns | None
-    is_usual: bool
 
 
 class Mapper:
@@ -154,6 +113,18 @@ class Mapper:
     def take(self, step: Step, looked: Looked) -> Frame:
         """Map a scan by what it shows: all of `process` that hangs on more than the scan itself. Of the
         step's scan only the time is asked."""
+        return self.map(self.locate(step, looked))
+
+    def locate(self, step: Step, looked: Looked, caught_up: Callable[[], None] = lambda: None) -> Located:
+        """The first half of `take`: where the scan was taken.
+
+        The next scan may be located, in another thread too, while this one is mapped, unless `may_close` says
+        that it has to wait.
+
+        Args:
+            caught_up: Is called before anything is asked of the map, or done to it; returns once all scans
+                before this one are mapped.
+        """
         p = self._parameters
         self._asked_trees = False
         seen = decide(looked, p.detection, self._watch)
@@ -169,46 +140,70 @@ class Mapper:
                 p,
                 Mapped(
                     self._slam,
-                    self._known,
-                    self._take_back,
-                    self._trees,
-                    lambda estimate: self._mapped(
-                        estimate, np.concatenate([self._path.motion, [moved.step.as_array()]])
+                    after(caught_up, self._known),
+                    after(caught_up, self._take_back),
+                    after(caught_up, self._trees),
+                    after(
+                        caught_up,
+                        lambda estimate: self._mapped(
+                            estimate, np.concatenate([self._path.motion, [moved.step.as_array()]])
+                        ),
                     ),
-                    lambda loop: self._bend(step.index, loop),
+                    after(caught_up, lambda loop: self._bend(step.index, loop)),
                     lambda pose, covariance: self._put(step.index, pose, covariance, step.index + 1),
                 ),
             )
+            landmarks = self._slam.landmarks()
 
-        if not self._recovery.searching:  # while it is lost, the map stays as it is
-            self._track(step.scan.stamp_ns, seen, estimate)
+        self._path.append(step.scan.stamp_ns, estimate, moved.step)
+        self._last = (estimate.T_map_base, estimate.covariance)
+        searching = self._recovery.searching
+        sought = p.relocalisation.method != "none" and not searching
+        return Located(
+            step=step,
+            seen=seen,
+            estimate=estimate,
+            T_odom_base=odometry,
+            warnings=(*refused, *told),
+            landmarks=landmarks,
+            searching=searching,
+            asked_trees=self._asked_trees,
+            may_close=sought and loops.is_due(step.index, self._path.sigma_xy),
+        )
+
+    def map(self, located: Located) -> Frame:
+        """The second half of `take`: what the scan makes of the map."""
+        p, step, looked = self._parameters, located.step, located.seen.looked
+        estimate, told = located.estimate, located.warnings
+
+        if not located.searching:  # while it is lost, the map stays as it is
+            self._track(located)
             self._map(step, looked, estimate)
         elif self._gathering.is_unsettled:
             with self._watch("gathering"):
                 self._gathering.settle()
 
-        self._path.append(step.scan.stamp_ns, estimate, moved.step)
-        closed = self._close_loop(step.index, estimate)
-        if closed is not None:
-            estimate, told = closed, (*told, LOOP)
-        self._last = (estimate.T_map_base, estimate.covariance)
+        if located.may_close:
+            located, closed = self._close_loop(located)
+            if closed:
+                estimate, told = located.estimate, (*told, LOOP)
         trees = self._tracker.trees()
         if self.note is not None:
-            self.note(self._noted(step, seen, estimate))
+            self.note(self._noted(located))
         return Frame(
             index=step.index,
             stamp_ns=step.scan.stamp_ns,
             raw=looked.raw,
             filtered=looked.filtered,
             labels=looked.labels,
-            clusters=seen.clusters,
-            detections=seen.detections,
+            clusters=located.seen.clusters,
+            detections=located.seen.detections,
             estimate=estimate,
-            T_odom_base=odometry,
+            T_odom_base=located.T_odom_base,
             sensor_offset=looked.sensor_offset,
             trees=trees,
             counts=looked.counts,
-            warnings=(*step.warnings, *looked.warnings, *refused, *told),
+            warnings=(*step.warnings, *looked.warnings, *told),
             columns=self._gathering.columns if p.gathering.method == "columns" else None,
             ground=None if p.ground.method == "none" else self._ground.state.record,
             base_z=(self._ground.state.sensor_z or 0.0) - float(looked.sensor_offset[2])
@@ -217,16 +212,16 @@ class Mapper:
             clearance=looked.clearance,
         )
 
-    def _noted(self, step: Step, seen: Seen, estimate: PoseEstimate) -> Noted:
-        gathered = seen.looked.overview is not None and not self._recovery.searching
+    def _noted(self, located: Located) -> Noted:
+        gathered = located.seen.looked.overview is not None and not located.searching
         return Noted(
-            step.index,
-            step.scan.stamp_ns,
-            seen,
-            estimate,
-            self._slam.landmarks(),
+            located.step.index,
+            located.step.scan.stamp_ns,
+            located.seen,
+            located.estimate,
+            located.landmarks,
             self._gathering.columns if gathered else None,
-            not self._asked_trees and not self._recovery.searching,
+            not located.asked_trees and not located.searching,
         )
 
     def _trees(self) -> Trees:
@@ -250,12 +245,13 @@ class Mapper:
             return moved, ()
         return moved._replace(measured=None), (REFUSED,)
 
-    def _track(self, stamp_ns: int, seen: Seen, estimate: PoseEstimate) -> None:
+    def _track(self, located: Located) -> None:
         """Each tree's own filter: section 3.5."""
         tracker, view_range = self._tracker, self._parameters.slam.view_range
+        seen, estimate = located.seen, located.estimate
         with self._watch("tracking"):
             tracker.process(
-                stamp_ns,
+                located.step.scan.stamp_ns,
                 estimate.T_map_base,
                 estimate.covariance,
                 seen.detections,
@@ -264,7 +260,7 @@ class Mapper:
                 seen.heights,
                 estimate.relative,
             )
-            tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, view_range)
+            tracker.anchor(*located.landmarks, estimate.T_map_base, view_range)
 
     def _map(self, step: Step, looked: Looked, estimate: PoseEstimate) -> None:
         """What is not taken from every scan (see turns): the columns that judge the trees, and the ground."""
@@ -291,18 +287,23 @@ class Mapper:
             with watch("height map"):
                 self._ground.add(looked.terrain, estimate.T_map_base, looked.sensor_offset)
 
-    def _close_loop(self, index: int, estimate: PoseEstimate) -> PoseEstimate | None:
-        """The pose after a loop was closed, if this scan closes one: see `pipeline.loops`."""
-        p = self._parameters.relocalisation
-        if p.method == "none" or self._recovery.searching or not loops.is_due(index, self._path.sigma_xy):
-            return None
+    def _close_loop(self, located: Located) -> tuple[Located, bool]:
+        """What is known of the scan after a loop was looked for, and whether it closed one: see
+        `pipeline.loops`."""
+        index, estimate = located.step.index, located.estimate
+        self._asked_trees = located.asked_trees
         with self._watch("slam"):
-            loop = loops.find_loop(self._mapped(estimate, self._path.motion), p)
-            if loop is None:
-                return None
-            self._bend(index, loop)
-            self._recovery.forget()
-            return self._slam.estimate(estimate)
+            run = self._mapped(estimate, self._path.motion)
+            loop = loops.find_loop(run, self._parameters.relocalisation)
+            if loop is not None:
+                self._bend(index, loop)
+                self._recovery.forget()
+                estimate = self._slam.estimate(estimate)
+                self._last = (estimate.T_map_base, estimate.covariance)
+        known = replace(
+            located, estimate=estimate, landmarks=self._slam.landmarks(), asked_trees=self._asked_trees
+        )
+        return known, loop is not None
 
     def _mapped(self, estimate: PoseEstimate, motion: Float) -> loops.Mapped:
         path, noise = self._slam.path(), noise_of(self._parameters.slam)

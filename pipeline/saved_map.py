@@ -13,7 +13,8 @@ import numpy as np
 from pipeline.gathering import GatheringState, PackedMemory, no_columns
 from pipeline.geometry import Float, Pose2
 from pipeline.height_map import PackedHeightMap
-from pipeline.mapper import Mapper, MapperState
+from pipeline.mapper import Mapper
+from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters
 from pipeline.records import Columns, Int, Trees
 from pipeline.recovery import RecoveryState

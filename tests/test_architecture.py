@@ -37,6 +37,7 @@ FOUNDATION = (
     "gyro",
     "measured_in_time",
     "watch",
+    "late",
 )
 # One stage each: they never know one another.
 STAGES = (
@@ -80,9 +81,10 @@ AROUND = {
         "gathering",
     },
     "innovation": {"slam"},
-    "mapper": {*STAGES, "perception", "loops", "recovery", "innovation"},
-    "rerun": {*STAGES, "perception", "mapper"},
-    "saved_map": {*STAGES, "mapper", "recovery"},
+    "mapper_records": {*STAGES, "perception", "recovery"},
+    "mapper": {*STAGES, "perception", "loops", "recovery", "innovation", "mapper_records"},
+    "rerun": {*STAGES, "perception", "mapper", "mapper_records"},
+    "saved_map": {*STAGES, "mapper", "mapper_records", "recovery"},
     "merged_map": {*STAGES, "saved_map"},
 }
 FORBIDDEN_IN_PIPELINE = {

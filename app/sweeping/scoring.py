@@ -23,7 +23,8 @@ from app.sweeping.jobs import Answer, Fault, Job, RunAsked, code_digest
 from app.tally import far_truth
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.evaluation import evaluate
-from pipeline.mapper import Mapper, MapperState
+from pipeline.mapper import Mapper
+from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters
 from pipeline.parameters.model import validated
 from pipeline.records import Path, Trees

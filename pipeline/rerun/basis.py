@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry import Float
-from pipeline.mapper import MapperState
+from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters
 from pipeline.records import Int, Path
 from pipeline.rerun.clusters import ClusterTable

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.gathering import Judged, judged
 from pipeline.geometry import Float, Pose2
-from pipeline.mapper import Noted
+from pipeline.mapper_records import Noted
 from pipeline.parameters import field_specs
 from pipeline.parameters.stages import Slam
 from pipeline.records import Detections

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from itertools import dropwhile
 
 from pipeline.errors import StemmapError
-from pipeline.mapper import Mapper, MapperState
+from pipeline.mapper import Mapper
+from pipeline.mapper_records import MapperState
 from pipeline.perception import Looked
 from pipeline.records import Frame, Step
 from pipeline.rerun.basis import Basis
@@ -17,6 +18,12 @@ from pipeline.rerun.tail import Recalled, Tail
 
 Reread = Callable[[], Iterator[Step]]
 Ahead = Callable[[Callable[[Step], Looked], Iterator[Step]], Iterator[tuple[Step, Looked]]]
+Abreast = Callable[[Mapper, Iterator[tuple[Step, Looked]]], Iterator[Frame]]
+
+
+def in_turn(mapper: Mapper, scans: Iterator[tuple[Step, Looked]]) -> Iterator[Frame]:
+    """Each scan located and mapped before the next one is."""
+    return (mapper.take(step, looked) for step, looked in scans)
 
 
 def one_by_one(look: Callable[[Step], Looked], steps: Iterator[Step]) -> Iterator[tuple[Step, Looked]]:
@@ -38,6 +45,7 @@ class Rerun:
         reread: The steps of the run from its first on; None where they come only once.
         basis: What is known of the run with other parameters; of the same seed and sensor.
         ahead: How scans are looked at that are read once more: one by one, or ahead of the mapping.
+        abreast: How scans are mapped that show something: in turn, or one located while another is mapped.
 
     Attributes:
         journal: What the stages make of each scan.
@@ -51,14 +59,15 @@ class Rerun:
         reread: Reread | None = None,
         basis: Basis | None = None,
         ahead: Ahead = one_by_one,
+        abreast: Abreast = in_turn,
     ) -> None:
         self.mapper = mapper
         self.journal = Journal()
         self.passed = 0
         self._kept = kept
         self._key = look_key(mapper.parameters)
-        self._next = 0
-        self._reread, self._ahead = reread, ahead
+        self._next = self._stop = 0
+        self._reread, self._ahead, self._abreast = reread, ahead, abreast
         self._steps: Iterator[tuple[Step, Looked]] | None = None
         self._fresh: KeptScans | None = None
         self._tail: Tail | None = None
@@ -77,20 +86,32 @@ class Rerun:
         """What the scans show to these parameters, as far as they are mapped."""
         return self._kept if self._fresh is None else self._fresh
 
-    def frames(self, scans: int) -> Iterator[Frame | Recalled]:
+    def frames(self, scans: int) -> Generator[Frame | Recalled, None, None]:
         """Map on until so many scans are mapped; the frames have no points and no clearance, unless the
         scans were read once more.
 
         Raises:
             StemmapError: A scan is not kept and cannot be read once more, or what was kept is damaged.
         """
-        while self._next < scans:
-            mapped = self._frame() if self._tail is None else self._tracked(self._tail)
+        while self._tail is not None and self._next < scans:
+            recalled = self._tracked(self._tail)
             self._next += 1
-            yield mapped
+            yield recalled
+        if self._next == scans:
+            return
+        self._stop = scans
+        mapped = self._abreast(self.mapper, self._shown())
+        try:
+            for frame in mapped:
+                self._next += 1
+                yield frame
+        finally:  # who asks for no more of them leaves a whole mapper all the same
+            self._stop = 0
+            for _ in mapped:
+                self._next += 1
 
     def state(self) -> MapperState | None:
-        """All that is known between two scans; None where no mapper was."""
+        """All that is known once the frames that were asked for are given; None where no mapper was."""
         return self.mapper.snapshot() if self._tail is None else self._tail.state()
 
     def go_back(self, scans: int, state: MapperState) -> None:
@@ -130,20 +151,27 @@ class Rerun:
             self._tail = None
         return recalled
 
-    def _frame(self) -> Frame:
+    def _shown(self) -> Iterator[tuple[Step, Looked]]:
+        """What the scans show that are asked for."""
+        index = self._next
+        while index < self._stop:
+            yield self._shown_by(index)
+            index += 1
+
+    def _shown_by(self, index: int) -> tuple[Step, Looked]:
         kept = self.kept
-        if kept.has(self._next, self._key):
+        if kept.has(index, self._key):
             try:
-                return self.mapper.take(*kept.scan(self._next))
+                return kept.scan(index)
             except DamagedError:
                 if self._reread is None:
                     raise
-                kept.forget_from(self._next)
-        step, looked = self._read_on()
+                kept.forget_from(index)
+        step, looked = self._read_on(index)
         self.kept.put(step, looked, self._key)
-        return self.mapper.take(step, looked)
+        return step, looked
 
-    def _read_on(self) -> tuple[Step, Looked]:
+    def _read_on(self, index: int) -> tuple[Step, Looked]:
         if self._reread is None:
             raise StemmapError(
                 "the scans of a live run cannot be read once more, and what these parameters change has to "
@@ -151,19 +179,18 @@ class Rerun:
                 remedy="Open the recording of the run",
             )
         if self._steps is None:
-            first = self._next
-            left = dropwhile(lambda step: step.index != first, self._reread())
+            left = dropwhile(lambda step: step.index != index, self._reread())
             self._steps = self._ahead(self.mapper.looker(), left)
             if self._fresh is None:
-                self._fresh = self._begun_anew()
+                self._fresh = self._begun_anew(index)
         for step, looked in self._steps:
-            if step.index == self._next:
+            if step.index == index:
                 return step, looked
-        raise StemmapError(f"the source does not give scan {self._next} again", remedy="Open it anew")
+        raise StemmapError(f"the source does not give scan {index} again", remedy="Open it anew")
 
-    def _begun_anew(self) -> KeptScans:
-        """What is kept up to here, in a file of its own."""
+    def _begun_anew(self, index: int) -> KeptScans:
+        """What is kept before a scan, in a file of its own."""
         fresh = KeptScans(self._kept.folder)
-        for k in range(self._next):
+        for k in range(index):
             fresh.put(*self._kept.scan(k), self._key)
         return fresh

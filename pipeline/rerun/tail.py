@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.gathering import Judged, no_columns
-from pipeline.mapper import MapperState
+from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters
 from pipeline.records import Columns, Int32, Trees
 from pipeline.rerun.journal import Entry

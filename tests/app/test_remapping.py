@@ -222,7 +222,7 @@ def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(session._run._remapping.rerun.mapper, "take", broken)
+    monkeypatch.setattr(session._run._remapping.rerun.mapper, "map", broken)
     with pytest.raises(ZeroDivisionError):
         session.remap(3)
     assert not session.is_remapping

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import StemmapError
-from pipeline.mapper import MapperState
+from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters, field_specs
 from pipeline.rerun import Basis, Journal, KeptScans, Rerun
 from pipeline.rerun.journal import FARTHEST

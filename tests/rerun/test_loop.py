@@ -6,10 +6,12 @@ from contextlib import closing
 
 import pytest
 
+from app.abreast import abreast
 from pipeline.geometry import Pose3
 from pipeline.mapper import LOOP, Mapper
 from pipeline.parameters import Parameters, preset
 from pipeline.rerun import Basis, Journal, KeptScans, Rerun, look_key
+from pipeline.rerun.rerun import in_turn
 from tests.benchmarks.wide_ring import SENSOR, WideRing
 from tests.rerun.test_basis import told
 
@@ -43,8 +45,9 @@ def ring():
 
 
 def finished(parameters: Parameters, kept: KeptScans, basis: Basis | None):
-    """All that is known at the end, where loops were closed, and in how many scans trees alone were anew."""
-    rerun = Rerun(mapper(parameters), kept, None, basis)
+    """All that is known at the end, where loops were closed, and in how many scans trees alone were anew; of
+    who goes on with both halves of the mapping at once."""
+    rerun = Rerun(mapper(parameters), kept, None, basis, abreast=in_turn if basis is None else abreast)
     frames = list(rerun.frames(len(kept)))
     closed = [frame.index for frame in frames if LOOP in getattr(frame, "warnings", ())]
     recalled = sum(not hasattr(frame, "warnings") for frame in frames)

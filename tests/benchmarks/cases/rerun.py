@@ -82,7 +82,8 @@ def run() -> list[Table]:
                 "memory, in proportion.",
                 f"Kept in memory: {noted / scans / 1e3:.1f} kB a scan of what the stages made of it, and "
                 f"{kept.clusters.nbytes / scans / 1e3:.1f} kB of clusters.",
-                "Scans that are looked at again are looked at on the second core; all else is done on one.",
+                "Where a scan was taken is found on one core while the one before it is mapped on the other; "
+                "what is looked at again is so in a third thread. Trees alone are tracked on one core.",
                 "A change of the tracking tracks the trees alone anew; one of a verdict begins at the first "
                 "scan whose detections differ, which often is one of the first.",
             ),
@@ -166,6 +167,7 @@ def _again(
     basis: Basis | None = None,
 ) -> float:
     """Seconds that a rerun takes; once before for the kernels, over a few scans."""
+    from app.abreast import abreast
     from app.ahead import looked_ahead
     from pipeline.rerun import Rerun
 
@@ -173,7 +175,7 @@ def _again(
     for most in (min(scans, 50), scans):
         gc.collect()
         start = time.perf_counter()
-        with closing(Rerun(_fresh(source, parameters), kept, reread, basis, looked_ahead)) as rerun:
+        with closing(Rerun(_fresh(source, parameters), kept, reread, basis, looked_ahead, abreast)) as rerun:
             for _ in rerun.frames(most):
                 pass
             spent = time.perf_counter() - start
