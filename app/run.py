@@ -31,6 +31,7 @@ from pipeline.rerun import (
     KeptScans,
     Reread,
     Rerun,
+    Sample,
     look_key,
     rough_trees,
 )
@@ -104,7 +105,7 @@ class Run:
         self.is_bare = self._hurried = False
         self._key = look_key(parameters)
         self._remapping: Remapping | None = None
-        self._journal = Journal()
+        self._journal, self._sample = Journal(), Sample()
         self._rough: Trees | None = None
         if isinstance(mapper, Mapper):
             mapper.note = lambda noted: self._journal.note(noted, mapper.parameters.slam)
@@ -190,6 +191,7 @@ class Run:
             self.frame = self._process(step)
         self._broken = False
         self._step, self.standing = step, step.index
+        self._sample.offer(step)
         self._told.record(self.frame, self.start_ns)
         return self.frame
 
@@ -224,7 +226,7 @@ class Run:
         if not isinstance(mapper, Mapper):
             return
         basis = self._basis()
-        self._rough = None if basis is None else rough_trees(basis, self._kept.clusters, parameters)
+        self._rough = None if basis is None else self._roughly(basis, parameters, mapper)
         rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead, abreast)
         if basis is None or not rerun.passed:
             self._remapping = Remapping(rerun, self.start_ns)
@@ -232,6 +234,12 @@ class Run:
         time_s = (self._cursor.stamp_ns(rerun.passed) - self.start_ns) / _NS
         told = self._told.before(rerun.passed, time_s)
         self._remapping = Remapping(rerun, self.start_ns, told, self._snapshots.first(rerun.passed))
+
+    def _roughly(self, basis: Basis, parameters: Parameters, mapper: Mapper) -> Trees | None:
+        sample = None
+        if self._reread is not None and not basis.shows_as(parameters):
+            sample = self._sample.looked(mapper.looker(), len(basis.entries))
+        return rough_trees(basis, self._kept.clusters, parameters, sample)
 
     def _basis(self) -> Basis | None:
         """What the scans so far were mapped to with one set of parameters."""

@@ -7,6 +7,7 @@ from pipeline.rerun.key import look_key
 from pipeline.rerun.named import Name, name_of
 from pipeline.rerun.rerun import Reread, Rerun
 from pipeline.rerun.rough import rough_trees
+from pipeline.rerun.sample import Sample
 from pipeline.rerun.tail import Recalled
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Recalled",
     "Reread",
     "Rerun",
+    "Sample",
     "look_key",
     "name_of",
     "rough_trees",

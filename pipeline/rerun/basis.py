@@ -19,6 +19,8 @@ from pipeline.rerun.journal import Entry
 LOOK = ("acquisition", "filters", "ground", "clustering", "shape")
 POSES = ("slam", "relocalisation")
 LATE = {"tree_share"}  # of the gathering: it only turns votes into verdicts
+GATHERED = ("acquisition", "filters", "ground")  # what is gathered of a scan hangs on these,
+AFTERWARDS = {"voxel_size"}  # but not on what follows of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,10 +59,25 @@ class Basis:
 
     def shows_as(self, parameters: Parameters) -> bool:
         """Whether other parameters find the same clusters and gather in the same way."""
-        before, now = self.parameters, parameters
-        return all(getattr(before, stage) == getattr(now, stage) for stage in LOOK) and (
-            before.gathering.model_dump(exclude=LATE) == now.gathering.model_dump(exclude=LATE)
-        )
+        looks = all(getattr(self.parameters, stage) == getattr(parameters, stage) for stage in LOOK)
+        return looks and self.gathers_as(parameters)
+
+    def gathers_as(self, parameters: Parameters) -> bool:
+        """Whether other parameters gather what a scan shows in the same way."""
+        before, now = self.parameters.gathering, parameters.gathering
+        return before.model_dump(exclude=LATE) == now.model_dump(exclude=LATE)
+
+    def gathers_the_same(self, parameters: Parameters) -> bool:
+        """Whether the same is gathered of each scan, whatever clusters there are."""
+        kept = [
+            [getattr(p, stage).model_dump(exclude=AFTERWARDS) for stage in GATHERED]
+            for p in (self.parameters, parameters)
+        ]
+        return kept[0] == kept[1] and self.gathers_as(parameters)
+
+    def looking_as_before(self, parameters: Parameters) -> Parameters:
+        """The other parameters, with those of what a scan shows as they were."""
+        return parameters.model_copy(update={stage: getattr(self.parameters, stage) for stage in LOOK})
 
     def holds_for(self, parameters: Parameters) -> bool:
         """Whether other parameters find the same clusters, and ask for poses and gather in the same way."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,15 @@ class ClusterTable:
             grown[first:last] = getattr(clusters, name)
             self._columns[name] = grown
         self.start.append(last)
+
+    def of(self, scans: Sequence[int]) -> ClusterTable:
+        """A table of some scans alone, in their order, which nobody adds to."""
+        rows = [np.arange(self.start[k], self.start[k + 1]) for k in scans]
+        taken = ClusterTable()
+        taken.start = np.cumsum([0, *map(len, rows)]).tolist()
+        every = np.concatenate([np.zeros(0, np.int64), *rows])
+        taken._columns = {name: column[every] for name, column in self._columns.items()}
+        return taken
 
     def centre(self, scans: int) -> Float:
         """x, y in the level sensor frame [m] of the clusters of the first scans, shape (K, 2)."""

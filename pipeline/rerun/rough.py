@@ -3,16 +3,23 @@
 It knows of no gate, no miss and no merging, and holds each pose for true, as it is known behind all loops,
 but those of a robot that is lost or looks for a loop. Other parameters of SLAM may find others; the map that
 follows is exact.
+
+Where a scan would show other clusters, some scans are looked at again: what they find of a tree, as against
+what they found, tells how often the others would.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiled import compiled, compiled_within
 from pipeline.geometry import Float
 from pipeline.parameters import Parameters
-from pipeline.records import Bool, Int, Trees, Verdict
+from pipeline.perception import Looked
+from pipeline.records import Bool, Columns, Int, Trees, Verdict
 from pipeline.rerun.basis import Basis
 from pipeline.rerun.clusters import ClusterTable
 from pipeline.rerun.journal import Entry
@@ -21,40 +28,70 @@ from pipeline.slam.cells import Cells, cell_of, cells_for, first_of_four, per_me
 from pipeline.tracking.judging import REACH, nearest_other, tree_columns
 
 MOST_PLACES = 20_000
+LEAST = 2  # looks at a tree in the sample that tell anything of it
 
 
-def rough_trees(basis: Basis, clusters: ClusterTable, parameters: Parameters) -> Trees | None:
+def rough_trees(
+    basis: Basis, clusters: ClusterTable, parameters: Parameters, sample: Mapping[int, Looked] | None = None
+) -> Trees | None:
     """Where trees will be, without diameters and with numbers that hold for nothing else.
 
     Args:
         basis: The run before; clusters: of the same scans.
         parameters: That are tried.
+        sample: What some of the scans show with these, by their numbers, ascending.
 
     Returns:
-        None where the parameters look at a scan in another way, or gather it in another.
+        None where the parameters gather in another way, or look at scans in another one without a sample.
     """
     scans = min(len(basis.entries), len(clusters))
-    if scans == 0 or not basis.shows_as(parameters):
+    if scans == 0 or not basis.gathers_as(parameters):
         return None
-    entries, p = basis.entries[:scans], parameters
-    pose = np.concatenate([basis.path[:scans], [e.offset[:2] for e in entries]], axis=1)
-    tree = clusters.verdicts(p.detection, scans) == Verdict.TREE
-    start = np.array(clusters.start[: scans + 1])
-    tree &= np.repeat([e.is_usual for e in entries], np.diff(start))
-    reach = max(p.tracking.proximity_radius, min(p.tracking.distance_max, REACH))
-    place, hits = _gathered(clusters.centre(scans), tree, start, pose, reach, MOST_PLACES)
-    confirmed = hits >= p.tracking.hits_to_confirm
-    return _trees(*_judged(place, hits, confirmed, entries, p))
+    if basis.shows_as(parameters):
+        return _trees(_known(basis, clusters, parameters, scans))
+    if not sample:
+        return None
+    before = _known(basis, clusters, basis.looking_as_before(parameters), scans)
+    return _trees(_with_sample(before, basis, clusters, parameters, sample))
 
 
-def _judged(
-    place: Float, hits: Int, confirmed: Bool, entries: tuple[Entry, ...], p: Parameters
+class _Places(NamedTuple):
+    """Trees: where, by how many clusters, and whether what was gathered tells of them, shape (T, ...)."""
+
+    place: Float
+    hits: Int
+    gathered: Bool
+
+
+def _known(basis: Basis, clusters: ClusterTable, p: Parameters, scans: int) -> _Places:
+    """Of what all scans have shown."""
+    usual = np.array([e.is_usual for e in basis.entries[:scans]])
+    place, hits = _found(basis, range(scans), clusters, p, usual)
+    return _judged(place, hits, hits >= p.tracking.hits_to_confirm, basis.entries[:scans], p)
+
+
+def _found(
+    basis: Basis, scans: Sequence[int], clusters: ClusterTable, p: Parameters, usual: Bool
 ) -> tuple[Float, Int]:
-    """Places and hits of the trees: what was gathered decides wherever it tells anything."""
-    known = next((e.columns for e in reversed(entries) if e.columns is not None), None)
-    if known is None or p.gathering.method == "none":
-        return place[confirmed], hits[confirmed]
-    columns = columns_of(known, p.gathering.tree_share)
+    """The places where the clusters of scans, which are those of the table in their order, show trees."""
+    rows = np.array(scans, np.int64)
+    offset = np.array([basis.entries[k].offset[:2] for k in scans]).reshape(-1, 2)
+    start = np.array(clusters.start[: len(rows) + 1])
+    tree = clusters.verdicts(p.detection, len(rows)) == Verdict.TREE
+    tree &= np.repeat(usual, np.diff(start))
+    pose = np.concatenate([basis.path[rows], offset], axis=1)
+    return _gathered(clusters.centre(len(rows)), tree, start, pose, _reach(p), MOST_PLACES)
+
+
+def _reach(p: Parameters) -> float:
+    return max(p.tracking.proximity_radius, min(p.tracking.distance_max, REACH))
+
+
+def _judged(place: Float, hits: Int, confirmed: Bool, entries: tuple[Entry, ...], p: Parameters) -> _Places:
+    """The trees among places: what was gathered decides wherever it tells anything."""
+    columns = _columns(entries, p)
+    if columns is None:
+        return _Places(place[confirmed], hits[confirmed], np.zeros(np.count_nonzero(confirmed), np.bool_))
     trees = tree_columns(columns)
     at = columns.axis[trees, :2].copy()
     track = nearest_other(at, place, REACH)
@@ -62,11 +99,60 @@ def _judged(
     at[seen] = place[track[seen]]
     free = confirmed & (nearest_other(place, columns.axis[:, :2].copy(), REACH) < 0)
     views = np.where(seen, hits[track] if len(hits) else 0, 0)
-    return np.concatenate([at, place[free]]), np.concatenate([views, hits[free]])
+    gathered = np.arange(len(at) + np.count_nonzero(free)) < len(at)
+    return _Places(np.concatenate([at, place[free]]), np.concatenate([views, hits[free]]), gathered)
 
 
-def _trees(place: Float, hits: Int) -> Trees:
-    n = len(place)
+def _columns(entries: tuple[Entry, ...], p: Parameters) -> Columns | None:
+    known = next((e.columns for e in reversed(entries) if e.columns is not None), None)
+    return (
+        None if known is None or p.gathering.method == "none" else columns_of(known, p.gathering.tree_share)
+    )
+
+
+def _with_sample(
+    before: _Places, basis: Basis, clusters: ClusterTable, p: Parameters, sample: Mapping[int, Looked]
+) -> _Places:
+    """The trees as a sample of scans changes them: who is found less often there has fewer hits, and what is
+    found there, and was not, is a tree. What was gathered hangs on no clusters, and stays; but where
+    something else is gathered too, it stays as long as anything is found of it."""
+    scans = [k for k in sample if k < min(len(basis.entries), len(clusters))]
+    fresh = ClusterTable()
+    for n, k in enumerate(scans):
+        fresh.put(n, sample[k].clusters)
+    usual = np.array([basis.entries[k].is_usual for k in scans], np.bool_)
+    old, old_hits = _found(basis, scans, clusters.of(scans), p, usual)
+    new, new_hits = _found(basis, scans, fresh, p, usual)
+
+    was, now = (
+        _sums(nearest_other(place, before.place, REACH), found, len(before.place))
+        for place, found in ((old, old_hits), (new, new_hits))
+    )
+    told = was >= LEAST
+    hits = np.where(told, before.hits * now // np.maximum(was, 1), before.hits)
+    gathered = before.gathered & (basis.gathers_the_same(p) | (now > 0))
+    stays = gathered | ~told | (hits >= p.tracking.hits_to_confirm)
+
+    alone = (new_hits >= LEAST) & (nearest_other(new, before.place, REACH) < 0)
+    alone &= nearest_other(new, old, REACH) < 0
+    columns = _columns(basis.entries, p)
+    if columns is not None:
+        alone &= nearest_other(new, columns.axis[:, :2].copy(), REACH) < 0
+    return _Places(
+        np.concatenate([before.place[stays], new[alone]]),
+        np.concatenate([hits[stays], new_hits[alone]]),
+        np.concatenate([before.gathered[stays], np.zeros(np.count_nonzero(alone), np.bool_)]),
+    )
+
+
+def _sums(row: Int, hits: Int, rows: int) -> Int:
+    """Of the hits of each row; -1 is none."""
+    there = row >= 0
+    return np.bincount(row[there], hits[there], rows).astype(np.int64)
+
+
+def _trees(known: _Places) -> Trees:
+    place, hits, n = known.place, known.hits, len(known.place)
     unknown, none = np.full(n, np.nan), np.zeros(n, np.int64)
     return Trees(
         number=np.arange(1, n + 1),

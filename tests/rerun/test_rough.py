@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from pipeline.records import Verdict
-from pipeline.rerun import Rerun, rough_trees
+from pipeline.rerun import Rerun, Sample, rough_trees
+from pipeline.rerun.clusters import ClusterTable
 from pipeline.rerun.rough import MOST_PLACES, _gathered
-from tests.rerun.mapped import BASE, mapper
+from pipeline.rerun.sample import MOST_SCANS
+from tests.rerun.mapped import BASE, mapper, run
 
 
 def share_within(place: np.ndarray, other: np.ndarray, distance: float) -> float:
@@ -92,3 +94,103 @@ def test_clusters_join_the_nearest_of_all_places(seed, reach, most):
 def test_nothing_is_told_of_clusters_that_nobody_knows(change, known):
     kept, basis = known
     assert rough_trees(basis, kept.clusters, BASE.replace(change)) is None
+
+
+LOOKS = [
+    {"clustering.eps": 0.3},
+    {"filters.voxel_size": 0.03},
+    {"clustering.min_points": 40},
+    {"filters.x_max": 8.0, "filters.x_min": -8.0, "tracking.hits_to_confirm": 4},
+]
+
+
+def sampled(parameters):
+    """What some scans of the run show with these parameters."""
+    sample = Sample()
+    for step in run()[0]:
+        sample.offer(step)
+    return sample.looked(mapper(parameters).looker(), len(run()[0]))
+
+
+@pytest.mark.parametrize("method", ["columns", "none"])
+@pytest.mark.parametrize("change", LOOKS)
+def test_scans_that_are_looked_at_again_tell_of_other_clusters(change, method, known):
+    kept, basis = known
+    if method == "none":  # hits alone make a tree
+        bare = tuple(replace(e, columns=None) for e in basis.entries)
+        basis = replace(basis, entries=bare)
+    parameters = BASE.replace(change)
+    rough = rough_trees(basis, kept.clusters, parameters, sampled(parameters))
+    assert rough is not None
+    if method == "columns":
+        *_, frame = Rerun(mapper(parameters), kept, lambda: iter(run()[0])).frames(len(kept))
+        exact = frame.trees.position[frame.trees.confirmed]
+    else:
+        exact = by_hits(parameters, basis)
+    assert len(exact) > 1
+    assert share_within(exact, rough.position, 0.3) > 0.7
+    # How the votes on less of a trunk would turn out, nobody knows.
+    known_votes = method == "none" or "filters.x_max" not in change
+    assert share_within(rough.position, exact, 0.3) > (0.7 if known_votes else 0.4)
+
+
+def by_hits(parameters, basis):
+    """Where the clusters of all scans, looked at again, show trees often enough."""
+    look = mapper(parameters).looker()
+    every = {step.index: look(step) for step in run()[0]}
+    table = ClusterTable()
+    for index, looked in every.items():
+        table.put(index, looked.clusters)
+    as_now = replace(basis, parameters=parameters)
+    rough = rough_trees(as_now, table, parameters)
+    assert rough is not None
+    return rough.position
+
+
+def test_a_sample_of_the_same_looks_changes_nothing(known):
+    kept, basis = known
+    other = replace(basis, parameters=BASE.replace({"clustering.eps": 0.3}))
+    wanted = rough_trees(basis, kept.clusters, BASE)
+    given = rough_trees(other, kept.clusters, BASE, sampled(BASE))
+    assert wanted is not None
+    assert given is not None
+    assert given.position.tobytes() == wanted.position.tobytes()
+    assert given.observations.tolist() == wanted.observations.tolist()
+
+
+def test_scans_that_show_nothing_leave_what_was_gathered_alone(known):
+    kept, basis = known
+    parameters = BASE.replace({"clustering.min_points": 500})
+    rough = rough_trees(basis, kept.clusters, parameters, sampled(parameters))
+    wanted = rough_trees(basis, kept.clusters, BASE)
+    assert rough is not None
+    assert wanted is not None
+    assert 0 < len(rough.position) <= len(wanted.position)
+    bare = replace(basis, entries=tuple(replace(e, columns=None) for e in basis.entries))
+    rough = rough_trees(bare, kept.clusters, parameters, sampled(parameters))
+    assert rough is not None
+    seen = np.hypot(*(wanted.position[:, None] - rough.position[None]).transpose(2, 0, 1)) < 0.3
+    assert seen.any(axis=1).mean() < 0.5
+
+
+def test_a_sample_is_spread_over_the_run_and_bounded():
+    step, sample = run()[0][0], Sample()
+    looked, asked = mapper(BASE).look(step), []
+
+    def look(step):
+        asked.append(step.index)
+        return looked
+
+    for index in range(1000):
+        sample.offer(replace(step, index=index))
+    held = list(sample.looked(look, 900))
+    assert held == asked
+    assert MOST_SCANS // 2 <= len(sample) <= MOST_SCANS
+    assert len(set(np.diff(held))) == 1
+    assert held[0] == 0
+    assert held[-1] < 900
+    large = replace(step, scan=replace(step.scan, points=np.zeros((500_000, 3), np.float32)))
+    sample = Sample()
+    for index in range(100):
+        sample.offer(replace(large, index=index))
+    assert len(sample) <= 3

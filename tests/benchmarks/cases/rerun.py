@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pipeline.mapper import Mapper
     from pipeline.parameters import Parameters
     from pipeline.records import Step
-    from pipeline.rerun import Basis, KeptScans
+    from pipeline.rerun import Basis, KeptScans, Sample
     from pipeline.sources.base import Source
 
 NAME = "rerun"
@@ -49,7 +49,7 @@ def run() -> list[Table]:
     source = open_source(URI)
     bandwidth = _bandwidth()
     with closing(KeptScans(most=8 << 30)) as kept:
-        held, mapping, basis = _first_time(source, base, kept)
+        held, sample, mapping, basis = _first_time(source, base, kept)
         size = kept.nbytes / max(len(kept), 1)
         scans = len(kept)
         noted = sum(entry.nbytes for entry in basis.entries)
@@ -61,14 +61,14 @@ def run() -> list[Table]:
             wall = _again(source, tried, kept, scans, None, basis)
             read = noted if tracked else round(kept.nbytes * (1 - begun / scans))
             rows.append(_whole(words, scans, wall, asked, read, bandwidth, _from(begun, tracked)))
-            roughly.append(_rough(words, basis, kept, tried, bandwidth))
+            roughly.append(_rough(words, basis, kept, tried, None, bandwidth))
         for name, value, asked in LOOKED:
-            wall = _again(source, base.replace({name: value}), kept, len(held), held)
+            tried, words = base.replace({name: value}), f"{name} {_of(base, name)} → {value}"
+            wall = _again(source, tried, kept, len(held), held)
+            roughly.append(_rough(words, basis, kept, tried, (source, sample), bandwidth))
             scaled = asked * len(held) / scans
             points = sum(step.scan.points.nbytes for step in held)
-            rows.append(
-                _whole(f"{name} {_of(base, name)} → {value}", len(held), wall, scaled, points, bandwidth)
-            )
+            rows.append(_whole(words, len(held), wall, scaled, points, bandwidth))
     return [
         Table(
             f"{URI}, preset forest, 100 particles, warm",
@@ -92,7 +92,11 @@ def run() -> list[Table]:
             "Rough answer before the exact one",
             ("change", "trees", "s", "asked s", "MB read", "limit s", "reached"),
             tuple(roughly),
-            ("Kept clusters judged anew at the poses of the map before; other poses it does not know.",),
+            (
+                "Kept clusters judged anew at the poses of the map before; other poses it does not know.",
+                f"For the last rows {len(sample)} scans of the run, evenly spread, are looked at again: what "
+                "they find of a tree, against what they found, tells of the others.",
+            ),
         ),
     ]
 
@@ -108,21 +112,30 @@ def _from(begun: int, tracked: bool) -> str:
 
 
 def _rough(
-    words: str, basis: Basis, kept: KeptScans, parameters: Parameters, bandwidth: float
+    words: str,
+    basis: Basis,
+    kept: KeptScans,
+    parameters: Parameters,
+    sampled: tuple[Source, Sample] | None,
+    bandwidth: float,
 ) -> tuple[Cell, ...]:
     """The rough answer; once before for the kernels."""
     from pipeline.rerun import rough_trees
 
-    trees, spent = None, 0.0
+    trees, spent, read = None, 0.0, kept.clusters.nbytes
     for _ in range(2):
+        looks = None
         start = time.perf_counter()
-        trees = rough_trees(basis, kept.clusters, parameters)
+        if sampled is not None:
+            source, sample = sampled
+            looks = sample.looked(_fresh(source, parameters).looker(), len(basis.entries))
+            read = kept.clusters.nbytes + sample.nbytes
+        trees = rough_trees(basis, kept.clusters, parameters, looks)
         spent = time.perf_counter() - start
     if trees is None:
         return (words, "none", "", ASKED_ROUGH, "", "", "")
-    size = kept.clusters.nbytes
     reached = verdict(spent <= ASKED_ROUGH)
-    return (words, len(trees.number), spent, ASKED_ROUGH, size / 1e6, size / bandwidth, reached)
+    return (words, len(trees.number), spent, ASKED_ROUGH, read / 1e6, read / bandwidth, reached)
 
 
 def _fresh(source: Source, parameters: Parameters) -> Mapper:
@@ -132,14 +145,17 @@ def _fresh(source: Source, parameters: Parameters) -> Mapper:
     return Mapper(parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=0)
 
 
-def _first_time(source: Source, parameters: Parameters, kept: KeptScans) -> tuple[list[Step], float, Basis]:
-    """Map the run, keep what it shows and what came of it, and hold its first scans; with the seconds of the
-    mapping alone."""
-    from pipeline.rerun import Basis, Journal, look_key
+def _first_time(
+    source: Source, parameters: Parameters, kept: KeptScans
+) -> tuple[list[Step], Sample, float, Basis]:
+    """Map the run, keep what it shows and what came of it, and hold its first scans and a sample of all; with
+    the seconds of the mapping alone."""
+    from pipeline.rerun import Basis, Journal, Sample, look_key
     from pipeline.steps import steps
 
     mapper, key = _fresh(source, parameters), look_key(parameters)
     held: list[Step] = []
+    sample = Sample()
     journal, states = Journal(), {}
     mapper.note = lambda noted: journal.note(noted, parameters.slam)
     spent = 0.0
@@ -151,11 +167,12 @@ def _first_time(source: Source, parameters: Parameters, kept: KeptScans) -> tupl
         mapper.take(step, looked)
         spent += time.perf_counter() - start
         kept.put(step, looked, key)
+        sample.offer(step)
         if len(held) < READ_AGAIN:
             held.append(step)
     states[len(kept)] = mapper.snapshot()
     entries, path = journal.first(len(kept)), mapper.path
-    return held, spent, Basis.of(parameters, entries, states, path, mapper.motion)
+    return held, sample, spent, Basis.of(parameters, entries, states, path, mapper.motion)
 
 
 def _again(
