@@ -117,6 +117,8 @@ class Verdict(IntEnum):
 
 #: What columns are voted to be, in the order of their shares (see Columns).
 CLASSES = (Verdict.TREE, Verdict.POLE, Verdict.PERSON, Verdict.BUSH, Verdict.WALL, Verdict.OTHER)
+#: What the votes count where circles show something round: so seldom is it anything else (docs/trunks.md).
+AT_ROUND = tuple(1.0 if k in (Verdict.TREE, Verdict.POLE, Verdict.PERSON) else 0.1 for k in CLASSES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,6 +14,7 @@ from pipeline.gathering.features import COUNT, features
 from pipeline.gathering.forest import CLASSES, ForestOf, package_alone, vote
 from pipeline.gathering.judged import judged
 from pipeline.gathering.memory import SLICE, SLICES, TILE, Memory
+from pipeline.gathering.outlook import seen_higher
 from pipeline.gathering.packed import PackedMemory
 from pipeline.gathering.sight import View, look, look_through
 from pipeline.geometry import Float
@@ -87,7 +88,7 @@ class Gathering:
         p, pose = self.parameters, view.T_map_base.as_array()
         here = _to_map(points, height, pose, view.sensor_offset, p.range_max)
         tiles = self._remember(here, scan, 1 << p.voxels_log2)
-        profiles = self._find_again(tiles)
+        profiles = self._find_again(_joined(tiles, seen_higher(self.columns)))
         c = self.columns
         first = len(c.verdict) - len(profiles)
         seen = (view.clear_range, view.steepest, view.sensor_offset, view.terrain)
@@ -184,6 +185,11 @@ def _rows(axis: Float, tile: Int) -> Columns:
         share=np.zeros((n, len(CLASSES))),
         verdict=np.full(n, Verdict.OTHER, np.int32),
     )
+
+
+def _joined(tiles: Int, more: Int) -> Int:
+    """The tiles and those of the others that are not among them."""
+    return np.concatenate([tiles, more[~_among(more, tiles)]])
 
 
 def _among(home: Int, tiles: Int) -> Bool:

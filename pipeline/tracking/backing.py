@@ -10,18 +10,15 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import CLASSES, Bool, Columns, Int, Int32, Verdict
+from pipeline.records import AT_ROUND, CLASSES, Bool, Columns, Int, Int32, Verdict
 from pipeline.tracking.observation import SECTORS
 from pipeline.tracking.table import TrackTable
 
 REACH = 0.25  # m; a column's axis lies so near to the trunk that it is of
 FITS = 20  # circles of single scans
 SIDES = SECTORS // 2  # that they were seen on
-ROUND = np.array([kind in (Verdict.TREE, Verdict.POLE, Verdict.PERSON) for kind in CLASSES])
-#: What the votes for all else count at a place that is round: so seldom is it anything else (docs/trunks.md).
-LEFT = 0.1
 TREE = CLASSES.index(Verdict.TREE)
-_KINDS = np.array(CLASSES, np.int64)
+_KINDS, _AT_ROUND = np.array(CLASSES, np.int64), np.array(AT_ROUND)
 
 
 def backed(columns: Columns, tracks: TrackTable, tree_share: float) -> Columns:
@@ -36,7 +33,7 @@ def backed(columns: Columns, tracks: TrackTable, tree_share: float) -> Columns:
     round_tracks = np.flatnonzero(tracks.radii >= FITS)
     if not len(round_tracks):
         return columns
-    doubtful = _doubtful(columns.share, columns.verdict, _KINDS, ROUND, tree_share)
+    doubtful = _doubtful(columns.share, columns.verdict, _KINDS, _AT_ROUND, tree_share)
     if not len(doubtful):
         return columns
     found = _near_round(
@@ -48,7 +45,7 @@ def backed(columns: Columns, tracks: TrackTable, tree_share: float) -> Columns:
 
 
 @compiled
-def _doubtful(share: Float, verdict: Int32, kinds: Int, is_round: Bool, tree_share: float) -> Int:
+def _doubtful(share: Float, verdict: Int32, kinds: Int, at_round: Float, tree_share: float) -> Int:
     """Rows of the columns that the votes alone refuse, and that would be trees were they round."""
     rows, n = np.empty(verdict.shape[0], np.int64), 0
     for c in range(verdict.shape[0]):
@@ -59,8 +56,8 @@ def _doubtful(share: Float, verdict: Int32, kinds: Int, is_round: Bool, tree_sha
             continue
         below, most = 0.0, 0.0
         for k in range(kinds.shape[0]):
-            below += share[c, k] * (1.0 if is_round[k] else LEFT)
-            if is_round[k]:
+            below += share[c, k] * at_round[k]
+            if at_round[k] == 1.0:
                 most = max(most, share[c, k])
         if share[c, TREE] >= most and share[c, TREE] / max(below, 1e-9) >= tree_share:
             rows[n] = c

@@ -12,6 +12,7 @@ from pipeline.tracking.table import TrackTable
 TREE, OTHER = int(Verdict.TREE), int(Verdict.OTHER)
 ONE_TREE = 0.5  # m; tree columns nearer to one another than this are one tree
 REACH = 0.45  # m; a track farther from a column than this is something else
+BESIDE = 0.7  # m; a tree whose own column is gone is what the column so near is: a person fits no circle well
 
 
 def tree_columns(columns: Columns) -> Int:
@@ -38,32 +39,42 @@ def assign_verdicts(tracks: TrackTable, columns: Columns, trees: Int, due: Bool)
     """Give every track the verdict of what stands at its place.
 
     Each tree column makes one track a tree, the one with most hits in reach. A track that no column
-    is near to keeps what it was; where its column is overdue, nothing upright stands there, and its hits
-    alone make it no tree.
+    is near to keeps what it was, but a tree does not beside a column of something else; where its column is
+    overdue, nothing upright stands there, and its hits alone make it no tree.
 
     Args:
         tracks: Changed in place.
         columns: All of them; trees: rows of those that are trees, best first.
-        due: shape (T,): which tracks would have a column by now if they were trees.
+        due: shape (T,): which tracks would have a column by now if they were trees, or be in sight.
 
     Returns:
         Places in `trees` of those without a track.
     """
     return _assigned(
-        tracks.x, tracks.hits, tracks.verdict, columns.axis, columns.verdict, trees, due, REACH
+        tracks.x, tracks.hits, tracks.verdict, columns.axis, columns.verdict, trees, due, REACH, BESIDE
     )  # fmt: skip
 
 
 @compiled
 def _assigned(
-    x: Float, hits: Int, verdict: Int, axis: Float, of_column: Int32, trees: Int, due: Bool, reach: float
+    x: Float,
+    hits: Int,
+    verdict: Int,
+    axis: Float,
+    of_column: Int32,
+    trees: Int,
+    due: Bool,
+    reach: float,
+    beside: float,
 ) -> Int:
-    nearest = nearest_other(x, axis, reach)
+    nearest, farther = nearest_other(x, axis, reach), nearest_other(x, axis, beside)
     for t in range(x.shape[0]):
         if nearest[t] >= 0:
             told = np.int64(of_column[nearest[t]])
             # Another track is that tree, unless told below.
             verdict[t] = OTHER if told == TREE else told
+        elif verdict[t] == TREE and farther[t] >= 0 and of_column[farther[t]] != TREE:
+            verdict[t] = of_column[farther[t]]
         elif due[t] and verdict[t] < 0:
             verdict[t] = OTHER
     place = np.empty((trees.shape[0], 2))

@@ -105,7 +105,8 @@ def _join(columns: _Columns, old: int, young: int) -> None:
     first_ns[old] = min(first_ns[old], first_ns[young])
     score[old] = max(score[old], score[young])
     sides[old] |= sides[young]
-    if verdict[old] != Verdict.TREE:
+    # A piece that was begun in this scan has no verdict yet, and must not take that of the whole away.
+    if verdict[young] == Verdict.TREE or verdict[old] < 0:
         verdict[old] = verdict[young]
     hits[old] += hits[young]
     eccentricity[old] += eccentricity[young]

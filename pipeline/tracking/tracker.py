@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Gathering, Tracking
-from pipeline.records import Columns, Detections, Int, Landmarks, Trees, Verdict
+from pipeline.records import Bool, Columns, Detections, Int, Landmarks, Trees, Verdict
 from pipeline.tracking.anchor import anchor
 from pipeline.tracking.assignment import assign, in_map
 from pipeline.tracking.backing import backed
@@ -26,6 +26,7 @@ GATHERED_SIGMA = 0.1  # m; the middle of the returns of one side lies so far bef
 NANOSECONDS = 1e-9
 DUE_NS = 5_000_000_000  # after its first sight a trunk so near has a column: a dozen scans were gathered
 DUE_REACH = 10.0  # m
+GLIMPSE_NS, FORMER_NS = 1_000_000_000, 60_000_000_000  # bounds of being out of sight, see `_out_of_sight`
 DUE_SHARE = 0.4  # of how far away returns are gathered: what stands farther may have been seen by few scans
 SHARED_SIGMA = 0.01  # m; bark and taper: the views of one trunk share part of their error
 SHARED_COVARIANCE = SHARED_SIGMA**2 * np.eye(2)
@@ -158,7 +159,8 @@ class Tracker:
         t, at = self.tracks, self._at
         reach = min(DUE_REACH, DUE_SHARE * parameters.range_max)
         near = np.hypot(t.x[:, 0] - at.x, t.x[:, 1] - at.y) < reach
-        fresh = assign_verdicts(t, columns, trees, near & (stamp_ns - t.first_ns >= DUE_NS))
+        due = near & (stamp_ns - t.first_ns >= DUE_NS)
+        fresh = assign_verdicts(t, columns, trees, due | _out_of_sight(t, stamp_ns))
         own = np.tile(GATHERED_SIGMA**2 * np.eye(2), (len(fresh), 1, 1))
         from_here = self._at.inverse().apply(place[fresh])
         Sigma = self._pose_covariance
@@ -226,6 +228,15 @@ class Tracker:
             confirmed=confirmed,
             sides=t.sides.copy(),
         )
+
+
+def _out_of_sight(t: TrackTable, stamp_ns: int) -> Bool:
+    """Which tracks have not been seen for longer than they had been seen, as who walked on has not, shape
+    (T,). At least a second and at most as long as a column takes; what was last seen long ago is of another
+    drive, or was put back by a loop, and nobody walked there."""
+    unseen = stamp_ns - t.stamp_ns
+    gone: Bool = unseen > np.clip(t.stamp_ns - t.first_ns, GLIMPSE_NS, DUE_NS)
+    return gone & (unseen < FORMER_NS)
 
 
 def _gather(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -138,13 +140,14 @@ def test_hits_make_no_tree_where_a_column_is_overdue(x, stays):
     columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
     tracker = Tracker(FOREST.tracking)
     second = 1_000_000_000
-    for k in range(3):
+    shown = []
+    for k in range(6):
         found = detections([[5.0, 1.0], [x, -3.0]])
         tracker.process(k * second, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
-    shown = []
-    for stamp_ns in (3 * second, DUE_NS):
-        tracker.judge(stamp_ns, columns, FOREST.gathering)
-        shown.append(tracker.trees().confirmed.tolist())
+        if k >= 4:
+            tracker.judge(k * second, columns, FOREST.gathering)
+            shown.append(tracker.trees().confirmed.tolist())
+    assert 5 * second == DUE_NS
     assert shown == [[True, True], [True, stays]]
     late = gathered(trunk(x, -3.0, 0.15, top=5.9), scans=3).columns
     tracker.judge(2 * DUE_NS, late, FOREST.gathering)
@@ -156,10 +159,49 @@ def test_hits_count_where_returns_are_gathered_only_from_nearer():
     nothing, near = no_columns(), FOREST.gathering.model_copy(update={"range_max": 5.0})
     for parameters, stays in ((FOREST.gathering, False), (near, True)):
         tracker = Tracker(FOREST.tracking)
-        for k in range(3):
-            tracker.process(k, Pose2(), np.eye(3) * 1e-6, detections([[6.0, -3.0]]), NOWHERE_FREE, 15.0)
+        for stamp_ns in (0, DUE_NS // 2, DUE_NS):
+            far = detections([[6.0, -3.0]])
+            tracker.process(stamp_ns, Pose2(), np.eye(3) * 1e-6, far, NOWHERE_FREE, 15.0)
         tracker.judge(DUE_NS, nothing, parameters)
         assert tracker.trees().confirmed.tolist() == [stays]
+
+
+@pytest.mark.parametrize(
+    ("seen_s", "unseen_s", "stays"),
+    [
+        (0.4, 0.9, True),
+        (0.4, 1.1, False),
+        (3.0, 2.9, True),
+        (3.0, 3.1, False),
+        (20.0, 4.9, True),
+        (20.0, 5.1, False),
+        (0.4, 61.0, True),  # of another drive, or put back by a loop
+    ],
+)
+def test_hits_make_no_tree_of_who_walked_on(seen_s, unseen_s, stays):
+    """Far away, where nothing is gathered and no miss is counted."""
+    tracker, scans = Tracker(FOREST.tracking), 5
+    for k in range(scans):
+        stamp_ns = round(1e9 * seen_s * k / (scans - 1))
+        found = detections([[20.0, -3.0]])
+        tracker.process(stamp_ns, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+    assert tracker.trees().confirmed.tolist() == [True]
+    tracker.judge(round(1e9 * (seen_s + unseen_s)), no_columns(), FOREST.gathering)
+    assert tracker.trees().confirmed.tolist() == [stays]
+
+
+def test_a_piece_that_is_joined_does_not_take_the_verdict_away():
+    """A person's arm begins a track of its own for one scan, and is the person's again in the next one."""
+    columns = gathered(trunk(5.0, 1.0, 0.15, top=1.7), scans=3).columns
+    columns = replace(columns, verdict=np.full(len(columns.verdict), Verdict.PERSON, np.int32))
+    tracker = Tracker(FOREST.tracking)
+    for k in range(5):
+        found = detections([[5.0, 1.0]] if k < 4 else [[5.0, 1.0], [5.0, 1.3]])
+        tracker.process(k, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+        if k == 3:
+            tracker.judge(k, columns, FOREST.gathering)
+            assert tracker.trees().confirmed.tolist() == [False]
+    assert tracker.trees().confirmed.tolist() == [False]
 
 
 def test_the_paper_gathers_nothing():
