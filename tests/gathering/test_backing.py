@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.gathering import judged
+from pipeline.gathering.features import NAMES
 from pipeline.gathering.forest import CLASSES
 from pipeline.gathering.gathering import no_columns
 from pipeline.parameters import preset
@@ -31,6 +33,7 @@ def column(verdict=Verdict.BUSH, **votes: float):
     rows = {name: np.zeros((1, *getattr(none, name).shape[1:])) for name in none.__dataclass_fields__}
     one = replace(none, **rows)
     one.axis[0, :2] = PLACE
+    one.figures[0, NAMES.index("voxels to 3 m")] = 100.0
     return replace(one, share=share[None], verdict=np.array([verdict], np.int32))
 
 
@@ -68,6 +71,32 @@ def test_what_is_round_too_is_told_by_the_votes(kind):
 @pytest.mark.parametrize("rule", [Verdict.MOVING, Verdict.TOO_FEW_POINTS])
 def test_what_a_rule_refused_stays_refused(rule):
     assert verdict(column(rule, tree=0.39), track()) is rule
+
+
+def rays(columns, met, passed):
+    """The columns after so many rays between 2.2 and 3.2 m ended at them or behind them."""
+    seen = replace(columns, met=columns.met.copy(), passed=columns.passed.copy())
+    seen.met[:, 12], seen.passed[:, 12] = met, passed
+    return replace(seen, verdict=judged(seen).verdict(0.4))
+
+
+@pytest.mark.parametrize(("met", "passed"), [(0, 10), (2, 8), (29, 71)])
+def test_what_ends_below_a_crown_is_too_low_however_round(met, passed):
+    """Somebody under a tree: votes between a tree and a bush, circles from all sides, and free air above."""
+    assert verdict(rays(column(tree=0.3), met, passed), track()) is Verdict.TOO_LOW
+
+
+@pytest.mark.parametrize(("met", "passed"), [(0, 9), (30, 70), (10, 0)])
+def test_what_goes_on_or_was_hardly_seen_stays_as_it_was(met, passed):
+    assert verdict(rays(column(tree=0.3), met, passed), track()) is Verdict.TREE
+
+
+@pytest.mark.parametrize(
+    ("votes", "kind"),
+    [({"tree": 0.03}, "bush"), ({"tree": 0.1, "person": 0.5}, "person"), ({"tree": 0.5}, "tree")],
+)
+def test_what_the_votes_alone_decide_is_not_asked_how_high_it_is(votes, kind):
+    assert verdict(rays(column(**votes), 0, 50), track()) is Verdict[kind.upper()]
 
 
 @LAW

@@ -190,6 +190,24 @@ def test_hits_make_no_tree_of_who_walked_on(seen_s, unseen_s, stays):
     assert tracker.trees().confirmed.tolist() == [stays]
 
 
+def test_a_tree_does_not_outlive_its_column_beside_something_else():
+    """Who stood beside the robot was a tree by the first votes; their circle lies half a metre off."""
+    columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
+    for kind, off, stays in (
+        (Verdict.MOVING, 0.5, False),
+        (Verdict.PERSON, 0.65, False),
+        (Verdict.BUSH, 0.75, True),
+    ):
+        tracker = Tracker(FOREST.tracking)
+        tracker.judge(0, columns, FOREST.gathering)
+        assert tracker.trees().confirmed.tolist() == [True]
+        place = tracker.trees().position[0]
+        moved = replace(columns, axis=columns.axis.copy(), verdict=np.full_like(columns.verdict, kind))
+        moved.axis[:, :2] = place + np.array([0.0, off])
+        tracker.judge(1, moved, FOREST.gathering)
+        assert tracker.trees().confirmed.tolist() == [stays], kind.label
+
+
 def test_a_piece_that_is_joined_does_not_take_the_verdict_away():
     """A person's arm begins a track of its own for one scan, and is the person's again in the next one."""
     columns = gathered(trunk(5.0, 1.0, 0.15, top=1.7), scans=3).columns
