@@ -114,19 +114,19 @@ def run_with(seed: int, kinds: tuple[str, ...]) -> SimulatedRun:
                 return float(x), float(y)
 
     def one(kind: str) -> tuple[Place, list[Leg]]:
-        side = float(rng.choice([-1.0, 1.0]) * rng.uniform(1.0, 2.5))
-        x = float(rng.uniform(5.0, 25.0))
-        return {
-            "still": lambda: (beside(), []),
-            "by a trunk": lambda: (by_a_trunk(), []),
-            "along": lambda: ((1.0, side), [((30.0, side), LANE.speed)]),
-            "ahead": lambda: ((3.0, 0.1), [((33.0, 0.1), LANE.speed)]),
-            "across": lambda: ((x, -6.0), [((x, 6.0 if k % 2 == 0 else -6.0), 1.0) for k in range(6)]),
-            "pausing": lambda: (
-                beside(),
-                [leg for _ in range(5) for leg in (float(rng.uniform(5.0, 15.0)), (beside(), 1.0))],
-            ),
-        }[kind]()
+        side, x = float(rng.choice([-1.0, 1.0]) * rng.uniform(1.0, 2.5)), float(rng.uniform(5.0, 25.0))
+        if kind == "along":
+            return (1.0, side), [((30.0, side), LANE.speed)]
+        if kind == "ahead":
+            return (3.0, 0.1), [((33.0, 0.1), LANE.speed)]
+        if kind == "across":
+            return (x, -6.0), [((x, 6.0 if k % 2 == 0 else -6.0), 1.0) for k in range(6)]
+        if kind == "by a trunk":
+            return by_a_trunk(), []
+        start, legs = beside(), list[Leg]()
+        for _ in range(5 if kind == "pausing" else 0):
+            legs += [float(rng.uniform(5.0, 15.0)), (beside(), 1.0)]
+        return start, legs
 
     first = len(run.scene.kinds)
     people = tuple(somebody(first + n, *one(kind), rng) for n, kind in enumerate(kinds))

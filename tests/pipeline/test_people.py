@@ -46,7 +46,8 @@ def away(place: Float, other: Float) -> Float:
     """From each place to the nearest other one [m]."""
     if len(other) == 0:
         return np.full(len(place), np.inf)
-    return np.hypot(*(place[:, None] - other[None]).transpose(2, 0, 1)).min(axis=1)
+    distance: Float = np.hypot(*(place[:, None] - other[None]).transpose(2, 0, 1)).min(axis=1)
+    return distance
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
