@@ -27,6 +27,7 @@ const RULES = {
   tree: (g) => `single scans fitted a round trunk on more than half of its sides, so votes for what is not round count a tenth. With them a tree needs ${percent(g.tree_share)} of the votes.`,
   moving: (g) => `Nothing stood there in ${g.absent} of the ${g.absent + g.present} scans with free view, so it moved away.`,
   wall: () => "It goes on sideways and is wide but not thick: a rule takes that for part of a wall before the votes count.",
+  "too low": () => "Of the rays between 2.2 and 3.2 m above the ground hardly any ended at it: it ends at a person's height, whatever hangs over it, so round fits from all sides do not make it a tree.",
   "too few points": () => "So few voxels can be piled up by chance; the votes do not count.",
 };
 
