@@ -116,7 +116,7 @@ def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
 def _saved_by_one(file: Any) -> Callable[[Any, Any], None]:  # noqa: ANN401
     """Let one process at a time write what is kept of a kernel: two that compile it for other types at once
     would give both the same file, and the index would lead one of them to the other's machine code."""
-    save: Callable[[Any, Any], None] = type(file).save
+    save: Callable[[Any, Any, Any], None] = type(file).save
 
     def save_alone(key: Any, data: Any) -> None:  # noqa: ANN401
         with locked(Path(file._index_path)):
