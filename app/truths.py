@@ -27,17 +27,25 @@ def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Agains
         own: What the source knows, if anything. It is never changed.
         rows: The annotations.
         against: "own" leaves annotations aside, "annotations" the source's truth, "both" neither.
+
+    Returns:
+        None where nothing counts.
     """
     used = counted(own, rows, against)
     if used == "both":
         return laid_over(own, rows)
-    return own if used in ("none", "source") else _as_truth([row.content for row in rows])
+    if used == "annotations":
+        return _as_truth([row.content for row in rows])
+    return own if used == "source" else None
 
 
 def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> Counted:
     """What counts, where one of the two may not be there."""
     if own is None:
         return "annotations" if rows else "none"
+    # Who asked for what people say is not told what the source knows.
+    if not rows and against == "annotations":
+        return "none"
     if not rows or against == "own":
         return "source"
     return against

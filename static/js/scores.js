@@ -1,6 +1,6 @@
 // The map against the ground truth: rates never without their counts.
 
-import { truthInWords, warnedInWords } from "./annotate.js";
+import { scoreAgainst, truthInWords, warnedInWords } from "./annotate.js";
 import { byId, el } from "./dom.js";
 import { figure, NONE, percent } from "./format.js";
 import { nothingYet } from "./nothing_yet.js";
@@ -52,8 +52,11 @@ function lines(score) {
 function nothing() {
   if (!state.map) return el("p", { class: "empty", text: nothingYet() });
   return el("div", { class: "empty" },
-    el("p", { text: "This run brings no ground truth, so there is nothing to score the map against. Annotate the trees, or open a simulated run." }),
-    el("button", { text: "Open a simulated run", onclick: openSources }));
+    el("p", { text: state.annotations?.own == null
+      ? "This run brings no ground truth, so there is nothing to score the map against. Annotate the trees, or open a simulated run."
+      : "Nothing is annotated yet, and annotations alone were chosen to score against. Annotate the trees, or let the run's own truth count." }),
+    state.annotations?.own == null ? el("button", { text: "Open a simulated run", onclick: openSources })
+      : el("button", { text: "Score against its truth and annotations", onclick: () => scoreAgainst("both") }));
 }
 
 export function startScores() {

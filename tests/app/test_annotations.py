@@ -268,7 +268,10 @@ async def test_what_agrees_leaves_the_truth_of_the_source_exact_and_a_person_cho
         assert sorted(dashboard.truth.x.tolist()) == [0.1, 2.2]
         await edit(client, "POST", "/undo")
         assert dashboard.truth.x.tolist() == [2.2]
-        await edit(client, "POST", "/undo")  # without any there is the source's truth alone
+        await edit(client, "POST", "/undo")
+        assert dashboard.truth is None  # who asked for annotations alone is not told the source's truth
+        assert dashboard.annotating.as_plain()["used"] == "none"
+        assert (await choose("both"))["used"] == "source"
         assert dashboard.truth is exact
         refused = await client.put("/api/annotations/against", json={"against": "nothing"})
         assert refused.status_code == 422
