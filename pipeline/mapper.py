@@ -240,8 +240,10 @@ class Mapper:
 
     def _gated(self, moved: Motion) -> tuple[Motion, tuple[str, ...]]:
         """The motion without a measured pose that cannot be, and what to say of that."""
-        noise = noise_of(self._parameters.slam)
-        if self._last is None or within_gate(*self._last, moved, noise):
+        if self._last is None or moved.measured is None:
+            return moved, ()
+        expected = moved._replace(measured=self._slam.as_seen(moved.measured))
+        if within_gate(*self._last, expected, noise_of(self._parameters.slam)):
             return moved, ()
         return moved._replace(measured=None), (REFUSED,)
 

@@ -65,4 +65,6 @@ def _carried(pose: PoseMeasurement, step: Pose2, stamp_ns: int) -> PoseMeasureme
     dx, dy = at.x - pose.T_map_base.x, at.y - pose.T_map_base.y
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     Q = np.diag([error**2, error**2, (CARRIED * step.yaw) ** 2])
-    return replace(pose, stamp_ns=stamp_ns, T_map_base=at, covariance=F @ pose.covariance @ F.T + Q)
+    covariance = F @ pose.covariance @ F.T + Q
+    shared = None if pose.shared is None else F @ pose.shared
+    return replace(pose, stamp_ns=stamp_ns, T_map_base=at, covariance=covariance, shared=shared)

@@ -69,9 +69,16 @@ class Odometry:
     T_odom_base: Pose3
 
 
+SHARED = 4  # errors that all poses of a source have alike, at the most: two of a shift, two of turns
+SOURCES = 2  # of measured poses, each with errors of its own: GNSS, another SLAM
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseMeasurement:
     """Where another source (GNSS, another SLAM) says the base is, in the frame of the map.
+
+    What its frame lies off errs all its poses alike: z = x + shared e + v with e ~ N(0, I) the same for all
+    poses of the source, and v of this one alone.
 
     Attributes:
         stamp_ns: Time of the pose.
@@ -79,18 +86,32 @@ class PoseMeasurement:
         covariance: shape (3, 3) of x, y [m], yaw [rad]; a large variance says nothing of the heading.
         gate: It is left out where the square of its distance from what is known, in sigmas, is larger: a
             source may jump.
+        shared: How x, y [m], yaw [rad] err by one sigma of each of the errors that all poses of the source
+            have alike, shape (3, SHARED); they are in the covariance too. None: each errs alone.
+        source: Whose errors those are, less than SOURCES.
     """
 
     stamp_ns: int
     T_map_base: Pose2
     covariance: Float
     gate: float = math.inf
+    shared: Float | None = None
+    source: int = 0
+
+    @property
+    def own(self) -> Float:
+        """Covariance of what this pose errs by alone, shape (3, 3)."""
+        return self.covariance if self.shared is None else self.covariance - self.shared @ self.shared.T
 
     def is_sound(self) -> bool:
         """Whether all numbers are finite and the covariance is symmetric and positive definite."""
         C, pose = self.covariance, self.T_map_base.as_array()
         if C.shape != (3, 3) or not (np.all(np.isfinite(C)) and np.all(np.isfinite(pose))):
             return False
+        if self.shared is not None:
+            if self.shared.shape != (3, SHARED) or not 0 <= self.source < SOURCES:
+                return False
+            C = self.own
         return bool(np.allclose(C, C.T) and np.all(np.linalg.eigvalsh(C) > 0.0))
 
 

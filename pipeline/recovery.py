@@ -206,7 +206,8 @@ class Recovery(Generic[S]):
             return None
         slam = FastSlam(parameters.slam.model_copy(update={"particles": len(s.local.pose)}), self._seed)
         slam.state = s.local
-        estimate = slam.process(index, motion, found, free)
+        # Measured poses are in the frame of the map, and not in that of the small one.
+        estimate = slam.process(index, motion._replace(measured=None), found, free)
         driven = s.driven + float(np.hypot(motion.step.x, motion.step.y))
         self.state = replace(s, local=slam.state, driven=driven)
         if index % EVERY:

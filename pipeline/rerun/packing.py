@@ -231,7 +231,9 @@ def _words(step: Step, looked: Looked) -> bytes:
             m.stamp_ns,
             m.T_map_base.as_array().tolist(),
             m.covariance.tolist(),
-            *([m.gate] if math.isfinite(m.gate) else []),
+            m.gate if math.isfinite(m.gate) else None,
+            None if m.shared is None else m.shared.tolist(),
+            m.source,
         ],
         "looked": looked.warnings,
         "counts": looked.counts,
@@ -242,4 +244,12 @@ def _words(step: Step, looked: Looked) -> bytes:
 def _measured(told: Any) -> PoseMeasurement | None:  # noqa: ANN401 - JSON
     if told is None:
         return None
-    return PoseMeasurement(int(told[0]), Pose2(*told[1]), np.array(told[2]), *map(float, told[3:]))
+    stamp_ns, pose, covariance, gate, shared, source = told
+    return PoseMeasurement(
+        int(stamp_ns),
+        Pose2(*pose),
+        np.array(covariance),
+        math.inf if gate is None else float(gate),
+        None if shared is None else np.array(shared),
+        int(source),
+    )

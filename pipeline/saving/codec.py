@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 R = TypeVar("R")
+NOT_SAVED = "not saved"  # in the metadata of a field: it is left out, and begins by its default
 _ALIGN = 8
 
 
@@ -45,7 +46,8 @@ def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
     if isinstance(value, np.ndarray):
         return blob.add(value)
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _encoded(getattr(value, f.name), blob) for f in fields(value)}
+        saved = [f.name for f in fields(value) if not f.metadata.get(NOT_SAVED)]
+        return {name: _encoded(getattr(value, name), blob) for name in saved}
     if isinstance(value, tuple | list):
         return [_encoded(part, blob) for part in value]
     if isinstance(value, dict):
@@ -101,7 +103,7 @@ def _decoded(kind: Any, tree: Any, blob: bytes, name: str) -> Any:  # noqa: ANN4
 
 
 def _record(kind: Any, tree: Any, blob: bytes, name: str) -> Any:  # noqa: ANN401
-    wanted = [f.name for f in fields(kind)]
+    wanted = [f.name for f in fields(kind) if not f.metadata.get(NOT_SAVED)]
     if not isinstance(tree, dict) or set(tree) != set(wanted):
         raise ValueError(f"{name} has not the parts that this version knows")
     kinds = typing.get_type_hints(kind)

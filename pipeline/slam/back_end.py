@@ -6,7 +6,7 @@ from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
 from pipeline.health import Health
 from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, Landmarks, PoseEstimate
+from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 from pipeline.slam.fastslam import FastSlam
 from pipeline.slam.loop import Loop
 from pipeline.slam.motion import Motion
@@ -62,6 +62,10 @@ class BackEnd:
     ) -> PoseEstimate:
         """See FastSlam.process."""
         return self._slam.process(index, motion, detections, clear_range)
+
+    def as_seen(self, pose: PoseMeasurement) -> PoseMeasurement:
+        """A measured pose without what all poses of its source are known by now to err by."""
+        return self._slam.as_seen(pose)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """See FastSlam.place."""

@@ -30,6 +30,7 @@ from pipeline.slam.maps import shared_map, take_ancestors
 from pipeline.slam.motion import Motion, accumulated, noise_of
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.scan import against_slip, estimated, use_scan
+from pipeline.slam.shared_errors import SharedErrors
 from pipeline.slam.state import SlamState
 from pipeline.slam.update import Rules
 
@@ -79,7 +80,8 @@ class FastSlam:
         if used and estimate.n_eff < p.resample_below * p.particles:
             ancestors = low_variance_ancestors(weights, offset)
             take_ancestors(ancestors, state.pose, state.maps)
-            state = replace(state, best=heir(state.best, ancestors, weights))
+            shared = state.shared.drawn(ancestors)
+            state = replace(state, best=heir(state.best, ancestors, weights), shared=shared)
             state.log_weight[:] = 0.0
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
         self.state = replace(state, genealogy=genealogy, frame=frame)
@@ -87,6 +89,10 @@ class FastSlam:
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
         )
         return replace(estimate, resampled=ancestors is not None, health=health)
+
+    def as_seen(self, pose: PoseMeasurement) -> PoseMeasurement:
+        """A measured pose without what all poses of its source are known by now to err by."""
+        return self.state.shared.as_seen(pose, normalised(self.state.log_weight))
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """Put all particles where another source says the base is now, with the map of the best one.
@@ -203,9 +209,10 @@ class FastSlam:
         if slipped:
             covariance = covariance + np.diag(slip.SIGMA**2)
             recent = replace(recent, distrust=1.0)
+        shared = self._shared(state, motion, covariance, measured)
         maps, weights, mean, odometry = use_scan(
             state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
-            state.detections, rules, *_arrays(measured),
+            state.detections, rules, shared.for_particles(measured),
         )  # fmt: skip
         scan = scan_of(mean, odometry, found)
         state = replace(
@@ -216,8 +223,23 @@ class FastSlam:
             since_update=0.0,
             detections=state.detections + found,
             recent=remembered(recent, scan, state.since_update),
+            shared=shared,
         )
         return state, scan, weights, slipped
+
+    def _shared(
+        self, state: SlamState, motion: Float, covariance: Float, measured: PoseMeasurement | None
+    ) -> SharedErrors:
+        """What is known after a motion and a measured pose of errors that all poses of its source share; the
+        particles' part of it is as it was."""
+        shared = state.shared.moved(motion, covariance)
+        if measured is None or (measured.shared is None and not shared.begun):
+            return shared
+        if not shared.begun:
+            moved = replace(state, motion=motion, motion_covariance=covariance)
+            now, _ = _estimate(moved, normalised(state.log_weight), self.parameters, 0.0)
+            shared = SharedErrors.begun_at(len(state.pose), now.T_map_base.as_array(), now.covariance)
+        return shared.measured(measured)
 
 
 def _farthest(detections: Detections) -> float:
@@ -228,12 +250,6 @@ def _farthest(detections: Detections) -> float:
 
 def _relative(estimate: PoseEstimate) -> Float:
     return estimate.covariance if estimate.relative is None else estimate.relative
-
-
-def _arrays(measured: PoseMeasurement | None) -> tuple[Float, Float]:
-    if measured is None:
-        return np.zeros(0), np.eye(3)
-    return measured.T_map_base.as_array(), measured.covariance
 
 
 def rules_of(p: Slam) -> Rules:
@@ -258,6 +274,10 @@ def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[
     covariance, frame = state.frame.told(
         mean, spread, n_eff, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
     )
+    if state.shared.begun:
+        by_trees = frame.knows(mean, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach)
+        least = state.shared.moved(state.motion, state.motion_covariance).joint[:3, :3]
+        covariance, frame = frame.told_at_least(spread, n_eff, least, covariance if by_trees else None)
     # Of hypotheses that trees tell apart the mean is none: where one of them stands, its trees fit.
     told = pose[state.best] if are_apart(pose, weights, p.distance_max) else mean
     return PoseEstimate(

@@ -69,6 +69,29 @@ class FrameMemory:
         )  # fmt: skip
         return covariance, replace(self, hidden=hidden, at=pose)
 
+    def knows(self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float) -> bool:
+        """Whether a pose was found by landmarks that belong to a mark; see `told`."""
+        if not len(self.serial):
+            return False
+        near = np.hypot(*(mean - pose[:2]).T) <= reach
+        return bool(np.any(near & (hits >= hits_min) & (birth >= self.serial[0])))
+
+    def told_at_least(
+        self, spread: Float, n_eff: float, least: Float, by_landmarks: Float | None
+    ) -> tuple[Float, FrameMemory]:
+        """The covariance of a pose, shape (3, 3), where measured poses tell it no better than `least`, and
+        the memory after it.
+
+        Args:
+            spread, n_eff: See `told`.
+            by_landmarks: Covariance by the landmarks around, None where there are none: who can go by two
+                things knows the place at least as well as by the better one.
+        """
+        covariance = at_least(spread, np.ascontiguousarray(least), NOISE / np.sqrt(n_eff))
+        if by_landmarks is not None and np.trace(by_landmarks[:2, :2]) < np.trace(covariance[:2, :2]):
+            covariance = by_landmarks
+        return covariance, replace(self, hidden=covariance - spread)
+
     def marked(self, serial: int, scan: int, pose: Float, covariance: Float) -> FrameMemory:
         """With a mark here if the last one is far enough behind; `serial`: of this scan's first detection."""
         if len(self.serial):

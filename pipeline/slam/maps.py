@@ -107,7 +107,9 @@ def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
     block = maps.block
     if places > k * ROOM:
         block = np.full((particles, max((places + ROOM - 1) // ROOM, 2 * k)), -1, np.int32)
-        block[:, :k] = maps.block
+        for p in range(particles):
+            for i in range(k):
+                block[p, i] = maps.block[p, i]
     n, free = len(maps.owners), maps.free_count[0]
     if rows <= free:
         return _with_block(maps, block)
@@ -125,13 +127,30 @@ def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
         np.zeros(n + more, np.int32),
         np.array([free + more]),
     )
-    grown.mean[:n], grown.covariance[:n] = maps.mean, maps.covariance
-    grown.hits[:n], grown.score[:n], grown.birth[:n] = maps.hits, maps.score, maps.birth
-    grown.box[:n], grown.owners[:n] = maps.box, maps.owners
-    grown.box[n:, :2], grown.box[n:, 2:] = np.inf, -np.inf
-    grown.free[:free] = maps.free[:free]
-    grown.free[free : free + more] = np.arange(n, n + more)
+    for b in range(n):
+        _copy_row(maps, b, grown, b)
+        grown.owners[b] = maps.owners[b]
+    for b in range(n, n + more):
+        grown.box[b, 0] = grown.box[b, 1] = np.inf
+        grown.box[b, 2] = grown.box[b, 3] = -np.inf
+        grown.free[free + b - n] = b
+    for i in range(free):
+        grown.free[i] = maps.free[i]
     return grown
+
+
+@compiled_within
+def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
+    """Row b of the pool into row n of another one or of the same; written out, for a copy of slices brings
+    its errors' words along, which take seconds to compile."""
+    for o in range(ROOM):
+        other.mean[n, o, 0], other.mean[n, o, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+        for a in range(3):
+            other.covariance[n, o, a] = maps.covariance[b, o, a]
+        other.hits[n, o], other.score[n, o] = maps.hits[b, o], maps.score[b, o]
+        other.birth[n, o] = maps.birth[b, o]
+    for a in range(4):
+        other.box[n, a] = maps.box[b, a]
 
 
 @compiled
@@ -283,14 +302,7 @@ def own_block(maps: Maps, p: int, k: int) -> int:
         maps.box[n, 0] = maps.box[n, 1] = np.inf
         maps.box[n, 2] = maps.box[n, 3] = -np.inf
     else:
-        for o in range(ROOM):
-            maps.mean[n, o, 0], maps.mean[n, o, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
-            for a in range(3):
-                maps.covariance[n, o, a] = maps.covariance[b, o, a]
-            maps.hits[n, o], maps.score[n, o] = maps.hits[b, o], maps.score[b, o]
-            maps.birth[n, o] = maps.birth[b, o]
-        for a in range(4):
-            maps.box[n, a] = maps.box[b, a]
+        _copy_row(maps, b, maps, n)
         maps.owners[b] -= 1
     maps.owners[n] = 1
     maps.block[p, k] = n

@@ -21,6 +21,7 @@ from pipeline.slam.maps import Maps, take_ancestors
 from pipeline.slam.motion import UNKNOWN, Noise, advanced, noise_of
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.scan import against_slip, estimated, use_scan
+from pipeline.slam.shared_errors import Measured, nothing_measured
 from pipeline.slam.update import Rules
 
 
@@ -85,9 +86,9 @@ def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
         state.since_update, state.detections, state.best, state.recent.mapped, state.recent.distrust,
         *_all_draws(slam, first_index, len(recorded.motion)), first_index, recorded.motion,
         recorded.centre, recorded.covariance, recorded.first, recorded.clear_range,
-        rules_of(p), noise_of(p), p.update_distance, p.resample_below,
+        rules_of(p), noise_of(p), p.update_distance, p.resample_below, nothing_measured(),
     )  # fmt: skip
-    recent, best, scans = state.recent, state.best, []
+    recent, best, shared, scans = state.recent, state.best, state.shared, []
     found = np.diff(recorded.first)
     for t in range(len(recorded.motion)):
         if told.used[t]:
@@ -95,11 +96,12 @@ def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
             scan = scan_of(told.mean[t], told.odometry[t], int(found[t]))
             recent = remembered(before, scan, told.driven[t])
         ancestors, best = told.ancestors[t] if told.ancestors[t, 0] >= 0 else None, int(told.best[t])
+        shared = shared if ancestors is None else shared.drawn(ancestors)
         scans.append((told.particles[t], ancestors, best))
     slam.state = replace(
         state, maps=maps, motion=motion, motion_covariance=motion_covariance, since_update=since_update,
         detections=state.detections + int(found[told.used].sum()), best=best, recent=recent,
-        genealogy=state.genealogy.with_scans(scans), frame=FrameMemory(),
+        genealogy=state.genealogy.with_scans(scans), frame=FrameMemory(), shared=shared,
     )  # fmt: skip
     return Driven(told.pose, told.n_eff)
 
@@ -128,11 +130,11 @@ def _drive(
     noise: Noise,
     update_distance: float,
     resample_below: float,
+    measured: Measured,
 ) -> tuple[Maps, Float, Float, float, _Told]:
     """See `drive`; `pose` and `log_weight` are changed in place."""
     particles, n = pose.shape[0], steps.shape[0]
     told = _room(n, particles)
-    nothing, no_covariance = np.zeros(0), np.eye(3)
     for t in range(n):
         _moved, motion, motion_covariance, driven = advanced(
             motion, motion_covariance, steps[t, 0], steps[t, 1], steps[t, 2], 0.0, 0.0, UNKNOWN, False,
@@ -151,7 +153,7 @@ def _drive(
                 motion_covariance = motion_covariance + np.diag(slip.SIGMA**2)
             maps, weights, mean, odometry = use_scan(
                 pose, log_weight, maps, motion, motion_covariance, normal[t], centre, R, clear_range,
-                detections, rules, nothing, no_covariance,
+                detections, rules, measured,
             )  # fmt: skip
             told.used[t], told.driven[t] = True, since_update
             best = leader(weights, best, pose, rules.distance_max)

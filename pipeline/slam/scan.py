@@ -11,6 +11,7 @@ from pipeline.slam.maps import ROOM, Maps, blocks_in_reach, well_known, with_roo
 from pipeline.slam.motion import moved_pose, moved_poses, weighted_pose
 from pipeline.slam.pairs import room_for
 from pipeline.slam.resampling import normalised
+from pipeline.slam.shared_errors import Measured
 from pipeline.slam.slip import FEWEST, SEARCH, motion_by_trees
 from pipeline.slam.update import Rules, near_for, observe, predict
 
@@ -52,8 +53,7 @@ def use_scan(
     clear_range: Float,
     first_birth: int,
     rules: Rules,
-    measured: Float,
-    measured_covariance: Float,
+    measured: Measured,
 ) -> tuple[Maps, Float, Float, float]:
     """Update every particle in place; the arguments are those of `update.observe`.
 
@@ -73,8 +73,7 @@ def use_scan(
     told = np.zeros((pose.shape[0], TOLD))
     observe(
         pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
-        clear_range, reach, first_birth, rules, near, room, told, measured, measured_covariance,
-        np.empty(3), np.zeros((3, 3)),
+        clear_range, reach, first_birth, rules, near, room, told, measured, np.empty(3), np.zeros((3, 3)),
     )  # fmt: skip
     log_weight -= log_weight.max()
     weights = normalised(log_weight)

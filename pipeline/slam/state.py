@@ -7,11 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.geometry import Float
+from pipeline.saving.codec import NOT_SAVED
 from pipeline.slam.frame import FrameMemory
 from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.health import Recent
 from pipeline.slam.maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
 from pipeline.slam.resampling import normalised
+from pipeline.slam.shared_errors import SharedErrors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +32,8 @@ class SlamState:
         genealogy: Where the particles came from.
         recent: What the health is judged by.
         frame: How well the frame was known where landmarks were begun.
+        shared: What measured poses err by alike; a map that is saved does not have it, for another source
+            lies in it otherwise.
     """
 
     pose: Float
@@ -43,6 +47,7 @@ class SlamState:
     genealogy: Genealogy = field(default_factory=Genealogy)
     recent: Recent = field(default_factory=Recent)
     frame: FrameMemory = field(default_factory=FrameMemory)
+    shared: SharedErrors = field(default_factory=SharedErrors, metadata={NOT_SAVED: True})
 
     @classmethod
     def at_origin(cls, particles: int) -> SlamState:
@@ -87,6 +92,7 @@ class SlamState:
             genealogy=self.genealogy.redrawn(rows),
             recent=Recent(mapped=self.recent.mapped),
             frame=self.frame.forgotten(),
+            shared=SharedErrors(),
         )
 
     def with_particles(self, particles: int) -> SlamState:
@@ -111,4 +117,5 @@ class SlamState:
             maps=taken(self.maps, rows),
             motion=self.motion.copy(),
             motion_covariance=self.motion_covariance.copy(),
+            shared=self.shared.drawn(rows),
         )

@@ -15,9 +15,9 @@ from pipeline.slam.gaussian import draw, rotated
 from pipeline.slam.health import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.maps import ROOM, Maps, own_block, widen
-from pipeline.slam.motion import correct_by_pose
 from pipeline.slam.pairs import Room
 from pipeline.slam.proposal import recognise
+from pipeline.slam.shared_errors import Measured, corrected_by, learn_shared
 from pipeline.visibility import BEHIND
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
@@ -132,8 +132,7 @@ def observe(
     near: Near,
     room: Room,
     told: Float,
-    measured: Float,
-    measured_covariance: Float,
+    measured: Measured,
     mu: Float,
     P: Float,
 ) -> None:
@@ -150,7 +149,7 @@ def observe(
         first_birth: Serial number of the first of the detections.
         near, room: Memory for the landmarks in reach and for pairs.
         told: shape (P, TOLD), filled: what each particle tells of the scan (see health).
-        measured: x, y, yaw by another source, shape (3,), or of no length; measured_covariance: (3, 3).
+        measured: The pose by another source; what its poses err by alike is learned.
         mu, P: Memory for a pose, shape (3,), and its covariance, shape (3, 3), zeros.
     """
     scale = per_metre(rules.distance_max)
@@ -161,8 +160,8 @@ def observe(
         mu[0], mu[1], mu[2] = moved[p, 0], moved[p, 1], moved[p, 2]
         if rules.use_proposal:
             _turned_covariance(motion_covariance, before_c, before_s, P)
-        if measured.shape[0] > 0:
-            log_weight[p] += correct_by_pose(mu, P, measured, measured_covariance)
+        if measured.z.shape[0] > 0:
+            log_weight[p] += corrected_by(mu, P, measured, p)
         known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, near)
         fill(near.cells, near.mean, known, scale)
         likelihood = recognise(
@@ -174,6 +173,8 @@ def observe(
             draw(mu, P, noise, p, pose)
         else:
             pose[p, 0], pose[p, 1], pose[p, 2] = mu[0], mu[1], mu[2]
+        if measured.mean.shape[0] > 0:
+            learn_shared(pose, measured, p)
         c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
         all_near = _learn(
             pose, p, c, s, maps, near, known, free, room.landmark_of, centre, R, first_birth, rules

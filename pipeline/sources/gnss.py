@@ -23,6 +23,8 @@ SHORTEST, LONGEST = 10.0, 100.0
 UNKNOWN_SIGMA, BEST_SIGMA = 3.0, 0.05
 #: Says nothing of the heading [rad^2].
 NO_HEADING = 1e4
+#: The number of its shared errors, see PoseMeasurement.
+SOURCE = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,17 +113,16 @@ class Alignment:
 
     def measured(self, fix: Fix) -> PoseMeasurement:
         """The pose that a fix tells, with what it and the plane are uncertain of."""
-        T, centre = self.laid.T_map_theirs, self.laid.centre
+        T = self.laid.T_map_theirs
         c, s = math.cos(T.yaw), math.sin(T.yaw)
         east, north = self.plane.place(fix)
         x = T.x + c * east - s * north
         y = T.y + s * east + c * north
-        across = np.array([-(y - centre[1]), x - centre[0]]) * self.yaw_sigma
-        C = np.zeros((3, 3))
-        own = fix.sigma**2 * max(self.laid.rate_hz, 1.0) + self.laid.sigma**2 + self.lever**2
-        C[:2, :2] = own * np.eye(2) + np.outer(across, across)
-        C[2, 2] = NO_HEADING
-        return PoseMeasurement(fix.stamp_ns, Pose2(x, y, 0.0), C)
+        # The lever errs alike as long as the robot drives straight on, and otherwise after a turn.
+        shared = self.laid.shared(x, y, math.hypot(self.laid.sigma, self.lever), self.yaw_sigma)
+        own = fix.sigma**2 * max(self.laid.rate_hz, 1.0) + self.lever**2
+        C = np.diag([own, own, NO_HEADING]) + shared @ shared.T
+        return PoseMeasurement(fix.stamp_ns, Pose2(x, y, 0.0), C, shared=shared, source=SOURCE)
 
 
 def align(

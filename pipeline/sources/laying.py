@@ -38,6 +38,23 @@ class Laid:
     length: float
     rate_hz: float
 
+    def shared(self, x: float, y: float, sigma: float, yaw_sigma: float, turn_sigma: float = 0.0) -> Float:
+        """What all positions err by alike, seen at a place in the map; see PoseMeasurement.
+
+        Args:
+            x, y: The place [m].
+            sigma: Of the frame's shift [m]; yaw_sigma: of its turn about where it was found, and turn_sigma:
+                of the headings [rad].
+        """
+        dx, dy = x - self.centre[0], y - self.centre[1]
+        return np.array(
+            [
+                [sigma, 0.0, -dy * yaw_sigma, 0.0],
+                [0.0, sigma, dx * yaw_sigma, 0.0],
+                [0.0, 0.0, 0.0, turn_sigma],
+            ]
+        )
+
 
 def interpolated(at_ns: Int, stamp_ns: Sequence[int], way: Float) -> Float:
     """The way at other times, column by column; its ends where they lie outside."""

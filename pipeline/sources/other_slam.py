@@ -28,6 +28,8 @@ DRIFT, TURN_DRIFT = 0.05, math.radians(0.5)
 SCATTER = 0.35
 #: Says nothing of the heading [rad^2].
 NO_HEADING = 1e4
+#: The number of its shared errors, see PoseMeasurement.
+SOURCE = 1
 #: Square of the distance in sigmas (chi-square of three degrees): 0.002 % of honest poses lie beyond.
 GATE = 25.0
 _ROWS = (0, 1, 5)  # x, y, yaw of ROS's six
@@ -110,17 +112,15 @@ class Relation:
         c, s = math.cos(T.yaw), math.sin(T.yaw)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         C = rate * (R @ placed.covariance @ R.T)
-        dx, dy = at.x - self.laid.centre[0], at.y - self.laid.centre[1]
-        across = np.array([-dy, dx]) * self.yaw_sigma
-        C[:2, :2] += self.sigma**2 * np.eye(2) + np.outer(across, across)
-        C[2, 2] += self.turn_sigma**2
+        shared = self.laid.shared(at.x, at.y, self.sigma, self.yaw_sigma, self.turn_sigma)
         yaw = 0.0
         if self.turn is None:
-            C[2], C[:, 2] = 0.0, 0.0
+            C[2], C[:, 2], shared[2] = 0.0, 0.0, 0.0
             C[2, 2] = NO_HEADING
         else:
             yaw = float(wrap_angle(placed.T_theirs_base.yaw + self.turn))
-        return PoseMeasurement(placed.stamp_ns, Pose2(at.x, at.y, yaw), 0.5 * (C + C.T), GATE)
+        C = 0.5 * (C + C.T) + shared @ shared.T
+        return PoseMeasurement(placed.stamp_ns, Pose2(at.x, at.y, yaw), C, GATE, shared, SOURCE)
 
 
 def relate(

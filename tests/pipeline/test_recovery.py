@@ -9,11 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.geometry import Pose2
 from pipeline.mapper import Mapper
 from pipeline.parameters import preset
+from pipeline.readings import PoseMeasurement
+from pipeline.recovery import Recovery, RecoveryState
 from pipeline.saved_map import SavedMap
+from pipeline.slam import Motion, SlamState
 from pipeline.sources import open_source
 from pipeline.steps import steps
+from tests.pipeline.strategies import NOTHING_SEEN, detections
 from tests.pipeline.test_mapper import as_bytes
 
 URI = "sim:stand?duration=22&seed=3"
@@ -164,3 +169,16 @@ def test_a_map_saved_while_lost_goes_on_to_the_same_bytes():
     assert [as_bytes(other.process(step)) for step in after[5:15]] == once
     with pytest.raises(ValueError, match="search"):
         replace(saved, search=replace(saved.search, since=10**6)).state()
+
+
+def test_measured_poses_are_of_the_map_and_not_of_the_small_one_of_a_search():
+    recovery: Recovery[Any] = Recovery(0)
+    recovery.state = RecoveryState(local=SlamState.at_origin(20))
+    far = PoseMeasurement(1, Pose2(100.0, 50.0, 1.0), np.eye(3) * 1e-4)
+    seen = detections([[3.0, 1.0], [4.0, -2.0]])
+    for index in (1, 2, 4):  # none of them is one at which it is looked for in the map
+        recovery._search(
+            index, Motion(Pose2(0.1), measured=far), seen, NOTHING_SEEN, preset("forest"), lambda: None
+        )
+    assert recovery.state.local is not None
+    np.testing.assert_allclose(recovery.state.local.pose.mean(axis=0), [0.3, 0.0, 0.0], atol=0.1)

@@ -137,7 +137,9 @@ def test_what_is_packed_comes_back_whole(store):
         doubt="no odometry",
         slack=(0.25, 0.5),
         turn=Turn(0.1, 0.01),
-        measured=PoseMeasurement(7, Pose2(1.0, 2.0, 0.1), np.eye(3) * 0.3),
+        measured=PoseMeasurement(
+            7, Pose2(1.0, 2.0, 0.1), np.eye(3) * 0.3, 25.0, np.arange(12.0).reshape(3, 4) / 99.0, 1
+        ),
     )
     parameters = preset("forest")
     for k in range(12):  # with and without an overview, with and without ground

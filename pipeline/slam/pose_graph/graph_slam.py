@@ -16,7 +16,7 @@ from pipeline.bend import Bend
 from pipeline.geometry import Float, Pose2
 from pipeline.health import Health
 from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, Landmarks, PoseEstimate
+from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
 from pipeline.slam.gaussian import rows_of
 from pipeline.slam.health import Recent, ScanTold, is_astray, judged
@@ -55,6 +55,10 @@ class GraphSlam:
         estimate = self._estimate()
         health = judged(state.recent, scan, 1.0, 1, estimate.covariance, doubt)
         return replace(estimate, health=health)
+
+    def as_seen(self, pose: PoseMeasurement) -> PoseMeasurement:
+        """See FastSlam.as_seen: the graph does not tell what poses of one source err by alike."""
+        return pose
 
     def place(self, _index: int, T_map_base: Pose2, covariance: Float) -> None:
         """See FastSlam.place: a keyframe that no odometry leads to."""
