@@ -27,7 +27,7 @@ from pipeline.slam.health import Recent, ScanTold, is_astray, judged, remembered
 from pipeline.slam.leading import are_apart, heir, leader
 from pipeline.slam.loop import Loop, bent_landmarks, bent_path
 from pipeline.slam.maps import shared_map, take_ancestors
-from pipeline.slam.motion import Motion, accumulated, noise_of
+from pipeline.slam.motion import Motion, accumulated, noise_of, wrapped
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.scan import against_slip, estimated, use_scan
 from pipeline.slam.shared_errors import SharedErrors
@@ -278,8 +278,15 @@ def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[
         by_trees = frame.knows(mean, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach)
         least = state.shared.moved(state.motion, state.motion_covariance).joint[:3, :3]
         covariance, frame = frame.told_at_least(spread, n_eff, least, covariance if by_trees else None)
-    # Of hypotheses that trees tell apart the mean is none: where one of them stands, its trees fit.
-    told = pose[state.best] if are_apart(pose, weights, p.distance_max) else mean
+    told = mean
+    if are_apart(pose, weights, p.distance_max):
+        # Of hypotheses that trees tell apart the mean is none: where one of them stands, its trees fit. About
+        # another point than the mean a second moment is larger by the square of the way there (Steiner).
+        told = pose[state.best]
+        away = told - mean
+        away[2] = wrapped(away[2])
+        steiner = np.outer(away, away)
+        covariance, spread = covariance + steiner, spread + steiner
     return PoseEstimate(
         T_map_base=Pose2(float(told[0]), float(told[1]), float(told[2])),
         covariance=covariance,

@@ -137,6 +137,10 @@ def test_a_pose_that_is_told_where_particles_lie_apart_is_one_of_them():
     slam.place(0, Pose2(3.0, 1.0, 0.0), np.diag([25.0, 25.0, 0.01]))
     told = slam.process(1, Pose2(0.1, 0.0, 0.0), detections([]), NOTHING_SEEN)
     assert told.T_map_base.as_array().tobytes() in {row.tobytes() for row in told.particles}
+    away = told.particles - told.T_map_base.as_array()
+    about_it = (told.weights[:, None] * away).T @ away
+    for covariance in (told.covariance, told.relative):
+        assert np.linalg.eigvalsh(covariance - about_it).min() > -1e-3, "of that pose, not of the mean"
     slam.state = replace(slam.state, pose=np.tile([3.0, 1.0, 0.0], (100, 1)))
     told = slam.process(2, Pose2(), detections([]), NOTHING_SEEN)
     assert told.T_map_base.x == pytest.approx(3.0, abs=0.01)
