@@ -84,8 +84,10 @@ async function start(event) {
   event.preventDefault();
   const limits = ["trials", "minutes"].map((key) => [key, Number(byId(`search-${key}`).value)]);
   const body = { over: [...axes.values()].map(({ text }) => text()), goal: goal.value, ...Object.fromEntries(limits), ...runsWanted() };
-  if (await attempt(() => post("/api/search", body))) form.hidden = true;
+  const begun = await attempt(() => post("/api/search", body));
+  if (begun) form.hidden = true;
   show();
+  if (begun) searchPart.scrollIntoView({ block: "center" }); // the form was long: what comes of it stands where it began
 }
 
 async function saveFound(event) {
