@@ -1,4 +1,4 @@
-"""Scans looked at on another core while those before them are mapped."""
+"""Scans looked at on another core while those before them are mapped, or on two cores at once."""
 
 from __future__ import annotations
 
@@ -30,3 +30,9 @@ def looked_ahead(look: Callable[[Step], Looked], steps: Iterator[Step]) -> Itera
             yield first, looked.result()
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def looked_at_once(look: Callable[[Step], Looked], steps: list[Step]) -> list[Looked]:
+    """What all of some steps show, looked at on two cores."""
+    with ThreadPoolExecutor(2, thread_name_prefix="look") as pool:
+        return list(pool.map(look, steps))

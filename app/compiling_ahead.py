@@ -7,6 +7,11 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import IO
+
+from app.settings import data_folder
 
 #: No machine compiles for so long: something else is wrong, which the mapping itself will say.
 PATIENCE_S = 900.0
@@ -23,17 +28,9 @@ def compile_ahead() -> None:
 
     if (os.cpu_count() or 1) < len(_HALVES) or is_compiled():
         return
-    running = [_started(half) for half in _HALVES]
-    try:
-        patient_until = time.monotonic() + PATIENCE_S
-        while any(process.poll() is None for process in running) and time.monotonic() < patient_until:
-            others_compile()
-            time.sleep(_EACH_S)
-    finally:
-        for process in running:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            process.wait()
+    with _one_at_a_time():
+        if not is_compiled():  # by who was first
+            _compile(others_compile)
 
 
 def is_compiled() -> bool:
@@ -43,6 +40,53 @@ def is_compiled() -> bool:
     from pipeline.slam.scan import use_scan
 
     return is_kept(examine) and is_kept(use_scan)
+
+
+def _compile(tell: Callable[[], None]) -> None:
+    running: list[subprocess.Popen[bytes]] = []
+    try:
+        for half in _HALVES:
+            running.append(_started(half))
+        patient_until = time.monotonic() + PATIENCE_S
+        while any(process.poll() is None for process in running) and time.monotonic() < patient_until:
+            tell()
+            time.sleep(_EACH_S)
+    finally:
+        for process in running:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+            process.wait()
+
+
+@contextmanager
+def _one_at_a_time() -> Iterator[None]:
+    """Inside, no other stemmap of this person compiles ahead: who comes second waits, then finds all kept.
+    Where there is no folder for a lock, or no lock on this system, nobody waits."""
+    from pipeline.compiled import others_compile
+
+    with ExitStack() as stack:
+        patient_until = time.monotonic() + PATIENCE_S
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            folder = data_folder(os.environ)
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                lock = stack.enter_context((folder / "compiling.lock").open("a"))
+                while not _taken(lock, fcntl.flock, fcntl.LOCK_EX | fcntl.LOCK_NB):
+                    if time.monotonic() > patient_until:
+                        break
+                    others_compile()
+                    time.sleep(_EACH_S)
+        yield
+
+
+def _taken(lock: IO[str], take: Callable[[IO[str], int], None], how: int) -> bool:
+    try:
+        take(lock, how)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _started(half: str) -> subprocess.Popen[bytes]:

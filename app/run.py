@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from app.abreast import abreast
-from app.ahead import looked_ahead
+from app.ahead import looked_ahead, looked_at_once
 from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
 from app.live_cursor import LiveCursor
@@ -238,7 +238,7 @@ class Run:
     def _roughly(self, basis: Basis, parameters: Parameters, mapper: Mapper) -> Trees | None:
         sample = None
         if self._reread is not None and not basis.shows_as(parameters):
-            sample = self._sample.looked(mapper.looker(), len(basis.entries))
+            sample = self._sample.looked(mapper.looker(), len(basis.entries), looked_at_once)
         return rough_trees(basis, self._kept.clusters, parameters, sample)
 
     def _basis(self) -> Basis | None:

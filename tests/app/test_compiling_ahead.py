@@ -67,6 +67,19 @@ def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
     assert told
 
 
+def test_who_comes_second_waits_and_finds_all_kept(monkeypatch, tmp_path):
+    fcntl = pytest.importorskip("fcntl", reason="no locks of files on this system")
+    monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path))
+    first = (tmp_path / "compiling.lock").open("w")
+    fcntl.flock(first, fcntl.LOCK_EX)
+    monkeypatch.setattr(compiling_ahead, "is_compiled", lambda: first.closed)
+    monkeypatch.setattr(compiling_ahead, "_started", lambda half: pytest.fail(half))
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    with on_compiling(first.close):  # the first is done while the second waits
+        compiling_ahead.compile_ahead()
+    assert first.closed
+
+
 def test_a_person_who_waits_no_longer_leaves_none_behind(monkeypatch):
     started = []
 
