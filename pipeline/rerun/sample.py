@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from pipeline.perception import Looked
 from pipeline.records import Step
 
+Each = Callable[[Callable[[Step], Looked], list[Step]], Iterable[Looked]]
 MOST_SCANS = 56
 MOST_BYTES = 20 << 20  # of points: what a look takes grows with them
 
@@ -39,6 +40,12 @@ class Sample:
     def _are_too_many(self) -> bool:
         return len(self._steps) > MOST_SCANS or self.nbytes > MOST_BYTES
 
-    def looked(self, look: Callable[[Step], Looked], scans: int) -> dict[int, Looked]:
-        """What those of the first scans show, by their numbers, ascending."""
-        return {n: look(self._steps[n]) for n in sorted(self._steps) if n < scans}
+    def looked(self, look: Callable[[Step], Looked], scans: int, each: Each = map) -> dict[int, Looked]:
+        """What those of the first scans show, by their numbers, ascending.
+
+        Args:
+            look: At one scan; scans: how many are asked of.
+            each: Applies a function to all of a list, in turn or several at once.
+        """
+        numbers = [n for n in sorted(self._steps) if n < scans]
+        return dict(zip(numbers, each(look, [self._steps[n] for n in numbers]), strict=True))

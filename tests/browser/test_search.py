@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from playwright.sync_api import Browser, expect
@@ -60,3 +61,45 @@ def test_a_better_set_is_found_used_undone_and_saved(chromium: Browser, tmp_path
         assert "# [tuned]" in text
         dashboard.errors = [error for error in dashboard.errors if "422" not in error]
         assert dashboard.errors == []
+
+
+def test_a_search_that_was_stopped_goes_on_with_the_trials_it_has(chromium: Browser, tmp_path: Path):
+    with (
+        Server("sim:stand?duration=2", STEMMAP_FOLDER=str(tmp_path)) as server,
+        opened(chromium, server.link) as dashboard,
+    ):
+        page = dashboard.page
+        told, go_on, stop = (page.locator(f"#search-{name}") for name in ("told", "go-on", "stop"))
+        dashboard.pause()
+        dashboard.tab("Tune")
+        page.locator("#search-open").click()
+        page.locator("#search-trials").fill("5000")
+        page.locator("#search-start").click()
+        made = 0
+        for _ in range(2):  # stopped, gone on with and stopped again
+            more = re.compile(rf"^(?!{made} of)\d+ of 5,?000 trials: best \S")
+            expect(told).to_have_text(more, timeout=120_000)
+            expect(go_on).to_be_hidden()
+            stop.click()
+            expect(told).to_contain_text("left.", timeout=60_000)
+            tried, left = map(digits, re.findall(r"([\d,]+) trials?", told.inner_text()))
+            assert tried > made, "those of before count"
+            assert tried + left == 5000
+            made = tried
+            expect(stop).to_be_hidden()
+            go_on.click()
+        expect(stop).to_be_visible()
+        page.locator("#search-stop").click()
+        expect(go_on).to_be_visible(timeout=60_000)
+        eps = page.locator("[id='tune-clustering.eps']")
+        eps.fill("0.3")
+        eps.press("Enter")
+        dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 0.3")
+        go_on.click()  # what it would find now is another search
+        expect(page.locator("#tune-error")).to_contain_text("parameters were changed since the search began")
+        dashboard.errors = [error for error in dashboard.errors if "422" not in error]
+        assert dashboard.errors == []
+
+
+def digits(number: str) -> int:
+    return int(number.replace(",", ""))

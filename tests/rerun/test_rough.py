@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.ahead import looked_at_once
 from pipeline.records import Verdict
 from pipeline.rerun import Rerun, Sample, rough_trees
 from pipeline.rerun.clusters import ClusterTable
 from pipeline.rerun.rough import MOST_PLACES, _gathered
 from pipeline.rerun.sample import MOST_SCANS
+from pipeline.saving import encode
 from tests.rerun.mapped import BASE, mapper, run
 
 
@@ -171,6 +173,16 @@ def test_scans_that_show_nothing_leave_what_was_gathered_alone(known):
     assert rough is not None
     seen = np.hypot(*(wanted.position[:, None] - rough.position[None]).transpose(2, 0, 1)) < 0.3
     assert seen.any(axis=1).mean() < 0.5
+
+
+def test_scans_that_are_looked_at_on_two_cores_show_the_same():
+    sample, parameters = Sample(), BASE.replace({"clustering.eps": 0.3})
+    for step in run()[0][:20]:
+        sample.offer(step)
+    one = sample.looked(mapper(parameters).looker(), 20)
+    two = sample.looked(mapper(parameters).looker(), 20, looked_at_once)
+    assert list(one) == list(two) == list(range(20))
+    assert encode(tuple(two.values())) == encode(tuple(one.values()))
 
 
 def test_a_sample_is_spread_over_the_run_and_bounded():

@@ -94,8 +94,8 @@ def run() -> list[Table]:
             tuple(roughly),
             (
                 "Kept clusters judged anew at the poses of the map before; other poses it does not know.",
-                f"For the last rows {len(sample)} scans of the run, evenly spread, are looked at again: what "
-                "they find of a tree, against what they found, tells of the others.",
+                f"For the last rows {len(sample)} scans of the run, evenly spread, are looked at again on "
+                "both cores: what they find of a tree, against what they found, tells of the others.",
             ),
         ),
     ]
@@ -120,6 +120,7 @@ def _rough(
     bandwidth: float,
 ) -> tuple[Cell, ...]:
     """The rough answer; once before for the kernels."""
+    from app.ahead import looked_at_once
     from pipeline.rerun import rough_trees
 
     trees, spent, read = None, 0.0, kept.clusters.nbytes
@@ -128,7 +129,8 @@ def _rough(
         start = time.perf_counter()
         if sampled is not None:
             source, sample = sampled
-            looks = sample.looked(_fresh(source, parameters).looker(), len(basis.entries))
+            look = _fresh(source, parameters).looker()
+            looks = sample.looked(look, len(basis.entries), looked_at_once)
             read = kept.clusters.nbytes + sample.nbytes
         trees = rough_trees(basis, kept.clusters, parameters, looks)
         spent = time.perf_counter() - start
