@@ -48,5 +48,6 @@ def far_truth(reach: float) -> str:
     """What to say when nothing of the truth lies near the path."""
     return (
         f"no ground truth lies within {reach:g} m of the path: it must be in the frame of the map, "
-        "with the first pose as the origin and x along its heading"
+        "with the first pose as the origin and x along its heading "
+        "(what stands farther away is asked for with evaluation.reach)"
     )
