@@ -269,8 +269,9 @@ async def test_what_agrees_leaves_the_truth_of_the_source_exact_and_a_person_cho
         await edit(client, "POST", "/undo")
         assert dashboard.truth.x.tolist() == [2.2]
         await edit(client, "POST", "/undo")
-        assert dashboard.truth is None  # who asked for annotations alone is not told the source's truth
+        # Who asked for annotations alone is not told the source's truth.
         assert dashboard.annotating.as_plain()["used"] == "none"
+        assert dashboard.annotating.truth is None
         assert (await choose("both"))["used"] == "source"
         assert dashboard.truth is exact
         refused = await client.put("/api/annotations/against", json={"against": "nothing"})

@@ -139,6 +139,7 @@ def test_a_pose_that_is_told_where_particles_lie_apart_is_one_of_them():
     assert told.T_map_base.as_array().tobytes() in {row.tobytes() for row in told.particles}
     away = told.particles - told.T_map_base.as_array()
     about_it = (told.weights[:, None] * away).T @ away
+    assert told.relative is not None
     for covariance in (told.covariance, told.relative):
         assert np.linalg.eigvalsh(covariance - about_it).min() > -1e-3, "of that pose, not of the mean"
     slam.state = replace(slam.state, pose=np.tile([3.0, 1.0, 0.0], (100, 1)))

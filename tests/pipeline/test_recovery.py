@@ -177,8 +177,9 @@ def test_measured_poses_are_of_the_map_and_not_of_the_small_one_of_a_search():
     far = PoseMeasurement(1, Pose2(100.0, 50.0, 1.0), np.eye(3) * 1e-4)
     seen = detections([[3.0, 1.0], [4.0, -2.0]])
     for index in (1, 2, 4):  # none of them is one at which it is looked for in the map
+        motion = Motion(Pose2(0.1), measured=far)
         recovery._search(
-            index, Motion(Pose2(0.1), measured=far), seen, NOTHING_SEEN, preset("forest"), lambda: None
+            index, motion, seen, NOTHING_SEEN, preset("forest"), lambda: pytest.fail("nobody asks for trees")
         )
     assert recovery.state.local is not None
     np.testing.assert_allclose(recovery.state.local.pose.mean(axis=0), [0.3, 0.0, 0.0], atol=0.1)
