@@ -13,9 +13,11 @@ from typing import IO
 
 from app.settings import data_folder
 
-#: No machine compiles for so long: something else is wrong, which the mapping itself will say.
-PATIENCE_S = 900.0
+#: A small machine that does other things beside may take half of it; what is kept until then is not lost.
+PATIENCE_S = 1800.0
 _HALVES = ("warm_eyes", "warm_map")
+# Who is ended without a word takes what it started along.
+_PROGRAM = "from app.parent import end_with; end_with({parent}); from app.warming import {half}; {half}()"
 _EACH_S = 0.2
 
 
@@ -26,7 +28,7 @@ def compile_ahead() -> None:
     """
     from pipeline.compiled import others_compile
 
-    if (os.cpu_count() or 1) < len(_HALVES) or is_compiled():
+    if _cores() < len(_HALVES) or is_compiled():
         return
     with _one_at_a_time():
         if not is_compiled():  # by who was first
@@ -40,6 +42,11 @@ def is_compiled() -> bool:
     from pipeline.slam.scan import use_scan
 
     return is_kept(examine) and is_kept(use_scan)
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def _compile(tell: Callable[[], None]) -> None:
@@ -91,7 +98,7 @@ def _taken(lock: IO[str], take: Callable[[IO[str], int], None], how: int) -> boo
 
 def _started(half: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-P", "-c", f"from app.warming import {half}; {half}()"],
+        [sys.executable, "-P", "-c", _PROGRAM.format(parent=os.getpid(), half=half)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

@@ -42,7 +42,7 @@ def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Agains
 def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> Counted:
     """What counts, where one of the two may not be there."""
     if own is None:
-        return "annotations" if rows else "none"
+        return "annotations" if rows and against != "own" else "none"
     # Who asked for what people say is not told what the source knows.
     if not rows and against == "annotations":
         return "none"

@@ -10,11 +10,12 @@ file alone when it asks whether what is kept is still good; here all files of ou
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -110,16 +111,27 @@ def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
     """Let what is kept of a kernel be good only while no source that it may have taken in has changed."""
     file = kernel._cache._cache_file  # numba has no public place for this
     file._source_stamp = (file._source_stamp, sources_digest(module))
-    file.save = _saved_by_one(file)
+    # Numba numbers files anew after a change of the sources, and writes its index first: who dies in between,
+    # or reads meanwhile, would run machine code of the sources before. No two sources share a name here.
+    digest = hashlib.sha256(repr(file._source_stamp).encode()).hexdigest()[:12]
+    base = file._index_name.removesuffix(".nbi")
+    file._data_name_pattern = f"{base}.{digest}.{{number:d}}.nbc"
+    file.save = _saved_by_one(file, base, digest)
 
 
-def _saved_by_one(file: Any) -> Callable[[Any, Any], None]:  # noqa: ANN401
+def _saved_by_one(file: Any, base: str, digest: str) -> Callable[[Any, Any], None]:  # noqa: ANN401
     """Let one process at a time write what is kept of a kernel: two that compile it for other types at once
-    would give both the same file, and the index would lead one of them to the other's machine code."""
+    would give both the same file, and the index would lead one of them to the other's machine code. What
+    other sources left behind goes."""
     save: Callable[[Any, Any, Any], None] = type(file).save
 
     def save_alone(key: Any, data: Any) -> None:  # noqa: ANN401
-        with locked(Path(file._index_path)):
+        index = Path(file._index_path)
+        with locked(index):
+            if not file._load_index():
+                for other in index.parent.glob(f"{glob.escape(base)}.*.nbc"):
+                    if f".{digest}." not in other.name:
+                        other.unlink(missing_ok=True)
             save(file, key, data)
 
     return save_alone
@@ -127,19 +139,18 @@ def _saved_by_one(file: Any) -> Callable[[Any, Any], None]:  # noqa: ANN401
 
 @contextmanager
 def locked(beside: Path) -> Iterator[None]:
-    """Inside, no other process holds the lock of a file's folder, where the system has locks."""
-    try:
-        import fcntl
-    except ImportError:  # not on this system
-        yield
-        return
-    with (beside.parent / ".lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # let go with the file
+    """Inside, no other process holds the lock of a file's folder; where there can be no lock, all goes on."""
+    with ExitStack() as stack:
+        with suppress(ImportError, OSError):
+            import fcntl
+
+            lock = stack.enter_context((beside.parent / ".lock").open("a"))
+            fcntl.flock(lock, fcntl.LOCK_EX)  # let go with the file
         yield
 
 
 def is_kept(kernel: Callable[..., Any]) -> bool:
-    """Whether machine code of a kernel is kept on this machine that was made from the sources as they are."""
+    """Whether machine code of a kernel is kept, for any types, that was made from the sources as they are."""
     return bool(kernel._cache._cache_file._load_index())  # type: ignore[attr-defined]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -58,7 +59,7 @@ def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
 
     monkeypatch.setattr(compiling_ahead, "is_compiled", lambda: False)
     monkeypatch.setattr(compiling_ahead, "_started", start)
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr(compiling_ahead, "_cores", lambda: 2)
     told = []
     with on_compiling(lambda: told.append(1)):
         compiling_ahead.compile_ahead()
@@ -74,7 +75,7 @@ def test_who_comes_second_waits_and_finds_all_kept(monkeypatch, tmp_path):
     fcntl.flock(first, fcntl.LOCK_EX)
     monkeypatch.setattr(compiling_ahead, "is_compiled", lambda: first.closed)
     monkeypatch.setattr(compiling_ahead, "_started", lambda half: pytest.fail(half))
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr(compiling_ahead, "_cores", lambda: 2)
     with on_compiling(first.close):  # the first is done while the second waits
         compiling_ahead.compile_ahead()
     assert first.closed
@@ -93,7 +94,37 @@ def test_a_person_who_waits_no_longer_leaves_none_behind(monkeypatch):
 
     monkeypatch.setattr(compiling_ahead, "is_compiled", lambda: False)
     monkeypatch.setattr(compiling_ahead, "_started", start)
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr(compiling_ahead, "_cores", lambda: 2)
     with on_compiling(interrupt), pytest.raises(KeyboardInterrupt):
         compiling_ahead.compile_ahead()
     assert [process.poll() is None for process in started] == [False, False]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_who_is_ended_without_a_word_takes_both_along():
+    program = """
+import os, sys, time
+from app import compiling_ahead
+compiling_ahead._PROGRAM = "from app.parent import end_with; end_with({parent}); import time; time.sleep(60)"
+print(*(compiling_ahead._started(half).pid for half in ("a", "b")), flush=True)
+time.sleep(0.5)
+os._exit(0)
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    left = [int(pid) for pid in told.stdout.split()]
+    assert len(left) == 2
+    until = time.monotonic() + 60.0
+    while left and time.monotonic() < until:
+        left = [pid for pid in left if is_alive(pid)]
+        time.sleep(0.1)
+    assert not left
+
+
+def is_alive(pid: int) -> bool:
+    """Whether it runs; one that nobody waited for yet does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

@@ -109,3 +109,40 @@ def test_processes_that_compile_a_kernel_for_other_types_at_once_keep_all_of_the
     first = [begun(value) for value in values]
     assert [process.communicate(timeout=120)[0] for process in first] == ["0\n"] * 4
     assert begun(*values).communicate(timeout=120)[0] == "4\n"
+
+
+DIE_BETWEEN = """
+import os
+from pathlib import Path
+from wood.tree import twice
+
+file = twice._cache._cache_file
+file._save_data = lambda *_: os._exit(0)  # killed when the index is written and the machine code is not
+twice(1.0)
+"""
+
+
+def test_who_dies_while_it_keeps_a_kernel_leads_nobody_to_the_code_of_other_sources(tmp_path):
+    (tmp_path / "wood").mkdir()
+    (tmp_path / "wood" / "__init__.py").touch()
+    (tmp_path / "wood" / "tree.py").write_text(CALLER)
+    assert call(tmp_path, 2.0, 1.0) == ["4.0", "0"]
+    assert call(tmp_path, 5.0, 1.0, DIE_BETWEEN) == []
+    assert call(tmp_path, 5.0, 1.0) == ["10.0", "0"], "not 4, of the sources before"
+    assert call(tmp_path, 5.0, 1.0) == ["10.0", "1"]
+    kept = [file.name for file in (tmp_path / "kept").rglob("*twice-*.nbc")]
+    assert len(kept) == 1, "what other sources left is gone"
+
+
+def test_where_nothing_can_be_locked_kernels_are_kept_all_the_same(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl", reason="no locks of files on this system")
+    from pipeline.compiled import locked
+
+    def refused(*_: object) -> None:
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refused)
+    with locked(tmp_path / "some.nbi"):
+        pass
+    with pytest.raises(OSError, match="of the work itself"), locked(tmp_path / "some.nbi"):
+        raise OSError("of the work itself")

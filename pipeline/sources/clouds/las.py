@@ -29,6 +29,7 @@ RECORD_LIMIT = 1024  # bytes of a point
 #: A variable length record: what it is (after who says it), how long it is (before what it is in words).
 _RECORD = struct.Struct("<18xHH32x")
 #: The one of LASzip lists the items of a point from that byte on: kind, length and version of each.
+_LASZIP_USER = b"laszip encoded"
 _LASZIP, _ITEMS, _ITEM = 22204, 34, struct.Struct("<HHH")
 _REMEDY = "Copy the file again, or export it again"
 
@@ -199,7 +200,7 @@ def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, 
             break
         number, content = _RECORD.unpack(head)
         at += _RECORD.size + content
-        if number != _LASZIP:
+        if number != _LASZIP or head[2:18].rstrip(b"\0") != _LASZIP_USER:
             continue
         told = file.read(content)
         items = int.from_bytes(told[_ITEMS - 2 : _ITEMS], "little")
