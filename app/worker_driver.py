@@ -53,7 +53,8 @@ _LISTEN_S = 0.005
 # plays are mapped before it is done once, however late the run is.
 _REMAP_S = 0.02
 _SCANS_A_REMAP = 4
-_AT_ONCE = 8  # scans that are mapped again at least: two halves of the work begin and end apart
+# Scans mapped again in one go: two halves of the work begin and end apart. Fewer, where looking at one takes long.
+_AT_ONCE = 8
 
 
 class Driver:
@@ -90,6 +91,7 @@ class Driver:
         self._glimpse_at = 0.0
         self._long_way_at = 0.0
         self._mapped = 0  # scans since a scan was mapped again
+        self._at_once = 1
 
     def run(self) -> None:
         """Work until None comes as a command."""
@@ -180,10 +182,18 @@ class Driver:
 
     def _remap(self) -> None:
         """Use the time between two scans, or while the run stands, to map it again."""
-        until = self._clock() + _REMAP_S
-        done = self._session.remap(_AT_ONCE)
-        while done is None and self._session.is_remapping and self._clock() < until:
-            done = self._session.remap(_AT_ONCE)
+        begun = self._clock()
+        done = None
+        while True:
+            asked = self._clock()
+            done = self._session.remap(self._at_once)
+            now = self._clock()
+            if now > asked + 2.0 * _REMAP_S:
+                self._at_once = max(1, self._at_once // 2)
+            elif now < asked + _REMAP_S:
+                self._at_once = min(_AT_ONCE, 2 * self._at_once)
+            if done is not None or not self._session.is_remapping or now >= begun + _REMAP_S:
+                break
         if done is None:
             self._report_when_due(self._clock())
             return
@@ -327,7 +337,10 @@ class Driver:
         self._put(Report(status))
 
     def _behind(self, status: Status, now: float) -> int:
-        return status.scans_behind if status.live else self._pacer.behind(now)
+        if status.live:
+            return status.scans_behind
+        behind = self._pacer.behind(now)
+        return behind if status.scans is None else min(behind, status.scans - 1 - status.scan_index)
 
     def _guarded(self, work: Callable[[], T]) -> T | None:
         """Do some work; what goes wrong becomes the state "failed", and the worker lives on."""

@@ -122,13 +122,21 @@ function showWay() {
   setText(byId("way-distance"), clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
 }
 
+let compilingAt = 0; // since when this machine compiles [ms], 0 when it does not
+
+function compilingFor(detail) {
+  if (!detail.startsWith("Compiling")) compilingAt = 0;
+  else compilingAt ||= performance.now();
+  return compilingAt && seconds(compilingAt) >= 10 ? ` (${seconds(compilingAt)} s so far; a machine that is busy or small takes longer)` : "";
+}
+
 function showNotice(quiet) {
   const notice = byId("notice");
   const status = state.status;
   const text = !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. This is the last picture; it goes on by itself when stemmap answers again.`
     : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
-    : status?.detail ?? "";
+    : status?.detail ? status.detail + compilingFor(status.detail) : "";
   notice.hidden = !text;
   const failed = state.connected && status?.state === "failed";
   notice.classList.toggle("failed", failed);

@@ -14,7 +14,9 @@ export function countsBeforeAfter() {
   const names = [...new Set(["tree", ...Object.keys(now), ...Object.keys(then ?? {})])].filter((name) => now[name] || then?.[name] || name === "tree");
   names.sort((a, b) => (b === "tree") - (a === "tree") || (now[b] ?? 0) - (now[a] ?? 0));
   const total = (of) => Object.values(of).reduce((sum, number) => sum + number, 0);
-  const lead = then ? `Scan ${index}: ${total(then)} → ${count(total(now), "cluster")} by the last change`
+  const pending = state.status?.revision < state.parameters?.revision;
+  const lead = pending ? `Scan ${index} is looked at with the new values …`
+    : then ? `Scan ${index}: ${total(then)} → ${count(total(now), "cluster")} by the last change`
     : `Scan ${index}: ${count(total(now), "cluster")}. ${state.status?.state === "playing" ? "Pause to see before and after." : "Change something, and before and after stand here."}`;
   const same = names.filter((name) => then && name !== "tree" && (now[name] ?? 0) === (then[name] ?? 0));
   return [el("p", { class: "note dim", text: lead }),

@@ -183,5 +183,5 @@ export function startTunePanel() {
   on("parameters sets", () => isTuning() && show());
   on("tuning", showError);
   on("tab", () => isTuning() && show());
-  on("map", showCounts);
+  on("map status parameters", showCounts);
 }

@@ -4,6 +4,10 @@ import { byId, recall, remember, setText } from "./dom.js";
 import { openSources } from "./sources.js";
 import { on } from "./state.js";
 
+const WORDS = {
+  finished: ["A robot has mapped a stand of trees", "Look at its map"],
+  starting: ["A robot is about to map a stand of trees", "Wait for it"],
+};
 const ROBOT = "zenoh:tcp/"; // the router's address follows
 
 export function startWelcome() {
@@ -16,9 +20,9 @@ export function startWelcome() {
     if (asked || recall("welcomed") !== null) return;
     asked = true;
     if (!status.source.startsWith("sim:")) return; // who opens a recording knows what this is
-    const over = status.state === "finished";
-    setText(byId("welcome-title"), over ? "A robot has mapped a stand of trees" : "A robot is mapping a stand of trees");
-    setText(byId("welcome-on"), over ? "Look at its map" : "Keep watching");
+    const [title, on] = WORDS[status.state] ?? ["A robot is mapping a stand of trees", "Keep watching"];
+    setText(byId("welcome-title"), title);
+    setText(byId("welcome-on"), on);
     card.showModal();
   });
 }
