@@ -53,7 +53,7 @@ _LISTEN_S = 0.005
 # plays are mapped before it is done once, however late the run is.
 _REMAP_S = 0.02
 _SCANS_A_REMAP = 4
-# Scans mapped again in one go, for two halves of the work begin and end apart; fewer where looking at one is slow.
+# Scans mapped again in one go: two halves of the work begin and end apart. Fewer where looking takes long.
 _AT_ONCE = 8
 
 
