@@ -20,7 +20,7 @@ from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
 from pipeline.slam.draws import draws
-from pipeline.slam.frame import FrameMemory
+from pipeline.slam.frame import NOISE, FrameMemory, at_least
 from pipeline.slam.gaussian import rows_of
 from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.health import Recent, ScanTold, is_astray, judged, remembered, scan_of
@@ -72,7 +72,11 @@ class FastSlam:
             scan, weights = ScanTold(), normalised(state.log_weight)
         if used:
             state = replace(state, best=leader(weights, state.best, state.pose, p.distance_max))
-        estimate, frame = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
+        estimate, frame, by_trees = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
+        if used:
+            at = estimate.T_map_base.as_array()
+            corrected = state.shared.corrected(at, estimate.covariance if by_trees else None)
+            state = replace(state, shared=corrected)
         if used and len(detections.cluster):
             serial = state.detections - len(detections.cluster)
             at = estimate.T_map_base.as_array()
@@ -138,7 +142,7 @@ class FastSlam:
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
         """After `place`: the pose, with the health of an estimate before it."""
         weights = normalised(self.state.log_weight)
-        estimate, _ = _estimate(self.state, weights, self.parameters, 0.0)
+        estimate, _, _ = _estimate(self.state, weights, self.parameters, 0.0)
         return replace(estimate, health=before.health)
 
     def lost(self, estimate: PoseEstimate) -> Health:
@@ -237,7 +241,7 @@ class FastSlam:
             return shared
         if not shared.begun:
             moved = replace(state, motion=motion, motion_covariance=covariance)
-            now, _ = _estimate(moved, normalised(state.log_weight), self.parameters, 0.0)
+            now, _, _ = _estimate(moved, normalised(state.log_weight), self.parameters, 0.0)
             shared = SharedErrors.begun_at(len(state.pose), now.T_map_base.as_array(), now.covariance)
         return shared.measured(measured)
 
@@ -268,16 +272,26 @@ def rules_of(p: Slam) -> Rules:
     )
 
 
-def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[PoseEstimate, FrameMemory]:
+def _estimate(
+    state: SlamState, weights: Float, p: Slam, reach: float
+) -> tuple[PoseEstimate, FrameMemory, bool]:
+    """The pose, the memory of the frame after it, and, asked for only where poses of another source count,
+    whether landmarks within `reach` [m] told it."""
     pose, mean, spread, n_eff = estimated(state.pose, weights, state.motion, state.motion_covariance)
     landmarks = state.map_of(state.best)
     covariance, frame = state.frame.told(
         mean, spread, n_eff, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
     )
+    by_trees = False
     if state.shared.begun:
         by_trees = frame.knows(mean, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach)
-        least = state.shared.moved(state.motion, state.motion_covariance).joint[:3, :3]
-        covariance, frame = frame.told_at_least(spread, n_eff, least, covariance if by_trees else None)
+        shared = state.shared.moved(state.motion, state.motion_covariance)
+        known = covariance if by_trees else None
+        if not by_trees and len(shared.by_trees):
+            # What trees told last still holds, but for the odometry since then: a scan that shows none is no
+            # reason to know the place as badly as the other source does.
+            known = at_least(spread, shared.by_trees, NOISE / np.sqrt(n_eff))
+        covariance, frame = frame.told_at_least(spread, n_eff, shared.joint[:3, :3], known)
     told = mean
     if are_apart(pose, weights, p.distance_max):
         # Of hypotheses that trees tell apart the mean is none: where one of them stands, its trees fit. About
@@ -287,7 +301,7 @@ def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[
         away[2] = wrapped(away[2])
         steiner = np.outer(away, away)
         covariance, spread = covariance + steiner, spread + steiner
-    return PoseEstimate(
+    estimate = PoseEstimate(
         T_map_base=Pose2(float(told[0]), float(told[1]), float(told[2])),
         covariance=covariance,
         particles=pose,
@@ -296,4 +310,5 @@ def _estimate(state: SlamState, weights: Float, p: Slam, reach: float) -> tuple[
         landmarks=landmarks.mean[landmarks.hits >= p.hits_to_weigh],
         resampled=False,
         relative=spread,
-    ), frame
+    )
+    return estimate, frame, by_trees

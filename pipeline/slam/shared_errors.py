@@ -64,12 +64,15 @@ class SharedErrors:
         joint: Covariance of the pose in the frame of the map and of all sources' errors, by odometry and
             measured poses alone, shape (3 + SOURCES * SHARED,) * 2.
         at: x, y [m], yaw [rad] where that was, shape (3,).
+        by_trees: Covariance of the pose as landmarks told it last, grown by the odometry since then, shape
+            (3, 3); (0, 0) as long as none told it.
     """
 
     mean: Float = field(default_factory=lambda: np.zeros((0, 0, SHARED)))
     covariance: Float = field(default_factory=lambda: np.zeros((0, 0, SHARED, SHARED)))
     joint: Float = field(default_factory=lambda: np.zeros((0, 0)))
     at: Float = field(default_factory=lambda: np.zeros(3))
+    by_trees: Float = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def begun(self) -> bool:
@@ -108,7 +111,21 @@ class SharedErrors:
         F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
         joint[:POSE, POSE:] = F @ joint[:POSE, POSE:]
         joint[POSE:, :POSE] = joint[:POSE, POSE:].T
-        return replace(self, joint=joint, at=at)
+        by_trees = self.by_trees
+        if len(by_trees):
+            _, by_trees = compounded(self.at, by_trees, x, y, yaw, motion_covariance)
+        return replace(self, joint=joint, at=at, by_trees=by_trees)
+
+    def corrected(self, pose: Float, by_trees: Float | None) -> SharedErrors:
+        """After a pose, shape (3,), was estimated: covariances move on from there. By odometry alone `at`
+        would turn away from the path, and what is unknown in one direction be taken for known in another.
+
+        Args:
+            by_trees: The covariance of the pose, shape (3, 3), where landmarks told it, else None.
+        """
+        if not self.begun:
+            return self
+        return replace(self, at=pose, by_trees=self.by_trees if by_trees is None else by_trees)
 
     def measured(self, pose: PoseMeasurement) -> SharedErrors:
         """What the joint Gaussian knows after a measured pose: P - K S K^T."""

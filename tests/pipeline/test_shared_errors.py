@@ -34,30 +34,37 @@ def spd(rng, n):
     return A @ A.T + 0.1 * np.eye(n)
 
 
-def drive(seed, strides, trees=None, *, poses=True):
+def drive(seed, strides, trees=None, *, poses=True, heading=True, bias=0.0, blind=()):
     """Of each scan the pose's normalised error squared, its error and its sigma [m]; and the filter.
 
     Args:
         strides: The true motion to each scan but the first.
         trees: Where they stand, shape (N, 2); None for nothing.
         poses: Whether another source tells where the robot is.
+        heading: Whether it tells the heading too, as GNSS does not.
+        bias: What the odometry turns too much [rad/m].
+        blind: Numbers of scans that see no tree.
     """
     rng = np.random.default_rng([11, seed])
     slam, truth, rows = FastSlam(FOREST, seed), Pose2(), []
-    e = rng.standard_normal(SHARED)
+    e, own = rng.standard_normal(SHARED), OWN if heading else np.array([*OWN[:2], 100.0])
     for k, stride in enumerate((None, *strides)):
         told, measured = Pose2(), None
         if stride is not None:
             truth = truth @ stride
             along, turn = step_variances(stride.x, stride.y, stride.yaw, noise_of(FOREST))
             told = Pose2(*(stride.as_array() + np.sqrt([along, along, turn]) * rng.standard_normal(3)))
+            told = Pose2(told.x, told.y, told.yaw + bias * stride.x)
         if poses and k > 10:
             H = shared_at(truth.x, truth.y)
-            z = truth.as_array() + H @ e + OWN * rng.standard_normal(3)
-            measured = PoseMeasurement(k, Pose2(*z), np.diag(OWN**2) + H @ H.T, shared=H)
+            if not heading:
+                H[2] = 0.0
+            z = truth.as_array() + H @ e + own * rng.standard_normal(3)
+            measured = PoseMeasurement(k, Pose2(*z), np.diag(own**2) + H @ H.T, shared=H)
         found = np.zeros((0, 2)) if trees is None else truth.inverse().apply(trees)
         found = found[np.hypot(*found.T) < SEEN]
         found = found + rng.normal(0.0, 0.05, found.shape)
+        found = found[:0] if k in blind else found
         at = slam.process(k, Motion(told, measured=measured), detections(found, sigma=0.05), NOTHING_SEEN)
         error = at.T_map_base.as_array() - truth.as_array()
         error[2] = wrap_angle(error[2])
@@ -90,6 +97,23 @@ def test_among_trees_that_are_known_better_the_poses_do_not_pull_and_sigmas_stay
     nees, error, _ = np.moveaxis(np.array(rows), 2, 0)
     assert nees.mean() < 6.0
     assert np.sqrt(np.square(error).mean()) < 0.12
+
+
+def test_a_heading_that_drifts_for_long_leaves_the_told_sigma_near_the_error():
+    """600 m on a circle: where the covariance followed the odometry alone it turned away from the path, and
+    the figure was 26 in place of 3.5."""
+    ring = (Pose2(1.0, 0.0, 1.0 / 60.0),) * 600
+    nees = [drive(seed, ring, heading=False, bias=np.radians(0.05))[0][450:, 0].mean() for seed in range(4)]
+    assert np.mean(nees) < 6.0
+
+
+def test_a_scan_without_trees_leaves_the_place_as_well_known_as_the_way_since():
+    """It had been told as badly as the other source knows it, and well again a scan later."""
+    along = np.stack(np.meshgrid(np.arange(-8.0, 40.0, 4.0), [-5.0, -2.0, 2.0, 5.0]), axis=-1)
+    rows, _ = drive(0, (Pose2(0.25),) * 60, along.reshape(-1, 2) + 0.3, blind=(40, 50))
+    sigma = dict(enumerate(rows[:, 2], start=1))
+    for k in (40, 50):
+        assert sigma[k] < 1.3 * max(sigma[k - 1], sigma[k + 1])
 
 
 @LAW
