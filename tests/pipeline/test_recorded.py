@@ -85,9 +85,11 @@ def _same(one, other):
     """All that is known is the same but for the memory of the frame, and so is the path."""
     a, b = one.state.copy(), other.state.copy()
     for field in fields(a):
-        if field.name not in ("maps", "genealogy", "frame"):
+        if field.name not in ("maps", "genealogy", "frame", "shared"):
             was, now = getattr(a, field.name), getattr(b, field.name)
             assert np.asarray(was).tobytes() == np.asarray(now).tobytes() or was == now, field.name
+    assert not a.shared.begun, "nothing was measured"
+    assert not b.shared.begun
     for name, was, now in zip(a.maps._fields, a.maps, b.maps, strict=True):
         assert was.tobytes() == now.tobytes(), name
     assert one.path().tobytes() == other.path().tobytes()
