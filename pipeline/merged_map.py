@@ -69,8 +69,9 @@ def merge_maps(
     for k in np.flatnonzero(~fresh):
         join(both, int(row_of[k]), len(a.tracks) + int(k))
     matched = row_of[~fresh]
-    hidden = (a.tracks.verdict[matched] < 0) & (both.verdict[matched] != Verdict.TREE)
-    both.verdict[matched[hidden]] = -1  # a tree that the first run shows by its hits stays shown
+    shown = (moved.verdict[~fresh] < 0) & (moved.hits[~fresh] >= parameters.tracking.hits_to_confirm)
+    hidden = ((a.tracks.verdict[matched] < 0) | shown) & (both.verdict[matched] != Verdict.TREE)
+    both.verdict[matched[hidden]] = -1  # a tree that one of the runs shows by its hits stays shown
     both.number[len(a.tracks) :] = number_of
     tracks = both.take(np.concatenate([np.ones(len(a.tracks), np.bool_), fresh]))
     path = np.concatenate([a.slam.genealogy.path(a.slam.best), _moved_path(b, T_a_b)])

@@ -74,11 +74,7 @@ def test_the_table_says_which_tree_is_which(runs):
     both = [row for row in table if row["tree_a"] and row["tree_b"]]
     assert [row["tree"] for row in table] == [row["tree"] for row in rows(runs / "both")]
     assert {row["tree_a"] for row in table if row["tree_a"]} >= {row["tree"] for row in rows(runs / "a")}
-    # What the second run shows by a few hits alone may be none to the first, which gathered what is there.
-    kept = {row["tree_b"] for row in table if row["tree_b"]}
-    left_out = [row for row in rows(runs / "b") if row["tree"] not in kept]
-    assert all(not row["dbh_cm"] for row in left_out)
-    assert len(left_out) <= 2
+    assert {row["tree_b"] for row in table if row["tree_b"]} >= {row["tree"] for row in rows(runs / "b")}
     assert all(row["tree"] == row["tree_a"] for row in both)
     assert len(both) >= 8
     assert max(float(row["distance_m"]) for row in both) < 0.6
