@@ -22,7 +22,7 @@ _SCENE = "sim:stand?duration=1"
 
 
 def warm_up(parameters: Parameters | None = None) -> None:
-    """Map a second of a simulated stand; the first time on a machine this takes up to a minute."""
+    """Map a second of a simulated stand; the first time on a machine this takes minutes."""
     from pipeline.mapper import Mapper
     from pipeline.sources import open_source
     from pipeline.steps import steps

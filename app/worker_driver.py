@@ -183,7 +183,6 @@ class Driver:
     def _remap(self) -> None:
         """Use the time between two scans, or while the run stands, to map it again."""
         begun = self._clock()
-        done = None
         while True:
             asked = self._clock()
             done = self._session.remap(self._at_once)

@@ -7,9 +7,9 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
+from app.compiling_ahead import PATIENCE_S
+
 WARMING = (sys.executable, "-P", "-c", "from app.warming import warm_up; warm_up()")
-#: No machine compiles for so long: something else is wrong, which the workers will say.
-PATIENCE_S = 900.0
 COMPILING = "Getting ready; on a new machine this compiles for a minute or two, and only the first time"
 
 

@@ -2,13 +2,14 @@
 
 import { el } from "./dom.js";
 import { count } from "./format.js";
+import { nothingYet } from "./nothing_yet.js";
 import { state } from "./state.js";
 import { verdictOf } from "./verdicts.js";
 
 const signed = (number) => (number > 0 ? `+${number}` : number < 0 ? `−${-number}` : "=");
 
 export function countsBeforeAfter() {
-  if (!state.map) return [el("p", { class: "empty", text: "No scan yet. Press play, or open a run; then every change shows here what it does." })];
+  if (!state.map) return [el("p", { class: "empty", text: `${nothingYet("No scan")} Then every change shows here what it does.` })];
   const { verdicts: now = {}, before, index, right, wrong } = state.map;
   const then = before?.verdicts;
   const names = [...new Set(["tree", ...Object.keys(now), ...Object.keys(then ?? {})])].filter((name) => now[name] || then?.[name] || name === "tree");

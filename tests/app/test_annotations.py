@@ -22,7 +22,7 @@ from app.keeper import Keeper
 from app.security import session_value
 from app.settings import Settings
 from app.store.records import Annotation, Content
-from app.truths import contents_of, laid_over
+from app.truths import contents_of, counted, laid_over, truth_of
 from app.worker_messages import Shown
 from pipeline.records import TruthTrees
 from pipeline.truth_table import parse_truth_trees
@@ -361,3 +361,10 @@ async def test_the_store_works_beside_the_event_loop() -> None:
     assert name.startswith("store")
     assert threading.current_thread().name != name
     await keeper.close()
+
+
+def test_who_asks_for_one_of_two_truths_is_not_told_the_other() -> None:
+    rows = [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", 0, 1)]
+    assert truth_of(None, rows, "own") is None
+    assert truth_of(truth_trees(), [], "annotations") is None
+    assert (counted(None, rows, "both"), counted(None, rows, "annotations")) == ("annotations",) * 2

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed
+from app.messages import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
 from app.picture import MOST_POINTS, picture_of
 from app.story.recent import Recent
 from app.wire import from_worker
@@ -415,3 +415,12 @@ def test_a_story_that_fails_is_logged_and_stops_nothing(
     assert "fault in stemmap" in answer.missing
     assert "on purpose" in capsys.readouterr().err
     assert last_status(said).state != "failed"
+
+
+def test_no_more_scans_are_behind_than_the_run_has_left(monkeypatch):
+    driver = Driver(make_session(FakeSource(8)), queue.Queue(), lambda _: None)
+    monkeypatch.setattr(driver._pacer, "behind", lambda _: 696)
+    status = Status("playing", source="sim:stand", kind="simulation", scans=750, scan_index=545)
+    assert driver._behind(status, 0.0) == 204
+    assert driver._behind(replace(status, scans=None), 0.0) == 696  # nobody knows how many there are
+    assert driver._behind(replace(status, live=True, scans_behind=3), 0.0) == 3

@@ -8,6 +8,7 @@ import select
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,8 +25,9 @@ COPIES = 5_000
 LONGEST_S, MOST_MIB = 2.0, 512.0
 #: No kind takes more of a core than this, however busy the machine is; the table says how many copies it was.
 BUDGET_S = float(os.environ.get("STEMMAP_FUZZ_SECONDS", "600"))
-#: A child that says nothing for so long (by the clock) hangs if it used so much of a core meanwhile.
-_SILENT_S, _HANGS_S = 10.0, 20.0
+#: A child that says nothing for so long (by the clock) hangs if it used so much of a core meanwhile, or if it
+#: stays silent for so long whatever it does.
+_SILENT_S, _HANGS_S, _SLEEPS_S = 10.0, 20.0, 600.0
 
 
 @dataclass(slots=True)
@@ -111,8 +113,10 @@ def _follow(child: subprocess.Popen[str], outcome: Outcome, first: int) -> int:
             child.kill()
             child.wait()
             return first
+        heard_at = time.monotonic()
         while not select.select([child.stdout], [], [], _SILENT_S)[0]:
-            if _processor_s(child.pid) > used_s + _HANGS_S:
+            asleep = time.monotonic() > heard_at + _SLEEPS_S
+            if asleep or _processor_s(child.pid) > used_s + _HANGS_S:
                 outcome.hangs += 1
                 outcome.used_s = before_s + _processor_s(child.pid)
                 child.kill()
