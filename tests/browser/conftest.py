@@ -61,13 +61,15 @@ def server(chromium: Browser) -> Iterator[Server]:
 
 
 @contextmanager
-def opened(chromium: Browser, link: str, width: int = 1260, height: int = 720) -> Iterator[Dashboard]:
+def opened(
+    chromium: Browser, link: str, width: int = 1260, height: int = 720, scene: bool = False
+) -> Iterator[Dashboard]:
     """The dashboard in a browser of its own, past the card of the first visit."""
     context = chromium.new_context(viewport={"width": width, "height": height})
     try:
         context.set_default_timeout(PATIENCE_MS)
         page = context.new_page()
-        dashboard = Dashboard(page)
+        dashboard = Dashboard(page, scene)
         page.goto(f"{link}&fixedDpr=0.3")
         page.locator("#welcome-on").click()
         yield dashboard
@@ -79,3 +81,15 @@ def opened(chromium: Browser, link: str, width: int = 1260, height: int = 720) -
 def dashboard(chromium: Browser, server: Server) -> Iterator[Dashboard]:
     with opened(chromium, server.link) as made:
         yield made
+
+
+@pytest.fixture
+def calm(dashboard: Dashboard) -> Iterator[None]:
+    """Each test begins on a standing scan in the middle of the run, with the parameters of the preset."""
+    dashboard.pause()
+    # To a place between two scans, so that the one before it is not taken for the end of the way.
+    dashboard.command({"type": "seek", "time_s": 22.55})
+    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 22.47 && it.time_s < 22.56")
+    yield
+    for dialog in dashboard.page.locator("dialog[open]").all():
+        dialog.press("Escape")

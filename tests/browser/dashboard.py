@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any, cast
 
-from playwright.sync_api import ConsoleMessage, Frame, Locator, Page, Response
+from playwright.sync_api import ConsoleMessage, Frame, Locator, Page, Response, Route
 
 # Of a machine that is busy and compiles the kernels first.
 PATIENCE_S = 150
@@ -18,12 +18,27 @@ STANDS = "['playing', 'paused', 'finished']"
 HARMLESS = ("GPU stall", "GL Driver Message", "Automatic fallback to software WebGL")
 
 
-class Dashboard:
-    """A page, with what it complained about."""
+# Where viser's client and its pictures come from.
+SCENE = "**/viser/**"
 
-    def __init__(self, page: Page) -> None:
+
+class Dashboard:
+    """A page, with what it complained about.
+
+    The 3D scene is loaded when a test first looks into it: without a graphics card it takes most of a core
+    for as long as it stands there, and tests that look at the page alone need none of it.
+
+    Args:
+        page: Of a browser.
+        scene: Whether the scene is loaded with the page, as for a person.
+    """
+
+    def __init__(self, page: Page, scene: bool = False) -> None:
         self.page = page
         self.errors: list[str] = []
+        self._has_scene = scene
+        if not scene:
+            page.route(SCENE, _leave_empty)
         page.on("pageerror", lambda error: self.errors.append(str(error)))
         page.on("console", self._listen)
         page.on("response", self._look_at)
@@ -115,12 +130,14 @@ class Dashboard:
 
         def told() -> tuple[list[int], list[int]]:
             return cast(list[int], self.page.evaluate(SHOWN)), [
-                self.node_points(f"/world/robot/scan/{name}") for name in ("raw", "filtered")
+                self.node_points(f"/world/robot/scan/{name}")
+                for name in ("raw", "filtered")
+                if self._has_scene
             ]
 
         def there() -> bool:
             (served, shown, *points), drawn = told()
-            return served == shown and points == drawn
+            return served == shown and (points == drawn or not self._has_scene)
 
         self.eventually(there, told)
 
@@ -154,11 +171,22 @@ class Dashboard:
 
     @property
     def scene(self) -> Frame:
-        """The frame with viser in it."""
+        """The frame with viser in it, which is loaded if it was not."""
+        self.load_scene()
         self.page.wait_for_function(
             "() => document.querySelector('#scene').contentWindow?.location.pathname === '/viser/'"
         )
         return next(frame for frame in self.page.frames if "/viser/" in frame.url)
+
+    def load_scene(self) -> None:
+        """Load viser if it was not, and wait for a scan in it."""
+        if self._has_scene:
+            return
+        self.page.unroute(SCENE)
+        with self.page.expect_response(SCENE):
+            self.page.evaluate("() => document.querySelector('#scene').contentWindow.location.reload()")
+        self._has_scene = True
+        self.scene.wait_for_function(HAS_NODE, arg="/world/robot/scan/raw")
 
     def row(self, label: str) -> Locator:
         """The row of a parameter in the Tune panel, by the text of its label."""
@@ -205,8 +233,13 @@ class Dashboard:
         """Where the middles of a node's copies are seen, in pixels of the page; by the number of the copy."""
         frame = self.page.locator("#scene").bounding_box()
         assert frame is not None
+        self.scene.wait_for_function(HAS_NODE, arg=name)
         found = self.scene.evaluate(PROJECTED, name)
         return [(frame["x"] + x, frame["y"] + y) for x, y in found]
+
+
+def _leave_empty(route: Route) -> None:
+    route.fulfill(body="<!doctype html><title>3D scene</title>", content_type="text/html")
 
 
 PRESET = """name => fetch('/api/parameters/preset', { method: 'POST', body: JSON.stringify({ name }),
@@ -220,6 +253,8 @@ SHOWN = """async () => {
   const { index, arrays } = unpack(await (await fetch('/api/stages')).arrayBuffer());
   return [index, state.map?.index ?? -1, arrays.raw.length / 3, arrays.points.length / 3];
 }"""
+
+HAS_NODE = "name => window.__viserSceneTree?.getState()[name]?.message"
 
 PROJECTED = """name => {
   const { props } = window.__viserSceneTree.getState()[name].message;

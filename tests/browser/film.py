@@ -77,7 +77,7 @@ def main(folder: Path) -> None:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", headless=True, args=FLAGS)
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
         page.set_default_timeout(PATIENCE_MS)
-        dashboard = Dashboard(page)
+        dashboard = Dashboard(page, scene=True)
         page.goto(server.link)
         page.locator("#welcome-on").click()
         dashboard.scene.get_by_text("Software WebGL").wait_for()

@@ -22,8 +22,6 @@ def page_of_a_run(request: pytest.FixtureRequest, chromium: Browser, server: Ser
     with opened(chromium, server.link, *request.param) as dashboard:
         trees = "() => document.querySelectorAll('#trees tbody tr').length > 0"
         dashboard.page.wait_for_function(trees, polling=200, timeout=1000 * COMPILING_S)
-        # Without the 3D scene, which is viser's and would be loaded anew with each theme.
-        dashboard.page.evaluate("() => document.querySelector('#scene').removeAttribute('src')")
         drawer = dashboard.page.locator("#drawer-button")
         if drawer.is_visible():
             drawer.click()

@@ -21,6 +21,48 @@ FOUND = {
 }
 
 
+def test_the_arrows_choose_and_the_list_is_read_aloud(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("#palette-button").click()
+    find = page.locator("#palette-find")
+    for place in (1, 2):
+        find.press("ArrowDown")
+        expect(find).to_have_attribute("aria-activedescendant", f"palette-{place}")
+        expect(page.locator(f"#palette-{place}")).to_have_attribute("aria-selected", "true")
+    find.press("Escape")
+    expect(page.locator("#palette")).to_be_hidden()
+    expect(page.locator("#palette-button")).to_be_focused()
+
+
+def test_the_sheet_names_every_key_that_acts(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("#map").press("?")
+    told = page.locator("#keys-list kbd").all_inner_texts()
+    acting = page.evaluate(
+        "() => import('/static/js/actions.js').then(all => all.ACTIONS.map(row => row[2]).filter(Boolean))"
+    )
+    shown = {" ": "space", "Escape": "esc"}
+    assert {shown.get(key, key) for key in acting} <= set(told)
+    assert {"ctrl+k", "1", "0", "y", "n", "ctrl+z", "←", "→", "f", "t", "b"} <= set(told)
+    page.keyboard.press("Escape")
+
+
+def test_every_control_has_a_name_and_every_parameter_its_sentence(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Tune")
+    assert page.evaluate(NAMELESS) == []
+    docs = page.evaluate("() => [...document.querySelectorAll('.tune-row label')].map(label => label.title)")
+    specs = dashboard.ask("/api/parameters")["specs"]
+    assert docs == [f"{spec['doc']} ({spec['name']})" for spec in specs]
+    assert dashboard.errors == []
+
+
+NAMELESS = """() => [...document.querySelectorAll('button, input, select, a[href], canvas, dialog')]
+  .filter(node => !(node.getAttribute('aria-label') || node.labels?.length || node.title
+    || node.textContent.trim() || node.getAttribute('aria-labelledby')))
+  .map(node => node.outerHTML.slice(0, 120))"""
+
+
 def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
     page = dashboard.page
     dashboard.pause()
@@ -67,45 +109,3 @@ def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
     expect(page.locator("#panel-story")).to_have_attribute("data-story", f"tree {number}")
     page.locator("#map").press("Escape")
     assert dashboard.errors == []
-
-
-def test_the_arrows_choose_and_the_list_is_read_aloud(dashboard: Dashboard):
-    page = dashboard.page
-    page.locator("#palette-button").click()
-    find = page.locator("#palette-find")
-    for place in (1, 2):
-        find.press("ArrowDown")
-        expect(find).to_have_attribute("aria-activedescendant", f"palette-{place}")
-        expect(page.locator(f"#palette-{place}")).to_have_attribute("aria-selected", "true")
-    find.press("Escape")
-    expect(page.locator("#palette")).to_be_hidden()
-    expect(page.locator("#palette-button")).to_be_focused()
-
-
-def test_the_sheet_names_every_key_that_acts(dashboard: Dashboard):
-    page = dashboard.page
-    page.locator("#map").press("?")
-    told = page.locator("#keys-list kbd").all_inner_texts()
-    acting = page.evaluate(
-        "() => import('/static/js/actions.js').then(all => all.ACTIONS.map(row => row[2]).filter(Boolean))"
-    )
-    shown = {" ": "space", "Escape": "esc"}
-    assert {shown.get(key, key) for key in acting} <= set(told)
-    assert {"ctrl+k", "1", "0", "y", "n", "ctrl+z", "←", "→", "f", "t", "b"} <= set(told)
-    page.keyboard.press("Escape")
-
-
-def test_every_control_has_a_name_and_every_parameter_its_sentence(dashboard: Dashboard):
-    page = dashboard.page
-    dashboard.tab("Tune")
-    assert page.evaluate(NAMELESS) == []
-    docs = page.evaluate("() => [...document.querySelectorAll('.tune-row label')].map(label => label.title)")
-    specs = dashboard.ask("/api/parameters")["specs"]
-    assert docs == [f"{spec['doc']} ({spec['name']})" for spec in specs]
-    assert dashboard.errors == []
-
-
-NAMELESS = """() => [...document.querySelectorAll('button, input, select, a[href], canvas, dialog')]
-  .filter(node => !(node.getAttribute('aria-label') || node.labels?.length || node.title
-    || node.textContent.trim() || node.getAttribute('aria-labelledby')))
-  .map(node => node.outerHTML.slice(0, 120))"""

@@ -16,7 +16,7 @@ POINTS = """() => {
 
 def test_a_lost_server_is_told_and_found_again(chromium: Browser):
     first = Server(token=TOKEN)
-    with first, opened(chromium, first.link) as dashboard:
+    with first, opened(chromium, first.link, scene=True) as dashboard:
         page = dashboard.page
         dashboard.scene.wait_for_function(POINTS)
         dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")

@@ -18,7 +18,7 @@ POINTS = (
 
 
 def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server: Server):
-    with opened(chromium, server.link) as dashboard:
+    with opened(chromium, server.link, scene=True) as dashboard:
         page = dashboard.page
         dashboard.until_server("/api/status", "it.scan_index > 5")
         dashboard.pause()
@@ -47,7 +47,7 @@ def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server
 
 
 def looks(chromium: Browser, link: str, scan: int) -> None:
-    with opened(chromium, link) as viewer:
+    with opened(chromium, link, scene=True) as viewer:
         page = viewer.page
         expect(page.locator("#looks-only")).to_be_visible()
         expect(page.locator("#trees tbody tr").first).to_be_visible()

@@ -1,0 +1,172 @@
+"""A person at the 3D scene: its sliders, its layers, its keys, and what the page knows of them."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.browser.dashboard import Dashboard
+
+pytestmark = pytest.mark.usefixtures("calm")
+
+
+def test_the_page_shows_the_run_and_complains_about_nothing(dashboard: Dashboard):
+    page = dashboard.page
+    expect(page.locator("#source-name")).to_have_text("sim:stand")
+    dashboard.tab("Trees")
+    expect(page.locator("#trees tbody tr").first).to_be_visible()
+    dashboard.scene.wait_for_function(
+        """() => { let points = 0;
+        window.__viserMutable?.scene?.traverse(o => {
+          if (o.isPoints) points += o.geometry.attributes.position.count;
+        });
+        return points > 1000; }"""
+    )
+    assert dashboard.node_points("/world/robot/scan/raw") > 1000
+    assert dashboard.errors == []
+
+
+def test_the_eps_slider_changes_the_clusters_of_the_standing_scan(dashboard: Dashboard):
+    before = dashboard.clusters()
+    assert before > 3
+    box = dashboard.row("Radius eps").locator("input[type=text]")
+    box.fill("5")  # all stems in one
+    box.press("Tab")
+    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
+    dashboard.until("was => Number(document.querySelector('[data-clusters]').dataset.clusters) < was", before)
+    expect(dashboard.scene.get_by_text("● Radius eps")).to_be_visible()
+    expect(dashboard.page.locator("#preset")).to_have_text("● forest, 1 changed")
+    dashboard.scene.get_by_role("button", name="Reset clustering").click()
+    dashboard.until_server("/api/parameters", "it.changed.length === 0")
+    dashboard.until(
+        "was => Number(document.querySelector('[data-clusters]').dataset.clusters) === was", before
+    )
+    expect(box).to_have_value("0.15")
+
+
+def test_the_eps_slider_moves_by_the_keyboard(dashboard: Dashboard):
+    slider = dashboard.row("Radius eps").get_by_role("slider")
+    slider.press("ArrowRight")
+    dashboard.until_server("/api/parameters", "Math.abs(it.values['clustering.eps'] - 0.16) < 1e-9")
+    slider.press("ArrowLeft")
+    dashboard.until_server("/api/parameters", "it.changed.length === 0")
+    assert dashboard.state == "paused"  # the arrow moved the slider, and not the run
+
+
+def test_a_value_that_contradicts_another_goes_back_and_says_why(dashboard: Dashboard):
+    box = dashboard.row("Eccentricity min").locator("input[type=text]")
+    box.fill("900")
+    box.press("Tab")
+    expect(dashboard.scene.get_by_text("must be less than")).to_be_visible()
+    expect(box).to_have_value("1")
+    assert dashboard.ask("/api/parameters")["changed"] == []
+
+
+def test_a_preset_is_chosen_in_the_scene(dashboard: Dashboard):
+    def choose(name: str) -> None:
+        dashboard.scene.get_by_role("combobox").first.click()
+        dashboard.scene.get_by_role("option", name=name, exact=True).click()
+        dashboard.until_server("/api/parameters", f"it.preset === '{name}'")
+        expect(dashboard.page.locator("#preset")).to_have_text(name)
+
+    choose("paper")
+    assert dashboard.ask("/api/parameters")["values"]["clustering.eps"] == 0.25
+    expect(dashboard.row("Radius eps").locator("input[type=text]")).to_have_value("0.25")
+    choose("forest")
+
+
+SELECTION_IS_PAINTED = """() => {
+  const canvas = document.querySelector('#map');
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  for (let i = 0; i < data.length; i += 4) {
+    if (data[i] === 0x56 && data[i + 1] === 0xB4 && data[i + 2] === 0xE9 && data[i + 3] === 255) return true;
+  }
+  return false;
+}"""
+
+
+def test_a_tree_is_found_and_selected_everywhere(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    number = page.locator("#trees tbody tr").nth(2).get_attribute("data-tree")
+    assert number is not None
+    page.locator("body").press("/")
+    page.locator("#find").fill(number)
+    row = page.locator(f"tr[data-tree='{number}']")
+    row.click()
+    expect(row).to_have_attribute("aria-selected", "true")
+    dashboard.until(SELECTION_IS_PAINTED)
+    expect(dashboard.scene.locator("body")).to_be_visible()
+    dashboard.scene.wait_for_function(
+        "number => Object.values(window.__viserSceneTree.getState())"
+        ".some(node => node?.message?.props?.text?.startsWith(`tree ${number}, DBH`))",
+        arg=number,
+    )
+    expect(page.locator("#panel-story")).to_have_attribute("data-story", f"tree {number}")
+    dashboard.tab("Trees")
+    page.locator("#find").fill("")
+    page.locator("#map").press("Escape")
+    expect(row).to_have_attribute("aria-selected", "false")
+
+
+def test_keys_work_on_the_page_and_in_the_scene(dashboard: Dashboard):
+    page = dashboard.page
+    start = dashboard.ask("/api/status")["scan_index"]
+    page.locator("#map").press("ArrowRight")
+    dashboard.until_server("/api/status", f"it.scan_index === {start + 1}")
+    page.locator("#map").press("Shift+ArrowLeft")
+    dashboard.until_server("/api/status", f"it.scan_index === {start - 9}")
+    dashboard.scene.locator("canvas").first.press("ArrowRight")
+    dashboard.until_server("/api/status", f"it.scan_index === {start - 8}")
+    page.locator("#map").press("?")
+    expect(page.get_by_role("heading", name="Keyboard shortcuts")).to_be_visible()
+
+
+def test_following_is_switched_by_a_key_of_the_page(dashboard: Dashboard):
+    scene = dashboard.scene
+    follow = dashboard.page.locator("#follow")
+    expect(follow).to_have_attribute("aria-pressed", "true")
+    dashboard.page.locator("#map").press("f")
+    expect(follow).to_have_attribute("aria-pressed", "false")
+    scene.locator("canvas").first.press("f")
+    expect(follow).to_have_attribute("aria-pressed", "true")
+
+
+def test_a_layer_is_switched_off(dashboard: Dashboard):
+    scene = dashboard.scene
+    page = dashboard.page
+    page.get_by_role("button", name="Layers").click()
+    switch = page.locator("#layer-list").get_by_role("checkbox", name="Raw scan")
+    expect(page.locator("#layer-list label", has_text="Raw scan").locator(".count")).to_have_text(
+        f"{dashboard.node_points('/world/robot/scan/raw'):,}"
+    )
+    hidden = "name => window.__viserSceneTree.getState()[name].visibility === false"
+    switch.click()
+    scene.wait_for_function(hidden, arg="/world/robot/scan/raw")
+    switch.click()
+    scene.wait_for_function(f"name => !({hidden})(name)", arg="/world/robot/scan/raw")
+    page.get_by_role("combobox", name="Labels").select_option("DBH")
+    centimetres = "() => Object.values(window.__viserSceneTree.getState())"
+    centimetres += ".some(node => / cm$/.test(node?.message?.props?.text ?? '') && node.visibility !== false)"
+    scene.wait_for_function(centimetres)
+    page.get_by_role("combobox", name="Labels").select_option("eccentricity")
+    key = (page.locator("#layer-list label", has_text="Raw scan").get_attribute("title") or "")[-1]
+    page.get_by_role("button", name="Layers").click()
+    page.locator("#map").press(key)
+    scene.wait_for_function(hidden, arg="/world/robot/scan/raw")
+    page.locator("#map").press(key)
+    scene.wait_for_function(f"name => !({hidden})(name)", arg="/world/robot/scan/raw")
+
+
+def test_light_and_dark_are_remembered(dashboard: Dashboard):
+    page = dashboard.page
+    page.get_by_role("button", name="Light or dark").click()
+    expect(page.locator("html")).to_have_attribute("data-theme", "light")
+    assert page.evaluate("localStorage.getItem('stemmap.theme')") == "light"
+    page.get_by_role("button", name="Light or dark").click()
+    expect(page.locator("html")).to_have_attribute("data-theme", "dark")
+    dashboard.scene.wait_for_function("() => window.__viserSceneTree?.getState()['/world/robot/scan/raw']")
+
+
+def test_nothing_was_complained_about(dashboard: Dashboard):
+    assert dashboard.errors == []
