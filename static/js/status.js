@@ -31,7 +31,7 @@ function budget({ scans, end_s: end }) {
 // What the standing scan took for trees, against the truth: it moves with a slider, before the map follows.
 function ofScan() {
   const { right, wrong } = state.map ?? {};
-  return right === null || right === undefined ? "F1 to truth" : `F1; this scan ${right} right, ${wrong} wrong`;
+  return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan ${right} of ${right + wrong} at trees`;
 }
 
 function reason({ health }) {
@@ -71,6 +71,7 @@ function show() {
   }
   cells.health.cell.title = healthFigures();
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
+  cells.f1.cell.title = "F1 of the map against the truth; clusters of the standing scan that were taken for trees, and how many of them stand at true ones";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   setText(byId("source-name"), shortSource(status.source) || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;

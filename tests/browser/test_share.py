@@ -43,7 +43,8 @@ def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server
         dashboard.scene.wait_for_function(f"() => Math.abs(({AT})()[1] - 12) < 0.02")
         assert "run=" not in page.url
         assert dashboard.errors == []
-        looks(chromium, viewers, dashboard.ask("/api/status")["scan_index"])
+        scan = dashboard.ask("/api/status")["scan_index"]
+    looks(chromium, viewers, scan)
 
 
 def looks(chromium: Browser, link: str, scan: int) -> None:
