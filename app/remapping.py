@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from app.history import Snapshots
 from app.story.history import TreeHistory
 from pipeline.parameters import Parameters
@@ -13,6 +15,7 @@ from pipeline.records import Frame
 from pipeline.rerun import Recalled, Rerun
 
 _NS = 1_000_000_000
+_TRACKED = 128  # scans of which the trees alone are found anew: a few milliseconds
 
 
 @dataclass(slots=True)
@@ -30,15 +33,24 @@ class Told:
     time_s: float = -math.inf
 
     def record(self, frame: Frame | Recalled, start_ns: int) -> None:
-        """Take a scan of a run whose first one was at this time. What was known of this and later scans is
-        forgotten: the run went back."""
+        """Take a scan, or several, of a run whose first one was at this time. What was known of these and
+        later scans is forgotten: the run went back."""
         self.history.record(frame, start_ns)
-        time_s = (frame.stamp_ns - start_ns) / _NS
-        if time_s <= self.time_s:
-            self.confirmed_s = {n: at for n, at in self.confirmed_s.items() if at < time_s}
-        self.time_s = time_s
-        for number in frame.trees.number[frame.trees.confirmed].tolist():
-            self.confirmed_s.setdefault(number, time_s)
+        first_ns = frame.stamps_ns[0] if isinstance(frame, Recalled) else frame.stamp_ns
+        if (first_ns - start_ns) / _NS <= self.time_s:
+            self._forget_from((first_ns - start_ns) / _NS)
+        self.time_s = (frame.stamp_ns - start_ns) / _NS
+        if isinstance(frame, Recalled):
+            number, scan = frame.confirmed
+            at_ns = frame.stamps_ns[scan - frame.first]
+        else:
+            number = frame.trees.number[frame.trees.confirmed]
+            at_ns = np.full(len(number), frame.stamp_ns)
+        for tree, time_s in zip(number.tolist(), ((at_ns - start_ns) / _NS).tolist(), strict=True):
+            self.confirmed_s.setdefault(tree, time_s)
+
+    def _forget_from(self, time_s: float) -> None:
+        self.confirmed_s = {number: at for number, at in self.confirmed_s.items() if at < time_s}
 
     def before(self, scan: int, time_s: float) -> Told:
         """Of its own, what was known before a scan of this time."""
@@ -76,7 +88,8 @@ class Remapping:
         return self.rerun.mapper.parameters
 
     def work(self, scans: int, until: int) -> bool:
-        """Map so many scans more, or go back, towards a map of `until` scans. Whether it is reached.
+        """Map so many scans more, or more where that takes next to nothing, or go back, towards a map of
+        `until` scans. Whether it is reached.
 
         Raises:
             StemmapError: A scan cannot be looked at again.
@@ -84,7 +97,7 @@ class Remapping:
         rerun = self.rerun
         if rerun.done > until:  # the run went back meanwhile
             rerun.go_back(*self.snapshots.newest(until))
-        most = min(rerun.done + scans, until)
+        most = min(rerun.done + (max(scans, _TRACKED) if rerun.tracks_alone else scans), until)
         while rerun.done < most:
             if self.snapshots.is_due(rerun.done) and (state := rerun.state()) is not None:
                 self.snapshots.offer(rerun.done, state)

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from app.abreast import abreast
-from app.ahead import looked_ahead, looked_at_once
+from app.ahead import aside, looked_ahead, looked_at_once
 from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
 from app.live_cursor import LiveCursor
@@ -227,7 +227,7 @@ class Run:
             return
         basis = self._basis()
         self._rough = None if basis is None else self._roughly(basis, parameters, mapper)
-        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead, abreast)
+        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead, abreast, aside)
         if basis is None or not rerun.passed:
             self._remapping = Remapping(rerun, self.start_ns)
             return
@@ -238,19 +238,19 @@ class Run:
     def _roughly(self, basis: Basis, parameters: Parameters, mapper: Mapper) -> Trees | None:
         sample = None
         if self._reread is not None and not basis.shows_as(parameters):
-            sample = self._sample.looked(mapper.looker(), len(basis.entries), looked_at_once)
+            sample = self._sample.looked(mapper.looker(), len(basis.notes), looked_at_once)
         return rough_trees(basis, self._kept.clusters, parameters, sample)
 
     def _basis(self) -> Basis | None:
         """What the scans so far were mapped to with one set of parameters."""
         if not isinstance(self._mapper, Mapper) or self._broken:
             return None
-        entries = self._journal.first(self._parameters.until(max(self.standing, 0)))
-        states = self._snapshots.first(len(entries))
-        if self._before is not None and self._before.path_length <= len(entries):
+        notes = self._journal.first(self._parameters.until(max(self.standing, 0)))
+        states = self._snapshots.first(len(notes))
+        if self._before is not None and self._before.path_length <= len(notes):
             states[self._before.path_length] = self._before
         path, motion = self._mapper.path, self._mapper.motion
-        return Basis.of(self._parameters.at(0), entries, states, path, motion)
+        return Basis.of(self._parameters.at(0), notes, states, path, motion)
 
     def stay(self) -> None:
         """Give up what `remap` began; the map stays as it is."""

@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.cells import Cells, cell_of, cells_for, fill, first_of_four, per_metre
+from pipeline.compiled import compiled, compiled_borrowing
 from pipeline.geometry import Float
 from pipeline.records import Int
+
+
+class _Pairs(NamedTuple):
+    """Room for pairs: the squared Mahalanobis distance of each and what it costs beside, its landmark and its
+    detection; and how many there are of each detection."""
+
+    squared: Float
+    beside: Float
+    landmark: Int
+    detection: Int
+    of_detection: Int
 
 
 @compiled
@@ -27,45 +41,100 @@ def associate(
     detections = centre.shape[0]
     landmark_of = np.full(detections, -1, np.int64)
     distance2 = np.zeros(detections)
-    if detections == 0:
+    cells, scale = cells_for(detections), per_metre(distance_max)
+    fill(cells, centre, detections, scale)
+    pairs, n, begin = _room_for(4 * detections + 16, detections), 0, 0
+    while True:
+        begin, n = _add_pairs(pairs, n, begin, cells, scale, centre, R, mean, covariance, gate, distance_max)
+        if begin == mean.shape[0]:
+            break
+        pairs = _widened(pairs, n)
+    if _is_one_to_one(pairs, n):
+        for k in range(n):
+            landmark_of[pairs.detection[k]] = pairs.landmark[k]
+            distance2[pairs.detection[k]] = pairs.squared[k]
         return landmark_of, distance2
-    low_x, high_x = centre[:, 0].min() - distance_max, centre[:, 0].max() + distance_max
-    low_y, high_y = centre[:, 1].min() - distance_max, centre[:, 1].max() + distance_max
-    pairs = 0
-    room = 4 * detections + 16
-    cost = np.empty(room)
-    pair = np.empty((room, 2), np.int64)
-    squared = np.empty(room)
-    for j in range(mean.shape[0]):
-        x, y = mean[j, 0], mean[j, 1]
-        if x < low_x or x > high_x or y < low_y or y > high_y:
-            continue
-        for d in range(detections):
-            y0, y1 = centre[d, 0] - x, centre[d, 1] - y
-            if y0 * y0 + y1 * y1 > distance_max * distance_max:
-                continue
-            a = covariance[j, 0] + R[d, 0]
-            b = covariance[j, 1] + R[d, 1]
-            e = covariance[j, 2] + R[d, 2]
-            det = a * e - b * b
-            d2 = (e * y0 * y0 - 2 * b * y0 * y1 + a * y1 * y1) / det
-            if d2 > gate * gate:
-                continue
-            if pairs == room:
-                room *= 2
-                cost = np.append(cost, np.empty(pairs))
-                squared = np.append(squared, np.empty(pairs))
-                pair = np.append(pair, np.empty((pairs, 2), np.int64), axis=0)
-            cost[pairs] = d2 + np.log(det)
-            squared[pairs] = d2
-            pair[pairs, 0], pair[pairs, 1] = d, j
-            pairs += 1
-    order = np.argsort(cost[:pairs], kind="mergesort")
+    order = np.argsort(pairs.squared[:n] + np.log(pairs.beside[:n]), kind="mergesort")
     taken = np.zeros(mean.shape[0], np.bool_)
     for k in order:
-        d, j = pair[k, 0], pair[k, 1]
+        d, j = pairs.detection[k], pairs.landmark[k]
         if landmark_of[d] < 0 and not taken[j]:
             landmark_of[d] = j
-            distance2[d] = squared[k]
+            distance2[d] = pairs.squared[k]
             taken[j] = True
     return landmark_of, distance2
+
+
+@compiled
+def _room_for(pairs: int, detections: int) -> _Pairs:
+    return _Pairs(
+        np.empty(pairs),
+        np.empty(pairs),
+        np.empty(pairs, np.int64),
+        np.empty(pairs, np.int64),
+        np.zeros(detections, np.int64),
+    )
+
+
+@compiled
+def _widened(pairs: _Pairs, used: int) -> _Pairs:
+    more = _room_for(2 * pairs.squared.shape[0], pairs.of_detection.shape[0])
+    more.squared[:used], more.beside[:used] = pairs.squared[:used], pairs.beside[:used]
+    more.landmark[:used], more.detection[:used] = pairs.landmark[:used], pairs.detection[:used]
+    more.of_detection[:] = pairs.of_detection
+    return more
+
+
+@compiled_borrowing
+def _add_pairs(
+    pairs: _Pairs,
+    n: int,
+    begin: int,
+    cells: Cells,
+    scale: float,
+    centre: Float,
+    R: Float,
+    mean: Float,
+    covariance: Float,
+    gate: float,
+    distance_max: float,
+) -> tuple[int, int]:
+    """Put the pairs of landmarks behind the first n, landmark by landmark and in the order of the detections:
+    of pairs that cost the same the first one counts. Returns the first landmark for which there may be no
+    room, and how many pairs there are then."""
+    for j in range(begin, mean.shape[0]):
+        if n + centre.shape[0] > pairs.squared.shape[0]:
+            return j, n
+        first = n
+        u, v = first_of_four(mean[j, 0], mean[j, 1], scale)
+        for quarter in range(4):
+            d = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+            while d >= 0:
+                y0, y1 = centre[d, 0] - mean[j, 0], centre[d, 1] - mean[j, 1]
+                a, b = covariance[j, 0] + R[d, 0], covariance[j, 1] + R[d, 1]
+                e = covariance[j, 2] + R[d, 2]
+                det = a * e - b * b
+                d2 = (e * y0 * y0 - 2 * b * y0 * y1 + a * y1 * y1) / det
+                if y0 * y0 + y1 * y1 <= distance_max * distance_max and not d2 > gate * gate:
+                    at = n
+                    while at > first and pairs.detection[at - 1] > d:
+                        pairs.squared[at], pairs.beside[at] = pairs.squared[at - 1], pairs.beside[at - 1]
+                        pairs.detection[at] = pairs.detection[at - 1]
+                        at -= 1
+                    pairs.squared[at], pairs.beside[at], pairs.detection[at] = d2, det, d
+                    pairs.of_detection[d] += 1
+                    pairs.landmark[n] = j
+                    n += 1
+                d = cells.following[d]
+    return mean.shape[0], n
+
+
+@compiled_borrowing
+def _is_one_to_one(pairs: _Pairs, n: int) -> bool:
+    """Whether no landmark and no detection has a choice."""
+    clear = True
+    for d in range(pairs.of_detection.shape[0]):
+        clear = clear and pairs.of_detection[d] <= 1
+    for k in range(1, n):
+        clear = clear and pairs.landmark[k] != pairs.landmark[k - 1]
+    return clear

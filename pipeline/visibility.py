@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing
 from pipeline.direction import direction_bin
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32
@@ -84,7 +84,7 @@ def in_free_view(place: Float, pose: Float, clear_range: Float, view_range: floa
     return free
 
 
-@compiled
+@compiled_borrowing
 def is_in_free_view(
     place: Float, pose: Float, c: float, s: float, clear_range: Float, view_range: float
 ) -> bool:

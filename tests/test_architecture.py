@@ -27,6 +27,7 @@ FOUNDATION = (
     "records",
     "parameters",
     "direction",
+    "cells",
     "association",
     "bend",
     "visibility",

@@ -41,33 +41,18 @@ class TreeHistory:
         return known
 
     def record(self, frame: Frame | Recalled, start_ns: int) -> None:
-        """Take a scan. What was known of this and later scans is forgotten: the run went back.
+        """Take a scan, or several. What was known of these and later scans is forgotten: the run went back.
 
         Args:
-            frame: The scan's results.
+            frame: The results.
             start_ns: Time of the run's first scan.
         """
-        scans = self._rows[: self._count, _SCAN]
-        self._count = int(np.searchsorted(scans, frame.index))
-        trees = frame.trees
-        # A tree that its column began has a place before any scan detected it.
-        seen = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
-        if frame.index % self._spacing:
-            seen = seen[trees.observations[seen] <= _ALL_OF_FIRST]
-        self._append(
-            np.column_stack(
-                [
-                    np.full(len(seen), frame.index),
-                    trees.number[seen],
-                    trees.observations[seen],
-                    np.full(len(seen), (frame.stamp_ns - start_ns) / _NS),
-                    trees.position[seen],
-                    trees.covariance[seen][:, [0, 0, 1], [0, 1, 1]],
-                    trees.dbh[seen],
-                    trees.dbh_sigma[seen],
-                ]
-            )
-        )
+        rows = _rows_of(frame, start_ns)
+        first = frame.first if isinstance(frame, Recalled) else frame.index
+        self._count = int(np.searchsorted(self._rows[: self._count, _SCAN], first))
+        if self._spacing > 1:
+            rows = rows[(rows[:, _SCAN] % self._spacing == 0) | (rows[:, _OBSERVATIONS] <= _ALL_OF_FIRST)]
+        self._append(rows)
 
     def of(self, number: int) -> History:
         """The story of one tree: at most 200 rows, the first and the last among them."""
@@ -110,3 +95,32 @@ def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _matrices(xx_xy_yy: NDArray[np.float64]) -> NDArray[np.float64]:
     return xx_xy_yy[:, [[0, 1], [1, 2]]]
+
+
+def _rows_of(frame: Frame | Recalled, start_ns: int) -> NDArray[np.float64]:
+    """What scans made of the trees that they detected, shape (R, _WIDTH)."""
+    if isinstance(frame, Recalled):
+        seen = frame.seen
+        place, covariance, dbh, dbh_sigma = seen.position, seen.covariance, seen.dbh, seen.dbh_sigma
+        scan, number, observations = seen.scan, seen.number, seen.observations
+        stamp_ns = frame.stamps_ns[scan - frame.first]
+    else:
+        trees = frame.trees
+        # A tree that its column began has a place before any scan detected it.
+        there = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
+        place, covariance = trees.position[there], trees.covariance[there]
+        dbh, dbh_sigma = trees.dbh[there], trees.dbh_sigma[there]
+        scan, number = np.full(len(there), frame.index), trees.number[there]
+        observations, stamp_ns = trees.observations[there], np.full(len(there), frame.stamp_ns)
+    return np.column_stack(
+        [
+            scan,
+            number,
+            observations,
+            (stamp_ns - start_ns) / _NS,
+            place,
+            covariance[:, [0, 0, 1], [0, 1, 1]],
+            dbh,
+            dbh_sigma,
+        ]
+    )

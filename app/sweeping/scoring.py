@@ -157,7 +157,8 @@ class _OpenRun:
             while rerun.done < self._scans:
                 if states.is_due(rerun.done) and (known := rerun.state()) is not None:
                     states.offer(rerun.done, known)
-                trees = next(rerun.frames(rerun.done + 1)).trees
+                for frame in rerun.frames(states.next_due(rerun.done, self._scans)):
+                    trees = frame.trees
         except StemmapError as error:  # what was kept is damaged: the source still has it
             raise _DamagedError(str(error)) from None
         assert trees is not None  # noqa: S101 - a basis ends before the last scan

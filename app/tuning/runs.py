@@ -169,11 +169,11 @@ class _Drive:
             step = following
         if trees is None:
             raise SourceError("there is no scan in it", where=self.uri)
-        entries, path = journal.first(number - 1), mapper.path
-        at = states.first(len(entries))
-        if len(entries) == number - 1:
+        notes, path = journal.first(number - 1), mapper.path
+        at = states.first(len(notes))
+        if len(notes) == number - 1:
             at[number - 1] = before_last
-        self._basis = Basis.of(mapper.parameters, entries, at, path, mapper.motion)
+        self._basis = Basis.of(mapper.parameters, notes, at, path, mapper.motion)
         self._scans, self._held = number, held
         return trees
 

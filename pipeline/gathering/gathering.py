@@ -104,10 +104,14 @@ class Gathering:
         """All state; parameters are not part of it."""
         return GatheringState(self._base, tuple(self._since), self.columns)
 
-    def restore(self, state: GatheringState) -> None:
-        """Go back to a snapshot; the state itself is left untouched."""
+    def restore(self, state: GatheringState, memory: Memory | None = None) -> None:
+        """Go back to a snapshot; the state itself is left untouched.
+
+        Args:
+            memory: What the state is when it is folded, of which nobody else knows; None folds it now.
+        """
         self._base, self._since = state.base, list(state.since)
-        self.memory = state.folded()
+        self.memory = state.folded() if memory is None else memory
         self.columns = state.columns
         self._vote_again = True  # another forest may have voted then
 

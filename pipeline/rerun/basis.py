@@ -12,7 +12,8 @@ from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters
 from pipeline.records import Int, Path
 from pipeline.rerun.clusters import ClusterTable
-from pipeline.rerun.journal import Entry
+from pipeline.rerun.notes import Notes
+from pipeline.tracking.kalman import COMPILED
 
 # What a scan shows hangs on these, and where it was taken on those: nothing of the run before holds to the
 # byte where one of them changes.
@@ -29,15 +30,15 @@ class Basis:
 
     Attributes:
         parameters: The set.
-        entries: Of its scans, see `Journal`.
+        notes: Of its scans, see `Journal`.
         states: Of its mapper by the number of scans they hold, that before the first among them.
         stamp_ns, sigma_xy, motion: Of its path, as `Mapper.load` takes them, as long as any state's.
         path: x, y [m], yaw [rad] of the base in the map as it is known at the end, behind all loops, shape
-            (N, 3), as long as the entries.
+            (N, 3), as long as the notes.
     """
 
     parameters: Parameters
-    entries: tuple[Entry, ...]
+    notes: Notes
     states: Mapping[int, MapperState]
     stamp_ns: Int
     sigma_xy: Float
@@ -48,14 +49,14 @@ class Basis:
     def of(
         cls,
         parameters: Parameters,
-        entries: tuple[Entry, ...],
+        notes: Notes,
         states: Mapping[int, MapperState],
         path: Path,
         motion: Float,
     ) -> Basis:
         """With the path of the mapper, and its motion."""
         poses = np.stack([path.x, path.y, path.yaw], axis=1)
-        return cls(parameters, entries, states, path.stamp_ns, path.sigma_xy, motion, poses)
+        return cls(parameters, notes, states, path.stamp_ns, path.sigma_xy, motion, poses)
 
     def shows_as(self, parameters: Parameters) -> bool:
         """Whether other parameters find the same clusters and gather in the same way."""
@@ -90,16 +91,18 @@ class Basis:
 
         Args:
             parameters: That are tried.
-            clusters: Of at least as many scans as there are entries, or what is behind them is not used.
+            clusters: Of at least as many scans as there are notes, or what is behind them is not used.
         """
         before, now = self.parameters, parameters
         if not self.holds_for(now):
             return 0, False
-        same = min(len(self.entries), len(clusters))
+        same = min(len(self.notes), len(clusters))
         if before.detection != now.detection:
             same = clusters.first_judged_otherwise(before.detection, now.detection, same)
         late = before.tracking != now.tracking or before.gathering != now.gathering
+        if late and now.tracking.engine != COMPILED:
+            return 0, False
         if late:
-            same = next((k for k in range(same) if not self.entries[k].is_usual), same)
+            same = min([same, *np.flatnonzero(~self.notes.is_usual[:same])[:1].tolist()])
         scans = max(known for known in self.states if known <= same)
         return scans, late and scans > 0

@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator, Iterator
 from itertools import dropwhile
 
 from pipeline.errors import StemmapError
+from pipeline.gathering import Memory
 from pipeline.mapper import Mapper
 from pipeline.mapper_records import MapperState
 from pipeline.perception import Looked
@@ -19,11 +20,17 @@ from pipeline.rerun.tail import Recalled, Tail
 Reread = Callable[[], Iterator[Step]]
 Ahead = Callable[[Callable[[Step], Looked], Iterator[Step]], Iterator[tuple[Step, Looked]]]
 Abreast = Callable[[Mapper, Iterator[tuple[Step, Looked]]], Iterator[Frame]]
+Aside = Callable[[Callable[[], Memory]], Callable[[], Memory]]
 
 
 def in_turn(mapper: Mapper, scans: Iterator[tuple[Step, Looked]]) -> Iterator[Frame]:
     """Each scan located and mapped before the next one is."""
     return (mapper.take(step, looked) for step, looked in scans)
+
+
+def when_asked(work: Callable[[], Memory]) -> Callable[[], Memory]:
+    """Something is done once somebody asks for it."""
+    return work
 
 
 def one_by_one(look: Callable[[Step], Looked], steps: Iterator[Step]) -> Iterator[tuple[Step, Looked]]:
@@ -46,6 +53,7 @@ class Rerun:
         basis: What is known of the run with other parameters; of the same seed and sensor.
         ahead: How scans are looked at that are read once more: one by one, or ahead of the mapping.
         abreast: How scans are mapped that show something: in turn, or one located while another is mapped.
+        aside: When it is unpacked what was gathered: once trees alone are tracked, or meanwhile.
 
     Attributes:
         journal: What the stages make of each scan.
@@ -60,6 +68,7 @@ class Rerun:
         basis: Basis | None = None,
         ahead: Ahead = one_by_one,
         abreast: Abreast = in_turn,
+        aside: Aside = when_asked,
     ) -> None:
         self.mapper = mapper
         self.journal = Journal()
@@ -67,11 +76,12 @@ class Rerun:
         self._kept = kept
         self._key = look_key(mapper.parameters)
         self._next = self._stop = 0
-        self._reread, self._ahead, self._abreast = reread, ahead, abreast
+        self._reread, self._ahead, self._abreast, self._aside = reread, ahead, abreast, aside
         self._steps: Iterator[tuple[Step, Looked]] | None = None
         self._fresh: KeptScans | None = None
         self._tail: Tail | None = None
         self._until = 0  # scans that are tracked anew alone
+        self._memory: Callable[[], Memory] | None = None  # of the gathering after them
         mapper.note = lambda noted: self.journal.note(noted, mapper.parameters.slam)
         if basis is not None:
             self._go_on_from(basis)
@@ -82,20 +92,25 @@ class Rerun:
         return self._next
 
     @property
+    def tracks_alone(self) -> bool:
+        """Whether of the next scan the trees alone are found anew, which takes next to nothing."""
+        return self._tail is not None
+
+    @property
     def kept(self) -> KeptScans:
         """What the scans show to these parameters, as far as they are mapped."""
         return self._kept if self._fresh is None else self._fresh
 
     def frames(self, scans: int) -> Generator[Frame | Recalled, None, None]:
         """Map on until so many scans are mapped; the frames have no points and no clearance, unless the
-        scans were read once more.
+        scans were read once more. Scans of which the trees alone are found anew are told some at a time.
 
         Raises:
             StemmapError: A scan is not kept and cannot be read once more, or what was kept is damaged.
         """
         while self._tail is not None and self._next < scans:
-            recalled = self._tracked(self._tail)
-            self._next += 1
+            recalled = self._tracked(self._tail, scans)
+            self._next = recalled.index + 1
             yield recalled
         if self._next == scans:
             return
@@ -116,7 +131,7 @@ class Rerun:
 
     def go_back(self, scans: int, state: MapperState) -> None:
         """Stand where so many scans were mapped, with the state that the mapper had then."""
-        self._next, self._steps, self._tail = scans, None, None
+        self._next, self._steps, self._tail, self._memory = scans, None, None, None
         self.mapper.restore(state)
 
     def stop_reading(self) -> None:
@@ -133,22 +148,23 @@ class Rerun:
         scans, anew = basis.begin(self.mapper.parameters, self._kept.clusters)
         if scans == 0:
             return
-        entries = basis.entries[:scans]
-        self.journal.take(entries)
+        notes = basis.notes.first(scans)
+        self.journal.take(notes)
         state = basis.states[0] if anew else basis.states[scans]
         self.mapper.load(state, basis.stamp_ns, basis.sigma_xy, basis.motion)
         if anew:
             states = {known: basis.states[known] for known in basis.states if known <= scans}
-            self._tail, self._until = Tail(self.mapper.parameters, entries, states), scans
+            self._tail, self._until = Tail(self.mapper.parameters, notes, states), scans
+            self._memory = self._aside(states[scans].gathering.folded)
         else:
             self._next = self.passed = scans
 
-    def _tracked(self, tail: Tail) -> Recalled:
-        recalled = tail.track()
+    def _tracked(self, tail: Tail, scans: int) -> Recalled:
+        recalled = tail.track(min(scans, self._until))
         state = tail.state() if tail.done == self._until else None
         if state is not None:
-            self.mapper.restore(state)
-            self._tail = None
+            self.mapper.restore(state, None if self._memory is None else self._memory())
+            self._tail = self._memory = None
         return recalled
 
     def _shown(self) -> Iterator[tuple[Step, Looked]]:

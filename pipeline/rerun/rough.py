@@ -15,16 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled, compiled_within
+from pipeline.cells import cells_for, nearest_in, per_metre, put_in, take_out
+from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.parameters import Parameters
 from pipeline.perception import Looked
 from pipeline.records import Bool, Columns, Int, Trees, Verdict
 from pipeline.rerun.basis import Basis
 from pipeline.rerun.clusters import ClusterTable
-from pipeline.rerun.journal import Entry
+from pipeline.rerun.notes import Notes
 from pipeline.rerun.tail import columns_of
-from pipeline.slam.cells import Cells, cell_of, cells_for, first_of_four, per_metre
 from pipeline.tracking.judging import REACH, nearest_other, tree_columns
 
 MOST_PLACES = 20_000
@@ -44,7 +44,7 @@ def rough_trees(
     Returns:
         None where the parameters gather in another way, or look at scans in another one without a sample.
     """
-    scans = min(len(basis.entries), len(clusters))
+    scans = min(len(basis.notes), len(clusters))
     if scans == 0 or not basis.gathers_as(parameters):
         return None
     if basis.shows_as(parameters):
@@ -65,17 +65,15 @@ class _Places(NamedTuple):
 
 def _known(basis: Basis, clusters: ClusterTable, p: Parameters, scans: int) -> _Places:
     """Of what all scans have shown."""
-    usual = np.array([e.is_usual for e in basis.entries[:scans]])
-    place, hits = _found(basis, range(scans), clusters, p, usual)
-    return _judged(place, hits, hits >= p.tracking.hits_to_confirm, basis.entries[:scans], p)
+    notes = basis.notes.first(scans)
+    place, hits = _found(basis, range(scans), clusters, p)
+    return _judged(place, hits, hits >= p.tracking.hits_to_confirm, notes, p)
 
 
-def _found(
-    basis: Basis, scans: Sequence[int], clusters: ClusterTable, p: Parameters, usual: Bool
-) -> tuple[Float, Int]:
+def _found(basis: Basis, scans: Sequence[int], clusters: ClusterTable, p: Parameters) -> tuple[Float, Int]:
     """The places where the clusters of scans, which are those of the table in their order, show trees."""
     rows = np.array(scans, np.int64)
-    offset = np.array([basis.entries[k].offset[:2] for k in scans]).reshape(-1, 2)
+    offset, usual = basis.notes.offset[rows, :2], basis.notes.is_usual[rows]
     start = np.array(clusters.start[: len(rows) + 1])
     tree = clusters.verdicts(p.detection, len(rows)) == Verdict.TREE
     tree &= np.repeat(usual, np.diff(start))
@@ -87,9 +85,9 @@ def _reach(p: Parameters) -> float:
     return max(p.tracking.proximity_radius, min(p.tracking.distance_max, REACH))
 
 
-def _judged(place: Float, hits: Int, confirmed: Bool, entries: tuple[Entry, ...], p: Parameters) -> _Places:
+def _judged(place: Float, hits: Int, confirmed: Bool, notes: Notes, p: Parameters) -> _Places:
     """The trees among places: what was gathered decides wherever it tells anything."""
-    columns = _columns(entries, p)
+    columns = _columns(notes, p)
     if columns is None:
         return _Places(place[confirmed], hits[confirmed], np.zeros(np.count_nonzero(confirmed), np.bool_))
     trees = tree_columns(columns)
@@ -103,8 +101,8 @@ def _judged(place: Float, hits: Int, confirmed: Bool, entries: tuple[Entry, ...]
     return _Places(np.concatenate([at, place[free]]), np.concatenate([views, hits[free]]), gathered)
 
 
-def _columns(entries: tuple[Entry, ...], p: Parameters) -> Columns | None:
-    known = next((e.columns for e in reversed(entries) if e.columns is not None), None)
+def _columns(notes: Notes, p: Parameters) -> Columns | None:
+    known = notes.newest_columns()
     return (
         None if known is None or p.gathering.method == "none" else columns_of(known, p.gathering.tree_share)
     )
@@ -116,13 +114,12 @@ def _with_sample(
     """The trees as a sample of scans changes them: who is found less often there has fewer hits, and what is
     found there, and was not, is a tree. What was gathered hangs on no clusters, and stays; but where
     something else is gathered too, it stays as long as anything is found of it."""
-    scans = [k for k in sample if k < min(len(basis.entries), len(clusters))]
+    scans = [k for k in sample if k < min(len(basis.notes), len(clusters))]
     fresh = ClusterTable()
     for n, k in enumerate(scans):
         fresh.put(n, sample[k].clusters)
-    usual = np.array([basis.entries[k].is_usual for k in scans], np.bool_)
-    old, old_hits = _found(basis, scans, clusters.of(scans), p, usual)
-    new, new_hits = _found(basis, scans, fresh, p, usual)
+    old, old_hits = _found(basis, scans, clusters.of(scans), p)
+    new, new_hits = _found(basis, scans, fresh, p)
 
     was, now = (
         _sums(nearest_other(place, before.place, REACH), found, len(before.place))
@@ -135,7 +132,7 @@ def _with_sample(
 
     alone = (new_hits >= LEAST) & (nearest_other(new, before.place, REACH) < 0)
     alone &= nearest_other(new, old, REACH) < 0
-    columns = _columns(basis.entries, p)
+    columns = _columns(basis.notes, p)
     if columns is not None:
         alone &= nearest_other(new, columns.axis[:, :2].copy(), REACH) < 0
     return _Places(
@@ -190,9 +187,9 @@ def _gathered(
                 continue
             bx, by = centre[row, 0] + pose[k, 3], centre[row, 1] + pose[k, 4]
             x, y = pose[k, 0] + c * bx - s * by, pose[k, 1] + s * bx + c * by
-            at = _nearest_in(cells, place, x, y, reach, scale)
+            at = nearest_in(cells, place, x, y, reach, scale)
             if at >= 0:
-                _take_out(cells, at)
+                take_out(cells, at)
             elif n < most:
                 at, n = n, n + 1
                 place[at, 0] = place[at, 1] = 0.0
@@ -201,39 +198,5 @@ def _gathered(
             hits[at] += 1
             place[at, 0] += (x - place[at, 0]) / hits[at]
             place[at, 1] += (y - place[at, 1]) / hits[at]
-            _put_in(cells, place, at, scale)
+            put_in(cells, place, at, scale)
     return place[:n].copy(), hits[:n].copy()
-
-
-@compiled_within
-def _nearest_in(cells: Cells, place: Float, x: float, y: float, reach: float, scale: float) -> int:
-    """The nearest place within reach of a point, -1 for none."""
-    u, v = first_of_four(x, y, scale)
-    best, at = reach * reach, -1
-    for quarter in range(4):
-        t = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
-        while t >= 0:
-            dx, dy = place[t, 0] - x, place[t, 1] - y
-            if dx * dx + dy * dy < best:
-                best, at = dx * dx + dy * dy, t
-            t = cells.following[t]
-    return at
-
-
-@compiled_within
-def _put_in(cells: Cells, place: Float, t: int, scale: float) -> None:
-    """File a place under the cell that it lies in."""
-    at = cell_of(int(np.floor(scale * place[t, 0])), int(np.floor(scale * place[t, 1])))
-    cells.cell[t], cells.following[t], cells.head[at] = at, cells.head[at], t
-
-
-@compiled_within
-def _take_out(cells: Cells, t: int) -> None:
-    """Take a place out of the cell that it is filed under."""
-    before = cells.head[cells.cell[t]]
-    if before == t:
-        cells.head[cells.cell[t]] = cells.following[t]
-        return
-    while cells.following[before] != t:
-        before = cells.following[before]
-    cells.following[before] = cells.following[t]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -10,19 +11,30 @@ import numpy as np
 from pipeline.gathering import Judged, no_columns
 from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters
-from pipeline.records import Columns, Int32, Trees
-from pipeline.rerun.journal import Entry
-from pipeline.tracking import Tracker
+from pipeline.records import Columns, Int, Int32, Trees
+from pipeline.rerun.notes import Notes
+from pipeline.tracking.recorded import Seen, Tracking
 from pipeline.tracking.table import TrackTable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recalled:
-    """A scan of which the trees alone were found anew."""
+    """Some scans of which the trees alone were found anew.
+
+    Attributes:
+        index, stamp_ns, trees: Of the last of them.
+        first: Number of the first of them; stamps_ns: int64, of each.
+        seen: What each made of the trees that it detected.
+        confirmed: Numbers of the trees that were confirmed for the first time, and at which scan.
+    """
 
     index: int
     stamp_ns: int
     trees: Trees
+    first: int
+    stamps_ns: Int
+    seen: Seen
+    confirmed: tuple[Int, Int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,46 +51,48 @@ class Tail:
 
     Args:
         parameters: That are tried.
-        entries: Of the scans from the first on, each one usual.
+        notes: Of the scans from the first on, each one usual.
         states: Of the mapper that noted them, by the number of scans they hold.
+
+    Attributes:
+        done: Scans that are tracked.
     """
 
-    def __init__(
-        self, parameters: Parameters, entries: tuple[Entry, ...], states: Mapping[int, MapperState]
-    ) -> None:
-        self._parameters = parameters
-        self._entries = entries
+    def __init__(self, parameters: Parameters, notes: Notes, states: Mapping[int, MapperState]) -> None:
+        self._tree_share = parameters.gathering.tree_share
+        self._notes = notes
+        self._starts = np.cumsum([0, *map(len, notes.stretches)]).tolist()
         self._states = states
-        self._tracker = Tracker(parameters.tracking)
+        self._tracking = Tracking(parameters)
         # What a search for a lost robot would go back to is a part of states that come later.
-        self._wanted = {kept.path_length for state in states.values() for kept in state.recovery.kept}
+        wanted = {kept.path_length for state in states.values() for kept in state.recovery.kept}
+        self._wanted = sorted(wanted, reverse=True)
         self._before: dict[int, Retold] = {}
-        self._verdict: Int32 = np.zeros(0, np.int32)  # of the columns, when they were judged last
+        self._verdict: tuple[int, Int32] = (-1, np.zeros(0, np.int32))  # of the columns of a stretch
         self.done = 0
         self._keep()
 
-    def track(self) -> Recalled:
-        """Take the next scan."""
-        entry, view_range = self._entries[self.done], self._parameters.slam.view_range
-        tracker = self._tracker
-        tracker.process(
-            entry.stamp_ns,
-            entry.T_map_base,
-            entry.covariance,
-            entry.detections,
-            entry.free,
-            view_range,
-            entry.heights,
-            entry.relative,
-        )
-        tracker.anchor(*entry.landmarks, entry.T_map_base, view_range)
-        if entry.columns is not None:
-            p = self._parameters.gathering
-            judged = tracker.judge(entry.stamp_ns, columns_of(entry.columns, p.tree_share), p)
-            self._verdict = judged.verdict
-        self.done += 1
+    def track(self, until: int) -> Recalled:
+        """Take the next scans, all that were laid together at most, and none beyond so many of the run."""
+        number = bisect_right(self._starts, self.done) - 1
+        stretch, begin = self._notes.stretches[number], self._starts[number]
+        if self._verdict[0] != number:
+            self._verdict = (number, stretch.judged.verdict(self._tree_share))
+        first, last = self.done - begin, min(until, self._starts[number + 1]) - begin
+        if self._wanted:
+            last = min(last, self._wanted[-1] - begin)
+        seen = self._tracking.track(stretch.recorded, self._verdict[1], first, last, begin)
+        index, self.done = self.done, begin + last
         self._keep()
-        return Recalled(self.done - 1, entry.stamp_ns, tracker.trees())
+        return Recalled(
+            index=self.done - 1,
+            stamp_ns=int(stretch.recorded.stamp_ns[last - 1]),
+            trees=self._tracking.trees(),
+            first=index,
+            stamps_ns=stretch.recorded.stamp_ns[first:last],
+            seen=seen,
+            confirmed=self._tracking.confirmed_since(index),
+        )
 
     def state(self) -> MapperState | None:
         """Of a mapper that had these parameters from the first scan on; None where the other kept none."""
@@ -88,11 +102,12 @@ class Tail:
         return _with_trees(before, self._trees(), self._before)
 
     def _keep(self) -> None:
-        if self.done in self._wanted:
-            self._before[self.done] = self._trees()
+        if self._wanted and self.done == self._wanted[-1]:
+            self._before[self._wanted.pop()] = self._trees()
 
     def _trees(self) -> Retold:
-        return Retold(self._tracker.tracks.copy(), self._tracker.next_number, self._verdict)
+        t = self._tracking
+        return Retold(t.tracks.copy(), t.next_number, t.verdict)
 
 
 def _with_trees(state: MapperState, trees: Retold, before: Mapping[int, Retold]) -> MapperState:

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.cells import Cells, cell_of, first_of_four
 from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Bool, Int
-from pipeline.slam.cells import Cells, cell_of, first_of_four
 from pipeline.slam.gaussian import Pose, expected_spread
 from pipeline.slam.joint_choice import CHOICES, MOST, Doubts, doubts_for
 

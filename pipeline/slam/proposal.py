@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.cells import Cells
 from pipeline.compiled import compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Int, Int32
-from pipeline.slam.cells import Cells
 from pipeline.slam.gaussian import Pose, corrected, expected_spread, keep_pose, pose_of, turned
 from pipeline.slam.health import AMBIGUOUS as DOUBTFUL
 from pipeline.slam.health import FOUND, INNOVATION, MOST_HITS, RECOGNISED

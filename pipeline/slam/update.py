@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.cells import Cells, cells_for, clear, fill, per_metre
 from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.direction import direction_bin
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
-from pipeline.slam.cells import Cells, cells_for, clear, fill, per_metre
 from pipeline.slam.gaussian import draw, rotated
 from pipeline.slam.health import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.landmarks import kalman_update, merge_duplicates

@@ -4,79 +4,65 @@ on its column say. Of trees, poles and persons that tells nothing, of bushes and
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.cells import Cells, cell_of, first_of_four
+from pipeline.compiled import compiled_borrowing, compiled_within
 from pipeline.geometry import Float
-from pipeline.records import AT_ROUND, CLASSES, Bool, Columns, Int, Int32, Verdict
-from pipeline.tracking.observation import SECTORS
-from pipeline.tracking.table import TrackTable
+from pipeline.records import AT_ROUND, CLASSES, Int32, Verdict
+from pipeline.tracking.observation import SECTORS, sides_of
+from pipeline.tracking.table import Rows
 
 REACH = 0.25  # m; a column's axis lies so near to the trunk that it is of
 FITS = 20  # circles of single scans
 SIDES = SECTORS // 2  # that they were seen on
-TREE = CLASSES.index(Verdict.TREE)
+TREE, TREE_VOTES = int(Verdict.TREE), CLASSES.index(Verdict.TREE)
 _KINDS, _AT_ROUND = np.array(CLASSES, np.int64), np.array(AT_ROUND)
 
 
-def backed(columns: Columns, tracks: TrackTable, tree_share: float) -> Columns:
-    """The columns, of which those that single scans back are trees: v_tree / (v_round + 0.1 v_else) is at
-    least `tree_share`, with the shares v of the votes, and neither poles nor persons have more than trees.
+@compiled_borrowing
+def back(
+    rows: Rows,
+    count: int,
+    cells: Cells,
+    scale: float,
+    place: Float,
+    votes: Float,
+    verdict: Int32,
+    tree_share: float,
+) -> None:
+    """Make trees of the columns that single scans back: v_tree / (v_round + 0.1 v_else) is at least
+    `tree_share`, with the shares v of the votes, and neither poles nor persons have more than trees.
 
     Args:
-        columns: With the verdicts of the votes and of the rules; what moved or is too few voxels stays so.
-        tracks: In the same frame.
+        rows: Tracks in the same frame, the first `count`.
+        cells: Of the columns, `scale` of them a metre, for searches of `REACH` at least.
+        place: Of the columns, x, y first, shape (C, 2 or more) [m]; votes: shape (C, 6); verdict: of the
+            votes and the rules, shape (C,), in place; what moved or is too few voxels stays so.
         tree_share: See `Gathering`.
     """
-    round_tracks = np.flatnonzero(tracks.radii >= FITS)
-    if not len(round_tracks):
-        return columns
-    doubtful = _doubtful(columns.share, columns.verdict, _KINDS, _AT_ROUND, tree_share)
-    if not len(doubtful):
-        return columns
-    found = _near_round(
-        columns.axis[doubtful, :2], tracks.x[round_tracks, :2], tracks.sides[round_tracks], REACH, SIDES
-    )
-    verdict = columns.verdict.copy()
-    verdict[doubtful[found]] = Verdict.TREE
-    return replace(columns, verdict=verdict)
-
-
-@compiled
-def _doubtful(share: Float, verdict: Int32, kinds: Int, at_round: Float, tree_share: float) -> Int:
-    """Rows of the columns that the votes alone refuse, and that would be trees were they round."""
-    rows, n = np.empty(verdict.shape[0], np.int64), 0
-    for c in range(verdict.shape[0]):
-        voted = False
-        for k in range(kinds.shape[0]):
-            voted = voted or (verdict[c] == kinds[k] and k != TREE)
-        if not voted:
+    for t in range(count):
+        if rows.radii[t] < FITS or sides_of(rows.sides[t]) < SIDES:
             continue
-        below, most = 0.0, 0.0
-        for k in range(kinds.shape[0]):
-            below += share[c, k] * at_round[k]
-            if at_round[k] == 1.0:
-                most = max(most, share[c, k])
-        if share[c, TREE] >= most and share[c, TREE] / max(below, 1e-9) >= tree_share:
-            rows[n] = c
-            n += 1
-    return rows[:n].copy()
+        x, y = rows.x[t, 0], rows.x[t, 1]
+        u, v = first_of_four(x, y, scale)
+        for quarter in range(4):
+            c = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+            while c >= 0:
+                dx, dy = place[c, 0] - x, place[c, 1] - y
+                near = dx * dx + dy * dy < REACH * REACH
+                if near and _would_be_a_tree(votes[c], verdict[c], tree_share):
+                    verdict[c] = TREE
+                c = cells.following[c]
 
 
-@compiled
-def _near_round(place: Float, track: Float, sides: Int, reach: float, least: int) -> Bool:
-    """Whether a track that was seen on so many sides stands within reach of each place."""
-    near = np.zeros(place.shape[0], np.bool_)
-    for b in range(track.shape[0]):
-        left, seen = sides[b], 0
-        while left:
-            left &= left - 1  # takes the lowest bit away
-            seen += 1
-        if seen < least:
-            continue
-        for a in range(place.shape[0]):
-            dx, dy = place[a, 0] - track[b, 0], place[a, 1] - track[b, 1]
-            near[a] = near[a] or dx * dx + dy * dy < reach * reach
-    return near
+@compiled_within
+def _would_be_a_tree(votes: Float, verdict: int, tree_share: float) -> bool:
+    """Whether the votes alone refuse a column that is a tree if it is round."""
+    voted, below, most = False, 0.0, 0.0
+    for k in range(_KINDS.shape[0]):
+        voted = voted or (verdict == _KINDS[k] and k != TREE_VOTES)
+        below += votes[k] * _AT_ROUND[k]
+        if _AT_ROUND[k] == 1.0:
+            most = max(most, votes[k])
+    return voted and votes[TREE_VOTES] >= most and votes[TREE_VOTES] / max(below, 1e-9) >= tree_share

@@ -4,15 +4,76 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.cells import (
+    Cells,
+    cell_of,
+    cells_for,
+    fill,
+    first_of_four,
+    nearest_in,
+    per_metre,
+    put_in,
+)
+from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Bool, Columns, Int, Int32, Verdict
-from pipeline.tracking.table import TrackTable
+from pipeline.tracking.assignment import by_pose
+from pipeline.tracking.backing import back
+from pipeline.tracking.sight import Sight
+from pipeline.tracking.table import Rows, begin
 
 TREE, OTHER = int(Verdict.TREE), int(Verdict.OTHER)
 ONE_TREE = 0.5  # m; tree columns nearer to one another than this are one tree
 REACH = 0.45  # m; a track farther from a column than this is something else
 BESIDE = 0.7  # m; a tree whose own column is gone is what the column so near is: a person fits no circle well
+SCORE_STANDING = 5.0  # at least, of a tree that what was gathered stands for
+GATHERED_SIGMA = 0.1  # m; the middle of the returns of one side lies so far before the axis
+DUE_NS = 5_000_000_000  # after its first sight a trunk so near has a column: a dozen scans were gathered
+DUE_REACH = 10.0  # m
+DUE_SHARE = 0.4  # of how far away returns are gathered: what stands farther may have been seen by few scans
+GLIMPSE_NS, FORMER_NS = 1_000_000_000, 60_000_000_000  # bounds of being out of sight, see `_is_out_of_sight`
+
+
+@compiled
+def judge(
+    rows: Rows,
+    count: int,
+    number: int,
+    sight: Sight,
+    place: Float,
+    votes: Float,
+    verdict: Int32,
+    tree_share: float,
+    range_max: float,
+    velocity_sigma: float,
+) -> tuple[int, int]:
+    """Take the verdicts of what was gathered: a track is confirmed by them alone, and a tree that no single
+    scan showed begins its track here.
+
+    Args:
+        rows: The first `count` are tracks, in place, with room for one more a column.
+        number: Of the next new tree.
+        sight: Of the scan.
+        place: Of the columns, x, y first, shape (C, 2 or more) [m]; votes: shape (C, 6); verdict: of the
+            votes and the rules, shape (C,): those that the tracks back become trees in place (see `backing`).
+        tree_share, range_max: See `Gathering`.
+
+    Returns:
+        The number of tracks, and that of the next new one.
+    """
+    columns = verdict.shape[0]
+    cells, scale = cells_for(columns), per_metre(BESIDE)
+    fill(cells, place, columns, scale)
+    back(rows, count, cells, scale, place, votes, verdict, tree_share)
+    trees = _best_first(place, votes, verdict)
+    _learn(rows, count, sight, cells, scale, place, verdict, min(DUE_REACH, DUE_SHARE * range_max))
+    fresh = _with_tree(rows, count, place, trees)
+    _begin_at(rows, count, number, sight, place, trees[fresh], velocity_sigma)
+    count += fresh.shape[0]
+    for t in range(count):
+        if rows.verdict[t] == TREE:
+            rows.score[t] = max(rows.score[t], SCORE_STANDING)
+    return count, number + fresh.shape[0]
 
 
 def tree_columns(columns: Columns) -> Int:
@@ -21,135 +82,141 @@ def tree_columns(columns: Columns) -> Int:
 
 
 @compiled
-def _best_first(axis: Float, share: Float, verdict: Int32) -> Int:
-    rows, votes, n = np.empty(verdict.shape[0], np.int64), np.empty(verdict.shape[0]), 0
+def _best_first(place: Float, votes: Float, verdict: Int32) -> Int:
+    rows, fewest, n = np.empty(verdict.shape[0], np.int64), np.empty(verdict.shape[0]), 0
     for c in range(verdict.shape[0]):
         if verdict[c] == TREE:
-            rows[n], votes[n] = c, -share[c, 0]
+            rows[n], fewest[n] = c, -votes[c, 0]
             n += 1
-    rows = rows[np.argsort(votes[:n], kind="mergesort")]
-    place = np.empty((rows.shape[0], 2))
-    for k in range(rows.shape[0]):
-        place[k, 0], place[k, 1] = axis[rows[k], 0], axis[rows[k], 1]
-    best: Int = rows[_apart(place, ONE_TREE)]
+    rows = rows[np.argsort(fewest[:n], kind="mergesort")]
+    cells, scale, apart = cells_for(place.shape[0]), per_metre(ONE_TREE), 0
+    for k in range(n):
+        c = rows[k]
+        if nearest_in(cells, place, place[c, 0], place[c, 1], ONE_TREE, scale) < 0:
+            put_in(cells, place, c, scale)
+            rows[apart] = c
+            apart += 1
+    best: Int = rows[:apart].copy()
     return best
 
 
-def assign_verdicts(tracks: TrackTable, columns: Columns, trees: Int, due: Bool) -> Int:
+@compiled_borrowing
+def _learn(
+    rows: Rows,
+    count: int,
+    sight: Sight,
+    cells: Cells,
+    scale: float,
+    place: Float,
+    verdict: Int32,
+    due_reach: float,
+) -> None:
     """Give every track the verdict of what stands at its place.
 
-    Each tree column makes one track a tree, the one with most hits in reach. A track that no column
-    is near to keeps what it was, but a tree does not beside a column of something else; where its column is
-    overdue, nothing upright stands there, and its hits alone make it no tree.
+    A track that no column is near to keeps what it was, but a tree does not beside a column of something
+    else; where its column is overdue, or it is out of sight, nothing upright stands there, and its hits alone
+    make it no tree.
+    """
+    for t in range(count):
+        x, y, known = rows.x[t, 0], rows.x[t, 1], rows.verdict[t]
+        near = nearest_in(cells, place, x, y, BESIDE, scale)
+        told = np.int64(verdict[near]) if near >= 0 else known
+        if near >= 0 and (place[near, 0] - x) ** 2 + (place[near, 1] - y) ** 2 < REACH * REACH:
+            rows.verdict[t] = OTHER if told == TREE else told  # another track is that tree, unless told below
+        elif known == TREE and near >= 0 and told != TREE:
+            rows.verdict[t] = told
+        elif known < 0 and (
+            _is_due(rows, t, sight, due_reach)
+            or _is_out_of_sight(rows.first_ns[t], rows.stamp_ns[t], sight.stamp_ns)
+        ):
+            rows.verdict[t] = OTHER
 
-    Args:
-        tracks: Changed in place.
-        columns: All of them; trees: rows of those that are trees, best first.
-        due: shape (T,): which tracks would have a column by now if they were trees, or be in sight.
+
+@compiled_within
+def _is_due(rows: Rows, t: int, sight: Sight, reach: float) -> bool:
+    """Whether a track would have a column by now if it were a tree."""
+    dx, dy = rows.x[t, 0] - sight.pose[0], rows.x[t, 1] - sight.pose[1]
+    return bool(dx * dx + dy * dy < reach * reach and sight.stamp_ns - rows.first_ns[t] >= DUE_NS)
+
+
+@compiled_within
+def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
+    """Whether a track has not been seen for longer than it had been seen, as who walked on has not. At least
+    a second and at most as long as a column takes; what was last seen long ago is of another drive, or was
+    put back by a loop, and nobody walked there."""
+    unseen = now_ns - last_ns
+    return min(max(last_ns - first_ns, GLIMPSE_NS), DUE_NS) < unseen < FORMER_NS
+
+
+@compiled
+def _with_tree(rows: Rows, count: int, place: Float, trees: Int) -> Int:
+    """Make one track of each tree column a tree, the free one in reach that has most hits, the first of
+    equals; the best columns choose first.
 
     Returns:
         Places in `trees` of those without a track.
     """
-    return _assigned(
-        tracks.x, tracks.hits, tracks.verdict, columns.axis, columns.verdict, trees, due, REACH, BESIDE
-    )  # fmt: skip
-
-
-@compiled
-def _assigned(
-    x: Float,
-    hits: Int,
-    verdict: Int,
-    axis: Float,
-    of_column: Int32,
-    trees: Int,
-    due: Bool,
-    reach: float,
-    beside: float,
-) -> Int:
-    nearest, farther = nearest_other(x, axis, reach), nearest_other(x, axis, beside)
-    for t in range(x.shape[0]):
-        if nearest[t] >= 0:
-            told = np.int64(of_column[nearest[t]])
-            # Another track is that tree, unless told below.
-            verdict[t] = OTHER if told == TREE else told
-        elif verdict[t] == TREE and farther[t] >= 0 and of_column[farther[t]] != TREE:
-            verdict[t] = of_column[farther[t]]
-        elif due[t] and verdict[t] < 0:
-            verdict[t] = OTHER
-    place = np.empty((trees.shape[0], 2))
+    taken, fresh, n = np.zeros(count, np.bool_), np.empty(trees.shape[0], np.int64), 0
+    cells, scale = cells_for(count), per_metre(REACH)
+    fill(cells, rows.x, count, scale)
+    at = np.empty(trees.shape[0], np.int64)
     for k in range(trees.shape[0]):
-        place[k, 0], place[k, 1] = axis[trees[k], 0], axis[trees[k], 1]
-    track_of = _track_of(place, x, hits, reach)
+        c = trees[k]
+        at[k] = _most_seen(rows, taken, cells, scale, place[c, 0], place[c, 1])
+        if at[k] >= 0:
+            taken[at[k]] = True
+        else:
+            fresh[n] = k
+            n += 1
     for k in range(trees.shape[0]):
-        t = track_of[k]
+        t, c = at[k], trees[k]
         if t < 0:
             continue
-        verdict[t] = TREE
-        if hits[t] == 0:  # what no scan has measured stands where what was gathered stands
-            x[t, 0], x[t, 1] = place[k, 0], place[k, 1]
-    return np.flatnonzero(track_of < 0)
+        rows.verdict[t] = TREE
+        if rows.hits[t] == 0:  # what no scan has measured stands where what was gathered stands
+            rows.x[t, 0], rows.x[t, 1] = place[c, 0], place[c, 1]
+    found: Int = fresh[:n].copy()
+    return found
+
+
+@compiled_within
+def _most_seen(rows: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
+    u, v = first_of_four(x, y, scale)
+    most, best = np.int64(-1), np.int64(-1)
+    for quarter in range(4):
+        t = np.int64(cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))])
+        while t >= 0:
+            dx, dy = x - rows.x[t, 0], y - rows.x[t, 1]
+            more = rows.hits[t] > most or (rows.hits[t] == most and t < best)
+            if more and not taken[t] and dx * dx + dy * dy < REACH * REACH:
+                most, best = rows.hits[t], t
+            t = np.int64(cells.following[t])
+    return int(best)
 
 
 @compiled
-def _apart(place: Float, distance: float) -> Bool:
-    """Which places are not within a distance of an earlier one that is kept, shape (N,)."""
-    kept = np.zeros(place.shape[0], np.bool_)
-    for a in range(place.shape[0]):
-        kept[a] = True
-        for b in range(a):
-            dx, dy = place[a, 0] - place[b, 0], place[a, 1] - place[b, 1]
-            if kept[b] and dx * dx + dy * dy < distance * distance:
-                kept[a] = False
-                break
-    return kept
+def _begin_at(
+    rows: Rows, count: int, number: int, sight: Sight, place: Float, trees: Int, velocity_sigma: float
+) -> None:
+    """Begin the tracks of tree columns, by their rows."""
+    z, R = np.empty((trees.shape[0], 2)), np.zeros((trees.shape[0], 2, 2))
+    B = np.empty((trees.shape[0], 2, 2))
+    for k in range(trees.shape[0]):
+        z[k, 0], z[k, 1] = place[trees[k], 0], place[trees[k], 1]
+        R[k, 0, 0] = R[k, 1, 1] = GATHERED_SIGMA * GATHERED_SIGMA
+        xx, xy, yy = by_pose(z[k, 0] - sight.pose[0], z[k, 1] - sight.pose[1], sight.covariance)
+        B[k, 0, 0], B[k, 0, 1], B[k, 1, 0], B[k, 1, 1] = xx, xy, xy, yy
+    begin(rows, count, number, sight.stamp_ns, z, R, B, velocity_sigma)
+    for k in range(trees.shape[0]):
+        rows.verdict[count + k] = TREE
 
 
 @compiled
 def nearest_other(place: Float, other: Float, reach: float) -> Int:
     """The nearest other place to each, the first of equals; -1 where none is in reach; shape (N,)."""
-    nearest = np.full(place.shape[0], -1, np.int64)
-    order, along = _from_left(other)
+    nearest = np.empty(place.shape[0], np.int64)
+    cells, scale = cells_for(other.shape[0]), per_metre(reach)
+    fill(cells, other, other.shape[0], scale)
     for a in range(place.shape[0]):
-        best = reach * reach
-        for k in range(np.searchsorted(along, place[a, 0] - reach), along.shape[0]):
-            b = order[k]
-            dx, dy = place[a, 0] - other[b, 0], place[a, 1] - other[b, 1]
-            if -dx > reach:
-                break
-            d = dx * dx + dy * dy
-            if d < best or (d == best and b < nearest[a]):
-                best, nearest[a] = d, b
+        nearest[a] = nearest_in(cells, other, place[a, 0], place[a, 1], reach, scale)
     return nearest
-
-
-@compiled
-def _track_of(place: Float, track: Float, hits: Int, reach: float) -> Int:
-    """The free track in reach of each place that has most hits, the first of equals, -1 for none; earlier
-    places choose first."""
-    track_of = np.full(place.shape[0], -1, np.int64)
-    taken = np.zeros(track.shape[0], np.bool_)
-    order, along = _from_left(track)
-    for a in range(place.shape[0]):
-        most = np.int64(-1)
-        for k in range(np.searchsorted(along, place[a, 0] - reach), along.shape[0]):
-            b = order[k]
-            dx, dy = place[a, 0] - track[b, 0], place[a, 1] - track[b, 1]
-            if -dx > reach:
-                break
-            more = hits[b] > most or (hits[b] == most and b < track_of[a])
-            if not taken[b] and more and dx * dx + dy * dy < reach * reach:
-                most, track_of[a] = hits[b], b
-        if track_of[a] >= 0:
-            taken[track_of[a]] = True
-    return track_of
-
-
-@compiled
-def _from_left(place: Float) -> tuple[Int, Float]:
-    """Rows by their x, and these, so that only those near to a place are looked at."""
-    along = np.empty(place.shape[0])
-    for k in range(place.shape[0]):
-        along[k] = place[k, 0]
-    order = np.argsort(along)
-    return order, along[order]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing
 from pipeline.geometry import Float
 from pipeline.records import Int
 
@@ -37,17 +37,31 @@ def process_noise(dt: float, acceleration_sigma: float) -> Float:
 
 
 @compiled
-def _update_rows_compiled(
+def update_rows(
     x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
 ) -> None:
-    K, M = np.empty((4, 2)), np.empty((4, 4))
+    _update_rows(x, P, rows, dt, acceleration_sigma, z, R, np.empty((4, 2)), np.empty((4, 4)))
+
+
+@compiled_borrowing
+def _update_rows(
+    x: Float,
+    P: Float,
+    rows: Int,
+    dt: Float,
+    acceleration_sigma: float,
+    z: Float,
+    R: Float,
+    K: Float,
+    M: Float,
+) -> None:
     for k in range(rows.shape[0]):
         row = rows[k]
         _predict(x[row], P[row], dt[k], acceleration_sigma)
         _correct(x[row], P[row], z[k], R[k], K, M)
 
 
-@compiled
+@compiled_borrowing
 def _predict(x: Float, P: Float, dt: float, acceleration_sigma: float) -> None:
     """x = F x, P = F P F^T + Q in place: velocities times dt come to the positions."""
     for a in range(2):
@@ -65,7 +79,7 @@ def _predict(x: Float, P: Float, dt: float, acceleration_sigma: float) -> None:
         P[a + 2, a + 2] += dt * dt * q
 
 
-@compiled
+@compiled_borrowing
 def _correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None:
     """x = x + K y, P = (I - K H) P (I - K H)^T + K R K^T in place; K (4, 2) and M (4, 4) are room.
 
@@ -96,15 +110,30 @@ def expected_positions(
     what it shares with the pose that looks for it is no reason to look farther. Of the pose's error in a
     single view, a part is of that view alone, so of `hits` views one part in so many counts."""
     place, spread = np.empty((x.shape[0], 2)), np.empty((x.shape[0], 3))
+    _expect(x, P, shared, hits, stamp_ns, now_ns, acceleration_sigma, place, spread)
+    return place, spread
+
+
+@compiled_borrowing
+def _expect(
+    x: Float,
+    P: Float,
+    shared: Float,
+    hits: Int,
+    stamp_ns: Int,
+    now_ns: int,
+    acceleration_sigma: float,
+    place: Float,
+    spread: Float,
+) -> None:
     for t in range(x.shape[0]):
         dt = (now_ns - stamp_ns[t]) * 1e-9
         noise = 0.25 * dt**4 * acceleration_sigma * acceleration_sigma
         place[t, 0], place[t, 1] = x[t, 0] + dt * x[t, 2], x[t, 1] + dt * x[t, 3]
-        C, B = P[t], shared[t] * (1.0 - 1.0 / max(hits[t], 1))
-        spread[t, 0] = C[0, 0] - B[0, 0] + dt * (C[0, 2] + C[2, 0]) + dt * dt * C[2, 2] + noise
-        spread[t, 1] = C[0, 1] - B[0, 1] + dt * (C[0, 3] + C[2, 1]) + dt * dt * C[2, 3]
-        spread[t, 2] = C[1, 1] - B[1, 1] + dt * (C[1, 3] + C[3, 1]) + dt * dt * C[3, 3] + noise
-    return place, spread
+        C, B, part = P[t], shared[t], 1.0 - 1.0 / max(hits[t], 1)
+        spread[t, 0] = C[0, 0] - part * B[0, 0] + dt * (C[0, 2] + C[2, 0]) + dt * dt * C[2, 2] + noise
+        spread[t, 1] = C[0, 1] - part * B[0, 1] + dt * (C[0, 3] + C[2, 1]) + dt * dt * C[2, 3]
+        spread[t, 2] = C[1, 1] - part * B[1, 1] + dt * (C[1, 3] + C[3, 1]) + dt * dt * C[3, 3] + noise
 
 
 def _update_rows_filterpy(
@@ -121,4 +150,5 @@ def _update_rows_filterpy(
 
 # x (T, 4), P (T, 4, 4), rows (D,), dt (D,) [s], acceleration sigma [m/s^2], z (D, 2) [m], R (D, 2, 2)
 UpdateRows = Callable[[Float, Float, Int, Float, float, Float, Float], None]
-ENGINES: dict[str, UpdateRows] = {"compiled": _update_rows_compiled, "filterpy": _update_rows_filterpy}
+COMPILED = "compiled"
+ENGINES: dict[str, UpdateRows] = {COMPILED: update_rows, "filterpy": _update_rows_filterpy}

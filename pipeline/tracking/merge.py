@@ -4,81 +4,67 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.cells import cell_of, cells_for, fill, first_of_four, per_metre
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.records import Bool, Int, Verdict
+from pipeline.records import Bool, Verdict
 from pipeline.tracking.shared import split
-from pipeline.tracking.table import TrackTable
-
-# Of a table, all that a merged row is made of; numbers stay.
-_Columns = tuple[
-    Float, Float, Float, Int, Int, Int, Float, Float, Int, Float, Float, Float, Float, Int, Int, Int
-]  # fmt: skip
-
-
-def merge_near(tracks: TrackTable, touched: Bool, radius: float) -> TrackTable:
-    """Join every touched tree with older ones within the radius; the older number stays.
-
-    Args:
-        tracks: Rows in the order of their numbers.
-        touched: shape (T,): trees that moved; two that rest cannot come nearer.
-        radius: [m].
-    """
-    if radius <= 0.0:
-        return tracks
-    alive = _merge(_columns(tracks), touched, radius)
-    return tracks if alive.all() else tracks.take(alive)
-
-
-def join(tracks: TrackTable, old: int, young: int) -> None:
-    """Add to a tree, by its row, what is known of another row of the same tree, which is left as it is."""
-    _join(_columns(tracks), old, young)
-
-
-def _columns(t: TrackTable) -> _Columns:
-    return (
-        t.x, t.P, t.shared, t.stamp_ns, t.first_ns, t.hits, t.score, t.eccentricity, t.eccentricities,
-        t.radius, t.radius_weight, t.radius_reach, t.radius_above, t.radii, t.sides, t.verdict,
-    )  # fmt: skip
+from pipeline.tracking.table import Rows, TrackTable
 
 
 @compiled
-def _merge(columns: _Columns, touched: Bool, radius: float) -> Bool:
-    """Which rows are still trees of their own, shape (T,)."""
+def merge_near(rows: Rows, touched: Bool, radius: float) -> Bool:
+    """Join every touched tree with older ones within the radius; the older number stays.
+
+    Args:
+        rows: In the order of their numbers; the joined ones change in place.
+        touched: shape (T,), of the first rows: trees that moved; two that rest cannot come nearer.
+        radius: [m]; 0 joins nothing.
+
+    Returns:
+        Which rows are still trees of their own, shape (T,).
+    """
     alive = np.ones(touched.shape[0], np.bool_)
-    while _is_any_near(columns[0], touched, alive, radius):
-        old, young = _first_pair(columns[0], touched, alive, radius)
-        _join(columns, old, young)
+    while radius > 0.0 and _is_any_near(rows.x, touched, alive, radius):
+        old, young = _first_pair(rows.x, touched, alive, radius)
+        _join(rows, old, young)
         alive[young] = False
         touched[old] = True
     return alive
 
 
+def join(tracks: TrackTable, old: int, young: int) -> None:
+    """Add to a tree, by its row, what is known of another row of the same tree, which is left as it is."""
+    _join(tracks.as_rows(), old, young)
+
+
 @compiled
 def _is_any_near(x: Float, touched: Bool, alive: Bool, radius: float) -> bool:
-    """Whether `_first_pair` finds any: from left to right each tree is held to the next ones alone."""
-    along = x[:, 0].copy()
-    order = np.argsort(along)
-    for a in range(order.shape[0]):
-        i = order[a]
-        for b in range(a + 1, order.shape[0]):
-            j = order[b]
-            dx, dy = along[j] - along[i], x[j, 1] - x[i, 1]
-            if not dx < radius:
-                break
-            near = dx * dx + dy * dy < radius * radius
-            if near and alive[i] and alive[j] and (touched[i] or touched[j]):
-                return True
+    """Whether `_first_pair` finds any."""
+    trees = touched.shape[0]
+    cells, scale = cells_for(trees), per_metre(radius)
+    fill(cells, x, trees, scale)
+    for i in range(trees):
+        if not (touched[i] and alive[i]):
+            continue
+        u, v = first_of_four(x[i, 0], x[i, 1], scale)
+        for quarter in range(4):
+            j = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+            while j >= 0:
+                dx, dy = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1]
+                if j != i and alive[j] and dx * dx + dy * dy < radius * radius:
+                    return True
+                j = cells.following[j]
     return False
 
 
 @compiled
 def _first_pair(x: Float, touched: Bool, alive: Bool, radius: float) -> tuple[int, int]:
     """Rows of two trees nearer than the radius, one of which was touched, the first of all."""
-    for i in range(x.shape[0]):
+    for i in range(touched.shape[0]):
         if not (touched[i] and alive[i]):
             continue
-        for j in range(x.shape[0]):
+        for j in range(touched.shape[0]):
             dx, dy = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1]
             # One before it that was touched has looked at this one already.
             near = dx * dx + dy * dy < radius * radius
@@ -88,9 +74,9 @@ def _first_pair(x: Float, touched: Bool, alive: Bool, radius: float) -> tuple[in
 
 
 @compiled
-def _join(columns: _Columns, old: int, young: int) -> None:
-    x, P, shared, stamp_ns, first_ns, hits, score, eccentricity, eccentricities = columns[:9]
-    radius, radius_weight, radius_reach, radius_above, radii, sides, verdict = columns[9:]
+def _join(rows: Rows, old: int, young: int) -> None:
+    x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
+    hits, score, sides, verdict = rows.hits, rows.score, rows.sides, rows.verdict
     # Two halves of one trunk in one scan; a tree that only its column tells of has no view to take off.
     if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
         hits[old] -= 1
@@ -109,13 +95,10 @@ def _join(columns: _Columns, old: int, young: int) -> None:
     if verdict[young] == Verdict.TREE or verdict[old] < 0:
         verdict[old] = verdict[young]
     hits[old] += hits[young]
-    eccentricity[old] += eccentricity[young]
-    eccentricities[old] += eccentricities[young]
-    radius[old] += radius[young]
-    radius_weight[old] += radius_weight[young]
-    radius_reach[old] += radius_reach[young]
-    radius_above[old] += radius_above[young]
-    radii[old] += radii[young]
+    for total in (rows.eccentricity, rows.radius, rows.radius_weight, rows.radius_reach, rows.radius_above):
+        total[old] += total[young]
+    for number in (rows.eccentricities, rows.radii):
+        number[old] += number[young]
 
 
 @compiled

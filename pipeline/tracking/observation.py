@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing, compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Bool, Int, Verdict
+from pipeline.tracking.table import Rows
 
 SECTORS = 36  # of 10 degrees around a trunk, kept as bits: which sides were seen
+WIDTH = 2.0 * np.pi / SECTORS  # rad
+ALL_SIDES = (1 << SECTORS) - 1
 DBH_OBSERVATIONS = 3  # fewer radii are no diameter yet
 TAPER = 0.005  # of the radius per metre of height; stems of pine and spruce lose 0.3 to 0.7 cm a metre
 # Below breast height stems swell to their roots: in two scanned plots radii grow by 1.5 to 2 cm a metre
@@ -21,7 +26,7 @@ EDGE, UNEVEN = 0.0003, 0.0005
 NEAREST = 1.0  # m; a trunk nearer than this counts no more
 
 
-@compiled
+@compiled_borrowing
 def add_observations(
     rows: Int,
     place: Float,
@@ -77,7 +82,7 @@ def add_observations(
         sides[t] |= seen_sides(bearing, arc[d])
 
 
-@compiled
+@compiled_borrowing
 def seen_sides(from_bearing: float, arc: float) -> np.int64:
     """Bits of the sectors around a trunk that a view from a direction shows.
 
@@ -85,34 +90,64 @@ def seen_sides(from_bearing: float, arc: float) -> np.int64:
         from_bearing: Direction from the trunk to the sensor, frame of the map [rad].
         arc: Visible arc around that direction [rad].
     """
-    step = 2.0 * np.pi / SECTORS
-    bits = np.int64(0)
-    first = int(np.ceil((from_bearing - arc / 2) / step - 1e-9))
-    last = int(np.floor((from_bearing + arc / 2) / step + 1e-9))
-    for k in range(first, min(last, first + SECTORS)):  # a sector counts when all of it was seen
-        bits |= np.int64(1) << np.int64(k % SECTORS)
-    return bits
+    first = int(np.ceil((from_bearing - arc / 2) / WIDTH - 1e-9))
+    last = int(np.floor((from_bearing + arc / 2) / WIDTH + 1e-9))
+    count, begin = max(min(last - first, SECTORS), 0), first % SECTORS  # whole sectors were seen alone
+    run = (np.int64(1) << np.int64(count)) - np.int64(1)
+    return ((run << np.int64(begin)) | (run >> np.int64(SECTORS - begin))) & ALL_SIDES
+
+
+class Telling(NamedTuple):
+    """Of the parameters `Tracking`: what the figures of a tree hang on."""
+
+    hits_to_confirm: int
+    dbh_arc_min: float
+    out_of_round: float
+    taper_sigma: float
 
 
 @compiled
-def table_figures(
-    sides: Int,
-    radii: Int,
-    radius: Float,
-    radius_weight: Float,
-    radius_reach: Float,
-    radius_above: Float,
-    eccentricity: Float,
-    eccentricities: Int,
-    verdict: Int,
-    hits: Int,
-    hits_to_confirm: int,
-    dbh_arc_min: float,
-    out_of_round: float,
-    taper_sigma: float,
-) -> tuple[Float, Float, Float, Float, Bool]:
+def table_figures(rows: Rows, telling: Telling) -> tuple[Float, Float, Float, Float, Bool]:
     """Coverage [rad], DBH and its sigma [m], mean eccentricity, and which trees are confirmed, each of
-    shape (T,), from the columns of a `TrackTable`; NaN for what was not told.
+    shape (T,), from the columns of a `TrackTable`; NaN for what was not told."""
+    T = rows.sides.shape[0]
+    coverage, dbh, dbh_sigma, mean = np.empty(T), np.empty(T), np.empty(T), np.full(T, np.nan)
+    confirmed = np.empty(T, np.bool_)
+    _figure(rows, telling, coverage, dbh, dbh_sigma, mean, confirmed)
+    return coverage, dbh, dbh_sigma, mean, confirmed
+
+
+@compiled_borrowing
+def _figure(
+    rows: Rows, telling: Telling, coverage: Float, dbh: Float, dbh_sigma: Float, mean: Float, confirmed: Bool
+) -> None:
+    for t in range(rows.sides.shape[0]):
+        coverage[t] = sides_of(rows.sides[t]) * WIDTH
+        dbh[t], dbh_sigma[t] = diameter(rows, t, coverage[t], telling)
+        if rows.eccentricities[t] > 0:
+            mean[t] = rows.eccentricity[t] / rows.eccentricities[t]
+        confirmed[t] = is_confirmed(rows.verdict[t], rows.hits[t], telling)
+
+
+@compiled_borrowing
+def sides_of(bits: int) -> int:
+    """How many sectors of a trunk were seen."""
+    seen = 0
+    while bits:
+        bits &= bits - 1  # takes the lowest bit away
+        seen += 1
+    return seen
+
+
+@compiled_within
+def is_confirmed(verdict: int, hits: int, telling: Telling) -> bool:
+    """Whether a track is a tree: by what was gathered where that tells anything, else by its hits."""
+    return bool(verdict == Verdict.TREE if verdict >= 0 else hits >= telling.hits_to_confirm)
+
+
+@compiled_within
+def diameter(rows: Rows, t: int, coverage: float, telling: Telling) -> tuple[float, float]:
+    """DBH and its sigma [m] of the tree of a row, NaN where too little of it was seen.
 
     The sigma of a diameter D of n views at distances r, of a mean height |h| above or below breast height:
 
@@ -121,23 +156,11 @@ def table_figures(
     The last three do not shrink with n: all views of one tree share its edges, its shape and its butt. What
     the views weigh by their height widens sigma_views too, so that it is told rather too large.
     """
-    T = sides.shape[0]
-    coverage, dbh, dbh_sigma, mean = np.empty(T), np.full(T, np.nan), np.full(T, np.nan), np.full(T, np.nan)
-    confirmed = np.empty(T, np.bool_)
-    for t in range(T):
-        left, seen = sides[t], 0
-        while left:
-            left &= left - 1  # takes the lowest bit away
-            seen += 1
-        coverage[t] = seen * (2.0 * np.pi / SECTORS)
-        if radii[t] >= DBH_OBSERVATIONS and coverage[t] >= dbh_arc_min - 1e-9:
-            weight = radius_weight[t]
-            reach, above = radius_reach[t] / weight, radius_above[t] / weight
-            dbh[t] = 2.0 * radius[t] / weight
-            views = 1.0 / (weight * reach * reach) + (EDGE * reach + UNEVEN) ** 2
-            stem = (out_of_round * dbh[t]) ** 2 + (taper_sigma * above) ** 2
-            dbh_sigma[t] = np.sqrt(4.0 * views + stem)
-        if eccentricities[t] > 0:
-            mean[t] = eccentricity[t] / eccentricities[t]
-        confirmed[t] = verdict[t] == Verdict.TREE if verdict[t] >= 0 else hits[t] >= hits_to_confirm
-    return coverage, dbh, dbh_sigma, mean, confirmed
+    if not (rows.radii[t] >= DBH_OBSERVATIONS and coverage >= telling.dbh_arc_min - 1e-9):
+        return np.nan, np.nan
+    weight = rows.radius_weight[t]
+    reach, above = rows.radius_reach[t] / weight, rows.radius_above[t] / weight
+    dbh = 2.0 * rows.radius[t] / weight
+    views = 1.0 / (weight * reach * reach) + (EDGE * reach + UNEVEN) ** 2
+    stem = (telling.out_of_round * dbh) ** 2 + (telling.taper_sigma * above) ** 2
+    return dbh, np.sqrt(4.0 * views + stem)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing
 from pipeline.geometry import Float
 from pipeline.records import Int
 
@@ -39,7 +39,24 @@ def split(
         P2 of each measurement, shape (D, 2, 2).
     """
     P2 = R.copy()
-    own, P1, S = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2))
+    room = np.empty((3, 2, 2))
+    _split(P, shared, rows, R, B, dt, acceleration_sigma, P2, room)
+    return P2
+
+
+@compiled_borrowing
+def _split(
+    P: Float,
+    shared: Float,
+    rows: Int,
+    R: Float,
+    B: Float,
+    dt: Float,
+    acceleration_sigma: float,
+    P2: Float,
+    room: Float,
+) -> None:
+    own, P1, S = room[0], room[1], room[2]
     for d in range(rows.shape[0]):
         t = rows[d]
         noise = 0.25 * dt[d] ** 4 * acceleration_sigma * acceleration_sigma
@@ -55,10 +72,9 @@ def split(
                 P2[d, a, b] += B[d, a, b] / (1.0 - w)
                 S[a, b] = P1[a, b] + P2[d, a, b]
         _share(shared[t], P1, S, w, B[d])
-    return P2
 
 
-@compiled
+@compiled_borrowing
 def _share(shared: Float, P1: Float, S: Float, w: float, B: Float) -> None:
     """(I - K) P_shared / w (I - K)^T + K B / (1 - w) K^T in place, with K = P1 S^-1."""
     det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
@@ -77,7 +93,7 @@ def _share(shared: Float, P1: Float, S: Float, w: float, B: Float) -> None:
     shared[0, 1] = shared[1, 0] = sxy / w + bxy / v
 
 
-@compiled
+@compiled_borrowing
 def _turned(
     a: float, b: float, c: float, d: float, xx: float, xy: float, yy: float
 ) -> tuple[float, float, float]:
@@ -89,12 +105,12 @@ def _turned(
     )
 
 
-@compiled
+@compiled_borrowing
 def _mean(C: Float) -> float:
     return float(0.5 * (C[0, 0] + C[1, 1]))
 
 
-@compiled
+@compiled_borrowing
 def weight(own: float, shared: float, R: float, B: float) -> float:
     """The w that makes the joined variance least, in closed form for variances; any other is right too."""
     if shared < NOTHING and B < NOTHING:

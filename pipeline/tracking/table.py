@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.compiled import compiled_borrowing
 from pipeline.geometry import Float
-from pipeline.records import Int
+from pipeline.records import Bool, Int
 
 
 @dataclass(slots=True, eq=False)
@@ -77,17 +79,114 @@ class TrackTable:
         """An independent copy."""
         return TrackTable(*(getattr(self, f.name).copy() for f in fields(self)))
 
-    def take(self, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> TrackTable:
+    def take(self, rows: Bool) -> TrackTable:
         """The rows where the mask holds."""
         return TrackTable(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def with_score(self) -> TrackTable:
-        """The rows that have any score left; itself where all have."""
-        standing = self.score > 0.0
-        return self if standing.all() else self.take(standing)
 
     def extended(self, more: TrackTable) -> TrackTable:
         """These rows and then the others."""
         return TrackTable(
             *(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self))
         )
+
+    def as_rows(self) -> Rows:
+        """The same columns."""
+        return Rows(*(getattr(self, f.name) for f in fields(self)))
+
+    def with_room(self, room: int) -> Rows:
+        """A copy with room for so many rows, at least as many as there are."""
+        rows = self.as_rows()
+        wide = Rows(*(np.empty((room, *column.shape[1:]), column.dtype) for column in rows))
+        for into, column in zip(wide, rows, strict=True):
+            into[: len(self)] = column
+        return wide
+
+
+class Rows(NamedTuple):
+    """The columns of a `TrackTable`, of which the first rows are trees and the others room for more."""
+
+    number: Int
+    x: Float
+    P: Float
+    shared: Float
+    stamp_ns: Int
+    first_ns: Int
+    hits: Int
+    score: Float
+    eccentricity: Float
+    eccentricities: Int
+    radius: Float
+    radius_weight: Float
+    radius_reach: Float
+    radius_above: Float
+    radii: Int
+    sides: Int
+    verdict: Int
+
+    def first(self, count: int) -> TrackTable:
+        """So many rows, which are not copied."""
+        return TrackTable(**{name: column[:count] for name, column in self._asdict().items()})
+
+
+@compiled_borrowing
+def begin(
+    rows: Rows,
+    count: int,
+    number: int,
+    stamp_ns: int,
+    z: Float,
+    R: Float,
+    B: Float,
+    velocity_sigma: float,
+) -> None:
+    """New trees behind the first rows, for which there is room, none of them seen yet.
+
+    Args:
+        number: Of the first one.
+        z: Places, shape (K, 2) [m]; R: their own covariances, shape (K, 2, 2); B: what the pose adds.
+    """
+    for k in range(z.shape[0]):
+        t = count + k
+        rows.number[t] = number + k
+        rows.x[t, 0], rows.x[t, 1], rows.x[t, 2], rows.x[t, 3] = z[k, 0], z[k, 1], 0.0, 0.0
+        for a in range(4):
+            for b in range(4):
+                rows.P[t, a, b] = 0.0
+        for a in range(2):
+            for b in range(2):
+                rows.P[t, a, b] = R[k, a, b] + B[k, a, b]
+                rows.shared[t, a, b] = B[k, a, b]
+        rows.P[t, 2, 2] = rows.P[t, 3, 3] = velocity_sigma**2
+        rows.stamp_ns[t] = rows.first_ns[t] = stamp_ns
+        rows.hits[t], rows.score[t] = 0, 1.0
+        rows.eccentricity[t], rows.eccentricities[t] = 0.0, 0
+        rows.radius[t], rows.radius_weight[t], rows.radius_reach[t] = 0.0, 0.0, 0.0
+        rows.radius_above[t], rows.radii[t] = 0.0, 0
+        rows.sides[t], rows.verdict[t] = 0, -1
+
+
+@compiled_borrowing
+def keep(rows: Rows, kept: Bool) -> int:
+    """Let the kept ones of the first rows, shape (T,), move together in their order; returns their number."""
+    n = 0
+    for t in range(kept.shape[0]):
+        if not kept[t]:
+            continue
+        if n < t:
+            rows.number[n] = rows.number[t]
+            for a in range(4):
+                rows.x[n, a] = rows.x[t, a]
+                for b in range(4):
+                    rows.P[n, a, b] = rows.P[t, a, b]
+            for a in range(2):
+                for b in range(2):
+                    rows.shared[n, a, b] = rows.shared[t, a, b]
+            rows.stamp_ns[n], rows.first_ns[n] = rows.stamp_ns[t], rows.first_ns[t]
+            rows.hits[n], rows.score[n] = rows.hits[t], rows.score[t]
+            rows.eccentricity[n], rows.eccentricities[n] = rows.eccentricity[t], rows.eccentricities[t]
+            rows.radius[n], rows.radius_weight[n] = rows.radius[t], rows.radius_weight[t]
+            rows.radius_reach[n], rows.radius_above[n] = rows.radius_reach[t], rows.radius_above[t]
+            rows.radii[n], rows.sides[n] = rows.radii[t], rows.sides[t]
+            rows.verdict[n] = rows.verdict[t]
+        n += 1
+    return n

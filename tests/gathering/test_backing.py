@@ -16,10 +16,11 @@ from pipeline.gathering.gathering import no_columns
 from pipeline.parameters import preset
 from pipeline.records import Verdict
 from pipeline.tracking import Tracker
-from pipeline.tracking.backing import FITS, REACH, SIDES, backed
+from pipeline.tracking.backing import FITS, REACH, SIDES
 from pipeline.tracking.table import TrackTable
 from tests.pipeline.strategies import LAW
 
+FOREST = preset("forest")
 PLACE = np.array([3.0, -2.0])
 
 
@@ -46,7 +47,10 @@ def track(*, sides=SIDES, fits=FITS, off=0.0):
 
 
 def verdict(columns, tracks, share=0.4):
-    return Verdict(int(backed(columns, tracks, share).verdict[0]))
+    tracker = Tracker(FOREST.tracking)
+    tracker.tracks = tracks
+    judged = tracker.judge(1, columns, FOREST.gathering.model_copy(update={"tree_share": share}))
+    return Verdict(int(judged.verdict[0]))
 
 
 def test_a_trunk_among_shrubs_is_a_tree_when_it_is_round_from_most_sides():
@@ -109,8 +113,8 @@ def test_no_tree_is_lost_and_more_votes_for_a_tree_never_harm(tree, more, needed
 
 
 def test_the_tracker_shows_the_tree_and_says_so_of_the_column():
-    tracker = Tracker(preset("forest").tracking)
+    tracker = Tracker(FOREST.tracking)
     tracker.tracks = track()
-    columns = tracker.judge(1, column(tree=0.3), preset("forest").gathering)
+    columns = tracker.judge(1, column(tree=0.3), FOREST.gathering)
     assert columns.verdict.tolist() == [Verdict.TREE]
     assert tracker.trees().confirmed.tolist() == [True]

@@ -17,7 +17,7 @@ from pipeline.parameters import preset
 from pipeline.records import Columns, Float32, Scan, Sensor, Step, Verdict
 from pipeline.terrain import SECTORS
 from pipeline.tracking import Tracker
-from pipeline.tracking.tracker import DUE_NS
+from pipeline.tracking.judging import DUE_NS
 from pipeline.visibility import BINS
 from tests.gathering.clouds import bush, trunk
 from tests.pipeline.strategies import detections

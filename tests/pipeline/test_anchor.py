@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry import Pose2
+from pipeline.parameters import preset
 from pipeline.tracking.anchor import anchor
+from pipeline.tracking.sight import Sight
 from pipeline.tracking.table import TrackTable
+from pipeline.tracking.tracker import limits_of
 
 COVARIANCE = np.array([[0.01, 0.0, 0.01]])
 SURE = np.zeros((3, 3))
@@ -20,9 +22,11 @@ def tracks(rows):
     return table
 
 
-def held(table, landmarks, reach=20.0):
+def held(table, landmarks, reach=20.0, distance_max=2.0, of_place=COVARIANCE, of_pose=SURE):
     landmarks = np.asarray(landmarks, np.float64).reshape(-1, 2)
-    anchor(table, landmarks, np.repeat(COVARIANCE, len(landmarks), 0), Pose2(), SURE, SURE, reach, 2.0, 1.0)
+    sight = Sight(0, np.zeros(3), of_pose, of_pose, np.zeros(0), reach)
+    limits = limits_of(preset("forest").tracking)._replace(distance_max=distance_max, miss=1.0)
+    anchor(table.as_rows(), len(table), sight, landmarks, np.repeat(of_place, len(landmarks), 0), limits)
     return table
 
 
@@ -57,6 +61,6 @@ def test_a_moved_tree_keeps_a_covariance_that_is_one():
     small = np.array([[1e-4, 0.0, 1e-4]])
     Sigma = 1e-6 * np.eye(3)
     tracks.P[0, :2, :2] = 1e-3 * np.eye(2)
-    anchor(tracks, np.array([[5.5, 0.0]]), small, Pose2(), Sigma, Sigma, 15.0, 1.0, 0.3)
+    held(tracks, [[5.5, 0.0]], 15.0, 1.0, small, Sigma)
     assert tracks.x[0, 0] == 5.5
     assert np.all(np.linalg.eigvalsh(tracks.P[0]) > 0.0)

@@ -55,6 +55,29 @@ def test_clear_cases_are_joined_as_the_best_of_all_assignments(seed, n):
     np.testing.assert_array_equal(row, best)
 
 
+@LAW
+@given(seeds, st.integers(0, 40), st.integers(0, 40), st.floats(0.05, 10.0), st.floats(0.3, 5.0))
+def test_every_pair_within_reach_is_weighed(seed, detections, landmarks, distance_max, gate):
+    """Against all pairs by brute force, ties by the landmark and then by the detection that comes first."""
+    rng = np.random.default_rng(seed)
+    centre, mean = (np.round(rng.uniform(-9, 9, (n, 2)), 1) for n in (detections, landmarks))
+    R, P = (np.array([[v, 0.2 * v, 1.5 * v]]) for v in (0.02, 0.3))
+    row, squared = join(centre, mean, R=R, P=P, gate=gate, distance_max=distance_max)
+    (a, b, e), pairs = (R + P)[0], []
+    for j, d in itertools.product(range(landmarks), range(detections)):
+        y0, y1 = centre[d] - mean[j]
+        d2 = (e * y0 * y0 - 2 * b * y0 * y1 + a * y1 * y1) / (a * e - b * b)
+        if y0 * y0 + y1 * y1 <= distance_max * distance_max and d2 <= gate * gate:
+            pairs.append((d2, j, d))
+    wanted, taken = np.full(detections, -1), set()
+    for d2, j, d in sorted(pairs, key=lambda pair: pair[0] + np.log(a * e - b * b)):
+        if wanted[d] < 0 and j not in taken:
+            wanted[d] = j
+            taken.add(j)
+            assert squared[d] == d2
+    assert row.tolist() == wanted.tolist()
+
+
 def test_the_likelier_landmark_is_the_surer_of_two_as_far():
     P = np.array([[0.1, 0.0, 0.1], [0.001, 0.0, 0.001]])
     row, _ = associate(np.zeros((1, 2)), SMALL, np.array([[0.05, 0.0], [-0.05, 0.0]]), P, 3.0, 1.0)

@@ -47,9 +47,10 @@ def test_who_knows_the_trees_no_better_than_the_robot_its_place_spares_none(seed
     random = np.random.default_rng(seed)
     places = random.uniform(-10.0, 10.0, (8, 2))
     at_tree = np.sqrt(sigma**2 + 0.5 * np.square(yaw) * np.square(places).sum(axis=1))
-    assert beyond_doubt(table(places, at_tree), Pose2(), pose_known(sigma, yaw), MAX, 15.0) is None
-    spared = beyond_doubt(table(places, 0.01), Pose2(), pose_known(sigma, yaw), MAX, 15.0)
-    np.testing.assert_array_equal(False if spared is None else spared, at_tree - 0.01 > 0.5 * MAX)
+    as_well, better = table(places, at_tree), table(places, 0.01)
+    assert not beyond_doubt(as_well.x, as_well.P, np.zeros(3), pose_known(sigma, yaw), MAX, 15.0).any()
+    spared = beyond_doubt(better.x, better.P, np.zeros(3), pose_known(sigma, yaw), MAX, 15.0)
+    np.testing.assert_array_equal(spared, at_tree - 0.01 > 0.5 * MAX)
 
 
 def after_misses(sigma, scans=60):

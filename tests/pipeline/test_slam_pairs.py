@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.slam.cells import cells_for, clear, fill, holds_unseen, per_metre
+from pipeline.cells import cells_for, clear, fill, holds_unseen, per_metre
 from pipeline.slam.gaussian import Pose, expected_spread, pose_of
 from pipeline.slam.pairs import likely_pairs, room_for
 

@@ -315,6 +315,14 @@ def test_coverage_is_never_more_than_the_arc_and_at_most_two_sectors_less(bearin
     assert arc - 2 * STEP - 1e-6 <= len(seen) * STEP <= arc + 1e-6
 
 
+@LAW
+@given(st.floats(-10, 10), st.floats(0, 3 * np.pi))
+def test_each_sector_is_seen_that_lies_within_the_arc(bearing, arc):
+    first = int(np.ceil((bearing - arc / 2) / STEP - 1e-9))
+    last = int(np.floor((bearing + arc / 2) / STEP + 1e-9))
+    assert sectors(bearing, arc) == {k % SECTORS for k in range(first, last)}
+
+
 def test_walking_around_a_tree_covers_it():
     t = tracker()
     trees = t.trees()

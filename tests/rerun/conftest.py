@@ -25,6 +25,6 @@ def known() -> Iterator[tuple[KeptScans, Basis]]:
             whole.take(step, looked)
         states[len(kept)] = whole.snapshot()
         path = whole.path
-        entries = journal.first(len(kept))
-        assert len(entries) == len(kept)
-        yield kept, Basis.of(BASE, entries, states, path, whole.motion)
+        notes = journal.first(len(kept))
+        assert len(notes) == len(kept)
+        yield kept, Basis.of(BASE, notes, states, path, whole.motion)

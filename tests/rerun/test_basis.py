@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
 
+from app.remapping import Told
 from pipeline.errors import StemmapError
 from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters, field_specs
-from pipeline.rerun import Basis, Journal, KeptScans, Rerun
+from pipeline.records import Frame
+from pipeline.rerun import Basis, Journal, KeptScans, Recalled, Rerun
 from pipeline.rerun.journal import FARTHEST
-from tests.rerun.mapped import BASE, mapper, run
+from tests.rerun.mapped import BASE, mapper, run, with_odd
 from tests.rerun.test_rerun import another
 
 SETS = 8
@@ -35,11 +38,22 @@ def finished(
 ) -> tuple[Rerun, object, dict[int, object]]:
     """A rerun at its end, all that its mapper knows then, and the trees after each scan."""
     rerun = Rerun(mapper(parameters), kept, None, basis)
-    trees = {f.index: told(f.trees) for f in rerun.frames(len(kept))}
+    trees: dict[int, object] = {}
+    while rerun.done < len(kept):  # scans of which the trees alone are tracked come many at once
+        trees |= {f.index: told(f.trees) for f in rerun.frames(rerun.done + 1)}
     m = rerun.mapper
     state: MapperState | None = rerun.state()
     assert state is not None
     return rerun, told((state, m.path, m.height_map)), trees
+
+
+def remembered(frames: Iterable[Frame | Recalled]) -> object:
+    """What is remembered of the trees of a run beside its map, all of it."""
+    known = Told()
+    for frame in frames:
+        known.record(frame, 0)
+    every = known.history
+    return told((every._rows[: every._count], tuple(sorted(known.confirmed_s.items())), known.time_s))
 
 
 def drawn(seed: int) -> Parameters:
@@ -65,6 +79,22 @@ def test_what_goes_on_is_what_begins_anew(seed, known):
     assert len(rerun.journal) == len(kept)
 
 
+@pytest.mark.parametrize("most", [1, 7, 1000])
+@pytest.mark.parametrize("change", [{"tracking.hits_to_confirm": 9}, {"gathering.tree_share": 0.7}])
+def test_the_same_is_remembered_of_scans_that_are_told_many_at_a_time(change, most, known, monkeypatch):
+    monkeypatch.setattr("app.story.history._MOST_ROWS", 150)
+    kept, basis = known
+    again = Rerun(mapper(BASE.replace(change)), kept, None, basis)
+    frames: list[Frame | Recalled] = []
+    while again.done < len(kept):
+        frames += again.frames(min(again.done + most, len(kept)))
+    assert len(frames) < len(kept) or most == 1
+    assert all(isinstance(frame, Recalled) for frame in frames)
+    whole = mapper(BASE.replace(change))
+    wanted = remembered(whole.process(step) for step in run()[0])
+    assert remembered(frames) == wanted
+
+
 @pytest.mark.parametrize(
     ("name", "value", "alone"),
     [
@@ -74,6 +104,7 @@ def test_what_goes_on_is_what_begins_anew(seed, known):
         ("slam.gate", 3.0, False),
         ("gathering.every", 2, False),
         ("clustering.eps", 0.2, False),
+        ("tracking.engine", "filterpy", False),
     ],
 )
 def test_trees_alone_are_tracked_where_nothing_before_them_changes(name, value, alone, known):
@@ -90,7 +121,7 @@ def test_a_journal_of_a_rerun_is_one_of_its_parameters(known):
     last = again.state()
     assert last is not None
     states = {0: mapper(first).snapshot(), len(kept): last}
-    after = replace(basis, parameters=first, entries=again.journal.first(len(kept)), states=states)
+    after = replace(basis, parameters=first, notes=again.journal.first(len(kept)), states=states)
     assert finished(second, kept, after)[1] == finished(second, kept, None)[1]
 
 
@@ -114,27 +145,28 @@ def test_a_verdict_that_changes_late_is_begun_late(known):
 
 def test_a_scan_that_hung_on_the_trees_is_mapped(known):
     kept, basis = known
-    odd = tuple(replace(e, is_usual=k != 30) for k, e in enumerate(basis.entries))
     later = BASE.replace({"tracking.gate": 2.5})
-    broken = replace(basis, entries=odd)
+    broken = with_odd(basis, np.arange(len(kept)) == 30)
     assert broken.begin(later, kept.clusters) == (28, True)
     assert finished(later, kept, broken)[1] == finished(later, kept, None)[1]
 
 
-def test_a_journal_without_room_ends_and_one_that_goes_back_is_cut(known):
+@pytest.mark.parametrize("room", [0.0, 0.13, 0.999, 1.0])
+def test_a_journal_without_room_ends_and_one_that_goes_back_is_cut(room, known):
     _, basis = known
-    journal = Journal()
-    journal.take(basis.entries)
-    size = journal.nbytes
-    journal.cut(10)
-    assert len(journal) == 10
-    assert journal.nbytes == sum(e.nbytes for e in basis.entries[:10]) < size
-    small, whole = Journal(most=60_000), mapper(BASE)
+    whole, size = mapper(BASE), basis.notes.nbytes
+    small = Journal(most=round(room * size))
     whole.note = lambda noted: small.note(noted, BASE.slam)
-    for step in run()[0][:20]:
+    for step in run()[0]:
         whole.process(step)
-    assert 0 < len(small) < 20
-    assert small.nbytes <= 60_000
+    kept = small.first(len(run()[0]))
+    assert kept.nbytes <= room * size
+    assert (len(kept) == len(basis.notes)) == (room == 1.0)
+    assert told(kept) == told(basis.notes.first(len(kept)))
+    if room == 0.13:
+        assert 0 < len(kept) < len(basis.notes)
+    small.cut(len(kept) // 2)
+    assert len(small) == len(small.first(1000)) == len(kept) // 2
 
 
 def test_no_tree_can_be_held_to_a_landmark_that_is_not_noted():

@@ -10,7 +10,7 @@ from app.abreast import abreast
 from pipeline.geometry import Pose3
 from pipeline.mapper import LOOP, Mapper
 from pipeline.parameters import Parameters, preset
-from pipeline.rerun import Basis, Journal, KeptScans, Rerun, look_key
+from pipeline.rerun import Basis, Journal, KeptScans, Recalled, Rerun, look_key
 from pipeline.rerun.rerun import in_turn
 from tests.benchmarks.wide_ring import SENSOR, WideRing
 from tests.rerun.test_basis import told
@@ -40,8 +40,8 @@ def ring():
             if closed and step.index == closed[0] + SPACING:
                 break
         states[len(kept)] = whole.snapshot()
-        path, entries = whole.path, journal.first(len(kept))
-        yield kept, Basis.of(STEMS, entries, states, path, whole.motion), closed
+        path, notes = whole.path, journal.first(len(kept))
+        yield kept, Basis.of(STEMS, notes, states, path, whole.motion), closed
 
 
 def finished(parameters: Parameters, kept: KeptScans, basis: Basis | None):
@@ -50,7 +50,7 @@ def finished(parameters: Parameters, kept: KeptScans, basis: Basis | None):
     rerun = Rerun(mapper(parameters), kept, None, basis, abreast=in_turn if basis is None else abreast)
     frames = list(rerun.frames(len(kept)))
     closed = [frame.index for frame in frames if LOOP in getattr(frame, "warnings", ())]
-    recalled = sum(not hasattr(frame, "warnings") for frame in frames)
+    recalled = sum(frame.index + 1 - frame.first for frame in frames if isinstance(frame, Recalled))
     m = rerun.mapper
     return told((m.snapshot(), m.path, m.height_map)), closed, recalled
 
@@ -59,7 +59,7 @@ def finished(parameters: Parameters, kept: KeptScans, basis: Basis | None):
 def test_the_loop_is_closed_again_by_who_goes_on_from_before_it(ring):
     kept, basis, closed = ring
     assert closed
-    assert not all(entry.is_usual for entry in basis.entries)
+    assert not basis.notes.is_usual.all()
     tried = STEMS.replace({"tracking.hits_to_confirm": 5})
     wanted, where, _ = finished(tried, kept, None)
     given, again, recalled = finished(tried, kept, basis)

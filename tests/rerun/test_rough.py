@@ -14,7 +14,7 @@ from pipeline.rerun.clusters import ClusterTable
 from pipeline.rerun.rough import MOST_PLACES, _gathered
 from pipeline.rerun.sample import MOST_SCANS
 from pipeline.saving import encode
-from tests.rerun.mapped import BASE, mapper, run
+from tests.rerun.mapped import BASE, mapper, run, ungathered, with_odd
 
 
 def share_within(place: np.ndarray, other: np.ndarray, distance: float) -> float:
@@ -40,7 +40,8 @@ def test_it_is_near_to_the_map_that_comes(change, known):
 
 def test_without_votes_enough_nothing_that_was_gathered_is_a_tree(known):
     kept, basis = known
-    columns = next(e.columns for e in reversed(basis.entries) if e.columns is not None)
+    columns = basis.notes.newest_columns()
+    assert columns is not None
     assert (columns.verdict(0.4) == Verdict.TREE).any()
     rough = rough_trees(basis, kept.clusters, BASE.replace({"gathering.tree_share": 1.0}))
     assert rough is not None
@@ -50,21 +51,21 @@ def test_without_votes_enough_nothing_that_was_gathered_is_a_tree(known):
 
 def test_hits_are_the_clusters_that_are_trees(known):
     kept, basis = known
-    ungathered = BASE.replace({"tracking.hits_to_confirm": 1, "tracking.distance_max": 0.4})
-    bare = replace(basis, entries=tuple(replace(e, columns=None) for e in basis.entries))
-    rough = rough_trees(bare, kept.clusters, ungathered)
+    parameters = BASE.replace({"tracking.hits_to_confirm": 1, "tracking.distance_max": 0.4})
+    bare = ungathered(basis)
+    rough = rough_trees(bare, kept.clusters, parameters)
     assert rough is not None
-    found = sum(len(e.detections.cluster) for e in basis.entries if e.is_usual)
+    assert basis.notes.is_usual.all()
+    found = sum(len(stretch.recorded.centre) for stretch in basis.notes.stretches)
     assert int(rough.observations.sum()) == found
 
 
 @pytest.mark.parametrize("lost", [True, False])
 def test_what_was_seen_by_a_lost_robot_is_nowhere(lost, known):
     kept, basis = known
-    entries, path = list(basis.entries), basis.path.copy()
-    for k in range(20, 40):
-        entries[k], path[k] = replace(entries[k], is_usual=not lost), (500.0, 0.0, 0.0)
-    rough = rough_trees(replace(basis, entries=tuple(entries), path=path), kept.clusters, BASE)
+    odd, path = np.zeros(len(basis.notes), np.bool_), basis.path.copy()
+    odd[20:40], path[20:40] = lost, (500.0, 0.0, 0.0)
+    rough = rough_trees(replace(with_odd(basis, odd), path=path), kept.clusters, BASE)
     assert rough is not None
     assert (rough.position[:, 0] < 300.0).any()
     assert (rough.position[:, 0] > 300.0).any() != lost
@@ -119,8 +120,7 @@ def sampled(parameters):
 def test_scans_that_are_looked_at_again_tell_of_other_clusters(change, method, known):
     kept, basis = known
     if method == "none":  # hits alone make a tree
-        bare = tuple(replace(e, columns=None) for e in basis.entries)
-        basis = replace(basis, entries=bare)
+        basis = ungathered(basis)
     parameters = BASE.replace(change)
     rough = rough_trees(basis, kept.clusters, parameters, sampled(parameters))
     assert rough is not None
@@ -168,7 +168,7 @@ def test_scans_that_show_nothing_leave_what_was_gathered_alone(known):
     assert rough is not None
     assert wanted is not None
     assert 0 < len(rough.position) <= len(wanted.position)
-    bare = replace(basis, entries=tuple(replace(e, columns=None) for e in basis.entries))
+    bare = ungathered(basis)
     rough = rough_trees(bare, kept.clusters, parameters, sampled(parameters))
     assert rough is not None
     seen = np.hypot(*(wanted.position[:, None] - rough.position[None]).transpose(2, 0, 1)) < 0.3

@@ -52,7 +52,7 @@ def run() -> list[Table]:
         held, sample, mapping, basis = _first_time(source, base, kept)
         size = kept.nbytes / max(len(kept), 1)
         scans = len(kept)
-        noted = sum(entry.nbytes for entry in basis.entries)
+        noted = basis.notes.nbytes
         rows = [_whole("mapped from its scans, without reading them", scans, mapping, None, 0, bandwidth)]
         roughly = []
         for name, value, asked in JUDGED:
@@ -130,7 +130,7 @@ def _rough(
         if sampled is not None:
             source, sample = sampled
             look = _fresh(source, parameters).looker()
-            looks = sample.looked(look, len(basis.entries), looked_at_once)
+            looks = sample.looked(look, len(basis.notes), looked_at_once)
             read = kept.clusters.nbytes + sample.nbytes
         trees = rough_trees(basis, kept.clusters, parameters, looks)
         spent = time.perf_counter() - start
@@ -173,8 +173,8 @@ def _first_time(
         if len(held) < READ_AGAIN:
             held.append(step)
     states[len(kept)] = mapper.snapshot()
-    entries, path = journal.first(len(kept)), mapper.path
-    return held, sample, spent, Basis.of(parameters, entries, states, path, mapper.motion)
+    notes, path = journal.first(len(kept)), mapper.path
+    return held, sample, spent, Basis.of(parameters, notes, states, path, mapper.motion)
 
 
 def _again(
@@ -187,14 +187,16 @@ def _again(
 ) -> float:
     """Seconds that a rerun takes; once before for the kernels, over a few scans."""
     from app.abreast import abreast
-    from app.ahead import looked_ahead
+    from app.ahead import aside, looked_ahead
     from pipeline.rerun import Rerun
 
     spent, reread = 0.0, None if held is None else lambda: iter(held)
     for most in (min(scans, 50), scans):
         gc.collect()
         start = time.perf_counter()
-        with closing(Rerun(_fresh(source, parameters), kept, reread, basis, looked_ahead, abreast)) as rerun:
+        with closing(
+            Rerun(_fresh(source, parameters), kept, reread, basis, looked_ahead, abreast, aside)
+        ) as rerun:
             for _ in rerun.frames(most):
                 pass
             spent = time.perf_counter() - start
