@@ -38,10 +38,9 @@ def compile_ahead() -> None:
 def is_compiled() -> bool:
     """Whether this machine keeps the last kernels of either half, as the sources are now."""
     from pipeline.compiled import is_kept
-    from pipeline.gathering.columns import examine
-    from pipeline.slam.scan import use_scan
+    from pipeline.tracking.judging import judge, nearest_other
 
-    return is_kept(examine) and is_kept(use_scan)
+    return is_kept(nearest_other) and is_kept(judge)
 
 
 def _cores() -> int:

@@ -43,42 +43,74 @@ def warm_up(parameters: Parameters | None = None) -> None:
 
 
 def warm_eyes() -> None:
-    """Look at the scans of that second, gather and judge what they show where odometry says that they were
-    taken: all of the mapper but SLAM and the trees' filters."""
+    """Look at the scans of that second, keep what they show, and gather it where odometry says that they were
+    taken: all of the mapper but SLAM and the trees' tracks."""
+    from contextlib import closing
+
     from pipeline.gathering import Gathering, View
     from pipeline.geometry import Pose2
     from pipeline.height_map import HeightMapper
     from pipeline.perception import decide, look
+    from pipeline.rerun import KeptScans, look_key
     from pipeline.sources import open_source
     from pipeline.steps import steps
-    from pipeline.tracking import Tracker
+    from pipeline.tracking.judging import nearest_other
 
     source = open_source(_SCENE)
     known, parameters = source.description, Parameters()
     gathering = Gathering(parameters.gathering, all_around=known.sensor.rings > 0, forests=kept_forests())
-    heights, tracker = HeightMapper(), Tracker(parameters.tracking)
-    for step in steps(source.records()):
-        looked = look(step, known.sensor, known.T_base_lidar, parameters)
-        decide(looked, parameters.detection)
-        pose, over = step.T_odom_base or Pose2(), looked.overview
-        if over is not None:
-            view = View(pose, looked.sensor_offset, looked.free, over.steepest, over.depth, over.terrain)
-            gathering.add(over.points, over.height, step.index, view)
-            tracker.judge(step.scan.stamp_ns, gathering.columns, parameters.gathering)
-        if looked.terrain is not None:
-            heights.add(looked.terrain, pose, looked.sensor_offset)
+    heights = HeightMapper()
+    with closing(KeptScans()) as kept:
+        for step in steps(source.records()):
+            looked = look(step, known.sensor, known.T_base_lidar, parameters)
+            decide(looked, parameters.detection)
+            kept.put(step, looked, look_key(parameters))
+        for index in range(len(kept)):
+            step, looked = kept.scan(index)
+            decide(looked, parameters.detection)
+            pose, over = step.T_odom_base or Pose2(), looked.overview
+            if over is not None:
+                view = View(pose, looked.sensor_offset, looked.free, over.steepest, over.depth, over.terrain)
+                gathering.add(over.points, over.height, step.index, view)
+            if looked.terrain is not None:
+                heights.add(looked.terrain, pose, looked.sensor_offset)
+    place = gathering.columns.axis[:, :2].copy()
+    nearest_other(place, place, 1.0)  # as a rough answer asks
 
 
 def warm_map() -> None:
-    """Map stems that nobody had to look for: SLAM and the trees' filters."""
+    """Map stems that nobody had to look for, and again with another parameter: SLAM, the trees' tracks, and
+    what is kept of a run."""
+    from contextlib import closing
+
+    from pipeline.gathering import no_columns
     from pipeline.geometry import Pose3
     from pipeline.mapper import Mapper
     from pipeline.parameters import preset
     from pipeline.records import Sensor
+    from pipeline.rerun import Basis, Journal, KeptScans, Rerun, look_key, rough_trees
+    from pipeline.tracking import Tracker
+    from pipeline.tracking.judging import tree_columns
 
-    mapper = Mapper(preset("stems"), sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
-    for step in _stems():
-        mapper.process(step)
+    stems, journal = preset("stems"), Journal()
+    mapper, again = (
+        Mapper(p, sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
+        for p in (stems, stems.replace({"tracking.hits_to_confirm": 4}))
+    )
+    mapper.note = lambda noted: journal.note(noted, stems.slam)
+    states = {0: mapper.snapshot()}
+    with closing(KeptScans()) as kept:
+        for step in _stems():
+            looked = mapper.look(step)
+            kept.put(step, looked, look_key(stems))
+            mapper.take(step, looked)
+        scans = len(journal)
+        states[scans] = mapper.snapshot()
+        basis = Basis.of(stems, journal.first(scans), states, mapper.path, mapper.motion)
+        rough_trees(basis, kept.clusters, again.parameters)
+        for _ in Rerun(again, kept, None, basis).frames(scans):
+            pass
+    tree_columns(Tracker(stems.tracking).judge(0, no_columns(), stems.gathering))
 
 
 def _stems() -> Iterator[Step]:

@@ -13,8 +13,8 @@ from pipeline.records import Int
 
 
 class _Pairs(NamedTuple):
-    """Room for pairs: the squared Mahalanobis distance of each and what it costs beside, its landmark and its
-    detection; and how many there are of each detection."""
+    """The squared Mahalanobis distance of each pair and the determinant of its covariance, its landmark and
+    its detection; and how many there are of each detection."""
 
     squared: Float
     beside: Float
@@ -43,20 +43,17 @@ def associate(
     distance2 = np.zeros(detections)
     cells, scale = cells_for(detections), per_metre(distance_max)
     fill(cells, centre, detections, scale)
-    pairs, n, begin = _room_for(4 * detections + 16, detections), 0, 0
-    while True:
-        begin, n = _add_pairs(pairs, n, begin, cells, scale, centre, R, mean, covariance, gate, distance_max)
-        if begin == mean.shape[0]:
-            break
-        pairs = _widened(pairs, n)
-    if _is_one_to_one(pairs, n):
+    n = _count_pairs(cells, scale, centre, mean, distance_max)
+    pairs = _Pairs(
+        np.empty(n), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.zeros(detections, np.int64)
+    )
+    n = _add_pairs(pairs, cells, scale, centre, R, mean, covariance, gate, distance_max)
+    clear = _is_one_to_one(pairs, n)
+    if not clear:
         for k in range(n):
-            landmark_of[pairs.detection[k]] = pairs.landmark[k]
-            distance2[pairs.detection[k]] = pairs.squared[k]
-        return landmark_of, distance2
-    order = np.argsort(pairs.squared[:n] + np.log(pairs.beside[:n]), kind="mergesort")
+            pairs.beside[k] = pairs.squared[k] + np.log(pairs.beside[k])
     taken = np.zeros(mean.shape[0], np.bool_)
-    for k in order:
+    for k in np.arange(n) if clear else np.argsort(pairs.beside[:n], kind="mergesort"):
         d, j = pairs.detection[k], pairs.landmark[k]
         if landmark_of[d] < 0 and not taken[j]:
             landmark_of[d] = j
@@ -65,31 +62,24 @@ def associate(
     return landmark_of, distance2
 
 
-@compiled
-def _room_for(pairs: int, detections: int) -> _Pairs:
-    return _Pairs(
-        np.empty(pairs),
-        np.empty(pairs),
-        np.empty(pairs, np.int64),
-        np.empty(pairs, np.int64),
-        np.zeros(detections, np.int64),
-    )
-
-
-@compiled
-def _widened(pairs: _Pairs, used: int) -> _Pairs:
-    more = _room_for(2 * pairs.squared.shape[0], pairs.of_detection.shape[0])
-    more.squared[:used], more.beside[:used] = pairs.squared[:used], pairs.beside[:used]
-    more.landmark[:used], more.detection[:used] = pairs.landmark[:used], pairs.detection[:used]
-    more.of_detection[:] = pairs.of_detection
-    return more
+@compiled_borrowing
+def _count_pairs(cells: Cells, scale: float, centre: Float, mean: Float, distance_max: float) -> int:
+    """How many landmarks and detections lie within reach of one another."""
+    n = 0
+    for j in range(mean.shape[0]):
+        u, v = first_of_four(mean[j, 0], mean[j, 1], scale)
+        for quarter in range(4):
+            d = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+            while d >= 0:
+                y0, y1 = centre[d, 0] - mean[j, 0], centre[d, 1] - mean[j, 1]
+                n += y0 * y0 + y1 * y1 <= distance_max * distance_max
+                d = cells.following[d]
+    return n
 
 
 @compiled_borrowing
 def _add_pairs(
     pairs: _Pairs,
-    n: int,
-    begin: int,
     cells: Cells,
     scale: float,
     centre: Float,
@@ -98,13 +88,11 @@ def _add_pairs(
     covariance: Float,
     gate: float,
     distance_max: float,
-) -> tuple[int, int]:
-    """Put the pairs of landmarks behind the first n, landmark by landmark and in the order of the detections:
-    of pairs that cost the same the first one counts. Returns the first landmark for which there may be no
-    room, and how many pairs there are then."""
-    for j in range(begin, mean.shape[0]):
-        if n + centre.shape[0] > pairs.squared.shape[0]:
-            return j, n
+) -> int:
+    """Fill in the pairs within the gate, landmark by landmark and in the order of the detections: of pairs
+    that cost the same the first one counts. Returns how many there are."""
+    n = 0
+    for j in range(mean.shape[0]):
         first = n
         u, v = first_of_four(mean[j, 0], mean[j, 1], scale)
         for quarter in range(4):
@@ -126,7 +114,7 @@ def _add_pairs(
                     pairs.landmark[n] = j
                     n += 1
                 d = cells.following[d]
-    return mean.shape[0], n
+    return n
 
 
 @compiled_borrowing

@@ -80,13 +80,16 @@ def _join(rows: Rows, old: int, young: int) -> None:
     # Two halves of one trunk in one scan; a tree that only its column tells of has no view to take off.
     if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
         hits[old] -= 1
-    other, row = P[young].copy(), np.array([old])
-    own, common = np.empty((1, 2, 2)), np.empty((1, 2, 2))
+    row, own, common = np.array([old]), np.empty((1, 2, 2)), np.empty((1, 2, 2))
     for a in range(2):
         for b in range(2):
-            own[0, a, b], common[0, a, b] = other[a, b] - shared[young, a, b], shared[young, a, b]
-    other[:2, :2] = split(P, shared, row, own, common, np.zeros(1), 0.0)[0]
-    x[old], P[old] = fuse(x[old], P[old], x[young], other)
+            own[0, a, b], common[0, a, b] = P[young, a, b] - shared[young, a, b], shared[young, a, b]
+    other = split(P, shared, row, own, common, np.zeros(1), 0.0)[0]
+    place, joined = fuse(x[old], P[old], x[young], other)
+    for a in range(4):
+        x[old, a] = place[a]
+        for b in range(4):
+            P[old, a, b] = joined[a, b]
     stamp_ns[old] = max(stamp_ns[old], stamp_ns[young])
     first_ns[old] = min(first_ns[old], first_ns[young])
     score[old] = max(score[old], score[young])

@@ -52,15 +52,38 @@ def recognise(rows: Rows, count: int, sight: Sight, found: Found, limits: Limits
             covariances are made ready for the filter's update.
     """
     row_of, touched, position, own, added = assign(rows, count, sight, found, limits)
-    known = np.flatnonzero(row_of >= 0)
-    seen, dt, z = row_of[known], np.empty(known.shape[0]), np.empty((known.shape[0], 2))
-    R, B = np.empty((known.shape[0], 2, 2)), np.empty((known.shape[0], 2, 2))
+    known = _places(row_of, True)
+    z, R, B = _picked(known, position, own, added)
+    seen, dt = np.empty(known.shape[0], np.int64), np.empty(known.shape[0])
     for k in range(known.shape[0]):
-        d = known[k]
+        seen[k] = row_of[known[k]]
         dt[k] = (sight.stamp_ns - rows.stamp_ns[seen[k]]) * NANOSECONDS
-        z[k], R[k], B[k] = position[d], own[d], added[d]
     R = split(rows.P, rows.shared, seen, R, B, dt, limits.acceleration_sigma)
     return Recognised(row_of, touched, position, own, added, seen, dt, z, R)
+
+
+@compiled
+def _places(row_of: Int, known: bool) -> Int:
+    """The detections that have a tree, or those that have none."""
+    places, n = np.empty(row_of.shape[0], np.int64), 0
+    for d in range(row_of.shape[0]):
+        if (row_of[d] >= 0) == known:
+            places[n] = d
+            n += 1
+    return places[:n]
+
+
+@compiled
+def _picked(places: Int, position: Float, own: Float, added: Float) -> tuple[Float, Float, Float]:
+    """The rows of some detections."""
+    n = places.shape[0]
+    z, R, B = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 2))
+    for k in range(n):
+        for a in range(2):
+            z[k, a] = position[places[k], a]
+            for b in range(2):
+                R[k, a, b], B[k, a, b] = own[places[k], a, b], added[places[k], a, b]
+    return z, R, B
 
 
 @compiled
@@ -81,14 +104,14 @@ def take(
         t = of.seen[k]
         rows.stamp_ns[t] = sight.stamp_ns
         rows.score[t] = min(rows.score[t] + 1.0, SCORE_MAX)
-    fresh = np.flatnonzero(of.row < 0)
-    begin(
-        rows, count, number, sight.stamp_ns, of.position[fresh], of.own[fresh], of.added[fresh],
-        limits.velocity_sigma,
-    )  # fmt: skip
+    fresh = _places(of.row, False)
+    z, R, B = _picked(fresh, of.position, of.own, of.added)
+    begin(rows, count, number, sight.stamp_ns, z, R, B, limits.velocity_sigma)
     row, touched = of.row.copy(), np.ones(count + fresh.shape[0], np.bool_)
-    row[fresh] = count + np.arange(fresh.shape[0])
-    touched[:count] = of.touched
+    for k in range(fresh.shape[0]):
+        row[fresh[k]] = count + k
+    for t in range(count):
+        touched[t] = of.touched[t]
     add_observations(
         row, of.position, sight.pose, found.eccentricity, found.radius, found.radius_sigma, found.arc,
         found.above_breast, rows.hits, rows.eccentricity, rows.eccentricities, rows.radius,

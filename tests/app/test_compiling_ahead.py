@@ -19,6 +19,8 @@ PROGRAM = """
 import sys
 from numba.core.dispatcher import Dispatcher
 from app.warming import warm_eyes, warm_map, warm_up
+from app.worker import new_session
+from pipeline.parameters import Parameters
 
 def seen():
     return {
@@ -33,11 +35,23 @@ warm_map()
 before = seen()
 assert len(before) > 20, before
 warm_up()
+session = new_session()
+session.open("sim:stand?duration=1", "auto", 0)
+session.set_parameters(Parameters(), 0)
+session.advance(10)
+while session.pace == "hurry":
+    session.work()
+for revision, change in enumerate([{"gathering.tree_share": 0.7}, {"detection.e_max": 20.0}]):
+    session.set_parameters(Parameters().replace(change), revision + 1, whole=True)
+    assert session.is_remapping and session.rough is not None
+    while session.is_remapping:
+        session.remap(8)
+session.close()
 print(*sorted(seen() - before), sep="\\n", end="")
 """
 
 
-def test_the_halves_compile_what_the_mapper_calls():
+def test_the_halves_compile_what_the_mapper_and_a_slider_call():
     run = [sys.executable, "-c", PROGRAM]
     told = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)
     assert not told.stdout
