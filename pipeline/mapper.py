@@ -381,8 +381,7 @@ class Mapper:
         return self._path.motion.copy()
 
     def restore(self, state: MapperState, memory: Memory | None = None) -> None:
-        """Go back to a snapshot of this mapper's own past; the state itself is left untouched. `memory`: see
-        `Gathering.restore`."""
+        """Go back to a snapshot of its own past, which is left untouched; memory: see `Gathering.restore`."""
         self._take_back(state, memory)
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry

@@ -40,6 +40,7 @@ def process_noise(dt: float, acceleration_sigma: float) -> Float:
 def update_rows(
     x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
 ) -> None:
+    """Predict the trees of some rows, in place, and correct each by its measurement, see `ENGINES`."""
     _update_rows(x, P, rows, dt, acceleration_sigma, z, R, np.empty((4, 2)), np.empty((4, 4)))
 
 
