@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from pipeline.parameters import Parameters
-from pipeline.slam import Smoother
+from pipeline.slam import Genealogy, Smoother
 
 S = TypeVar("S")
 
@@ -22,7 +22,7 @@ _MOST_BYTES = 256 << 20
 
 def nbytes(state: object) -> int:
     """Bytes of the arrays in a state: of dataclasses, lists and tuples, however deep."""
-    if isinstance(state, np.ndarray | Smoother):
+    if isinstance(state, np.ndarray | Genealogy | Smoother):
         return state.nbytes
     if isinstance(state, list | tuple):
         return sum(map(nbytes, state))
@@ -44,6 +44,7 @@ class Snapshots(Generic[S]):
 
     def __init__(self, start: S, size_of: Callable[[S], int] = nbytes) -> None:
         self._states: dict[int, S] = {0: start}
+        self._sizes: dict[int, int] = {0: size_of(start)}
         self._size_of = size_of
         self._spacing = _SPACING
 
@@ -51,15 +52,13 @@ class Snapshots(Generic[S]):
         """Keep a state if it is due."""
         if not self.is_due(scans):
             return
-        self._states[scans] = state
+        self._states[scans], self._sizes[scans] = state, self._size_of(state)
         while len(self._states) > 1 and self._are_too_many():
             self._spacing *= 2
             self._states = {n: s for n, s in self._states.items() if n % self._spacing == 0}
 
     def _are_too_many(self) -> bool:
-        if len(self._states) > _MOST_STATES:
-            return True
-        return sum(self._size_of(state) for state in self._states.values()) > _MOST_BYTES
+        return len(self._states) > _MOST_STATES or sum(self._sizes[n] for n in self._states) > _MOST_BYTES
 
     def is_due(self, scans: int) -> bool:
         """Whether `offer` would keep a state of so many scans."""

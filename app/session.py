@@ -49,6 +49,10 @@ class Session:
         parameters: In force at the beginning.
         keep: Where what the scans show is kept.
         compile_ahead: Compiles what is not compiled on this machine yet, faster than the first scan would.
+
+    Attributes:
+        on_rough: Is told a rough answer (see `Run.rough`) with the revision of the parameters, before any
+            scan is mapped with them.
     """
 
     def __init__(
@@ -74,6 +78,7 @@ class Session:
         self._way = Way()
         self._whole = WholeRun()
         self._warnings: dict[str, None] = {}
+        self.on_rough: Callable[[int, Trees], None] = lambda _revision, _trees: None
 
     @property
     def pace(self) -> Pace:
@@ -265,17 +270,13 @@ class Session:
             self._robot.use_parameters(revision, from_scan, parameters)
         if whole and run.standing >= 0:
             run.remap(parameters)
+            self._tell_rough(run)
         return run.map_again() if stands and self._state != "failed" else None
 
     @property
     def is_remapping(self) -> bool:
         """Whether `remap` has work that can be done now."""
         return self._run is not None and self._run.remapped is not None and not self._way.sought
-
-    @property
-    def rough(self) -> Trees | None:
-        """See `Run.rough`."""
-        return self._run.rough if self._run is not None else None
 
     def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
         """Map so many scans of the run again. Once all are, the map is another one: gives the standing scan
@@ -355,9 +356,13 @@ class Session:
         from this scan on, whenever on the way they came."""
         self._way.forget()
         changed = run.use(self._parameters, run.standing)
-        frame = run.map_again() if changed or run.is_bare else run.frame
-        self._whole.arrived(run, self._parameters)
-        return frame
+        if self._whole.arrived(run, self._parameters):
+            self._tell_rough(run)
+        return run.map_again() if changed or run.is_bare else run.frame
+
+    def _tell_rough(self, run: Run) -> None:
+        if run.rough is not None:
+            self.on_rough(self._revision, run.rough)
 
     def _leave(self) -> None:
         owner = self._run or self._robot

@@ -74,6 +74,7 @@ def warm_eyes() -> None:
                 gathering.add(over.points, over.height, step.index, view)
             if looked.terrain is not None:
                 heights.add(looked.terrain, pose, looked.sensor_offset)
+    gathering.snapshot().folded()  # as a step back does
     place = gathering.columns.axis[:, :2].copy()
     nearest_other(place, place, 1.0)  # as a rough answer asks
 

@@ -20,11 +20,12 @@ class WholeRun:
 
     wanted_there: bool = False
 
-    def arrived(self, run: Run, parameters: Parameters) -> None:
-        """The sought scan stands; what waited for it begins."""
+    def arrived(self, run: Run, parameters: Parameters) -> bool:
+        """The sought scan stands; what waited for it begins. Whether anything did."""
         wanted, self.wanted_there = self.wanted_there, False
         if wanted:
             run.remap(parameters)
+        return wanted
 
     @staticmethod
     def work(run: Run, scans: int, revision: int, time_s: float) -> tuple[Frame, MapChanges] | None:

@@ -77,6 +77,7 @@ class Driver:
         recent: Recent | None = None,
     ) -> None:
         self._session = session
+        session.on_rough = lambda revision, trees: put(Rough(self._run, revision, trees))
         self._commands = commands
         self._put = put
         self._clock = clock
@@ -236,8 +237,6 @@ class Driver:
                 self._pacer.speed = factor
             case SetParameters(values=values, revision=revision, whole=whole):
                 self._show(session.set_parameters(validated(values), revision, whole=whole))
-                if session.rough is not None:
-                    self._put(Rough(self._run, revision, session.rough))
             case Open():
                 self._open(command)
             case Begin():

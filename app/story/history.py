@@ -75,7 +75,9 @@ class TreeHistory:
 
     def _append(self, rows: NDArray[np.float64]) -> None:
         while self._count + len(rows) > len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+            grown = np.empty((2 * len(self._rows), _WIDTH))
+            grown[: self._count] = self._rows[: self._count]
+            self._rows = grown
         self._rows[self._count : self._count + len(rows)] = rows
         self._count += len(rows)
         while self._count > _MOST_ROWS and self._spacing < _MOST_ROWS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,7 +62,8 @@ class Gathering:
     ) -> None:
         self._all_around, self._forests = all_around, forests
         self.parameters = parameters
-        self.memory = Memory.empty(1 << parameters.voxels_log2)
+        self._memory: Memory | None = Memory.empty(1 << parameters.voxels_log2)
+        self._folded: Callable[[], Memory] | None = None  # gives the memory where nobody has asked for it yet
         self.columns = no_columns()
         self._base = PackedMemory.of(self.memory)
         self._since: list[tuple[Float32, int, int]] = []
@@ -76,6 +78,14 @@ class Gathering:
         self._forest = self._forests(parameters.forest, self._all_around)
         self._parameters = parameters
         self._vote_again = True
+
+    @property
+    def memory(self) -> Memory:
+        """The voxels of all scans. After a step back it is unpacked once somebody asks for it."""
+        if self._memory is None:
+            assert self._folded is not None  # noqa: S101 - one of both is there
+            self._memory, self._folded = self._folded(), None
+        return self._memory
 
     def add(self, points: Float32, height: Float32, scan: int, view: View) -> None:
         """Take one scan.
@@ -104,21 +114,22 @@ class Gathering:
         """All state; parameters are not part of it."""
         return GatheringState(self._base, tuple(self._since), self.columns)
 
-    def restore(self, state: GatheringState, memory: Memory | None = None) -> None:
+    def restore(self, state: GatheringState, folded: Callable[[], Memory] | None = None) -> None:
         """Go back to a snapshot; the state itself is left untouched.
 
         Args:
-            memory: What the state is when it is folded, of which nobody else knows; None folds it now.
+            folded: Gives what the state is when it is folded, of which nobody else knows; None folds it once
+                it is asked for.
         """
         self._base, self._since = state.base, list(state.since)
-        self.memory = state.folded() if memory is None else memory
+        self._memory, self._folded = None, folded or state.folded
         self.columns = state.columns
         self._vote_again = True  # another forest may have voted then
 
     def bend(self, bend: Bend) -> None:
         """Move what is known with a path that was bent."""
         self.columns = bent_columns(self.columns, self.memory, bend)
-        self.memory = bent(self.memory, bend)
+        self._memory = bent(self.memory, bend)
         self.settle()
 
     @property

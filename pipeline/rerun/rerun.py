@@ -29,7 +29,7 @@ def in_turn(mapper: Mapper, scans: Iterator[tuple[Step, Looked]]) -> Iterator[Fr
 
 
 def when_asked(work: Callable[[], Memory]) -> Callable[[], Memory]:
-    """Something is done once somebody asks for it."""
+    """It is done once somebody asks for it."""
     return work
 
 
@@ -53,7 +53,7 @@ class Rerun:
         basis: What is known of the run with other parameters; of the same seed and sensor.
         ahead: How scans are looked at that are read once more: one by one, or ahead of the mapping.
         abreast: How scans are mapped that show something: in turn, or one located while another is mapped.
-        aside: When it is unpacked what was gathered: once trees alone are tracked, or meanwhile.
+        aside: When what was gathered is unpacked: once it is needed, or while trees alone are tracked.
 
     Attributes:
         journal: What the stages make of each scan.
@@ -163,7 +163,7 @@ class Rerun:
         recalled = tail.track(min(scans, self._until))
         state = tail.state() if tail.done == self._until else None
         if state is not None:
-            self.mapper.restore(state, None if self._memory is None else self._memory())
+            self.mapper.restore(state, self._memory)
             self._tail = self._memory = None
         return recalled
 

@@ -2,9 +2,20 @@
 
 from pipeline.slam.back_end import BackEnd, BackEndState
 from pipeline.slam.fastslam import FastSlam
+from pipeline.slam.genealogy import Genealogy
 from pipeline.slam.loop import Loop
 from pipeline.slam.motion import Motion
 from pipeline.slam.pose_graph import GraphState, Smoother
 from pipeline.slam.state import SlamState
 
-__all__ = ["BackEnd", "BackEndState", "FastSlam", "GraphState", "Loop", "Motion", "SlamState", "Smoother"]
+__all__ = [
+    "BackEnd",
+    "BackEndState",
+    "FastSlam",
+    "Genealogy",
+    "GraphState",
+    "Loop",
+    "Motion",
+    "SlamState",
+    "Smoother",
+]

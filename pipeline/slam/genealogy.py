@@ -59,6 +59,12 @@ class Genealogy:
     def __len__(self) -> int:
         return BLOCK * len(self.settled) + len(self.recent)
 
+    @property
+    def nbytes(self) -> int:
+        """Of all arrays but the founders."""
+        poses = sum(block.nbytes for block in self.settled) + sum(g.pose.nbytes for g in self.recent)
+        return poses + sum(g.ancestors.nbytes for g in self.recent if g.ancestors is not None)
+
     def with_scan(self, pose: Float, ancestors: Int | None, leaf: int) -> Genealogy:
         """One scan more.
 

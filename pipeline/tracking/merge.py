@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cells import cell_of, cells_for, fill, first_of_four, per_metre
-from pipeline.compiled import compiled
+from pipeline.cells import Cells, cell_of, cells_for, fill, first_of_four, per_metre
+from pipeline.compiled import compiled, compiled_borrowing
 from pipeline.geometry import Float
 from pipeline.records import Bool, Verdict
 from pipeline.tracking.shared import split
@@ -25,8 +25,12 @@ def merge_near(rows: Rows, touched: Bool, radius: float) -> Bool:
         Which rows are still trees of their own, shape (T,).
     """
     alive = np.ones(touched.shape[0], np.bool_)
-    while radius > 0.0 and _is_any_near(rows.x, touched, alive, radius):
-        old, young = _first_pair(rows.x, touched, alive, radius)
+    while radius > 0.0:
+        cells, scale = cells_for(touched.shape[0]), per_metre(radius)
+        fill(cells, rows.x, touched.shape[0], scale)
+        old, young = _first_pair(rows.x, touched, alive, radius, cells, scale)
+        if old < 0:
+            break
         _join(rows, old, young)
         alive[young] = False
         touched[old] = True
@@ -38,38 +42,27 @@ def join(tracks: TrackTable, old: int, young: int) -> None:
     _join(tracks.as_rows(), old, young)
 
 
-@compiled
-def _is_any_near(x: Float, touched: Bool, alive: Bool, radius: float) -> bool:
-    """Whether `_first_pair` finds any."""
-    trees = touched.shape[0]
-    cells, scale = cells_for(trees), per_metre(radius)
-    fill(cells, x, trees, scale)
-    for i in range(trees):
+@compiled_borrowing
+def _first_pair(
+    x: Float, touched: Bool, alive: Bool, radius: float, cells: Cells, scale: float
+) -> tuple[int, int]:
+    """Rows of two trees nearer than the radius, one of which was touched, the first of all; -1 for none."""
+    for i in range(touched.shape[0]):
         if not (touched[i] and alive[i]):
             continue
+        first = -1
         u, v = first_of_four(x[i, 0], x[i, 1], scale)
         for quarter in range(4):
             j = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
             while j >= 0:
                 dx, dy = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1]
-                if j != i and alive[j] and dx * dx + dy * dy < radius * radius:
-                    return True
+                near = j != i and alive[j] and dx * dx + dy * dy < radius * radius
+                # One before it that was touched has looked at this one already.
+                if near and (j > i or not touched[j]) and (first < 0 or j < first):
+                    first = j
                 j = cells.following[j]
-    return False
-
-
-@compiled
-def _first_pair(x: Float, touched: Bool, alive: Bool, radius: float) -> tuple[int, int]:
-    """Rows of two trees nearer than the radius, one of which was touched, the first of all."""
-    for i in range(touched.shape[0]):
-        if not (touched[i] and alive[i]):
-            continue
-        for j in range(touched.shape[0]):
-            dx, dy = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1]
-            # One before it that was touched has looked at this one already.
-            near = dx * dx + dy * dy < radius * radius
-            if near and j != i and alive[j] and (j > i or not touched[j]):
-                return min(i, j), max(i, j)
+        if first >= 0:
+            return min(i, first), max(i, first)
     return -1, -1
 
 

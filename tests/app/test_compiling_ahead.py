@@ -43,7 +43,7 @@ while session.pace == "hurry":
     session.work()
 for revision, change in enumerate([{"gathering.tree_share": 0.7}, {"detection.e_max": 20.0}]):
     session.set_parameters(Parameters().replace(change), revision + 1, whole=True)
-    assert session.is_remapping and session.rough is not None
+    assert session.is_remapping
     while session.is_remapping:
         session.remap(8)
 session.close()

@@ -96,15 +96,41 @@ def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parame
         assert (told(session.frame), told(session.path)) == mapped_with(parameters, index)
 
 
-def test_a_rough_answer_is_there_before_the_exact_one(session):
-    assert [session.rough] == [None]
+def test_a_rough_answer_is_there_before_the_exact_one_and_before_the_standing_scan(session, monkeypatch):
+    heard: list[tuple[int, int]] = []
+    session.on_rough = lambda revision, trees: heard.append((revision, len(trees.number)))
+    again = session._run.map_again
+
+    def mapped_again() -> object:
+        heard.append((-1, 0))
+        return again()
+
+    monkeypatch.setattr(session._run, "map_again", mapped_again)
     for revision, change in enumerate([{"clustering.eps": 0.25}, {"detection.e_max": 12.0}]):
         session.set_parameters(BASE.replace(change), revision + 1, whole=True)
-        rough = session.rough
-        assert rough is not None
+        assert [told_of for told_of, _ in heard] == [revision + 1, -1]
+        trees = heard[0][1]
+        heard.clear()
         frame, _ = remapped(session)
-        assert abs(int(frame.trees.confirmed.sum()) - len(rough.number)) <= 2
-        assert [session.rough] == [None]
+        assert abs(int(frame.trees.confirmed.sum()) - trees) <= 2
+    assert heard == []
+
+
+@pytest.mark.parametrize("begun_before", [False, True])
+def test_where_the_scan_is_sought_first_it_comes_once_the_scan_is_there(session, begun_before):
+    heard: list[int] = []
+    session.on_rough = lambda revision, _: heard.append(revision)
+    if begun_before:
+        session.set_parameters(WIDER, 1, whole=True)
+        assert heard == [1]
+        session.seek(2.0)
+        settle(session)
+        assert heard == [1]
+    session.seek(1.5)
+    session.set_parameters(FEWER, 2, whole=True)
+    assert heard == [1] * begun_before
+    settle(session)
+    assert heard == [*[1] * begun_before, 2]
 
 
 def test_a_newer_change_stops_an_older_one(session):
