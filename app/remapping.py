@@ -97,10 +97,13 @@ class Remapping:
         rerun = self.rerun
         if rerun.done > until:  # the run went back meanwhile
             rerun.go_back(*self.snapshots.newest(until))
-        most = min(rerun.done + (max(scans, _TRACKED) if rerun.tracks_alone else scans), until)
-        while rerun.done < most:
+        alone = rerun.tracks_alone
+        most = min(rerun.done + (max(scans, _TRACKED) if alone else scans), until)
+        while rerun.done < most and rerun.tracks_alone == alone:
             if self.snapshots.is_due(rerun.done) and (state := rerun.state()) is not None:
                 self.snapshots.offer(rerun.done, state)
             for frame in rerun.frames(self.snapshots.next_due(rerun.done, most)):
                 self.told.record(frame, self._start_ns)
+                if rerun.tracks_alone != alone:  # what follows takes its time
+                    break
         return rerun.done == until

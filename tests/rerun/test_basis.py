@@ -8,7 +8,7 @@ from dataclasses import fields, is_dataclass, replace
 import numpy as np
 import pytest
 
-from app.remapping import Told
+from app.remapping import Remapping, Told
 from pipeline.errors import StemmapError
 from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters, field_specs
@@ -149,6 +149,16 @@ def test_a_scan_that_hung_on_the_trees_is_mapped(known):
     broken = with_odd(basis, np.arange(len(kept)) == 30)
     assert broken.begin(later, kept.clusters) == (28, True)
     assert finished(later, kept, broken)[1] == finished(later, kept, None)[1]
+
+
+def test_no_more_scans_are_mapped_at_once_where_the_trees_alone_no_longer_do(known):
+    kept, basis = known
+    broken = with_odd(basis, np.arange(len(kept)) == 30)
+    remapping = Remapping(Rerun(mapper(BASE.replace({"tracking.gate": 2.5})), kept, None, broken), 0)
+    done = []
+    while not remapping.work(5, 40):
+        done.append(remapping.rerun.done)
+    assert done == [28, 33, 38]
 
 
 @pytest.mark.parametrize("room", [0.0, 0.13, 0.999, 1.0])
