@@ -1,16 +1,14 @@
-"""What is done on another core: scans looked at while those before them are mapped, or two at once."""
+"""Scans looked at on another core while those before them are mapped, or on two cores at once."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
 
 from pipeline.perception import Looked
 from pipeline.records import Step
 
-T = TypeVar("T")
 AHEAD = 4  # scans; more wait for nothing but memory
 
 
@@ -32,14 +30,6 @@ def looked_ahead(look: Callable[[Step], Looked], steps: Iterator[Step]) -> Itera
             yield first, looked.result()
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def aside(work: Callable[[], T]) -> Callable[[], T]:
-    """Begin something on another core; who asks for what comes of it waits until it is there."""
-    pool = ThreadPoolExecutor(1, thread_name_prefix="aside")
-    begun = pool.submit(work)
-    pool.shutdown(wait=False)
-    return begun.result
 
 
 def looked_at_once(look: Callable[[Step], Looked], steps: list[Step]) -> list[Looked]:

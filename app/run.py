@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from app.abreast import abreast
-from app.ahead import aside, looked_ahead, looked_at_once
+from app.ahead import looked_ahead, looked_at_once
 from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
 from app.live_cursor import LiveCursor
@@ -227,7 +227,7 @@ class Run:
             return
         basis = self._basis()
         self._rough = None if basis is None else self._roughly(basis, parameters, mapper)
-        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead, abreast, aside)
+        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead, abreast)
         if basis is None or not rerun.passed:
             self._remapping = Remapping(rerun, self.start_ns)
             return

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline import loops
-from pipeline.gathering import ForestOf, Gathering, Memory, View, package_alone
+from pipeline.gathering import ForestOf, Gathering, View, package_alone
 from pipeline.geometry import Float, Pose2, Pose3
 from pipeline.growing_path import GrowingPath
 from pipeline.gyro import fused
@@ -380,19 +380,19 @@ class Mapper:
         """x, y [m], yaw [rad] by the odometry to each scan from the one before, shape (N, 3)."""
         return self._path.motion.copy()
 
-    def restore(self, state: MapperState, folded: Callable[[], Memory] | None = None) -> None:
-        """Go back to a snapshot of its own past, which is left untouched; folded: see `Gathering.restore`."""
-        self._take_back(state, folded)
+    def restore(self, state: MapperState) -> None:
+        """Go back to a snapshot of this mapper's own past; the state itself is left untouched."""
+        self._take_back(state)
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
         self._path.cut(state.path_length)
         self._placed, self._closed, self._last = state.placed, state.closed, state.last
         self._recovery.state = state.recovery.copy()
 
-    def _take_back(self, before: MapperState, folded: Callable[[], Memory] | None = None) -> None:
+    def _take_back(self, before: MapperState) -> None:
         """Leave the map as it was in a state; path, odometry and the numbers of trees go on."""
         self._slam.state = before.slam.copy()
-        self._gathering.restore(before.gathering, folded)
+        self._gathering.restore(before.gathering)
         self._ground.state = before.ground
         self._tracker.tracks = before.tracks
 

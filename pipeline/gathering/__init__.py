@@ -3,7 +3,6 @@
 from pipeline.gathering.forest import Forest, ForestOf, package_alone
 from pipeline.gathering.gathering import Gathering, GatheringState, no_columns
 from pipeline.gathering.judged import Judged, judged
-from pipeline.gathering.memory import Memory
 from pipeline.gathering.packed import PackedMemory
 from pipeline.gathering.sight import View, depth_image, steepest_by_direction
 
@@ -13,7 +12,6 @@ __all__ = [
     "Gathering",
     "GatheringState",
     "Judged",
-    "Memory",
     "PackedMemory",
     "View",
     "depth_image",

@@ -114,15 +114,10 @@ class Gathering:
         """All state; parameters are not part of it."""
         return GatheringState(self._base, tuple(self._since), self.columns)
 
-    def restore(self, state: GatheringState, folded: Callable[[], Memory] | None = None) -> None:
-        """Go back to a snapshot; the state itself is left untouched.
-
-        Args:
-            folded: Gives what the state is when it is folded, of which nobody else knows; None folds it once
-                it is asked for.
-        """
+    def restore(self, state: GatheringState) -> None:
+        """Go back to a snapshot; the state itself is left untouched."""
         self._base, self._since = state.base, list(state.since)
-        self._memory, self._folded = None, folded or state.folded
+        self._memory, self._folded = None, state.folded
         self.columns = state.columns
         self._vote_again = True  # another forest may have voted then
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Generator, Iterator
 from itertools import dropwhile
 
 from pipeline.errors import StemmapError
-from pipeline.gathering import Memory
 from pipeline.mapper import Mapper
 from pipeline.mapper_records import MapperState
 from pipeline.perception import Looked
@@ -20,17 +19,11 @@ from pipeline.rerun.tail import Recalled, Tail
 Reread = Callable[[], Iterator[Step]]
 Ahead = Callable[[Callable[[Step], Looked], Iterator[Step]], Iterator[tuple[Step, Looked]]]
 Abreast = Callable[[Mapper, Iterator[tuple[Step, Looked]]], Iterator[Frame]]
-Aside = Callable[[Callable[[], Memory]], Callable[[], Memory]]
 
 
 def in_turn(mapper: Mapper, scans: Iterator[tuple[Step, Looked]]) -> Iterator[Frame]:
     """Each scan located and mapped before the next one is."""
     return (mapper.take(step, looked) for step, looked in scans)
-
-
-def when_asked(work: Callable[[], Memory]) -> Callable[[], Memory]:
-    """It is done once somebody asks for it."""
-    return work
 
 
 def one_by_one(look: Callable[[Step], Looked], steps: Iterator[Step]) -> Iterator[tuple[Step, Looked]]:
@@ -53,7 +46,6 @@ class Rerun:
         basis: What is known of the run with other parameters; of the same seed and sensor.
         ahead: How scans are looked at that are read once more: one by one, or ahead of the mapping.
         abreast: How scans are mapped that show something: in turn, or one located while another is mapped.
-        aside: When what was gathered is unpacked: once it is needed, or while trees alone are tracked.
 
     Attributes:
         journal: What the stages make of each scan.
@@ -68,7 +60,6 @@ class Rerun:
         basis: Basis | None = None,
         ahead: Ahead = one_by_one,
         abreast: Abreast = in_turn,
-        aside: Aside = when_asked,
     ) -> None:
         self.mapper = mapper
         self.journal = Journal()
@@ -76,12 +67,11 @@ class Rerun:
         self._kept = kept
         self._key = look_key(mapper.parameters)
         self._next = self._stop = 0
-        self._reread, self._ahead, self._abreast, self._aside = reread, ahead, abreast, aside
+        self._reread, self._ahead, self._abreast = reread, ahead, abreast
         self._steps: Iterator[tuple[Step, Looked]] | None = None
         self._fresh: KeptScans | None = None
         self._tail: Tail | None = None
         self._until = 0  # scans that are tracked anew alone
-        self._memory: Callable[[], Memory] | None = None  # of the gathering after them
         mapper.note = lambda noted: self.journal.note(noted, mapper.parameters.slam)
         if basis is not None:
             self._go_on_from(basis)
@@ -131,7 +121,7 @@ class Rerun:
 
     def go_back(self, scans: int, state: MapperState) -> None:
         """Stand where so many scans were mapped, with the state that the mapper had then."""
-        self._next, self._steps, self._tail, self._memory = scans, None, None, None
+        self._next, self._steps, self._tail = scans, None, None
         self.mapper.restore(state)
 
     def stop_reading(self) -> None:
@@ -155,7 +145,6 @@ class Rerun:
         if anew:
             states = {known: basis.states[known] for known in basis.states if known <= scans}
             self._tail, self._until = Tail(self.mapper.parameters, notes, states), scans
-            self._memory = self._aside(states[scans].gathering.folded)
         else:
             self._next = self.passed = scans
 
@@ -163,8 +152,8 @@ class Rerun:
         recalled = tail.track(min(scans, self._until))
         state = tail.state() if tail.done == self._until else None
         if state is not None:
-            self.mapper.restore(state, self._memory)
-            self._tail = self._memory = None
+            self.mapper.restore(state)
+            self._tail = None
         return recalled
 
     def _shown(self) -> Iterator[tuple[Step, Looked]]:

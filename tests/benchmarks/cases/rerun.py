@@ -187,16 +187,14 @@ def _again(
 ) -> float:
     """Seconds that a rerun takes; once before for the kernels, over a few scans."""
     from app.abreast import abreast
-    from app.ahead import aside, looked_ahead
+    from app.ahead import looked_ahead
     from pipeline.rerun import Rerun
 
     spent, reread = 0.0, None if held is None else lambda: iter(held)
     for most in (min(scans, 50), scans):
         gc.collect()
         start = time.perf_counter()
-        with closing(
-            Rerun(_fresh(source, parameters), kept, reread, basis, looked_ahead, abreast, aside)
-        ) as rerun:
+        with closing(Rerun(_fresh(source, parameters), kept, reread, basis, looked_ahead, abreast)) as rerun:
             for _ in rerun.frames(most):
                 pass
             spent = time.perf_counter() - start
