@@ -31,7 +31,7 @@ function budget({ scans, end_s: end }) {
 // What the standing scan took for trees, against the truth: it moves with a slider, before the map follows.
 function ofScan() {
   const { right, wrong } = state.map ?? {};
-  return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan ${right} of ${right + wrong} at trees`;
+  return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan ${right} of ${right + wrong}`;
 }
 
 function reason({ health }) {
