@@ -196,7 +196,8 @@ class Trees:
         dbh: Diameter at breast height [m], NaN where no arc carried one.
         dbh_sigma: [m], NaN likewise.
         eccentricity: Mean over the observations.
-        observations: int64, number of scans it was seen in.
+        observations: int64, number of scans it was seen in; where pieces of it were trees of their own before
+            they came to be one, the scans in which each was seen count for each.
         coverage: Part of its circumference that was seen [rad].
         first_seen_ns, last_seen_ns: int64.
         confirmed: Whether it was seen often enough to be shown and exported.

@@ -70,7 +70,8 @@ def _first_pair(
 def _join(rows: Rows, old: int, young: int) -> None:
     x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
     hits, score, sides, verdict = rows.hits, rows.score, rows.sides, rows.verdict
-    # Two halves of one trunk in one scan; a tree that only its column tells of has no view to take off.
+    # Two halves of one trunk in one scan; a tree that only its column tells of has no view to take off. In
+    # how many scans before this one both halves were seen is not kept, and they count for both.
     if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
         hits[old] -= 1
     row, own, common = np.array([old]), np.empty((1, 2, 2)), np.empty((1, 2, 2))

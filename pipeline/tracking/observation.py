@@ -51,7 +51,8 @@ def add_observations(
     Args:
         rows: The tree of each detection, none twice, shape (D,).
         place: Frame of the map, shape (D, 2) [m]; pose: of the robot, shape (3,).
-        eccentricity, radius, radius_sigma, arc: See `Detections`, shape (D,).
+        eccentricity, radius, radius_sigma, arc: See `Detections`, shape (D,); of an arc no more counts than
+            one view can show (see `widest_view`).
         above_breast: How far above breast height the radius was measured, shape (D,) [m]; NaN where no
             ground was seen: such a radius counts as it is, and as half a metre off.
 
@@ -78,8 +79,24 @@ def add_observations(
             radius_reach[t] += weight * reach
             radius_above[t] += weight * (abs(above) if known else HALF)
             radii[t] += 1
-        bearing = np.arctan2(pose[1] - place[d, 1], pose[0] - place[d, 0])
-        sides[t] |= seen_sides(bearing, arc[d])
+        # A view without a circle of its own is of a stem as thick as the others say.
+        known_radius = radius[d] if np.isfinite(radius[d]) else radius_sum[t] / max(radius_weight[t], 1e-300)
+        dx, dy = pose[0] - place[d, 0], pose[1] - place[d, 1]
+        shown = min(arc[d], widest_view(known_radius, np.hypot(dx, dy)))
+        sides[t] |= seen_sides(np.arctan2(dy, dx), shown)
+
+
+@compiled_within
+def widest_view(radius: float, distance: float) -> float:
+    """How much of a round stem one view shows at most, from tangent to tangent: 2 arccos(r / d) [rad].
+
+    It is less than half of it, however many returns noise throws behind the axis, where a fit counts them.
+
+    Args:
+        radius: r > 0, without which nothing is known to be round: 0.
+        distance: d, from the sensor to the axis [m]; a sensor within the stem sees nothing of it.
+    """
+    return 2.0 * np.arccos(min(radius / distance, 1.0)) if radius > 0.0 and distance > 0.0 else 0.0
 
 
 @compiled_borrowing

@@ -21,7 +21,7 @@ class TrackTable:
         x: shape (T, 4): x, y [m], vx, vy [m/s]; P: its covariance, shape (T, 4, 4).
         shared: What of P the poses have done that the tree was seen from, shape (T, 2, 2) [m^2].
         stamp_ns: int64, of `x` and of the last observation; first_ns: of the first.
-        hits: int64, observations; score: hits less misses.
+        hits: int64, observations, see `Trees`; score: hits less misses.
         eccentricity: Sum over the observations with a finite one; eccentricities: their number.
         radius: Sum of weights times radii; radius_weight: sum of weights (see `add_observations`) [1/m^4];
             radius_reach: sum of weights times distances; radius_above: of weights times how far

@@ -333,6 +333,38 @@ def test_walking_around_a_tree_covers_it():
     assert trees.coverage[0] == pytest.approx(2 * np.pi)
 
 
+@LAW
+@given(
+    st.floats(1.0, 40.0),
+    st.floats(-3.1, 3.1),
+    st.lists(st.tuples(st.floats(0.02, 0.9), st.floats(0.0, 2.0 * np.pi)), min_size=1, max_size=8),
+)
+def test_views_from_one_place_cover_no_more_than_one_can_show(distance, bearing, views):
+    """From tangent to tangent: 2 arccos(r / d), whatever arc the noise of a fit claims."""
+    t = tracker(dbh_arc_min=180.0)
+    away = distance * np.array([np.cos(bearing), np.sin(bearing)])
+    for k, (radius, arc) in enumerate(views):
+        show(t, k, [away], radius=radius, arc=arc)
+    trees = t.trees()
+    widest = max(min(arc, 2.0 * np.arccos(radius / distance)) for radius, arc in views)
+    assert trees.coverage[0] == pytest.approx(len(sectors(bearing + np.pi, widest)) * STEP)
+    assert trees.coverage[0] <= widest + 1e-6 < np.pi
+    assert np.isnan(trees.dbh[0])
+
+
+def test_a_view_without_a_circle_shows_what_the_others_say():
+    def covered(*radii: float):
+        t = tracker()
+        for k, radius in enumerate(radii):
+            show(t, k, [[1.0, 0.0]], radius=radius, arc=6.0 if np.isnan(radius) else 0.0)
+        return t.trees().coverage[0]
+
+    assert covered(0.5, np.nan) == pytest.approx(np.radians(120.0))  # 2 arccos(0.5)
+    assert covered(np.nan) == 0.0
+    assert covered(0.5) == 0.0
+    assert covered(1.2, np.nan) == 0.0, "a robot within a stem sees nothing of it"
+
+
 def test_a_diameter_needs_half_the_trunk():
     def seen_from(bearings):
         t = tracker()
