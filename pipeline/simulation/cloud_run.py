@@ -18,7 +18,7 @@ from pipeline.plot.cloud import Cloud
 from pipeline.plot.height_map import HeightMap
 from pipeline.records import Float, Float32, Scan, TruthTrees
 from pipeline.simulation import run as simulated
-from pipeline.simulation.drive import drive_course, lay_course
+from pipeline.simulation.drive import drive_course, lap_time, lay_course
 from pipeline.simulation.inertial import inertial_readings
 from pipeline.simulation.lidar import SpinningLidar, Sweep
 from pipeline.simulation.motion import lay_on_terrain
@@ -32,11 +32,12 @@ from pipeline.simulation.uri import RunRequest
 from pipeline.simulation.way import loop_through
 
 # Raise it with every change that changes the bytes of runs through clouds and of no others.
-VERSION = 2
+VERSION = 3
 SLOPE = 35.0  # degrees; of the terrain against the plane of the plot
 BAND = (-0.5, 40.0)  # m above the ground; noise below it is not scanned
 MOST = 1 << 20  # points after thinning
 SPEED = 0.6  # m/s
+SHORTEST, LONGEST = 10.0, 600.0  # s; of one loop, unless a duration is asked for
 SHADE = 60.0  # reflectance of all returns: clouds have none that means the same
 
 
@@ -63,10 +64,12 @@ class CloudRun(SimulatedRun):
     Attributes:
         surfels: The cloud in the frame of the first pose.
         source_digest: SHA-256 of the cloud and of the table of its trees.
+        warnings: What a person should know.
     """
 
     surfels: Surfels
     source_digest: str
+    warnings: tuple[str, ...]
 
     def sweep(self, k: int) -> Sweep:
         """Scan k (from 0), the same whether or not others were made before it."""
@@ -127,8 +130,8 @@ def open_cloud_run(
     course = lay_course(way, closed=True)
     heading = _heading(way)
     start = np.append(way[0], ground.at(way[:1, 0], way[:1, 1]))
-    length_s = float(np.ceil(1.35 * course.s[-1] / SPEED)) + 3.0
-    duration = request.duration_s or min(max(length_s, 10.0), 600.0)
+    lap = float(np.ceil(lap_time(course, SPEED)))
+    duration = request.duration_s or min(max(lap, SHORTEST), LONGEST)
     asked = RunRequest(request.name, request.seed, request.sigma, request.odometry, duration, 0)
     drive = drive_course(course, SPEED, duration)
     motion = lay_on_terrain(drive, PlotGround(ground, start, heading), stream(simulated.SHAKE, asked))
@@ -143,6 +146,14 @@ def open_cloud_run(
         scans=round(duration * 1e9) // SpinningLidar().period_ns,
         surfels=lay_surfels(_from(points[:, :3], start, heading)),
         source_digest=cloud.description.digest,
+        warnings=_cut_short(course.s[-1], lap) if lap > LONGEST and not request.duration_s else (),
+    )
+
+
+def _cut_short(way: float, lap: float) -> tuple[str]:
+    return (
+        f"the loop through the plot is {way:.0f} m long, of which {LONGEST:.0f} s are driven: "
+        f"duration={lap:.0f} (3600 at most) drives all of it",
     )
 
 

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
 from pipeline.records import Float
+from pipeline.simulation.pace import (
+    ACCELERATION,
+    YAW_RATE,
+    Spin,
+    curvature_beside,
+    runs_of,
+    sharp_cells,
+    within_gains,
+)
 
 RATE_HZ = 200
 _DS = 0.02
-_ACCELERATION = 0.5
-_YAW_RATE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,38 +80,84 @@ def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
 
     Args:
         course: Where to drive.
-        speed: On the straight [m/s]; turns are driven at 0.5 rad/s at most.
+        speed: On the straight [m/s]; turns are driven at 0.5 rad/s at most, and where the way goes back on
+            itself the robot stops and turns on the spot.
         duration_s: Length of the run [s]; the table reaches a little beyond.
     """
     until = duration_s + 0.5
-    limit = speed_limit(course, speed)
     laps = max(1, int(np.ceil(until * speed / course.s[-1])) + 1) if course.closed else 1
-    v = np.concatenate([np.tile(limit[:-1], laps), limit[:1] if course.closed else limit[-1:]])
-    s = np.arange(v.size) * (course.s[1] - course.s[0])
-    v = np.minimum(v, np.sqrt(2.0 * _ACCELERATION * s))
-    if not course.closed:
-        v = np.minimum(v, np.sqrt(2.0 * _ACCELERATION * (s[-1] - s)))
-    time = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(s) / (v[1:] + v[:-1]))])
+    table = _timetable(course, speed, laps)
+    s, course = table.s, table.course
     t = np.arange(int(np.ceil(until * RATE_HZ)) + 1) / RATE_HZ
-    along = np.interp(t, time, s)
+    along = np.interp(t, table.time, s)
+    v = np.where(along < s[-1], np.interp(along, s, table.v), 0.0)
+    during = [(t >= spin.begin) & (t < spin.begin + spin.takes) for spin in table.spins]
+    for rows, spin in zip(during, table.spins, strict=True):
+        part, pace = spin.at(t[rows])
+        along[rows], v[rows] = spin.first + part * spin.way, pace * spin.way
     lap, rest = np.divmod(along, course.s[-1]) if course.closed else (np.zeros_like(along), along)
     x, y = (np.asarray(np.interp(rest, course.s, line)) for line in (course.x, course.y))
     yaw = np.interp(rest, course.s, course.yaw) + lap * (course.yaw[-1] - course.yaw[0])
-    v_t = np.where(along < s[-1], np.interp(along, s, v), 0.0)
-    return Drive(
-        t=t,
-        x=x,
-        y=y,
-        yaw=yaw,
-        speed=v_t,
-        yaw_rate=v_t * np.interp(rest, course.s, course.curvature),
+    yaw_rate = v * np.interp(rest, course.s, course.curvature)
+    for rows, spin in zip(during, table.spins, strict=True):
+        part, pace = spin.at(t[rows])
+        yaw[rows], yaw_rate[rows] = spin.yaw + part * spin.turn, pace * spin.turn
+    return Drive(t=t, x=x, y=y, yaw=yaw, speed=v, yaw_rate=yaw_rate)
+
+
+def lap_time(course: Course, speed: float) -> float:
+    """How long it takes to drive a course once, from standing still; see `drive_course` [s]."""
+    return float(_timetable(course, speed, 1).time[-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Timetable:
+    """Way [m], speed [m/s] and time [s] where the robot does not turn on the spot, the turns that it does
+    there, and the course without their curvature."""
+
+    s: Float
+    v: Float
+    time: Float
+    spins: list[Spin]
+    course: Course
+
+
+def _timetable(course: Course, speed: float, laps: int) -> _Timetable:
+    sharp = sharp_cells(course.s, course.yaw)
+    if sharp.any():
+        beside = curvature_beside(sharp, course.s, course.yaw, course.closed)
+        course = replace(course, curvature=beside)
+    limit, curvature = speed_limit(course, speed), course.curvature
+    # All laps in a row, so that the seam between two is a place as any other.
+    v, k = (
+        np.concatenate([np.tile(c[:-1], laps), c[:1] if course.closed else c[-1:]])
+        for c in (limit, curvature)
     )
+    s = np.arange(v.size) * (course.s[1] - course.s[0])
+    yaw = np.append(0.0, np.cumsum(np.tile(np.diff(course.yaw), laps)))
+    runs = runs_of(np.tile(sharp, laps))
+    v[runs] = 0.0
+    v = np.minimum(v, np.sqrt(2.0 * ACCELERATION * s))
+    if not course.closed:
+        v = np.minimum(v, np.sqrt(2.0 * ACCELERATION * (s[-1] - s)))
+    v = within_gains(v, s, k)
+    spins = [Spin.over(s[i], s[j] - s[i], yaw[i], yaw[j] - yaw[i]) for i, j in runs]
+    takes = np.zeros(v.size - 1)
+    driven = np.ones(v.size, np.bool_)
+    for (i, j), spin in zip(runs, spins, strict=True):
+        takes[i] = spin.takes
+        driven[i + 1 : j] = False
+    cells = ~np.tile(sharp, laps)
+    takes[cells] = (2.0 * np.diff(s))[cells] / (v[1:] + v[:-1])[cells]
+    time = np.concatenate([[0.0], np.cumsum(takes)])
+    spins = [spin._replace(begin=time[i]) for (i, _), spin in zip(runs, spins, strict=True)]
+    return _Timetable(s[driven], v[driven], time[driven], spins, course)
 
 
 def speed_limit(course: Course, speed: float) -> Float:
     """How fast each place of a course may be driven [m/s]: turns at 0.5 rad/s at most."""
     mode = "wrap" if course.closed else "nearest"
-    limit = np.minimum(speed, _YAW_RATE / np.maximum(np.abs(course.curvature), 1e-6))
+    limit = np.minimum(speed, YAW_RATE / np.maximum(np.abs(course.curvature), 1e-6))
     window = int(0.6 / _DS)
     slowest: Float = minimum_filter1d(limit, 2 * window + 1, mode=mode)
     smooth: Float = gaussian_filter1d(slowest, window / 3.0, mode=mode)

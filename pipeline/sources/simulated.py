@@ -24,7 +24,13 @@ class SimulatedSource:
     """A simulated run, read like any recording (see `pipeline.sources.base.Source`)."""
 
     def __init__(
-        self, uri: str, run: SimulatedRun, *, knows_trees: bool = True, kind: str = "simulated run"
+        self,
+        uri: str,
+        run: SimulatedRun,
+        *,
+        knows_trees: bool = True,
+        kind: str = "simulated run",
+        warnings: tuple[str, ...] = (),
     ) -> None:
         self.run = run
         self._knows_trees = knows_trees
@@ -40,6 +46,7 @@ class SimulatedSource:
             start_ns=START_NS,
             end_ns=last,
             digest=run.digest(),
+            warnings=warnings,
         )
         self.losses: dict[str, int] = {}
 
@@ -95,7 +102,7 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
 
     trees = read_truth_trees(Path(request.truth).expanduser()) if request.truth else None
     run = open_cloud_run(request, open_cloud(request.file), trees, options.T_base_lidar)
-    return SimulatedSource(uri, run, knows_trees=trees is not None)
+    return SimulatedSource(uri, run, knows_trees=trees is not None, warnings=run.warnings)
 
 
 def drive_through(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
@@ -116,4 +123,4 @@ def drive_through(uri: str, file: Path, options: SourceOptions) -> SimulatedSour
             error.what, where=uri, remedy="`stemmap map` maps the cloud as a whole, without a robot"
         ) from None
     kind = f"simulated drive through a whole cloud ({cloud.description.kind})"
-    return SimulatedSource(uri, run, knows_trees=False, kind=kind)
+    return SimulatedSource(uri, run, knows_trees=False, kind=kind, warnings=run.warnings)

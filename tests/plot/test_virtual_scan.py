@@ -10,6 +10,7 @@ import pytest
 from app.routes.run import what_may_be_opened
 from app.settings import Settings
 from pipeline.errors import SourceError
+from pipeline.simulation import cloud_run
 from pipeline.simulation.lidar import SpinningLidar
 from pipeline.simulation.surfels import first_surfels, lay_surfels
 from pipeline.simulation.uri import parse_uri
@@ -36,6 +37,24 @@ def source(files):
 def test_the_run_begins_at_the_origin_and_ahead(source):
     path = source.truth().path
     assert np.abs([path.x[0], path.y[0], path.yaw[0]]).max() < 1e-6
+
+
+def test_a_loop_ends_where_it_began(source):
+    path = source.truth().path
+    assert np.hypot(path.x[-1], path.y[-1]) < 0.7, "the last scan begins within a second of the end"
+    assert source.description.warnings == ()
+
+
+def test_a_loop_that_is_cut_short_says_so(files, monkeypatch):
+    monkeypatch.setattr(cloud_run, "LONGEST", 12.0)
+    uri = f"sim:cloud?file={files / 'plot.laz'}"
+    cut = open_source(uri).description
+    assert cut.scans == 120
+    (warning,) = cut.warnings
+    assert "12 s are driven" in warning
+    whole = int(warning.split("duration=")[1].split()[0])
+    asked = open_source(f"{uri}&duration={whole}").description
+    assert (asked.scans, asked.warnings) == (10 * whole, ())
 
 
 def test_the_way_keeps_clear_of_the_stems_and_goes_around(source):

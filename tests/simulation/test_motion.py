@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.geometry import Pose3
 from pipeline.records import Float
-from pipeline.simulation.drive import RATE_HZ, Course, drive_course, lay_course
+from pipeline.simulation.drive import RATE_HZ, Course, drive_course, lap_time, lay_course
 from pipeline.simulation.inertial import GRAVITY, inertial_readings
 from pipeline.simulation.motion import lay_on_terrain, rotations
 from pipeline.simulation.scenarios import SCENARIOS, Scenario
@@ -62,6 +62,16 @@ def test_an_open_course_ends_standing_still():
     drive = drive_course(course, plan.speed, 60.0)
     assert drive.speed[-1] == 0.0
     assert drive.x[-1] == pytest.approx(course.x[-1], abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["stand", "slope", "long"])
+def test_a_lap_takes_the_robot_back_to_where_it_began(name):
+    course, plan = course_of(name)
+    lap = lap_time(course, plan.speed)
+    drive = drive_course(course, plan.speed, lap)
+    at = np.searchsorted(drive.t, lap)
+    assert np.hypot(drive.x[at], drive.y[at]) < 0.02
+    assert drive.yaw[at] == pytest.approx(course.yaw[-1], abs=0.01)
 
 
 def test_the_base_stands_upright_to_the_ground():
