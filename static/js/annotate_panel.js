@@ -36,9 +36,9 @@ function build() {
       button("annotate-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("annotate-redo", "Redo", "Do it again (Ctrl+Shift+Z)", redo)),
     el("div", { class: "annotate-tools" },
       button("annotate-add", "Add", "Add trees by clicks on the map (a)", () => toggleAdding()),
-      button("annotate-next", "Next", "The next found tree that nobody judged, the one that the decision trees doubt most first (Tab on the map)", next),
-      button("annotate-yes", "Is a tree", "The selected found tree is one (y)", () => judge("tree")),
-      button("annotate-no", "Is no tree", "The selected found tree is something else (n)", () => judge(draft.kind)), el("label", { class: "annotate-as" }, "it is ", kind)),
+      button("annotate-next", "Next", "The next found tree that nobody judged, the one that the decision trees doubt most first (Tab on the map)", thenByKeys(next)),
+      button("annotate-yes", "Is a tree", "The selected found tree is one (y)", thenByKeys(() => judge("tree"))),
+      button("annotate-no", "Is no tree", "The selected found tree is something else (n)", thenByKeys(() => judge(draft.kind))), el("label", { class: "annotate-as" }, "it is ", kind)),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
     el("p", { id: "annotate-hint", class: "note dim" }),
     el("div", { id: "annotate-truth", class: "annotate-truth", hidden: true },
@@ -125,6 +125,15 @@ function fill() {
   byId("annotate-against").value = state.annotations?.against ?? "both";
   setText(byId("annotate-warned"), warnedInWords());
   fillTable();
+}
+
+// Who clicks goes on by Tab, y and n, which act on the map; on a button Tab would go to the next button, and y or n
+// would judge the tree before. Who came to the button by Tab (a click without a pointer) stays there.
+function thenByKeys(act) {
+  return (event) => {
+    act();
+    if (event.detail > 0) byId("map").focus({ preventScroll: true });
+  };
 }
 
 function hint() {

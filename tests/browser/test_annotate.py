@@ -165,6 +165,23 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     assert person.errors == []
 
 
+def test_whoever_clicks_next_goes_on_by_keys(person: Dashboard):
+    page = person.page
+    first, second = doubted(person)[:2]
+    hint = page.locator("#annotate-hint")
+    page.locator("#annotate-next").click()
+    expect(hint).to_contain_text(f"Tree {first['number']}, seen in")
+    page.keyboard.press("Tab")
+    expect(hint).to_contain_text(f"Tree {second['number']}, seen in")
+    page.keyboard.press("n")
+    expect(page.locator("#annotations tbody tr")).to_have_count(1)
+    (row,) = rows(person)
+    assert (row["x"], row["y"]) == (second["x"], second["y"])
+    page.locator("#annotate-next").focus()
+    page.keyboard.press("Enter")
+    expect(page.locator("#annotate-next")).to_be_focused()  # who walks by Tab stays among the buttons
+
+
 def test_two_people_see_one_another_and_a_stale_edit_is_refused(
     person: Dashboard, chromium: Browser, annotated: Server
 ):
