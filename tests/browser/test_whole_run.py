@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from playwright.sync_api import Locator, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.dashboard import Dashboard
 
@@ -21,6 +21,30 @@ def opened(dashboard: Dashboard) -> Locator:
     return dashboard.page.locator("[id='tune-gathering.tree_share']")
 
 
+def drag(page: Page, slider: Locator, begin: float, ends: list[float]) -> None:
+    """Take the thumb of a slider from one part of it to others, and let go at the last one."""
+    slider.scroll_into_view_if_needed()
+    box = slider.bounding_box()
+    assert box is not None
+    thumb = 16.0  # its middle never comes to the ends
+
+    def to(part: float, steps: int) -> None:
+        x = box["x"] + thumb / 2 + part * (box["width"] - thumb)
+        page.mouse.move(x, box["y"] + box["height"] / 2, steps=steps)
+
+    to(begin, 1)
+    page.mouse.down()
+    for end in ends:
+        to(end, 8)
+        page.wait_for_timeout(60)  # as a hand that looks
+    page.mouse.up()
+
+
+def drawn(page: Page) -> str:
+    """What the canvas of the map shows."""
+    return str(page.evaluate("() => document.querySelector('#map').toDataURL()"))
+
+
 def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     dashboard.stand()
     dashboard.tab("Tune")
@@ -29,14 +53,18 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     expect(page.locator("#tune-whole")).to_be_checked()
     known = trees(dashboard)
     assert known > 3
+    score = page.locator("[data-figure=f1] dd").inner_text()
     completeness = dashboard.ask("/api/evaluation")["TA"]["count"]
     assert completeness > 0
 
     share = opened(dashboard)
     before = float(share.input_value())
-    share.fill("0.95")
-    share.press("Enter")
+    dashboard.drawn()
+    picture = drawn(page)
+    slider = page.locator("[data-parameter='gathering.tree_share'] input[type=range]")
+    drag(page, slider, before, [0.75, 0.95])
     expect(told).to_contain_text(f"mapped again: {known} → ", timeout=60_000)
+    assert 0.9 < float(share.input_value()) < 1.0
     fewer = int(re.search(r"→ (\d+)", told.inner_text()).group(1))  # type: ignore[union-attr]
     assert fewer < known
     dashboard.until_server("/api/trees", f"it.trees.length === {fewer}")
@@ -47,6 +75,9 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     assert rows.count() >= known - fewer
     expect(rows.first).to_contain_text("votes for a tree")
     assert page.evaluate(f"{STATE} state.ghost.ghost.length)") == known
+    expect(page.locator("#map")).to_have_attribute("aria-label", re.compile(f"Map: {fewer} trees"))
+    expect(page.locator("[data-figure=f1] dd")).not_to_have_text(score)
+    assert drawn(page) != picture
 
     # Back again: the same trees, which now appear; a click selects one of them everywhere.
     share.fill(str(before))
