@@ -114,6 +114,8 @@ def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
     # Numba numbers files anew after a change of the sources, and writes its index first: who dies in between,
     # or reads meanwhile, would run machine code of the sources before. No two sources share a name here.
     digest = hashlib.sha256(repr(file._source_stamp).encode()).hexdigest()[:12]
+    # Of other sources nothing but this is read: what they left may name classes that are no more.
+    file._version = f"{file._version} {digest}"
     base = file._index_name.removesuffix(".nbi")
     file._data_name_pattern = f"{base}.{digest}.{{number:d}}.nbc"
     file.save = _saved_by_one(file, base, digest)

@@ -146,3 +146,26 @@ def test_where_nothing_can_be_locked_kernels_are_kept_all_the_same(tmp_path, mon
         pass
     with pytest.raises(OSError, match="of the work itself"), locked(tmp_path / "some.nbi"):
         raise OSError("of the work itself")
+
+
+OF_A_CLASS = """
+from typing import NamedTuple
+from pipeline.compiled import compiled
+
+class {name}(NamedTuple):
+    x: float
+
+@compiled
+def twice(of):
+    return 2.0 * of.x
+
+print(twice({name}(1.0)))
+"""
+
+
+def test_a_kernel_that_took_a_class_which_is_called_otherwise_now_is_compiled_anew(tmp_path):
+    (tmp_path / "wood").mkdir()
+    (tmp_path / "wood" / "__init__.py").touch()
+    for name in ("Leaf", "Needle"):
+        (tmp_path / "wood" / "tree.py").write_text(OF_A_CLASS.format(name=name))
+        assert call(tmp_path, 2.0, 1.0, "import wood.tree") == ["2.0"]
