@@ -167,6 +167,9 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
 
 def test_whoever_clicks_next_goes_on_by_keys(person: Dashboard):
     page = person.page
+    page.evaluate("() => import('/static/js/live.js').then(({ select }) => select(null))")
+    nothing = "() => import('/static/js/state.js').then(({ state }) => state.selected === null)"
+    person.eventually(lambda: bool(page.evaluate(nothing)), lambda: "a tree of the test before is selected")
     first, second = doubted(person)[:2]
     hint = page.locator("#annotate-hint")
     page.locator("#annotate-next").click()
