@@ -161,13 +161,13 @@ class Dashboard:
         self._show_parameters()  # the worker gets them when the source is open
         await self.open(source)
 
-    async def change_parameters(self, changes: dict[str, Value]) -> None:
-        """Change values by their dotted names.
+    async def change_parameters(self, changes: dict[str, Value], gesture: str = "") -> None:
+        """Change values by their dotted names, as part of a gesture (see `ParameterState.change`).
 
         Raises:
             ParameterError: A value does not fit; nothing is changed.
         """
-        await self.tune(lambda state: state.change(changes))
+        await self.tune(lambda state: state.change(changes, gesture))
 
     async def use_preset(self, name: str) -> None:
         """Take all values of a preset.
@@ -248,7 +248,7 @@ class Dashboard:
     async def _send_parameters(self) -> None:
         state = self.parameters
         values = state.parameters.model_dump()
-        await self.worker.send(SetParameters(values, state.revision, state.whole))
+        await self.worker.send(SetParameters(values, state.revision, state.whole, state.step))
 
     # --- what the worker says --------------------------------------------------------------------
 
@@ -286,7 +286,7 @@ class Dashboard:
         self.live.tell("remapped", msgspec.to_builtins(changes))
         self.events.remapped(changes.confirmed, changes.time_s)
         self._tell_events()
-        self.selecting.renamed(dict(changes.renamed))
+        self.selecting.renamed(dict(changes.followed))
 
     async def _begin(self, opened: Opened) -> None:
         """A source is open and waits: parameters that suit it first, then it plays."""

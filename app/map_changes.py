@@ -44,6 +44,7 @@ class MapChanges(msgspec.Struct, frozen=True):
         before, after: Number of trees.
         ghost: x, y [m] and DBH [m] (None where it is not known) of every tree before.
         renamed: Old and new number of each tree that stayed.
+        followed: The same of the trees that were shown last, where that is another map than the one before.
         changes: The others, and those that moved.
         confirmed: New number of each tree, and when it was confirmed [s since the run's first scan].
     """
@@ -55,17 +56,24 @@ class MapChanges(msgspec.Struct, frozen=True):
     after: int
     ghost: list[tuple[float, float, float | None]]
     renamed: list[tuple[int, int]]
+    followed: list[tuple[int, int]]
     changes: list[TreeChange]
     confirmed: list[tuple[int, float]]
 
 
 def changes_between(
-    before: Frame, after: Frame, revision: int, time_s: float, confirmed_s: Mapping[int, float]
+    before: Frame,
+    shown: Frame,
+    after: Frame,
+    revision: int,
+    time_s: float,
+    confirmed_s: Mapping[int, float],
 ) -> MapChanges:
     """Compare two maps of the same scans.
 
     Args:
         before, after: The last scan of each.
+        shown: The same of the map that was shown last.
         revision: Of the parameters of `after`.
         time_s: Of both frames, since the run's first scan.
         confirmed_s: When trees of `after` were confirmed.
@@ -74,6 +82,7 @@ def changes_between(
     old_at, new_at = before.trees.position[old], after.trees.position[new]
     old_of = match(new_at, old_at, SAME)
     stayed = [(k, int(row)) for k, row in enumerate(old_of.tolist()) if row >= 0]
+    renamed = _renamed(before.trees, after.trees)
     gone = sorted(set(range(len(old))) - {row for _, row in stayed})
     changes = [
         *(_came(before, after.trees, int(new[k])) for k, row in enumerate(old_of.tolist()) if row < 0),
@@ -95,10 +104,22 @@ def changes_between(
             (round(float(x), 3), round(float(y), 3), round(float(d), 3) if np.isfinite(d) else None)
             for (x, y), d in zip(old_at, dbh, strict=True)
         ],
-        renamed=[(int(before.trees.number[old[row]]), int(after.trees.number[new[k]])) for k, row in stayed],
+        renamed=renamed,
+        followed=renamed if shown is before else _renamed(shown.trees, after.trees),
         changes=changes,
         confirmed=[(n, confirmed_s[n]) for n in after.trees.number[new].tolist() if n in confirmed_s],
     )
+
+
+def _renamed(before: Trees, after: Trees) -> list[tuple[int, int]]:
+    """Old and new number of each tree of a map that is in another one too."""
+    old, new = np.flatnonzero(before.confirmed), np.flatnonzero(after.confirmed)
+    old_of = match(after.position[new], before.position[old], SAME)
+    return [
+        (int(before.number[old[row]]), int(after.number[new[k]]))
+        for k, row in enumerate(old_of.tolist())
+        if row >= 0
+    ]
 
 
 def _came(before: Frame, trees: Trees, row: int) -> TreeChange:

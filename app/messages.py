@@ -103,11 +103,17 @@ class SetSpeed(msgspec.Struct, frozen=True, tag="set_speed"):
 
 class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
     """Parameters, already validated, as nested values; they act on the next scan, and when paused on
-    the standing scan at once. If `whole` says so, the run is mapped again with them from its first scan."""
+    the standing scan at once. If `whole` says so, the run is mapped again with them from its first scan.
+
+    Attributes:
+        step: Those of one step, as of a slider that is held, are compared with the map before its first;
+            None is a step of its own.
+    """
 
     values: dict[str, Any]
     revision: int
     whole: bool = False
+    step: int | None = None
 
 
 class Open(msgspec.Struct, frozen=True, tag="open"):

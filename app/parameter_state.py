@@ -31,6 +31,17 @@ class _Standing(NamedTuple):
     parameters: Parameters
 
 
+class _Gesture(NamedTuple):
+    """What was changed last: which values, by which movement of a hand, and when [s]."""
+
+    names: frozenset[str]
+    gesture: str
+    at_s: float
+
+
+_NO_GESTURE = _Gesture(frozenset(), "", 0.0)
+
+
 class ParameterState:
     """A set of parameters with the preset it came from, and a revision that counts the changes.
 
@@ -55,10 +66,14 @@ class ParameterState:
         self._chosen = False
         self._undo: list[_Standing] = []
         self._redo: list[_Standing] = []
-        self._gesture: tuple[frozenset[str], float] = (frozenset(), 0.0)
+        self._gesture = _NO_GESTURE
 
-    def change(self, changes: dict[str, Value]) -> None:
+    def change(self, changes: dict[str, Value], gesture: str = "") -> None:
         """Change values by their dotted names.
+
+        Args:
+            gesture: Of a slider that is held: all values until it is let go are one step, however long that
+                takes. Empty where nobody knows; then those that follow one another fast are one.
 
         Raises:
             ParameterError: A name is unknown, a value is out of bounds, or two values contradict;
@@ -66,9 +81,10 @@ class ParameterState:
         """
         parameters = self.parameters.replace(changes)
         names, now = frozenset(changes), self._clock()
-        goes_on = names == self._gesture[0] and now - self._gesture[1] < _ONE_GESTURE_S
-        self._become(self.preset, parameters, goes_on)
-        self._gesture = (names, now)
+        before = self._gesture
+        soon = bool(gesture) or now - before.at_s < _ONE_GESTURE_S
+        self._become(self.preset, parameters, (names, gesture) == before[:2] and soon)
+        self._gesture = _Gesture(names, gesture, now)
 
     def use_preset(self, name: str) -> None:
         """Take all values of a preset.
@@ -166,7 +182,7 @@ class ParameterState:
         """Let this hold from now on; `goes_on`: as part of the step before."""
         before = _Standing(self.preset, self.parameters)
         self.check(parameters)
-        self._gesture = (frozenset(), 0.0)
+        self._gesture = _NO_GESTURE
         self._chosen = True
         self.revision += 1
         if before == (preset_name, parameters):
@@ -183,6 +199,6 @@ class ParameterState:
         self.check(steps[-1].parameters)
         others.append(_Standing(self.preset, self.parameters))
         self.preset, self.parameters = steps.pop()
-        self._gesture = (frozenset(), 0.0)
+        self._gesture = _NO_GESTURE
         self.revision += 1
         self.step += 1

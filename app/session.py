@@ -248,14 +248,18 @@ class Session:
         seconds = min(max(time_s, 0.0), LONGEST_S)
         self._way.to_time(self._run, self._run.start_ns + round(seconds * _NS))
 
-    def set_parameters(self, parameters: Parameters, revision: int, *, whole: bool = False) -> Frame | None:
+    def set_parameters(
+        self, parameters: Parameters, revision: int, *, whole: bool = False, step: int | None = None
+    ) -> Frame | None:
         """Use other parameters: from the next scan on, or from the sought or the standing scan on; and if
-        `whole` says so, begin to map the run again with them from its first scan (see `remap`).
+        `whole` says so, begin to map the run again with them from its first scan (see `remap`). What that
+        changes is told of all with the same `step` together.
 
         Returns:
             The standing scan, mapped again, when the run stands still; else None.
         """
         self._parameters, self._revision = parameters, revision
+        self._whole.begin(step)
         run = self._run
         if run is None:
             return None

@@ -12,13 +12,21 @@ from pipeline.records import Frame
 
 @dataclass(slots=True)
 class WholeRun:
-    """What is asked for and not begun.
+    """What is asked for and not begun, and what it is compared with.
 
     Attributes:
         wanted_there: Begin once the sought scan is reached: until then nobody knows up to where.
     """
 
     wanted_there: bool = False
+    _step: int | None = None
+    _before: Frame | None = None  # the map before the step
+
+    def begin(self, step: int | None) -> None:
+        """A change comes; those of one step are compared with the map before the first of them."""
+        if step is None or step != self._step:
+            self._before = None
+        self._step = step
 
     def arrived(self, run: Run, parameters: Parameters) -> bool:
         """The sought scan stands; what waited for it begins. Whether anything did."""
@@ -27,8 +35,7 @@ class WholeRun:
             run.remap(parameters)
         return wanted
 
-    @staticmethod
-    def work(run: Run, scans: int, revision: int, time_s: float) -> tuple[Frame, MapChanges] | None:
+    def work(self, run: Run, scans: int, revision: int, time_s: float) -> tuple[Frame, MapChanges] | None:
         """Map so many scans more again.
 
         Args:
@@ -43,9 +50,11 @@ class WholeRun:
         Raises:
             StemmapError: A scan cannot be looked at again. The map stays as it is.
         """
-        before = run.frame
-        done = None if before is None else run.remap_on(scans)
-        if before is None or done is None:
+        shown = run.frame
+        done = None if shown is None else run.remap_on(scans)
+        if shown is None or done is None:
             return None
         frame, confirmed_s = done
-        return frame, changes_between(before, frame, revision, time_s, confirmed_s)
+        if self._before is None or self._before.index != frame.index:  # the run went on, or elsewhere
+            self._before = shown
+        return frame, changes_between(self._before, shown, frame, revision, time_s, confirmed_s)

@@ -235,8 +235,8 @@ class Driver:
                 session.seek(time_s)
             case SetSpeed(factor=factor):
                 self._pacer.speed = factor
-            case SetParameters(values=values, revision=revision, whole=whole):
-                self._show(session.set_parameters(validated(values), revision, whole=whole))
+            case SetParameters(values=values, revision=revision, whole=whole, step=step):
+                self._show(session.set_parameters(validated(values), revision, whole=whole, step=step))
             case Open():
                 self._open(command)
             case Begin():

@@ -21,6 +21,7 @@ _Value = bool | int | float | Annotated[str, Meta(max_length=100)]
 
 class _Changes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     changes: Annotated[dict[_Name, _Value], Meta(min_length=1, max_length=500)]
+    gesture: _Name = ""  # of a slider that is held, see ParameterState.change
 
 
 class _Preset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -45,7 +46,7 @@ async def read(dashboard: Dash) -> Response:
 async def change(request: Request, dashboard: Dash) -> Response:
     """Change values by their dotted names."""
     wanted: _Changes = await body_of(request, _Changes)
-    await dashboard.change_parameters(wanted.changes)
+    await dashboard.change_parameters(wanted.changes, wanted.gesture)
     return await read(dashboard)
 
 

@@ -11,6 +11,8 @@ export const tuning = {
   error: "",
 };
 let last = Promise.resolve(), waiting = {}, sending = false;
+const page = Math.random().toString(36).slice(2); // tells the gestures of two pages apart
+let gestures = 0;
 
 export const isTuning = () => visible("tune");
 export const valueOf = (name) => state.parameters?.values[name];
@@ -35,15 +37,18 @@ export function attempt(work) {
   return last;
 }
 
+// A slider is taken: what it sends until it is let go is one step, compared with what was before.
+export const newGesture = () => `${page} ${gestures += 1}`;
+
 // While the server is busy with a value, only the newest of each slider is kept.
-export async function setValue(name, value) {
-  waiting[name] = value;
+export async function setValue(name, value, gesture = "") {
+  waiting[name] = { value, gesture };
   if (sending) return;
   sending = true;
   while (Object.keys(waiting).length) {
-    const changes = waiting;
-    waiting = {};
-    await attempt(() => patch("/api/parameters", { changes }));
+    const [[first, sent]] = Object.entries(waiting);
+    delete waiting[first];
+    await attempt(() => patch("/api/parameters", { changes: { [first]: sent.value }, gesture: sent.gesture }));
   }
   sending = false;
   changed("tuning");

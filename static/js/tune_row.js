@@ -1,7 +1,7 @@
 // One parameter: slider, value typed in, and back to the preset.
 
 import { el } from "./dom.js";
-import { isChanged, isMoving, redo, refuse, reset, setValue, shown, undo, valueOf } from "./tune.js";
+import { isChanged, isMoving, newGesture, redo, refuse, reset, setValue, shown, undo, valueOf } from "./tune.js";
 
 export const FINE = 1000; // places of a slider
 const BENT = 3; // how a slider is bent whose usual values lie near its lower end
@@ -69,12 +69,16 @@ function number(spec, id) {
     slider.value = String(toPlace(spec, value));
     slider.setAttribute("aria-valuetext", shown(value, spec));
   };
+  let gesture = "";
   const send = (value) => {
     typed.value = String(value);
-    setValue(spec.name, value);
+    setValue(spec.name, value, gesture);
   };
+  slider.addEventListener("pointerdown", () => { gesture = newGesture(); });
   slider.addEventListener("input", () => send(fromPlace(spec, Number(slider.value))));
+  slider.addEventListener("change", () => { gesture = ""; }); // it was let go
   slider.addEventListener("keydown", (event) => {
+    gesture = "";
     const step = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10 }[event.key];
     if (!step || event.ctrlKey || event.metaKey) return;
     event.preventDefault(); // by the step of the parameter, not by that of the picture

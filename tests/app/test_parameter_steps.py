@@ -79,6 +79,22 @@ def test_values_of_a_slider_that_moves_are_one_step():
     assert state.as_plain()["redo"] == 3
 
 
+def test_what_a_held_slider_sends_is_one_step_however_long_it_is_held():
+    clock = Clock()
+    state = ParameterState(clock=clock)
+    for value in (0.2, 0.3, 0.4):
+        clock.now += 60.0
+        state.change({"clustering.eps": value}, "first")
+    state.change({"clustering.eps": 0.5}, "second")  # taken again at once
+    state.change({"clustering.eps": 0.6})
+    assert (state.as_plain()["undo"], state.step) == (3, 3)
+    state.undo()
+    state.undo()
+    assert state.parameters.clustering.eps == 0.4
+    state.undo()
+    assert state.parameters == preset("forest")
+
+
 def test_what_was_undone_is_gone_after_another_change():
     state = ParameterState()
     state.change({"clustering.eps": 0.2})

@@ -144,7 +144,18 @@ async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: R
     client, dashboard = both
     await show(dashboard)
     await dashboard.select_tree(2)
-    changes = MapChanges(1, 3, 0.2, 4, 2, [(0.0, 1.0, None)], [(1, 1), (2, 5)], [], [(1, 0.1), (5, 0.2)])
+    changes = MapChanges(
+        revision=1,
+        scans=3,
+        time_s=0.2,
+        before=4,
+        after=2,
+        ghost=[(0.0, 1.0, None)],
+        renamed=[(3, 1), (4, 5)],  # of a map before the one that was shown last
+        followed=[(1, 1), (2, 5)],
+        changes=[],
+        confirmed=[(1, 0.1), (5, 0.2)],
+    )
     frame = dashboard.shown.frame if dashboard.shown else None
     assert frame is not None
     await dashboard.receive(Rough(7, 1, frame.trees))  # of a run that was left
@@ -159,7 +170,7 @@ async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: R
     marks = [e for e in dashboard.events.as_plain()["events"] if e["kind"] == "tree"]
     assert [(e["t"], e["text"]) for e in marks] == [(0.1, "Tree 1 confirmed"), (0.2, "Tree 5 confirmed")]
     assert (await client.get("/api/trees")).status_code == 200
-    await dashboard.receive(Remapped(1, msgspec.structs.replace(changes, renamed=[(1, 1)])))
+    await dashboard.receive(Remapped(1, msgspec.structs.replace(changes, followed=[(1, 1)])))
     assert dashboard.selecting.selection.tree is None
 
 
