@@ -6,6 +6,7 @@ import { byId, el, setText } from "./dom.js";
 import { count } from "./format.js";
 import { on, state } from "./state.js";
 import { visible } from "./tabs.js";
+import { counted } from "./verdicts.js";
 
 // In the order and words of the tab Scores; here it is what was annotated that is judged, and not a map.
 const RATES = [
@@ -14,12 +15,11 @@ const RATES = [
   ["TR", "TR  others left out. True rejection: annotated poles, persons, bushes and other things that are not taken for trees"],
   ["FA", "FA  others taken for trees. False acceptance: annotated other things that are taken for trees"],
 ];
-const LABELS = { tree: ["tree"], pole: ["pole"], person: ["person"], bush: ["bush", "bushes"], other: ["other thing"] };
 const PACKAGE = "package";
 const ASK_AGAIN = 300; // [ms] after an edit until what there is to learn from is asked for
 let known = null, asked = 0, error = "";
 
-const inWords = (things) => Object.entries(things).map(([kind, n]) => count(n, ...(LABELS[kind] ?? [kind, kind]))).join(", ");
+const inWords = (things) => Object.entries(things).map(([kind, n]) => counted(n, kind === "other" ? "other thing" : kind)).join(", ");
 const inForce = () => state.parameters?.values["gathering.forest"] ?? PACKAGE;
 const button = (id, text, title, onclick) => el("button", { id, class: "small", type: "button", text, title, onclick });
 

@@ -12,16 +12,21 @@ const OLD_AFTER = 3000; // [ms] without a word while a run plays
 
 // name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
 const FIGURES = {
-  trees: ["trees", "", (s) => [String(s.trees)]],
+  trees: ["trees", "", (s) => [String(s.trees), ...anew(s)]],
   health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health], reason(s)]],
   rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
   mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `mapping, of ${figure(budget(s))} ms`], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
   sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
-  f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE, "", ofScan()]],
+  f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
 };
 const cells = {};
+
+// While the run is mapped again its map is still that of the values before.
+function anew({ remapped }) {
+  return remapped === null || remapped === undefined ? [] : ["anew", `trees; mapped anew, ${Math.floor(100 * remapped)} %`];
+}
 
 // Time from scan to scan [ms]: mapping that takes longer falls behind.
 function budget({ scans, end_s: end }) {
@@ -30,6 +35,7 @@ function budget({ scans, end_s: end }) {
 
 // What the standing scan took for trees, against the truth: it moves with a slider, before the map follows.
 function ofScan() {
+  if (state.evaluation?.warning) return "F1: is it this truth? see Scores";
   const { right, wrong } = state.map ?? {};
   return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan ${right} of ${right + wrong}`;
 }
@@ -71,7 +77,7 @@ function show() {
   }
   cells.health.cell.title = healthFigures();
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
-  cells.f1.cell.title = "F1 of the map against the truth; clusters of the standing scan that were taken for trees, and how many of them stand at true ones";
+  cells.f1.cell.title = state.evaluation?.warning || "F1 of the map against the truth; clusters of the standing scan that were taken for trees, and how many of them stand at true ones";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   setText(byId("source-name"), shortSource(status.source) || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;

@@ -4,7 +4,7 @@ import { el } from "./dom.js";
 import { count } from "./format.js";
 import { nothingYet } from "./nothing_yet.js";
 import { state } from "./state.js";
-import { verdictOf } from "./verdicts.js";
+import { counted, verdictOf } from "./verdicts.js";
 
 const signed = (number) => (number > 0 ? `+${number}` : number < 0 ? `−${-number}` : "=");
 
@@ -22,7 +22,7 @@ export function countsBeforeAfter() {
   const same = names.filter((name) => then && name !== "tree" && (now[name] ?? 0) === (then[name] ?? 0));
   return [el("p", { class: "note dim", text: lead }),
     el("ul", { class: "chips" }, ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
-      same.length ? el("li", { class: "same", text: `as before: ${same.map((name) => `${now[name]} ${name}`).join(", ")}` }) : "")];
+      same.length ? el("li", { class: "same", text: `as before: ${same.map((name) => counted(now[name], name)).join(", ")}` }) : "")];
 }
 
 function chip(name, then, now) {

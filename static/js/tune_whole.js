@@ -8,15 +8,19 @@ import { changed, on, state } from "./state.js";
 import { attempt, isTuning } from "./tune.js";
 
 const MOST = 30;
+const FOLDED_FROM = 9; // lines: so many would take the place of the sliders
 const SIGNS = { appeared: "+", vanished: "−", moved: "→" };
-let begun = null; // {share, at}: when the mapping was first heard of
+let begun = null; // {share, at, left}: when the mapping was first heard of, and how long it took yet [s]
+let known = 0; // lines of the list
 const progress = el("progress", { id: "tune-progress", max: "1", hidden: true, "aria-label": "The run is mapped again" });
 const told = el("p", { id: "tune-whole-told", class: "note dim", role: "status" });
 const list = el("ul", { id: "tune-changes" });
+const folded = el("summary");
+const all = el("details", { id: "tune-changes-all" }, folded, list);
 const box = el("input", { id: "tune-whole", type: "checkbox", onchange: () => attempt(() => put("/api/parameters/reach", { whole: box.checked })) });
 export const wholeRun = el("section", { id: "tune-whole-run", "aria-label": "The whole run" },
   el("label", { title: "Each change maps the run again from its first scan, so that the whole map and its score follow; else it acts from the scan that stands here" }, box, " map the whole run again"),
-  progress, told, list);
+  progress, told, all);
 
 // Trees that stayed and are called otherwise now, as [before, now]: numbers are those of the new run, as its files have them.
 const renumbered = ({ renamed }) => renamed.filter(([before, now]) => before !== now);
@@ -30,16 +34,29 @@ function lead(told) {
   return `${count(scans, "scan")} mapped again: ${before} → ${count(after, "tree")}${parts.length ? `, ${parts.join(", ")}` : ", all where they were"}.${numbers}`;
 }
 
-// How long it takes yet [s], by how long it took so far; null while that tells nothing.
+const FIRST = 2; // [s] that tell nothing yet: kernels are loaded, and the standing scan is mapped
+const SMOOTH = 0.15; // weight of the newest guess
+
+// About how long it takes yet, in words, by how long it took so far; empty while that tells nothing.
 function left(share) {
-  if (!begun || share < begun.share) begun = { share, at: performance.now() };
-  if (share - begun.share < 0.02) return null;
-  return ((performance.now() - begun.at) / 1000) * (1 - share) / (share - begun.share);
+  const now = performance.now() / 1000;
+  if (!begun || share < begun.share) begun = { share, at: now, left: null, told: now };
+  const spent = now - begun.at;
+  if (spent < FIRST || share - begun.share < 0.02) return "";
+  const guess = (spent * (1 - share)) / (share - begun.share);
+  const before = begun.left === null ? guess : Math.max(begun.left - (now - begun.told), 0);
+  Object.assign(begun, { left: before + SMOOTH * (guess - before), told: now });
+  return `, exact in about ${inWords(begun.left)}`;
+}
+
+// Minutes from 90 s on, and tens of seconds before: more would be a guess.
+function inWords(seconds) {
+  if (seconds >= 90) return `${Math.round(seconds / 60)} min`;
+  return `${seconds > 10 ? 10 * Math.round(seconds / 10) : Math.max(1, Math.round(seconds))} s`;
 }
 
 function progressTold(share, rough) {
-  const seconds = left(share);
-  const percent = `${Math.round(100 * share)} %${seconds === null ? "" : `, exact in about ${Math.ceil(seconds)} s`}`;
+  const percent = `${Math.round(100 * share)} %${left(share)}`;
   if (!rough) return `Mapping the run again: ${percent}`;
   const f1 = rough.score?.f1 ?? null;
   return `Rough answer, dashed in the map: ${count(rough.places.length, "tree")}${f1 === null ? "" : `, F1 ${f1.toFixed(3)}`}. Mapping the run again: ${percent}`;
@@ -52,7 +69,7 @@ function show() {
   if (share === null) begun = null;
   box.checked = state.parameters?.whole ?? true;
   progress.hidden = share === null;
-  list.hidden = !newest || (!newest.changes.length && !renumbered(newest).length);
+  all.hidden = !newest || (!newest.changes.length && !renumbered(newest).length);
   if (share !== null) progress.value = share;
   const ghost = isTuning() ? rough ?? newest : null;
   if (state.ghost !== ghost) {
@@ -71,6 +88,9 @@ function showChanges() {
   const lines = [
     ...changes.map(({ kind, number, why }) => lineOf(kind, SIGNS[kind], kind === "vanished" ? el("span", { text: `Tree ${number} vanished` }) : treeLink(number, ` ${kind}`), why)),
     ...renumbered({ renamed }).map(([before, now]) => lineOf("renumbered", "#", treeLink(now, ""), `was tree ${before}`))];
+  setText(folded, `${count(lines.length, "tree")} not as before`);
+  if (lines.length !== known) all.open = lines.length < FOLDED_FROM;
+  known = lines.length;
   list.replaceChildren(...lines.slice(0, MOST), lines.length > MOST ? el("li", { text: `and ${lines.length - MOST} more` }) : "");
   show();
 }

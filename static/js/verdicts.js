@@ -20,4 +20,10 @@ const VERDICTS = {
   hidden: ["X", "uncertain", "Something nearer hides its edge."],
 };
 
+// Of what is counted; what is not named here is no noun and stays as it is ("3 too few points").
+const MANY = { tree: "trees", pole: "poles", person: "persons", bush: "bushes", wall: "walls", "other thing": "other things" };
+
+// "1 bush", "33 bushes".
+export const counted = (number, label) => `${number} ${number === 1 ? label : (MANY[label] ?? label)}`;
+
 export const verdictOf = (label) => VERDICTS[label] ?? ["?", "other", ""];

@@ -5,6 +5,7 @@ import { openSources } from "./sources.js";
 import { on } from "./state.js";
 
 const WORDS = {
+  playing: ["A robot is mapping a stand of trees", "Keep watching"],
   finished: ["A robot has mapped a stand of trees", "Look at its map"],
   starting: ["A robot is about to map a stand of trees", "Wait for it"],
 };
@@ -17,12 +18,13 @@ export function startWelcome() {
   byId("welcome-robot").addEventListener("click", () => card.addEventListener("close", () => openSources(ROBOT), { once: true }));
   let asked = false;
   on("status", ({ status }) => {
-    if (asked || recall("welcomed") !== null) return;
+    const first = !asked && recall("welcomed") === null;
     asked = true;
+    if (!card.open && !first) return;
     if (!status.source.startsWith("sim:")) return; // who opens a recording knows what this is
-    const [title, on] = WORDS[status.state] ?? ["A robot is mapping a stand of trees", "Keep watching"];
-    setText(byId("welcome-title"), title);
+    const [title, on] = WORDS[status.scan_index >= 0 && status.state === "starting" ? "playing" : status.state] ?? WORDS.playing;
+    setText(byId("welcome-title"), title); // it follows the run while the card stands there
     setText(byId("welcome-on"), on);
-    card.showModal();
+    if (!card.open) card.showModal();
   });
 }

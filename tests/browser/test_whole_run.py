@@ -11,6 +11,12 @@ from tests.browser.dashboard import Dashboard
 STATE = "import('/static/js/state.js').then(({ state }) =>"
 
 
+ANEW = """() => import('/static/js/state.js').then(({ state, changed }) => {
+  state.status = { ...state.status, remapped: 0.431 };
+  changed("status");
+})"""
+
+
 def trees(dashboard: Dashboard) -> int:
     return len(dashboard.ask("/api/trees")["trees"])
 
@@ -36,7 +42,7 @@ def drag(page: Page, slider: Locator, begin: float, ends: list[float]) -> None:
     page.mouse.down()
     for end in ends:
         to(end, 8)
-        page.wait_for_timeout(60)  # as a hand that looks
+        page.wait_for_timeout(2000)  # as a hand that looks: the map of this value is there meanwhile
     page.mouse.up()
 
 
@@ -71,6 +77,11 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     dashboard.until_server("/api/evaluation", f"it.TA.count < {completeness}")
     assert page.evaluate(f"{STATE} state.rough.places.length)") < known  # it came before
     expect(page.locator("[data-figure=trees] dd")).to_have_text(str(fewer))
+    whole = page.locator("#tune-changes-all")
+    many = page.locator("#tune-changes li").count() > 8  # which would take the place of the sliders
+    expect(whole.locator("summary")).to_contain_text("not as before")
+    assert (whole.get_attribute("open") is None) == many
+    assert page.locator("#map").bounding_box()["height"] > 190  # type: ignore[index]
     rows = page.locator("#tune-changes li[data-kind=vanished]")
     assert rows.count() >= known - fewer
     expect(rows.first).to_contain_text("votes for a tree")
@@ -86,13 +97,17 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     dashboard.until_server("/api/trees", f"it.trees.length === {known}")
     dashboard.until_server("/api/evaluation", f"it.TA.count === {completeness}")
     came = page.locator("#tune-changes li[data-kind=appeared] button").first
+    whole.evaluate("node => { node.open = true; }")
     number = int(re.search(r"\d+", came.inner_text()).group())  # type: ignore[union-attr]
     came.click()
     dashboard.tab("Story")
     expect(page.locator("#panel-story")).to_contain_text(f"Tree {number}")
-    # The ghost is of this tab alone.
+    # The ghost is of this tab alone; that the map is made anew is said wherever one looks.
     dashboard.tab("Trees")
     assert page.evaluate(f"{STATE} state.ghost)") is None
+    page.evaluate(ANEW)
+    expect(page.locator("[data-figure=trees]")).to_have_class(re.compile("anew"))
+    expect(page.locator("[data-figure=trees] dt")).to_have_text("trees; mapped anew, 43 %")
     assert dashboard.errors == []
 
 
