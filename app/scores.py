@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.summary import truth_in_doubt
 from pipeline.parameters.stages import Evaluation
 from pipeline.records import Trees, TruthTrees
 
@@ -92,6 +93,7 @@ def score_payload(trees: Trees, truth: TruthTrees, parameters: Evaluation, path_
         "mean_pair_error_percent": score.mean_pair_error_percent,
         "largest_pair_error_percent": score.largest_pair_error_percent,
         "reach_m": score.reach,
+        "warning": truth_in_doubt(score),
     }
 
 

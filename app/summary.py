@@ -51,7 +51,20 @@ def evaluation_lines(e: Evaluation, *, whole: bool = False) -> list[str]:
         f"F1 {_percent(e.f1)}",
         f"position RMSE {_metres(e.position_rmse)}   DBH RMSE {_metres(e.dbh_rmse)} "
         f"({count(e.dbh_count, 'tree')})   mean pair error {_pair(e.mean_pair_error_percent)}",
+        *([f"warning: {truth_in_doubt(e)}"] if e.is_doubtful else []),
     ]
+
+
+def truth_in_doubt(e: Evaluation) -> str:
+    """What a person is asked where the truth may be of another forest; empty where nothing says so."""
+    if not e.is_doubtful:
+        return ""
+    few = f"only {e.TA.count}" if e.TA.count else "none"
+    lie = "lies" if e.TA.count <= 1 else "lie"
+    return (
+        f"{few} of {count(e.TA.of, 'true tree')} {lie} near a mapped one: is this the truth of this forest, "
+        "in the map's frame?"
+    )
 
 
 def _rate(rate: Rate) -> str:

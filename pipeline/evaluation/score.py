@@ -12,6 +12,9 @@ from pipeline.geometry import Float
 from pipeline.parameters.stages import Evaluation as Parameters
 from pipeline.records import Bool, Trees, TruthTrees
 
+_LEAST_TREES = 4
+_DOUBTFUL = 0.25  # share of the trees that match
+
 
 @dataclass(frozen=True, slots=True)
 class Rate:
@@ -59,6 +62,14 @@ class Evaluation:
     mean_pair_error_percent: float | None
     largest_pair_error_percent: float | None
     reach: float
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether so few of the trees match, of map or truth, whichever has fewer, that the truth may be of
+        another forest or in another frame. A few trees tell nothing."""
+        mapped = self.TA.count + self.FA.count + self.spurious
+        fewer = min(mapped, self.TA.of)
+        return fewer >= _LEAST_TREES and self.TA.count < _DOUBTFUL * fewer
 
 
 def evaluate(

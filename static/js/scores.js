@@ -34,7 +34,12 @@ const LINES = [
 function show() {
   if (!visible("scores")) return;
   const score = state.evaluation;
-  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthInWords(), warnedInWords()].filter(Boolean).join(" ") }), rates(score), lines(score)] : [nothing()]));
+  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthInWords(), warnedInWords()].filter(Boolean).join(" ") }), doubt(score), rates(score), lines(score)] : [nothing()]));
+}
+
+// So few trees match that the truth may be of another forest.
+function doubt({ warning }) {
+  return el("p", { class: "note", id: "truth-doubt", role: "status", hidden: !warning, text: warning ? `▲ ${warning.charAt(0).toUpperCase()}${warning.slice(1)}` : "" });
 }
 
 function rates(score) {

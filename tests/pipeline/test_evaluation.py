@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from app.summary import evaluation_lines, truth_in_doubt
 from pipeline.evaluation import (
     PathError,
     evaluate,
@@ -64,6 +65,31 @@ def test_two_trees_between_two_truths_are_both_matched():
 
 
 # --- scores ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("right", "elsewhere", "missed", "doubtful"),
+    [
+        (1, 12, 15, True),
+        (0, 12, 16, True),
+        (4, 12, 12, False),  # a quarter
+        (3, 0, 13, False),  # a map that has begun, and is right so far
+        (12, 40, 0, False),  # a map with much that is wrong
+        (0, 3, 16, False),  # too few to tell
+    ],
+)
+def test_a_truth_that_few_trees_match_is_doubted(right, elsewhere, missed, doubtful):
+    found = np.column_stack([5.0 * np.arange(right + elsewhere), np.zeros(right + elsewhere)])
+    truth = np.column_stack([5.0 * np.arange(right + missed), np.zeros(right + missed)])
+    truth[right:] += (0.0, 2.5)
+    score = evaluate(trees(found), truth_trees(truth, ("tree",) * len(truth)), FOREST)
+    assert (score.TA.count, score.FR.count, score.spurious) == (right, missed, elsewhere)
+    assert score.is_doubtful is doubtful
+    told = truth_in_doubt(score)
+    assert bool(told) is doubtful
+    if doubtful:
+        assert told.startswith(f"only 1 of {right + missed} true trees lies" if right else "none of 16")
+        assert f"warning: {told}" in evaluation_lines(score)
 
 
 @LAW
