@@ -19,7 +19,7 @@ from app.tuning.goal import RunScore, pool, score_of
 from app.tuning.plan import Plan, identity
 from app.tuning.runs import ScoredRun, check_start, open_runs, scores_of
 from app.tuning.space import check, values_of
-from app.tuning.storage import open_study
+from app.tuning.storage import close_storage, open_study
 from app.tuning.trial import Trial
 from pipeline.errors import ParameterError
 from pipeline.parameters import Parameters
@@ -28,6 +28,7 @@ from pipeline.parameters.model import Value
 _ABANDONED_S = 1800.0  # after which a trial of another machine that tells nothing is made again
 _UNNAMED_S = 60.0  # the same, of one whose process ended before it said which it was
 _LOOK_EVERY_S = 0.2
+_FIXED = "fixed_params"  # Optuna's attribute of a trial whose values were told beforehand
 
 
 class StoppedError(Exception):
@@ -53,6 +54,7 @@ class Search:
         self._known: dict[int, Trial] = {}
         self._start = plan.parameters
         check(plan.axes, self._start)
+        self._storage: Any = None
         self._runs = open_runs(plan.runs, plan.seed, plan.odometry)
         try:
             self.sources = [(run.uri, run.source_digest, run.held_out) for run in self._runs]
@@ -66,9 +68,11 @@ class Search:
             raise
 
     def close(self) -> None:
-        """Let go of the runs."""
+        """Let go of the runs and of the storage."""
         for run in self._runs:
             run.close()
+        if self._storage is not None:
+            close_storage(self._storage)
 
     @property
     def training(self) -> list[ScoredRun]:
@@ -107,13 +111,17 @@ class Search:
         left = self._abandoned()
         if left is not None:
             return self._make(left.number, left.params)
-        states = [trial.state.name for trial in self._all()]
-        if sum(state in ("COMPLETE", "PRUNED", "RUNNING") for state in states) >= self.plan.trials:
-            return None
-        self.study.sampler = self._sampler(len(states))
-        asked = self.study.ask({axis.name: axis.distribution() for axis in self.plan.axes})
-        self._note(asked.number, "by", self._me)
-        return self._make(asked.number, asked.params)
+        while _counted(self._all()) < self.plan.trials:
+            asked = self.study.ask()
+            self._note(asked.number, "by", self._me)
+            if self._is_too_much(asked.number):  # another process asked at the same time
+                self._drop(asked.number)
+                continue
+            self.study.sampler = self._sampler(asked.number)
+            for axis in self.plan.axes:
+                axis.suggest(asked)
+            return self._make(asked.number, asked.params)
+        return None
 
     @property
     def is_under_way(self) -> bool:
@@ -148,6 +156,19 @@ class Search:
         return self._start.replace(dict(trial.values))
 
     # --- one trial ---------------------------------------------------------------------------------
+
+    def _is_too_much(self, number: int) -> bool:
+        """Whether a trial that begins is one more than the plan has, or the second that tries the start:
+        numbers are given one after the other, so that of two processes one alone sees the other's before its
+        own."""
+        before = [trial for trial in self._all() if trial.number <= number]
+        starts = [trial.number for trial in before if _FIXED in trial.system_attrs]
+        return _counted(before) > self.plan.trials or number in starts[1:]
+
+    def _drop(self, number: int) -> None:
+        from optuna.trial import TrialState
+
+        self.study.tell(number, state=TrialState.FAIL, skip_if_finished=True)
 
     def _make(self, number: int, params: dict[str, Any]) -> Trial:
         from optuna.trial import TrialState
@@ -218,13 +239,11 @@ class Search:
 
     def _abandoned(self) -> Any | None:  # noqa: ANN401
         """A trial whose process is gone, now taken over."""
-        from optuna.trial import TrialState
-
         for trial in self._all():
             if trial.state.name != "RUNNING" or not self._is_gone(trial):
                 continue
             if len(trial.params) < len(self.plan.axes):  # it ended before it knew what to try
-                self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+                self._drop(trial.number)
                 continue
             if self._note(trial.number, "by", self._me):
                 return trial
@@ -250,6 +269,11 @@ class Search:
             self._looked_s = now
             if self.stop():
                 raise StoppedError
+
+
+def _counted(trials: list[Any]) -> int:
+    """How many are made or being made."""
+    return sum(trial.state.name in ("COMPLETE", "PRUNED", "RUNNING") for trial in trials)
 
 
 def importances(study: Any) -> dict[str, float]:  # noqa: ANN401 - Optuna has no types

@@ -47,16 +47,15 @@ class Axis(msgspec.Struct, frozen=True):
     high: float = 0.0
     choices: tuple[str | bool, ...] = ()
 
-    def distribution(self) -> Any:  # noqa: ANN401 - Optuna has no types
-        """For Optuna."""
-        from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
-
+    def suggest(self, trial: Any) -> None:  # noqa: ANN401 - Optuna has no types
+        """Let a trial of Optuna choose a value, which is among its `params` then."""
         log = self.low > 0.0 and self.high >= _LOG_FROM * self.low
         if self.kind == "choice":
-            return CategoricalDistribution(self.choices)
-        if self.kind == "int":
-            return IntDistribution(int(self.low), int(self.high), log=log)
-        return FloatDistribution(self.low, self.high, log=log)
+            trial.suggest_categorical(self.name, self.choices)
+        elif self.kind == "int":
+            trial.suggest_int(self.name, int(self.low), int(self.high), log=log)
+        else:
+            trial.suggest_float(self.name, self.low, self.high, log=log)
 
     def value_of(self, suggested: Any) -> Value:  # noqa: ANN401
         """The parameter's value for what Optuna suggests: a number of few digits within the bounds."""

@@ -11,6 +11,7 @@ from pipeline.errors import StemmapError
 
 SERVER = ("postgresql://", "postgresql+psycopg://")
 _SCHEMA = "stemmap_tuning"  # Optuna's tables have names of their own there, and its own account of versions
+_OPENING = 0x73746D70  # number of the lock; any that no other program takes
 _LARGEST = 1 << 30
 _MEANT = {
     "format": "another version of stemmap",
@@ -67,6 +68,13 @@ def open_study(storage: str, identity: dict[str, Any]) -> tuple[Any, Any]:
     except Exception as error:  # whatever a damaged file or a server that went makes of Optuna
         raise _refused(storage, error) from None
     return study, backend
+
+
+def close_storage(backend: Any) -> None:  # noqa: ANN401 - Optuna has no types
+    """Let go of a database; a journal needs no closing."""
+    if (engine := getattr(backend, "engine", None)) is not None:
+        backend.remove_session()
+        engine.dispose()
 
 
 def _name(identity: dict[str, Any]) -> str:
@@ -148,13 +156,18 @@ def _server(address: str) -> Any:  # noqa: ANN401
     except (ArgumentError, ValueError):
         raise StemmapError("this is no address of a database") from None
     try:
-        engine = create_engine(url, connect_args={"connect_timeout": 5})
-        with engine.begin() as connection:
-            connection.execute(text(f"CREATE SCHEMA IF NOT EXISTS {_SCHEMA}"))
-        engine.dispose()
+        engine = create_engine(url, connect_args={"connect_timeout": 5}, isolation_level="AUTOCOMMIT")
         options = {"connect_timeout": 5, "options": f"-csearch_path={_SCHEMA}"}
         plain = url.render_as_string(hide_password=False)
-        return RDBStorage(plain, engine_kwargs={"connect_args": options, "pool_pre_ping": True})
+        try:
+            with engine.connect() as connection:
+                # Of machines that begin at the same time one alone makes the tables. The lock goes with the
+                # connection.
+                connection.execute(text(f"SELECT pg_advisory_lock({_OPENING})"))
+                connection.execute(text(f"CREATE SCHEMA IF NOT EXISTS {_SCHEMA}"))
+                return RDBStorage(plain, engine_kwargs={"connect_args": options, "pool_pre_ping": True})
+        finally:
+            engine.dispose()
     except ImportError:
         raise StemmapError(
             "the driver of PostgreSQL is missing", remedy="Install stemmap[postgres]"

@@ -3,82 +3,29 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sqlalchemy import create_engine, text
 
 from app.store.book import Beginning, Change, Standing
 from app.store.records import Author, Content, StaleError
 from app.store.store import Store
 from pipeline.errors import StemmapError
+from tests.postgresql import empty, running
 
 ANN, BOB = Author("a" * 16, "Ann"), Author("b" * 16, "Bob")
 
 
-def _as_somebody() -> tuple[list[str], tuple[int, int] | None]:
-    """How to run a program that refuses root, and whose files it writes then."""
-    if os.name != "posix" or os.geteuid() != 0:
-        return [], None
-    import pwd
-
-    try:
-        person = pwd.getpwnam("postgres")
-    except KeyError:
-        pytest.skip("PostgreSQL does not run as root, and there is no user postgres")
-    if shutil.which("setpriv") is None:
-        pytest.skip("PostgreSQL does not run as root, and there is no setpriv")
-    ids = ["--reuid", str(person.pw_uid), "--regid", str(person.pw_gid), "--clear-groups"]
-    return ["setpriv", *ids], (person.pw_uid, person.pw_gid)
-
-
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Address of an empty database of a server of our own; it listens on a socket in a folder alone."""
-    if given := os.environ.get("STEMMAP_TEST_DATABASE"):
-        yield given
-        return
-    pytest.importorskip("psycopg", reason="the driver of PostgreSQL is not installed")
-    initdb, pg_ctl = shutil.which("initdb"), shutil.which("pg_ctl")
-    if initdb is None or pg_ctl is None:
-        pytest.skip("there is no PostgreSQL server on this machine")
-    prefix, owner = _as_somebody()
-    # The path of a socket may not be long.
-    folder = Path(f"/tmp/stemmap-{os.getpid()}")  # noqa: S108 - made here, and it must not be there before
-    folder.mkdir(mode=0o700)
-    try:
-        if owner is not None:
-            os.chown(folder, *owner)
-        data = folder / "data"
-
-        def run(*words: str) -> None:
-            told = subprocess.run(
-                [*prefix, *words], cwd=folder, capture_output=True, text=True, timeout=120, check=False
-            )
-            assert told.returncode == 0, told.stderr
-
-        run(initdb, "-D", str(data), "-U", "stemmap", "-A", "trust", "--no-sync", "-E", "UTF8", "--locale=C")
-        options = f"-c listen_addresses='' -k {folder} -F"
-        run(pg_ctl, "-D", str(data), "-w", "-l", str(folder / "log"), "-o", options, "start")
-        try:
-            yield f"postgresql://stemmap@/postgres?host={folder}"
-        finally:
-            run(pg_ctl, "-D", str(data), "-w", "-m", "immediate", "stop")
-    finally:
-        shutil.rmtree(folder)
+def server() -> Iterator[str]:
+    with running() as address:
+        yield address
 
 
 @pytest.fixture
 def store(server: str) -> Iterator[Store]:
-    engine = create_engine(server.replace("postgresql:", "postgresql+psycopg:"))
-    with engine.begin() as connection:
-        connection.execute(text("DROP SCHEMA public CASCADE"))
-        connection.execute(text("CREATE SCHEMA public"))
-    engine.dispose()
+    empty(server, "public")
     with contextlib.closing(Store(None, database=server)) as opened:
         yield opened
 
