@@ -25,6 +25,9 @@ from pipeline.tracking.table import Rows, begin
 TREE, OTHER = int(Verdict.TREE), int(Verdict.OTHER)
 ONE_TREE = 0.5  # m; tree columns nearer to one another than this are one tree
 REACH = 0.45  # m; a track farther from a column than this is something else
+# m; how near to the axis of its column a trunk's track lies: of those alone in reach 95 of 100 within 16 cm
+# in sim:stand and within 12 cm in sim:dense.
+OWN = 0.15
 BESIDE = 0.7  # m; a tree whose own column is gone is what the column so near is: a person fits no circle well
 SCORE_STANDING = 5.0  # at least, of a tree that what was gathered stands for
 GATHERED_SIGMA = 0.1  # m; the middle of the returns of one side lies so far before the axis
@@ -150,8 +153,8 @@ def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
 
 @compiled
 def _with_tree(rows: Rows, count: int, place: Float, trees: Int) -> Int:
-    """Make one track of each tree column a tree, the free one in reach that has most hits, the first of
-    equals; the best columns choose first.
+    """Make one track of each tree column a tree, the likeliest free one in reach; the best columns choose
+    first.
 
     Returns:
         Places in `trees` of those without a track.
@@ -162,7 +165,7 @@ def _with_tree(rows: Rows, count: int, place: Float, trees: Int) -> Int:
     at = np.empty(trees.shape[0], np.int64)
     for k in range(trees.shape[0]):
         c = trees[k]
-        at[k] = _most_seen(rows, taken, cells, scale, place[c, 0], place[c, 1])
+        at[k] = _likeliest(rows, taken, cells, scale, place[c, 0], place[c, 1])
         if at[k] >= 0:
             taken[at[k]] = True
         else:
@@ -180,16 +183,25 @@ def _with_tree(rows: Rows, count: int, place: Float, trees: Int) -> Int:
 
 
 @compiled_within
-def _most_seen(rows: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
+def _likeliest(rows: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
+    """The free track in reach of a column's axis that is its likeliest, by hits and distance d, the first row
+    of equals, -1 for none:
+
+    (1 + ln(1 + hits)) exp(-d^2 / (2 OWN^2))
+
+    Hits alone would give a stem in undergrowth the branches beside it, seen before it and as often.
+    """
     u, v = first_of_four(x, y, scale)
-    most, best = np.int64(-1), np.int64(-1)
+    most, best = 0.0, np.int64(-1)
     for quarter in range(4):
         t = np.int64(cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))])
         while t >= 0:
             dx, dy = x - rows.x[t, 0], y - rows.x[t, 1]
-            more = rows.hits[t] > most or (rows.hits[t] == most and t < best)
-            if more and not taken[t] and dx * dx + dy * dy < REACH * REACH:
-                most, best = rows.hits[t], t
+            square = dx * dx + dy * dy
+            if not taken[t] and square < REACH * REACH:
+                likely = (1.0 + np.log(1.0 + rows.hits[t])) * np.exp(-0.5 * square / (OWN * OWN))
+                if likely > most or (likely == most and t < best):
+                    most, best = likely, t
             t = np.int64(cells.following[t])
     return int(best)
 
