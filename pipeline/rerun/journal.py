@@ -50,21 +50,27 @@ class Journal:
             del self._newest[left:]
 
     def first(self, scans: int) -> Notes:
-        """Of the first scans, or as many as there are."""
-        if self._newest and scans > len(self._notes):
-            self._lay_together()
-        return self._notes.first(scans)
+        """Of the first scans, or as many as there are. Asking changes nothing: those not laid together
+        yet are so for the answer alone."""
+        notes = self._notes
+        if self._newest and scans > len(notes):
+            notes = self._within(notes.with_more(Stretch.of(self._newest)))
+        return notes.first(scans)
 
     def take(self, notes: Notes) -> None:
         """Begin with these."""
         self._notes, self._newest, self._is_full = notes, [], False
 
     def _lay_together(self) -> None:
-        notes = self._notes.with_more(Stretch.of(self._newest))
-        self._newest = []
+        more = self._notes.with_more(Stretch.of(self._newest))
+        self._notes, self._newest = self._within(more), []
+        self._is_full = len(self._notes) < len(more)
+
+    def _within(self, notes: Notes) -> Notes:
+        """The first of them, for which there is room."""
         while notes.nbytes > self._most:
-            notes, self._is_full = notes.first(len(notes) - 1), True
-        self._notes = notes
+            notes = notes.first(len(notes) - 1)
+        return notes
 
 
 def _entry(noted: Noted, reach: float) -> Entry:

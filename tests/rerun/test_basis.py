@@ -14,7 +14,7 @@ from pipeline.mapper_records import MapperState
 from pipeline.parameters import Parameters, field_specs
 from pipeline.records import Frame
 from pipeline.rerun import Basis, Journal, KeptScans, Recalled, Rerun
-from pipeline.rerun.journal import FARTHEST
+from pipeline.rerun.journal import FARTHEST, STRETCH
 from tests.rerun.mapped import BASE, mapper, run, with_odd
 from tests.rerun.test_rerun import another
 
@@ -171,12 +171,24 @@ def test_a_journal_without_room_ends_and_one_that_goes_back_is_cut(room, known):
         whole.process(step)
     kept = small.first(len(run()[0]))
     assert kept.nbytes <= room * size
+    assert told(small.first(len(run()[0]))) == told(kept)
     assert (len(kept) == len(basis.notes)) == (room == 1.0)
     assert told(kept) == told(basis.notes.first(len(kept)))
     if room == 0.13:
         assert 0 < len(kept) < len(basis.notes)
     small.cut(len(kept) // 2)
     assert len(small) == len(small.first(1000)) == len(kept) // 2
+
+
+def test_asking_a_journal_leaves_no_short_stretches(known):
+    _, basis = known
+    whole, journal = mapper(BASE), Journal()
+    whole.note = lambda noted: journal.note(noted, BASE.slam)
+    for step in run()[0]:
+        whole.process(step)
+        assert len(journal.first(step.index + 1)) == step.index + 1
+    assert len(journal.first(1000).stretches) == -(-len(basis.notes) // STRETCH)
+    assert told(journal.first(1000)) == told(basis.notes)
 
 
 def test_no_tree_can_be_held_to_a_landmark_that_is_not_noted():
