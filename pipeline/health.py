@@ -23,6 +23,7 @@ class Health:
             errors are as large as their covariances say; NaN where no known landmark was recognised.
         sigma_xy: Standard deviation of the position [m]; sigma_yaw: of the heading [rad].
         odometry: How far the scan moved the pose away from what the odometry said [sigma].
+        doubt: Why the odometry is not believed, for people; it may be good nevertheless, by the trees.
     """
 
     state: HealthState = "good"
@@ -36,3 +37,8 @@ class Health:
     sigma_xy: float = 0.0
     sigma_yaw: float = 0.0
     odometry: float = 0.0
+    doubt: str = ""
+
+    def warnings(self, said: str) -> tuple[str, ...]:
+        """Of what people are warned: of an odometry that is not believed, where that was not `said` yet."""
+        return (self.doubt,) if self.doubt not in ("", said) else ()

@@ -164,7 +164,7 @@ class Mapper:
             seen=seen,
             estimate=estimate,
             T_odom_base=odometry,
-            warnings=(*refused, *told),
+            warnings=(*refused, *estimate.health.warnings(step.doubt), *told),
             landmarks=landmarks,
             searching=searching,
             asked_trees=self._asked_trees,

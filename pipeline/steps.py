@@ -21,12 +21,16 @@ STALE_NS = 250_000_000  # a reading farther away in time than this says nothing 
 JUMP_SPEED, JUMP_TURN = 15.0, 6.0  # m/s, rad/s; nothing that maps trees moves this fast
 STILL = (0.0, 0.0, 0.0)
 JUMP_SLACK = (0.2, 0.05)  # m, rad; what the robot may have moved while its odometry jumped
+PAUSE_NS = 10_000_000_000  # without a scan; trees that were in view may be out of it
 WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion that no odometry told
 WALK_MOST = (3.0, 0.5)  # m, rad; beyond it the trees around are others
 STANDS = (0.005, 0.002)  # m, rad; a robot that stands stays within it
 SETTLES_NS = 300_000_000
 AHEAD_NS = 1_000_000_000
 TILTS_NS = 90_000_000
+NO_ODOMETRY = (
+    "there is no odometry for some scans: the robot stands still in them, unless trees tell its motion"
+)
 FASTEST = 20.0  # rad/s; a robot that maps trees, whatever it shakes like, does not turn this fast
 
 
@@ -242,6 +246,9 @@ class Joiner:
         return self._odometry[-1].stamp_ns >= scan.stamp_ns
 
     def _join(self, scan: Scan) -> Step:
+        if self._stepped_ns is None and self._after is not None and self._after.stamp_ns < scan.stamp_ns:
+            self._stepped_ns = self._after.stamp_ns
+        self._tell_pause(scan.stamp_ns)
         pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
         turn = self._turn_to(scan.stamp_ns, pose)
@@ -284,10 +291,13 @@ class Joiner:
     ) -> tuple[Pose2 | None, tuple[float, float, float], tuple[float, float] | None]:
         """Pose, velocity in the base frame, and tilt where the odometry is of the whole pose."""
         if not self._odometry:
+            if self._use_odometry:
+                self._warn(NO_ODOMETRY)
+                self._bridge(stamp_ns)
             return None, STILL, None
         before, after = _around(self._odometry, stamp_ns)
         if stamp_ns > after.stamp_ns + STALE_NS:
-            self._warn("there is no odometry for some scans: the robot stands still in them")
+            self._warn(NO_ODOMETRY)
             self._bridge(stamp_ns)
             return after.pose, STILL, None
         span = (after.stamp_ns - before.stamp_ns) * 1e-9
@@ -298,6 +308,13 @@ class Joiner:
         twist = (step.x / span, step.y / span, step.yaw / span)
         tilt = _tilt_between(before, after, fraction)
         return interpolate(before.pose, after.pose, fraction), twist, tilt
+
+    def _tell_pause(self, stamp_ns: int) -> None:
+        """Of a long time without a scan the odometry alone tells; the trees after it may contradict that."""
+        seconds = 0.0 if self._stepped_ns is None else (stamp_ns - self._stepped_ns) * 1e-9
+        if seconds * 1e9 > PAUSE_NS:
+            self._warn(f"no scan came for {seconds:.0f} s: where the robot is then, the odometry alone tells")
+            self._suspect(f"no scan came for {seconds:.0f} s", (0.0, 0.0))
 
     def _bridge(self, stamp_ns: int) -> None:
         """Nothing told the motion since the scan before: it may have been any walk of a robot."""

@@ -23,7 +23,7 @@ from pipeline.slam.draws import draws
 from pipeline.slam.frame import NOISE, FrameMemory, at_least
 from pipeline.slam.gaussian import rows_of
 from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.health import Recent, ScanTold, is_astray, judged, remembered, scan_of
+from pipeline.slam.health import Recent, ScanTold, disagreement, is_astray, judged, remembered, scan_of
 from pipeline.slam.leading import are_apart, heir, leader
 from pipeline.slam.loop import Loop, bent_landmarks, bent_path
 from pipeline.slam.maps import shared_map, take_ancestors
@@ -31,6 +31,7 @@ from pipeline.slam.motion import Motion, accumulated, noise_of, wrapped
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.scan import against_slip, estimated, use_scan
 from pipeline.slam.shared_errors import SharedErrors
+from pipeline.slam.slip import ByTrees
 from pipeline.slam.state import SlamState
 from pipeline.slam.update import Rules
 
@@ -62,12 +63,14 @@ class FastSlam:
         motion = Motion(motion) if isinstance(motion, Pose2) else motion
         state = self._moved(self.state.with_particles(p.particles), motion)
         ancestors, doubt = None, motion.doubt
-        used = index == 0 or state.since_update >= p.update_distance
+        trees = self._by_trees(state, detections)
+        used = index == 0 or state.since_update >= p.update_distance or trees.slipped
+        if trees.slipped or state.recent.slipped:
+            doubt = doubt or slip.why(state.motion)
         if used:
-            state, scan, weights, slipped = self._observed(
-                state, detections, clear_range, noise, motion.measured
+            state, scan, weights = self._observed(
+                state, trees, detections, clear_range, noise, motion.measured, bool(doubt)
             )
-            doubt = doubt or ("the trees contradict the odometry: corrected by them" if slipped else "")
         else:
             scan, weights = ScanTold(), normalised(state.log_weight)
         if used:
@@ -197,27 +200,26 @@ class FastSlam:
     def _observed(
         self,
         state: SlamState,
+        trees: ByTrees,
         detections: Detections,
         clear_range: Float,
         noise: Float,
         measured: PoseMeasurement | None,
-    ) -> tuple[SlamState, ScanTold, Float, bool]:
-        """The state after a scan, what it told, the weights, and whether it put the motion right."""
+        doubted: bool,
+    ) -> tuple[SlamState, ScanTold, Float]:
+        """The state after a scan, what it told, and the weights."""
         rules, found = rules_of(self.parameters), len(detections.cluster)
         centre, R = detections.centre, rows_of(detections.covariance)
-        motion, covariance, recent, slipped = state.motion, state.motion_covariance, state.recent, False
-        if recent.mapped:
-            slipped, motion = against_slip(
-                state.pose, state.maps, state.best, motion, covariance, centre, R, rules
-            )
-        if slipped:
-            covariance = covariance + np.diag(slip.SIGMA**2)
+        motion, covariance, recent = trees.motion, trees.covariance, state.recent
+        if trees.slipped:
             recent = replace(recent, distrust=1.0)
         shared = self._shared(state, motion, covariance, measured)
         maps, weights, mean, odometry = use_scan(
             state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
             state.detections, rules, shared.for_particles(measured),
         )  # fmt: skip
+        if trees.slipped:
+            odometry = disagreement(motion, state.motion, state.motion_covariance)
         scan = scan_of(mean, odometry, found)
         state = replace(
             state,
@@ -226,10 +228,17 @@ class FastSlam:
             motion_covariance=np.zeros((3, 3)),
             since_update=0.0,
             detections=state.detections + found,
-            recent=remembered(recent, scan, state.since_update),
+            recent=remembered(recent, scan, state.since_update, doubted=doubted),
             shared=shared,
         )
-        return state, scan, weights, slipped
+        return state, scan, weights
+
+    def _by_trees(self, state: SlamState, detections: Detections) -> ByTrees:
+        return against_slip(
+            state.pose, state.maps, state.best, state.motion, state.motion_covariance, state.since_update,
+            state.recent.wheels(noise_of(self.parameters)), detections.centre,
+            rows_of(detections.covariance), rules_of(self.parameters),
+        )  # fmt: skip
 
     def _shared(
         self, state: SlamState, motion: Float, covariance: Float, measured: PoseMeasurement | None

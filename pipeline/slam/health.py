@@ -10,6 +10,8 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.health import Health, HealthState
+from pipeline.slam.motion import Noise, Wheels, wrapped
+from pipeline.slam.together import FAMILIAR
 
 # What a particle tells of a scan, columns of `told`.
 INNOVATION, RECOGNISED, AMBIGUOUS, FOUND, MISSED, SHIFT = 0, 1, 2, 3, 4, slice(5, 8)
@@ -22,14 +24,23 @@ MOST_HITS = 20.0
 SIGMA_GOOD, SIGMA_WEAK = 0.5, 1.5  # m
 INNOVATION_WEAK = 3.0  # fading mean; the errors are 1.7 times as large as their covariances say
 FOUND_WEAK, FOUND_LOST = 0.35, 0.2  # fading share of the known trees in free view that were found
-# A tree of three hits is well known: before those of another place are, the robot must be told lost.
-STRANGE_LOST, STRANGE_MISSED = 3, 15.0  # scans; hits of the known trees that such a scan misses
+# Scans in a row that show another place. More than make a tree well known: what a bend or an end of leaves
+# hid is new as well, and must have the time to become known before the robot is told lost. Trees of another
+# place become known as soon, so that from then on the hits count: a few new ones outvote no map.
+STRANGE_LOST, STRANGE_MISSED = 5, 15.0  # scans; hits of the known trees in free view that such a scan misses
 ODOMETRY_WEAK = 5.0  # sigma
 AMBIGUOUS_WEAK = 0.5  # fading share of the detections
 ALONE_WEAK = 5.0  # m without two known trees: then the heading is the odometry's alone
 FADING = 0.1  # of a fading mean is the newest scan
 FADING_FOUND = 0.2
+OVERRULED = 0.5  # of the distrust is left for six scans
 FEWEST = 2.0  # trees; fewer say nothing about shares
+EXPECTED = 100.0  # hits in free view that are missed in a known place where few are recognised by chance:
+BY_CHANCE, STILL_BY_CHANCE = 0.15, 0.4  # share of those found that is so; of the scans after such a one
+NEARBY = 3.0  # m without a known tree, after which a place is a known one no more
+LEADING = 3.0  # well known trees tell the motion where no odometry is to be believed,
+LED = 20  # and are believed in that after so many scans;
+LED_MOST, LED_AGAIN = 60, 2  # what counts for more, so that a doubt that comes and goes does not begin anew
 SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad
 
 
@@ -41,11 +52,15 @@ class Recent:
         innovation: Normalised innovation squared a degree of freedom.
         found: Share of the well known landmarks in free view that were found.
         ambiguous: Share of the detections that have two likely landmarks.
-        odometry: Largest disagreement with the odometry, fading [sigma].
+        odometry: Largest disagreement with the odometry where that was not doubted anyway, fading [sigma].
         alone: Distance driven since two known trees were recognised in a scan [m].
         mapped: Whether any landmark is well known.
         distrust: 1 when the trees overruled the odometry, fading.
-        strange: Scans in a row of which every detection is new while known trees in free view are missed.
+        strange: Scans in a row that miss nearly all known trees in free view, and recognise none or, in a
+            place that was well known, few.
+        familiar: Fading share of the detections that are well known.
+        led: Of scans in which trees told the motion as the odometry was doubted, LED_AGAIN for each; one less
+            for each scan since then.
     """
 
     innovation: float = 1.0
@@ -56,6 +71,17 @@ class Recent:
     mapped: bool = False
     distrust: float = 0.0
     strange: int = 0
+    familiar: float = 0.0
+    led: int = 0
+
+    @property
+    def slipped(self) -> bool:
+        """Whether the trees overruled the odometry in one of the last scans."""
+        return self.distrust >= OVERRULED
+
+    def wheels(self, noise: Noise) -> Wheels:
+        """How far an odometry of this noise may lie from what the trees say now."""
+        return Wheels(noise, self.distrust, self.alone, self.familiar)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +138,14 @@ def mean_told(told: Float, weights: Float, motion_covariance: Float) -> tuple[Fl
 
 
 @compiled
+def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> float:
+    """How far two motions, shape (3,), lie apart [sigma]; covariance: of the odometry's, shape (3, 3)."""
+    shift = by_trees - by_odometry
+    shift[2] = wrapped(shift[2])
+    return float(np.sqrt(_mahalanobis2(shift, covariance)))
+
+
+@compiled
 def _mahalanobis2(shift: Float, covariance: Float) -> float:
     """d^T P^-1 d of three numbers by elimination; P has no less than the floor on its diagonal, for an
     odometry that stands still has no sigma."""
@@ -130,8 +164,9 @@ def _mahalanobis2(shift: Float, covariance: Float) -> float:
     return square
 
 
-def remembered(recent: Recent, scan: ScanTold, driven: float) -> Recent:
-    """The fading means after one scan more, `driven` metres after the one before it."""
+def remembered(recent: Recent, scan: ScanTold, driven: float, *, doubted: bool = False) -> Recent:
+    """The fading means after one scan more, `driven` metres after the one before it; `doubted` says whether
+    the odometry was."""
     expected, told = scan.found + scan.missed, math.isfinite(scan.innovation)
     return Recent(
         innovation=_faded(recent.innovation, scan.innovation, FADING if told else 0),
@@ -141,12 +176,20 @@ def remembered(recent: Recent, scan: ScanTold, driven: float) -> Recent:
             scan.ambiguous / max(scan.detections, 1),
             FADING if scan.detections >= FEWEST else 0,
         ),
-        odometry=max(scan.odometry, (1.0 - FADING) * recent.odometry),
-        alone=0.0 if scan.recognised >= FEWEST else recent.alone + driven,
+        odometry=max(0.0 if doubted else scan.odometry, (1.0 - FADING) * recent.odometry),
+        alone=driven_alone(recent.alone, scan.recognised, driven),
         mapped=recent.mapped or scan.recognised > 0.5,
         distrust=fading_distrust(recent.distrust),
-        strange=_strange(recent.strange, scan),
+        strange=_strange(recent, scan, doubted or recent.alone + driven < NEARBY),
+        familiar=fading_familiar(recent.familiar, scan.recognised, scan.detections),
+        led=_led(recent.led, scan, doubted),
     )
+
+
+@compiled
+def driven_alone(alone: float, recognised: float, driven: float) -> float:
+    """The distance without two known trees after one scan more, see Recent."""
+    return 0.0 if recognised >= FEWEST else alone + driven
 
 
 @compiled
@@ -155,22 +198,47 @@ def fading_distrust(distrust: float) -> float:
     return (1.0 - FADING) * distrust if distrust > 0.01 else 0.0
 
 
+@compiled
+def fading_familiar(familiar: float, recognised: float, detections: int) -> float:
+    """The share of well known trees after one scan more, see Recent."""
+    if detections < FEWEST:
+        return familiar
+    return familiar + FADING_FOUND * (recognised / detections - familiar)
+
+
 def is_astray(recent: Recent) -> bool:
     """Whether the known trees are not where they should be seen."""
     return recent.mapped and (recent.found < FOUND_LOST or recent.strange >= STRANGE_LOST)
 
 
-def _strange(before: int, scan: ScanTold) -> int:
-    """Counted until a known tree is recognised; a scan that misses none or sees nothing says nothing."""
-    if scan.recognised >= 0.5 or scan.found > 0.0:
-        return 0
-    return before + 1 if scan.detections >= FEWEST and scan.missed >= STRANGE_MISSED else before
+def _led(before: int, scan: ScanTold, doubted: bool) -> int:
+    """Counted while trees tell what the odometry does not; forgotten when it is right for long."""
+    if not doubted:
+        return max(before - 1, 0)
+    return min(before + LED_AGAIN, LED_MOST) if scan.recognised >= LEADING else 0
+
+
+def _strange(recent: Recent, scan: ScanTold, here: bool) -> int:
+    """Counted until a known tree is recognised; a scan that misses none in free view or sees nothing says
+    nothing. In a place that is `here`, where known trees were seen last, or may be, a few of many are
+    recognised by chance, and those of the new place once they were seen for long enough."""
+    before = recent.strange
+    told = scan.detections >= FEWEST and scan.missed >= STRANGE_MISSED
+    share = scan.found / max(scan.found + scan.missed, 1e-9)
+    if scan.recognised < 0.5 and scan.found == 0.0:
+        return before + 1 if told else before
+    if before:
+        return before + 1 if told and share < STILL_BY_CHANCE else 0
+    return int(
+        told and here and recent.familiar >= FAMILIAR and scan.missed >= EXPECTED and share < BY_CHANCE
+    )
 
 
 def judged(
     recent: Recent, scan: ScanTold, n_eff: float, ancestors: int, covariance: Float, doubt: str = ""
 ) -> Health:
-    """The health after a scan.
+    """The health after a scan. An odometry that is doubted makes it weak until the trees have led for long
+    enough to be believed in that.
 
     Args:
         recent, scan: What the last scans and this one told.
@@ -192,6 +260,7 @@ def judged(
         sigma_xy=sigma_xy,
         sigma_yaw=float(np.sqrt(covariance[2, 2])),
         odometry=scan.odometry,
+        doubt=doubt,
     )
 
 
@@ -200,8 +269,10 @@ def _word(recent: Recent, sigma_xy: float, doubt: str) -> tuple[HealthState, str
         return "lost", f"the position is uncertain by {sigma_xy:.1f} m, more than trees stand apart"
     if is_astray(recent):
         return "lost", "the known trees are not where they should be seen"
-    if doubt:
+    if doubt and recent.led < LED_AGAIN * LED:
         return "weak", doubt
+    if recent.strange:
+        return "weak", "most detections stand where the map has no tree"
     if sigma_xy > SIGMA_GOOD:
         return "weak", f"the position is uncertain by {sigma_xy:.1f} m"
     if recent.mapped and recent.found < FOUND_WEAK:

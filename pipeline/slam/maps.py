@@ -226,10 +226,11 @@ def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
 
 
 @compiled
-def well_known(maps: Maps, p: int, hits: int, x: float, y: float, reach: float) -> Float:
-    """Where the landmarks of one particle with so many hits stand, shape (L, 2) [m], within a reach of a
-    place."""
-    near = np.empty((maps.places[p], 2))
+def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32]:
+    """The landmarks of one particle within a reach of a place: mean, shape (L, 2) [m], covariance xx, xy, yy,
+    shape (L, 3) [m^2], and hits, shape (L,)."""
+    places = maps.places[p]
+    mean, covariance, hits = np.empty((places, 2)), np.empty((places, 3)), np.empty(places, np.int32)
     n = 0
     for k in range((maps.places[p] + ROOM - 1) // ROOM):
         b = maps.block[p, k]
@@ -239,10 +240,13 @@ def well_known(maps: Maps, p: int, hits: int, x: float, y: float, reach: float) 
             continue
         for o in range(min(ROOM, maps.places[p] - k * ROOM)):
             dx, dy = maps.mean[b, o, 0] - x, maps.mean[b, o, 1] - y
-            if maps.hits[b, o] >= hits and dx * dx + dy * dy < reach * reach:
-                near[n, 0], near[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+            if maps.hits[b, o] > 0 and dx * dx + dy * dy < reach * reach:
+                mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+                for a in range(3):
+                    covariance[n, a] = maps.covariance[b, o, a]
+                hits[n] = maps.hits[b, o]
                 n += 1
-    return near[:n]
+    return mean[:n], covariance[:n], hits[:n]
 
 
 @compiled

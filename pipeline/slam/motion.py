@@ -43,6 +43,41 @@ def step_variances(x: float, y: float, yaw: float, noise: Noise) -> tuple[float,
     return noise.distance**2 * distance, heading
 
 
+class Wheels(NamedTuple):
+    """How far an odometry may lie from what the trees say.
+
+    Attributes:
+        noise: Of one that is as good as it should be.
+        distrust: 0 to 1, how much it was wrong lately.
+        alone: Distance that it led alone, without two known trees in view [m].
+        familiar: Fading share of the detections that were well known trees.
+    """
+
+    noise: Noise
+    distrust: float
+    alone: float
+    familiar: float
+
+
+@compiled
+def away_from_trees(motion: Float, driven: float, wheels: Wheels) -> tuple[float, float]:
+    """Variances with respect to the trees around of a place that an honest odometry led to: of x and of y
+    [m^2], and of yaw [rad^2].
+
+    Args:
+        motion: Since the last scan that was used, shape (3,); driven: all the way there, turns as well, more
+            than the motion where the robot came back [m], infinite where that was not counted. Of wheels that
+            were wrong lately it is not asked: each step of theirs counts for more, see advanced.
+    """
+    way, turned = np.hypot(motion[0], motion[1]), abs(motion[2])
+    counted = np.isfinite(driven) and wheels.distrust == 0.0
+    besides = max(driven - way - TURN_AS_DISTANCE * turned, 0.0) if counted else 0.0
+    besides += wheels.alone  # it is not known how much of these was a turn
+    way, turned = way + besides, turned + besides / TURN_AS_DISTANCE
+    position, heading = step_variances(way, 0.0, turned, wheels.noise)
+    return position + heading * way * way / 3.0, heading  # the heading went astray on the way
+
+
 def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -> tuple[Float, Float]:
     """A motion and then a step, with the covariance of both (Smith, Self, Cheeseman 1990).
 

@@ -11,14 +11,22 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int
-from pipeline.slam import slip
 from pipeline.slam.draws import draws
 from pipeline.slam.fastslam import FastSlam, rules_of
 from pipeline.slam.frame import FrameMemory
-from pipeline.slam.health import RECOGNISED, TOLD, fading_distrust, remembered, scan_of
+from pipeline.slam.health import (
+    RECOGNISED,
+    TOLD,
+    disagreement,
+    driven_alone,
+    fading_distrust,
+    fading_familiar,
+    remembered,
+    scan_of,
+)
 from pipeline.slam.leading import are_apart, heir, leader
 from pipeline.slam.maps import Maps, take_ancestors
-from pipeline.slam.motion import UNKNOWN, Noise, advanced, noise_of
+from pipeline.slam.motion import UNKNOWN, Noise, Wheels, advanced, noise_of
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.scan import against_slip, estimated, use_scan
 from pipeline.slam.shared_errors import Measured, nothing_measured
@@ -83,7 +91,8 @@ def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
     p, state = slam.parameters, slam.state.with_particles(slam.parameters.particles)
     maps, motion, motion_covariance, since_update, told = _drive(
         state.pose, state.log_weight, state.maps, state.motion, state.motion_covariance,
-        state.since_update, state.detections, state.best, state.recent.mapped, state.recent.distrust,
+        state.since_update, state.detections, state.best, state.recent.distrust, state.recent.alone,
+        state.recent.familiar,
         *_all_draws(slam, first_index, len(recorded.motion)), first_index, recorded.motion,
         recorded.centre, recorded.covariance, recorded.first, recorded.clear_range,
         rules_of(p), noise_of(p), p.update_distance, p.resample_below, nothing_measured(),
@@ -94,7 +103,7 @@ def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
         if told.used[t]:
             before = replace(recent, distrust=1.0) if told.slipped[t] else recent
             scan = scan_of(told.mean[t], told.odometry[t], int(found[t]))
-            recent = remembered(before, scan, told.driven[t])
+            recent = remembered(before, scan, told.driven[t], doubted=bool(told.slipped[t]) or recent.slipped)
         ancestors, best = told.ancestors[t] if told.ancestors[t, 0] >= 0 else None, int(told.best[t])
         shared = shared if ancestors is None else shared.drawn(ancestors)
         scans.append((told.particles[t], ancestors, best))
@@ -116,8 +125,9 @@ def _drive(
     since_update: float,
     detections: int,
     best: int,
-    mapped: bool,
     distrust: float,
+    alone: float,
+    familiar: float,
     normal: Float,
     offset: Float,
     first_index: int,
@@ -141,25 +151,30 @@ def _drive(
             distrust, noise, update_distance,
         )  # fmt: skip
         since_update += driven
-        used = first_index + t == 0 or since_update >= update_distance
+        centre, R = centres[first[t] : first[t + 1]], covariances[first[t] : first[t + 1]]
+        by_trees = against_slip(
+            pose, maps, best, motion, motion_covariance, since_update,
+            Wheels(noise, distrust, alone, familiar), centre, R, rules,
+        )  # fmt: skip
+        used = first_index + t == 0 or since_update >= update_distance or by_trees.slipped
         if used:
-            centre, R = centres[first[t] : first[t + 1]], covariances[first[t] : first[t + 1]]
-            if mapped:
-                told.slipped[t], motion = against_slip(
-                    pose, maps, best, motion, motion_covariance, centre, R, rules
-                )
-            if told.slipped[t]:
+            told.slipped[t] = by_trees.slipped
+            away = disagreement(by_trees.motion, motion, motion_covariance)
+            motion, motion_covariance = by_trees.motion, by_trees.covariance
+            if by_trees.slipped:
                 distrust = 1.0
-                motion_covariance = motion_covariance + np.diag(slip.SIGMA**2)
             maps, weights, mean, odometry = use_scan(
                 pose, log_weight, maps, motion, motion_covariance, normal[t], centre, R, clear_range,
                 detections, rules, measured,
             )  # fmt: skip
             told.used[t], told.driven[t] = True, since_update
             best = leader(weights, best, pose, rules.distance_max)
+            if by_trees.slipped:
+                odometry = away
             told.mean[t], told.odometry[t] = mean, odometry
-            mapped = mapped or mean[RECOGNISED] > 0.5
             distrust = fading_distrust(distrust)
+            alone = driven_alone(alone, mean[RECOGNISED], since_update)
+            familiar = fading_familiar(familiar, mean[RECOGNISED], centre.shape[0])
             detections += centre.shape[0]
             motion, motion_covariance, since_update = np.zeros(3), np.zeros((3, 3)), 0.0
         else:

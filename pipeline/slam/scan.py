@@ -7,12 +7,13 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.slam.health import TOLD, mean_told
-from pipeline.slam.maps import ROOM, Maps, blocks_in_reach, well_known, with_room
-from pipeline.slam.motion import moved_pose, moved_poses, weighted_pose
+from pipeline.slam.maps import ROOM, Maps, blocks_in_reach, known_near, with_room
+from pipeline.slam.motion import Wheels, moved_pose, moved_poses, weighted_pose
 from pipeline.slam.pairs import room_for
 from pipeline.slam.resampling import normalised
 from pipeline.slam.shared_errors import Measured
-from pipeline.slam.slip import FEWEST, SEARCH, motion_by_trees
+from pipeline.slam.slip import SEARCH, ByTrees, motion_by_trees
+from pipeline.slam.together import FEWEST as FEWEST_PAIRS
 from pipeline.slam.update import Rules, near_for, observe, predict
 
 
@@ -23,21 +24,27 @@ def against_slip(
     best: int,
     motion: Float,
     motion_covariance: Float,
+    driven: float,
+    wheels: Wheels,
     centre: Float,
     R: Float,
     rules: Rules,
-) -> tuple[bool, Float]:
-    """Whether the scan contradicts the map that the best particle knows well, and how the robot moved then.
+) -> ByTrees:
+    """What the scan tells of the motion by the map of the best particle: see `slip.motion_by_trees`.
 
     Args:
         pose: shape (P, 3) before the motion; maps: of the particles; best: which one is asked.
         motion, motion_covariance, centre, R, rules: See `update.observe`.
+        driven, wheels: How far the odometry may be wrong, see away_from_trees.
     """
-    if centre.shape[0] < FEWEST:
-        return False, motion.copy()
+    if centre.shape[0] < FEWEST_PAIRS:
+        return ByTrees(False, motion.copy(), motion_covariance.copy())
     at = moved_pose(pose[best], motion)
-    known = well_known(maps, best, rules.hits_to_weigh, at[0], at[1], rules.view_range + SEARCH)
-    return motion_by_trees(pose[best], motion, motion_covariance, centre, R, known, rules.gate)
+    known, spread, hits = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
+    return motion_by_trees(
+        pose[best], motion, motion_covariance, driven, wheels, centre, R, known, spread, hits,
+        rules.hits_to_weigh, rules.gate,
+    )  # fmt: skip
 
 
 @compiled

@@ -1,16 +1,21 @@
-"""Wheels that slipped, an odometry that jumped: how far the robot really moved, told by the trees.
+"""Wheels that slip or are stuck, an odometry that jumped: how far the robot really moved, told by the trees.
 
-Asked only where a scan contradicts the map: then the offset is sought that brings most detections onto
-known landmarks. The filter's own gates are far too narrow for it, and would begin all trees again.
+Where all trees lie off alike by a little, that is the motion that the odometry does not tell of (see
+`together`). Where a scan contradicts the map, the offset is sought that brings most detections onto known
+landmarks: the filter's own gates are far too narrow for it, and would begin all trees again.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.slam.motion import moved_pose
+from pipeline.records import Int32
+from pipeline.slam.motion import Wheels, away_from_trees, moved_pose
+from pipeline.slam.together import STANDING, moved_together
 
 SEARCH = 8.0  # m around where the odometry has the robot
 TURNS = np.radians(np.arange(-12.0, 12.5, 2.0))
@@ -20,6 +25,31 @@ EXPLAINED = 0.4  # of the detections on known landmarks contradict nothing
 CONVINCING = 0.7  # of the detections must lie on landmarks after the offset
 MARGIN = 2  # detections more than at any other place
 SIGMA = np.array([0.15, 0.15, np.radians(1.5)])  # of the offset that is found: m, m, rad
+FITTED = np.array([0.05, 0.05, np.radians(0.5)])  # the same of the least squares, and
+OWN = 2.0  # times their own sigma: the filter takes in the scan that told them once more
+WIDE = 0.5  # m; with so unsure a motion trees are mixed up
+STOOD = (0.005, 0.002)  # m, rad; an odometry that moves less since a scan says that the robot stands
+STUCK = "the odometry says that the robot stands, but the trees go by: it is stuck, and the trees lead"
+SLIPPED = "the trees contradict the odometry (wheels that slip, or a jump): the trees lead"
+
+
+class ByTrees(NamedTuple):
+    """What a scan tells of the motion.
+
+    Attributes:
+        slipped: Whether the trees say that it was another one.
+        motion: Then that one, else as it was, shape (3,); covariance: of it, shape (3, 3).
+    """
+
+    slipped: bool
+    motion: Float
+    covariance: Float
+
+
+def why(motion: Float) -> str:
+    """Why a motion, shape (3,), that the trees have corrected is not believed, for people."""
+    stood = np.hypot(motion[0], motion[1]) < STOOD[0] and abs(motion[2]) < STOOD[1]
+    return STUCK if stood else SLIPPED
 
 
 @compiled
@@ -27,68 +57,108 @@ def motion_by_trees(
     before: Float,
     motion: Float,
     covariance: Float,
+    driven: float,
+    wheels: Wheels,
     centre: Float,
     R: Float,
     known: Float,
+    spread: Float,
+    hits_of: Int32,
+    hits_to_weigh: int,
     gate: float,
-) -> tuple[bool, Float]:
-    """Whether the scan says how the robot really moved, and that motion, shape (3,); not where it
-    contradicts nothing or tells nothing.
+) -> ByTrees:
+    """What a scan tells of the motion.
 
     Args:
         before: x, y [m], yaw [rad] in the frame of the map.
-        motion: By the odometry since then, shape (3,); covariance: shape (3, 3).
+        motion: By the odometry since then, shape (3,); covariance: shape (3, 3); driven: see away_from_trees.
+        wheels: How it errs if it is right: what is added where it is doubted does not count here, for it is
+            contradicted still.
         centre: Detections in the base frame, shape (D, 2) [m]; R: their covariance xx, xy, yy, (D, 3).
-        known: Well known landmarks within SEARCH of what the robot can see, shape (L, 2) [m].
+        known: Landmarks within SEARCH of what the robot can see, shape (L, 2) [m]; spread: their covariance
+            xx, xy, yy, shape (L, 3) [m^2]; hits_of: shape (L,).
+        hits_to_weigh: With fewer a landmark is not well known.
         gate: [sigma].
     """
-    sigma = np.sqrt(0.5 * (R[:, 0] + R[:, 2]))
-    spread = np.empty(3)
-    for i in range(3):
-        spread[i] = np.sqrt(max(covariance[i, i], 0.0))
     pose = moved_pose(before, motion)
-    if not contradicts(pose, centre, sigma, known, spread, gate):
-        return False, motion.copy()
-    sure, place = offset(pose, centre, sigma, known)
-    if not sure:
-        return False, motion.copy()
-    c, s = np.cos(before[2]), np.sin(before[2])
-    dx, dy = place[0] - before[0], place[1] - before[1]
-    turn = (place[2] - before[2] + np.pi) % (2.0 * np.pi) - np.pi
-    return True, np.array([c * dx + s * dy, c * dy - s * dx, turn])
+    position, heading = away_from_trees(motion, driven, wheels)
+    well_known = hits_of >= hits_to_weigh
+    sure, place, fitted = moved_together(
+        pose, position, heading, wheels, centre, R, known, spread, well_known
+    )
+    if sure:
+        told = np.zeros((3, 3))
+        told[0, 0] = told[1, 1] = FITTED[0] ** 2 + OWN * OWN * max(fitted[0, 0], fitted[1, 1])
+        told[2, 2] = FITTED[2] ** 2 + OWN * OWN * fitted[2, 2]
+        return ByTrees(True, _from(before, place), told)
+    well = known[well_known]
+    sigma = np.sqrt(0.5 * (R[:, 0] + R[:, 2]))
+    hits, expected, by_chance = explained(pose, centre, sigma, well, position, heading, gate)
+    told = np.zeros((3, 3))
+    told[0, 0], told[1, 1], told[2, 2] = position, position, heading
+    for i in range(3):
+        told[i, i] += SIGMA[i] ** 2
+    if expected < FEWEST or hits >= EXPLAINED * expected:
+        wide = covariance[0, 0] + covariance[1, 1] > 2.0 * WIDE * WIDE
+        if wide and expected >= FEWEST and hits >= CONVINCING * expected:
+            return ByTrees(False, motion.copy(), told)  # what was feared did not happen
+        return ByTrees(False, motion.copy(), covariance.copy())
+    agree, sure, place = offset(pose, centre, sigma, well)
+    if not sure or hits > by_chance + agree // STANDING:
+        return ByTrees(False, motion.copy(), covariance.copy())
+    return ByTrees(True, _from(before, place), told)
 
 
 @compiled
-def contradicts(
-    pose: Float, centre: Float, sigma: Float, landmarks: Float, spread: Float, gate: float
-) -> bool:
-    """Whether most detections lie where no landmark is, though landmarks stand within their reach.
+def _from(before: Float, place: Float) -> Float:
+    """The motion from a pose to a place, shape (3,)."""
+    c, s = np.cos(before[2]), np.sin(before[2])
+    dx, dy = place[0] - before[0], place[1] - before[1]
+    turn = (place[2] - before[2] + np.pi) % (2.0 * np.pi) - np.pi
+    return np.array([c * dx + s * dy, c * dy - s * dx, turn])
+
+
+@compiled
+def explained(
+    pose: Float,
+    centre: Float,
+    sigma: Float,
+    landmarks: Float,
+    position: float,
+    heading: float,
+    gate: float,
+) -> tuple[int, int, float]:
+    """How many detections lie where a landmark is; how many of them should: as many as landmarks stand within
+    their reach; and how many would if they stood anywhere in it. Where most of many do not, the scan
+    contradicts the map.
 
     Args:
         pose: x, y [m], yaw [rad] by the odometry.
         centre: Detections, base frame, shape (D, 2) [m]; sigma: of each one [m].
         landmarks: Well known ones near by, shape (L, 2) [m].
-        spread: Standard deviations of x, y [m] and yaw [rad] of the pose.
+        position: Variance of x and of y of the pose [m^2]; heading: of its yaw [rad^2].
         gate: [sigma].
     """
     found = centre.shape[0]
     if found < FEWEST or landmarks.shape[0] < FEWEST:
-        return False
-    reach2, hits, expected = 0.0, 0, 0
+        return 0, 0, 0.0
+    reach2, hits, expected, covered = 0.0, 0, 0, 0.0
     for d in range(found):
         square = centre[d, 0] ** 2 + centre[d, 1] ** 2
         reach2 = max(reach2, square)
-        wide = gate * np.sqrt(sigma[d] ** 2 + spread[0] ** 2 + spread[1] ** 2 + square * spread[2] ** 2)
+        wide = gate * np.sqrt(sigma[d] ** 2 + 2.0 * position + square * heading)
         hits += _on_landmark(pose[0], pose[1], np.cos(pose[2]), np.sin(pose[2]), centre, d, landmarks, wide)
+        covered += wide * wide
     for j in range(landmarks.shape[0]):
         dx, dy = landmarks[j, 0] - pose[0], landmarks[j, 1] - pose[1]
         expected += dx * dx + dy * dy < reach2
-    return expected >= FEWEST and hits < EXPLAINED * min(found, expected)
+    return hits, min(found, expected), covered * expected / reach2
 
 
 @compiled
-def offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) -> tuple[bool, Float]:
-    """Where the robot is instead: x, y [m], yaw [rad], shape (3,), and whether that is certain."""
+def offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) -> tuple[int, bool, Float]:
+    """Where the robot is instead: how many detections lie on landmarks there, whether that is certain, and
+    x, y [m], yaw [rad], shape (3,)."""
     found = centre.shape[0]
     best, second = 0, 0
     place = pose.copy()
@@ -123,7 +193,7 @@ def offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) -> tuple[
                 elif hits > second and away > 1.0:
                     second = hits
     sure = best >= FEWEST and best >= CONVINCING * found and best >= second + MARGIN
-    return sure, place
+    return best, sure, place
 
 
 @compiled

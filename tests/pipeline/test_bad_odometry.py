@@ -109,19 +109,34 @@ def test_wheels_that_are_stuck_are_overruled_by_the_trees():
     truth, told = wheels(KNOWN + AFTER)
     told = [p if k < KNOWN else told[KNOWN - 1] for k, p in enumerate(told)]
     slam, rows, _ = driven(told, truth)
-    assert "weak" in {health.state for _, health, _, _ in rows[KNOWN:]}
-    assert good_again(rows) or rows[-1][1].state == "weak"
-    assert rows[-1][2] < 0.3
-    assert false_trees(slam) <= 3, "each of the 50 scans is a jump"
+    assert rows[KNOWN][1].state == "weak"
+    assert all("it is stuck" in health.doubt for _, health, _, _ in rows[KNOWN:])
+    assert rows[-1][1].state == "good", "the trees lead"
+    assert max(error for _, _, error, _ in rows[KNOWN:]) < 0.1
+    assert false_trees(slam) == 0
 
 
-def test_odometry_that_ends_is_weak_and_the_trees_lead():
+def test_odometry_that_ends_is_weak_until_the_trees_have_led_for_long():
     truth, told = wheels(KNOWN + AFTER)
     slam, rows, _ = driven(told, truth, missing=range(KNOWN, KNOWN + AFTER))
-    assert rows[-1][1].state == "weak"
-    assert "no odometry" in rows[-1][1].reason
-    assert rows[-1][2] < 0.3
-    assert false_trees(slam) <= 1
+    begun = next(k for k, (_, health, _, _) in enumerate(rows) if "no odometry" in health.doubt)
+    assert KNOWN <= begun <= KNOWN + 3
+    assert {health.state for _, health, _, _ in rows[begun : begun + 10]} == {"weak"}
+    assert "no odometry" in rows[begun + 10][1].reason
+    assert "no odometry" in rows[-1][1].doubt
+    assert good_again(rows)
+    assert max(error for _, _, error, _ in rows[KNOWN:]) < 0.1
+    assert false_trees(slam) == 0
+
+
+@pytest.mark.parametrize("seen_trees", [0, 2])
+def test_where_no_trees_lead_a_missing_odometry_stays_weak(seen_trees):
+    slam, states = FastSlam(FOREST, 0), []
+    for k in range(60):
+        motion = Motion(Pose2(), (0.05, 0.02), "there is no odometry") if k >= 10 else Pose2()
+        found = [[4.0, 1.0], [4.0, -1.0]][:seen_trees]
+        states.append(slam.process(k, motion, detections(found), NOTHING_SEEN).health.state)
+    assert set(states[10:]) == {"weak"}
 
 
 def test_a_gap_of_sixty_seconds_without_anything_is_bridged():

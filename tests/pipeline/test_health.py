@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,14 +16,18 @@ from pipeline.slam.health import (
     FOUND_LOST,
     INNOVATION,
     INNOVATION_WEAK,
+    LED,
+    LED_MOST,
     ODOMETRY_WEAK,
     RECOGNISED,
     SHIFT,
     SIGMA_GOOD,
     SIGMA_WEAK,
+    STRANGE_LOST,
     TOLD,
     Recent,
     ScanTold,
+    is_astray,
     judged,
     remembered,
     scan_told,
@@ -75,6 +81,10 @@ def test_wheels_that_slip_show_in_the_odometry():
     honest, at = driven(slam, 30, rng)
     slipped = slam.process(30, Pose2(0.07), seen(Pose2(at), rng=rng), NOTHING_SEEN).health
     assert slipped.odometry > 2.0 * np.median([h.odometry for h in honest[5:]])
+    assert slipped.state == "weak"
+    assert "contradict the odometry" in slipped.doubt
+    assert slipped.warnings("") == (slipped.doubt,)
+    assert slipped.warnings(slipped.doubt) == honest[-1].warnings("") == ()
     assert (
         judged(Recent(odometry=1.01 * ODOMETRY_WEAK), ScanTold(), 50.0, 9, np.zeros((3, 3))).state == "weak"
     )
@@ -141,6 +151,60 @@ def test_a_scan_that_says_nothing_leaves_the_means():
     after = remembered(recent, ScanTold(), 1.0)
     assert (after.innovation, after.found, after.ambiguous) == (2.0, 0.4, 0.3)
     assert after.alone == 1.0
+
+
+def test_trees_that_led_for_long_make_a_doubted_odometry_good():
+    recent, states = Recent(mapped=True), []
+    for _ in range(LED + 5):
+        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.0, doubted=True)
+        states.append(judged(recent, ScanTold(), 50.0, 20, np.zeros((3, 3)), "no odometry").state)
+    assert states == ["weak"] * (LED - 1) + ["good"] * 6
+    few = remembered(recent, ScanTold(detections=2, recognised=2.0), 0.0, doubted=True)
+    assert few.led == 0
+    for k in range(2 * LED):
+        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.1, doubted=k % 2 == 1)
+        word = judged(recent, ScanTold(), 50.0, 20, np.zeros((3, 3)), "no odometry" if k % 2 else "").state
+        assert word == "good", "a doubt that comes and goes does not begin anew"
+    for _ in range(LED_MOST):
+        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.1)
+    assert recent.led == 0, "another doubt is another one"
+
+
+CHANCE = ScanTold(detections=12, recognised=1.0, found=20.0, missed=200.0)
+
+
+@pytest.mark.parametrize(
+    ("familiar", "alone", "doubted", "missed", "lost"),
+    [
+        (0.9, 0.0, False, 200.0, True),
+        (0.9, 0.0, False, 0.0, False),  # what was known is hidden: the view has changed, and not the place
+        (0.9, 0.0, False, 30.0, False),  # or a tree fell
+        (0.9, 20.0, False, 200.0, False),
+        (0.9, 20.0, True, 200.0, True),
+        (0.3, 0.0, False, 200.0, False),
+    ],
+)
+def test_a_known_place_whose_trees_are_all_missed_at_once_is_another_one(
+    familiar, alone, doubted, missed, lost
+):
+    """Some trees are recognised there by chance."""
+    recent, states = Recent(mapped=True, familiar=familiar, alone=alone), []
+    for _ in range(STRANGE_LOST):
+        recent = remembered(recent, replace(CHANCE, missed=missed), 0.2, doubted=doubted)
+        states.append(judged(recent, CHANCE, 50.0, 20, np.zeros((3, 3))).state)
+    assert (recent.strange == STRANGE_LOST) == lost
+    assert (states == ["weak"] * (STRANGE_LOST - 1) + ["lost"]) == lost
+    assert is_astray(recent) == lost
+    assert remembered(recent, replace(CHANCE, found=200.0), 0.2).strange == 0
+
+
+def test_the_trees_of_another_place_do_not_soon_make_it_the_known_one():
+    assert preset("forest").slam.hits_to_weigh < STRANGE_LOST
+    recent = Recent(mapped=True, familiar=0.9)
+    for hits in (0, 0, 0, 3, 4):
+        scan = ScanTold(detections=12, recognised=12.0 if hits else 0.0, found=12.0 * hits, missed=200.0)
+        recent = remembered(recent, scan, 0.2)
+    assert is_astray(recent)
 
 
 def test_distinct_ancestors_are_those_of_the_generations():

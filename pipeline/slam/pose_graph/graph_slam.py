@@ -19,9 +19,9 @@ from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
 from pipeline.slam.gaussian import rows_of
-from pipeline.slam.health import Recent, ScanTold, is_astray, judged
+from pipeline.slam.health import Recent, ScanTold, disagreement, is_astray, judged, remembered
 from pipeline.slam.loop import Loop
-from pipeline.slam.motion import Motion, accumulated, compound, moved_pose
+from pipeline.slam.motion import Motion, accumulated, compound, moved_pose, noise_of
 from pipeline.slam.pose_graph.keyframe import observe, placed
 from pipeline.slam.pose_graph.smoother import Additions
 from pipeline.slam.pose_graph.state import NOTHING, GraphState
@@ -46,10 +46,19 @@ class GraphSlam:
         self._move(motion)
         due = state.since_update >= max(KEYFRAME, p.update_distance)
         due = due or motion.measured is not None or motion.slack != (0.0, 0.0)  # news that must not wait
-        if due and (len(detections.cluster) or motion.measured is not None):
-            slipped = self._against_slip(detections)
-            doubt = doubt or ("the trees contradict the odometry: corrected by them" if slipped else "")
+        by_trees = self._by_trees(detections)
+        if by_trees.slipped or state.recent.slipped:
+            doubt = doubt or slip.why(state.motion)
+        if by_trees.slipped or (due and (len(detections.cluster) or motion.measured is not None)):
+            driven = state.since_update if np.isfinite(state.since_update) else 0.0
+            away = disagreement(by_trees.motion, state.motion, state.motion_covariance)
+            state.motion, state.motion_covariance = by_trees.motion, by_trees.covariance
+            if by_trees.slipped:
+                state.recent = replace(state.recent, distrust=1.0)
             scan = observe(state, p, motion, detections, clear_range)
+            if by_trees.slipped:
+                scan = replace(scan, odometry=away)
+            state.recent = remembered(state.recent, scan, driven, doubted=bool(doubt))
         state.keyframe_of.append(state.keyframes - 1)
         state.since.append(state.motion)
         estimate = self._estimate()
@@ -153,22 +162,17 @@ class GraphSlam:
             s.since_update += moved[2]
             s.driven += moved[2]
 
-    def _against_slip(self, detections: Detections) -> bool:
+    def _by_trees(self, detections: Detections) -> slip.ByTrees:
+        """What the scan tells of the motion."""
         s, p = self.state, self.parameters
-        if not s.recent.mapped:
-            return False
-        known = s.landmarks.mean[s.landmarks.hits >= p.hits_to_weigh]
-        pose = moved_pose(s.pose, s.motion)
-        near = np.hypot(known[:, 0] - pose[0], known[:, 1] - pose[1]) < p.view_range + slip.SEARCH
-        slipped, motion = slip.motion_by_trees(
-            s.pose, s.motion, s.motion_covariance, detections.centre, rows_of(detections.covariance),
-            known[near], p.gate,
+        known, pose = s.landmarks, moved_pose(s.pose, s.motion)
+        away = known.mean - pose[:2]
+        near = np.hypot(away[:, 0], away[:, 1]) < p.view_range + slip.SEARCH
+        return slip.motion_by_trees(
+            s.pose, s.motion, s.motion_covariance, s.since_update, s.recent.wheels(noise_of(p)),
+            detections.centre, rows_of(detections.covariance), known.mean[near],
+            rows_of(known.covariance[near]), known.hits[near], p.hits_to_weigh, p.gate,
         )  # fmt: skip
-        if not slipped:
-            return False
-        s.motion, s.motion_covariance = motion, s.motion_covariance + np.diag(slip.SIGMA**2)
-        s.recent = replace(s.recent, distrust=1.0)
-        return True
 
     def _estimate(self) -> PoseEstimate:
         s = self.state

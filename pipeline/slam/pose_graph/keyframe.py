@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.geometry import Float, Pose2, wrap_angle
 from pipeline.parameters.stages import Slam
 from pipeline.records import Bool, Detections, Int
-from pipeline.slam.health import MISSED, MOST_HITS, SHIFT, TOLD, ScanTold, remembered, scan_told
+from pipeline.slam.health import MISSED, MOST_HITS, SHIFT, TOLD, ScanTold, scan_told
 from pipeline.slam.motion import Motion
 from pipeline.slam.pose_graph.joint import correct_by_pose, moved_joint, recognise_jointly
 from pipeline.slam.pose_graph.landmarks import Landmarks, Sightings, sharpened, turned
@@ -37,11 +37,10 @@ def observe(s: GraphState, p: Slam, motion: Motion, detections: Detections, clea
     seen = np.zeros(len(s.landmarks.hits), np.bool_)
     seen[row_of[row_of >= 0]] = True
     told[MISSED] = _miss(s, p, m[:3], seen, clear_range)
-    scan_covariance, driven = s.motion_covariance, s.since_update
+    scan_covariance = s.motion_covariance
     _extend(s, p, motion, m[:3], row_of, centre, R, _one_tree(s, p, m, Sigma, near, seen))
     s.covariance = Sigma[:3, :3]
     scan = scan_told(told[None], np.ones(1), len(centre), scan_covariance)
-    s.recent = remembered(s.recent, scan, driven if np.isfinite(driven) else 0.0)
     s.motion, s.motion_covariance, s.since_update = np.zeros(3), np.zeros((3, 3)), 0.0
     return scan
 

@@ -1,0 +1,93 @@
+"""Bad days: what becomes of the map when odometry or scans go wrong, in five places, twenty drives each."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from tests.benchmarks.table import Cell, Table
+
+if TYPE_CHECKING:
+    from tests.benchmarks.troubled import Place, Trouble
+
+NAME = "troubles"
+LINE = "Bad odometry and bad scans, twenty drives each: error, false trees, what is said"
+SEEDS = range(4)
+DRIFT, WRONG = 0.3, 0.5  # m; more than the first the map may not lie off, and at the second it is another one
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Of one drive: error of the pose at its end [m], false trees, whether it was warned of within the scans
+    that it may take, and the state in the end."""
+
+    error: float
+    false: int
+    warned: bool
+    state: str
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether the map is wrong without a word."""
+        return self.state == "good" and (self.error > WRONG or self.false > 1)
+
+
+def run() -> list[Table]:
+    """A row of each trouble."""
+    import numpy as np
+
+    from tests.benchmarks.troubled import PLACES, TROUBLES
+
+    rows: list[tuple[Cell, ...]] = []
+    for name, trouble in TROUBLES.items():
+        done = [outcome(place, seed, trouble) for place in PLACES.values() for seed in SEEDS]
+        errors = [one.error for one in done]
+        rows.append(
+            (name, len(done), sum(one.warned for one in done), float(np.median(errors)), max(errors),
+             max(one.false for one in done), *(sum(one.state == word for one in done) for word in WORDS),
+             sum(one.is_silent for one in done))
+        )  # fmt: skip
+        print(f"{name}: worst {max(errors):.2f} m", file=sys.stderr, flush=True)
+    columns = (
+        "trouble", "drives", "warned of", "median error [m]", "worst [m]", "most false trees",
+        *(f"{word} in the end" for word in WORDS), "wrong without a word",
+    )  # fmt: skip
+    return [
+        Table(
+            LINE,
+            columns,
+            tuple(rows),
+            (
+                f"Ready stems in {len(PLACES)} places (0.03 to 0.2 trees a square metre, 1 and 3 m/s, "
+                "straight and on a circle), 40 scans before the trouble and 55 since it began; error of the "
+                "pose at the end, false: where no tree stands, or one has another already.",
+            ),
+        )
+    ]
+
+
+WORDS = ("good", "weak", "lost")
+
+
+def outcome(place: Place, seed: int, trouble: Trouble) -> Outcome:
+    """Drive once."""
+    from pipeline.geometry import Pose3
+    from pipeline.mapper import Mapper
+    from pipeline.steps import steps
+    from tests.benchmarks.troubled import KNOWN, SENSOR, drive, parameters
+
+    driven = drive(place, seed, trouble)
+    mapper = Mapper(parameters(), sensor=SENSOR, T_base_lidar=Pose3.identity(), seed=seed)
+    frames = [mapper.process(step) for step in steps(driven.records)]
+    first = 0 if trouble.from_start else KNOWN
+    soon = frames[first : first + trouble.soon + 1]
+    last = frames[-1]
+    error = driven.error(len(driven.truth) - 1, last.estimate.T_map_base)
+    trees = last.trees.position[last.trees.confirmed]
+    return Outcome(
+        error,
+        driven.false_trees(trees, min(error, DRIFT)),
+        any(trouble.said in word for frame in soon for word in frame.warnings),
+        last.health.state,
+    )

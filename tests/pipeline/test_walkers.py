@@ -1,0 +1,106 @@
+"""People who walk side by side look as trees do from a robot whose wheels are stuck: they carry it nowhere.
+And a robot that is where it says is not told lost because what it sees changes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.direction import bin_direction
+from pipeline.geometry import Pose2
+from pipeline.parameters import preset
+from pipeline.slam import FastSlam
+from pipeline.visibility import BINS
+from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections
+
+FOREST = preset("forest").slam
+WALK, RATE = 1.4, 10  # m/s, Hz
+SIGMA = (0.03, 0.06)  # m
+SCANS = 40
+STRIDE = 0.1  # m, of a robot that drives
+
+
+def walked(seed, people, trees, *, sigma, stride=0.0, speed=WALK, free=NOTHING_SEEN):
+    """Estimates and true poses of a robot with honest wheels that people pass, all at one speed."""
+    rng = np.random.default_rng([7, seed])
+    direction = rng.uniform(-np.pi, np.pi)
+    velocity = speed / RATE * np.array([np.cos(direction), np.sin(direction)])
+    standing, walking = rng.uniform(-8.0, 8.0, (trees, 2)), rng.uniform(-6.0, 6.0, (people, 2))
+    slam, pose, told = FastSlam(FOREST, seed), Pose2(), []
+    for k in range(SCANS):
+        step = Pose2(stride if k else 0.0)
+        pose = pose @ step
+        world = np.concatenate([standing, walking + velocity * (k - SCANS / 2)])
+        centre = pose.inverse().apply(world)
+        centre = centre + rng.normal(0.0, sigma, centre.shape)
+        told.append((slam.process(k, step, detections(centre, sigma=sigma), free), pose))
+    return told
+
+
+def worst(told):
+    """The largest error of the position [m]."""
+    return max(np.hypot(e.T_map_base.x - true.x, e.T_map_base.y - true.y) for e, true in told)
+
+
+@pytest.mark.parametrize("stride", [0.0, STRIDE])
+@pytest.mark.parametrize("trees", [0, 1, 2])
+@pytest.mark.parametrize("people", [4, 5])
+def test_people_who_walk_together_carry_no_robot_away(people, trees, stride):
+    for seed in range(5):
+        for sigma in SIGMA:
+            for free in (NOTHING_SEEN, ALL_FREE):
+                told = walked(seed, people, trees, sigma=sigma, stride=stride, free=free)
+                assert worst(told) <= 0.1
+                assert not any("trees go by" in estimate.health.doubt for estimate, _ in told)
+
+
+@pytest.mark.parametrize("trees", [1, 2, 3])
+def test_a_tree_that_stands_beside_outvotes_people_who_stroll(trees):
+    for seed in range(5):
+        assert worst(walked(seed, 5, trees, sigma=0.03, speed=0.7)) <= 0.1
+
+
+def looked(first, then, *, free, scans=40):
+    """The health of a robot that stands still and sees some of its trees for long, and others then."""
+    rng, slam, states = np.random.default_rng(0), FastSlam(FOREST, 0), []
+    for k in range(scans + 30):
+        trees = first if k < scans else then
+        centre = trees + rng.normal(0.0, 0.02, trees.shape)
+        states.append(slam.process(k, Pose2(), detections(centre, sigma=0.03), free).health.state)
+    return states
+
+
+def stand(seed):
+    """Trees to the left and to the right of a robot at the origin that looks along x."""
+    rng, trees = np.random.default_rng([8, seed]), np.zeros((0, 2))
+    while len(trees) < 30:
+        place = rng.uniform(-9.0, 9.0, 2)
+        if abs(place[1]) > 2.0 and np.hypot(*(trees - place).T).min(initial=9.0) > 1.5:
+            trees = np.concatenate([trees, [place]])
+    return trees[trees[:, 1] > 0.0], trees[trees[:, 1] < 0.0]
+
+
+def free_to_the_right():
+    """To the left something hides what there is."""
+    return np.array([20.0 if bin_direction(k, BINS)[1] < -0.2 else 0.0 for k in range(BINS)])
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("free", [NOTHING_SEEN, free_to_the_right()])
+def test_a_robot_whose_view_changes_is_not_lost(seed, free):
+    assert set(looked(*stand(seed), free=free)) == {"good"}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nor_where_a_bend_shows_other_trees_and_a_known_one_fell(seed):
+    left, right = stand(seed)
+    fell = np.concatenate([left, [[1.0, -1.5]]])
+    assert "lost" not in looked(fell, right, free=free_to_the_right())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_robot_that_misses_all_trees_in_free_view_is_lost(seed):
+    states = looked(*stand(seed), free=ALL_FREE)
+    assert set(states[:40]) == {"good"}
+    assert "lost" in states[40:46]
