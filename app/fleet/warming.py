@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from app.compiling_ahead import PATIENCE_S
 
 WARMING = (sys.executable, "-P", "-c", "from app.warming import warm_up; warm_up()")
-COMPILING = "Getting ready; on a new machine this compiles for a minute or two, and only the first time"
+COMPILING = "Getting ready; on a new machine this compiles for some minutes, and only the first time"
 
 
 async def warmed(command: Sequence[str] = WARMING) -> None:

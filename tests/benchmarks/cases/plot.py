@@ -101,12 +101,21 @@ print(wall, used.ru_utime + used.ru_stime, used.ru_maxrss)
 sys.exit(child.returncode not in (0, 3))
 """
 
-_SCORES = ("found", "of", "position RMSE [cm]", "DBH RMSE [cm]", "DBH bias [cm]", "DBH scored")
-_NO_SCORES = (None, None, None, None, None, None)
+_SCORES = (
+    "found",
+    "of",
+    "position RMSE [cm]",
+    "DBH RMSE [cm]",
+    "DBH bias [cm]",
+    "DBH scored",
+    "their position [cm]",
+)
+_NO_SCORES = (None,) * len(_SCORES)
 
 
 def _scores(place, dbh, table: Path) -> tuple[int | float | None, ...]:
-    """Found stems of the table, error of place and of those diameters that can be scored."""
+    """Found stems of the table, error of place and of those diameters that can be scored, and of the place of
+    those stems."""
     import csv
 
     import numpy as np
@@ -128,7 +137,8 @@ def _against(place, dbh, truth, stems, truth_of) -> tuple[int | float | None, ..
     off = np.hypot(*(place[found] - truth[truth_of[found]]).T)
     tape = np.array([float(s["dbh_cm"]) if 0.0 < float(s["spread_cm"]) <= SPREAD else np.nan for s in stems])
     wider = 100.0 * dbh[found] - tape[truth_of[found]]
-    wider = wider[np.isfinite(wider)]
+    scored = np.isfinite(wider)
+    wider = wider[scored]
     return (
         int(found.sum()),
         len(truth),
@@ -136,6 +146,7 @@ def _against(place, dbh, truth, stems, truth_of) -> tuple[int | float | None, ..
         float(np.sqrt(np.mean(wider**2))) if len(wider) else None,
         float(wider.mean()) if len(wider) else None,
         len(wider),
+        100.0 * float(np.sqrt(np.mean(off[scored] ** 2))) if len(wider) else None,
     )
 
 
