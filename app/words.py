@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-COMPILING = "compiling for this machine; the first time this takes some minutes, and less for a new kind of source"
+COMPILING = "compiling for this machine; it takes some minutes the first time, less for a new kind of source"
 
 
 def count(n: int, one: str, many: str = "") -> str:
