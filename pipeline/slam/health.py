@@ -228,7 +228,11 @@ def _strange(recent: Recent, scan: ScanTold, here: bool) -> int:
     if scan.recognised < 0.5 and scan.found == 0.0:
         return before + 1 if told else before
     if before:
-        return before + 1 if told and share < STILL_BY_CHANCE else 0
+        # What was recognised has no more hits than what was begun since the first of these scans, and more
+        # is missed than one tree, which may have fallen.
+        young = scan.found <= (min(before, STRANGE_LOST) + 2) * scan.recognised
+        young = young and scan.missed >= FEWEST * STRANGE_MISSED
+        return before + 1 if told and (young or share < STILL_BY_CHANCE) else 0
     return int(
         told and here and recent.familiar >= FAMILIAR and scan.missed >= EXPECTED and share < BY_CHANCE
     )

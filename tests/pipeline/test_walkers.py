@@ -104,3 +104,13 @@ def test_a_robot_that_misses_all_trees_in_free_view_is_lost(seed):
     states = looked(*stand(seed), free=ALL_FREE)
     assert set(states[:40]) == {"good"}
     assert "lost" in states[40:46]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("few", "many"), [(3, 14), (5, 14), (3, 6), (8, 10)])
+def test_a_robot_that_is_carried_from_few_trees_to_many_is_lost(few, many, seed):
+    """The many become known within three scans, and soon outweigh the few."""
+    left, right = stand(seed)
+    states = looked(left[:few], np.concatenate([right, 1.3 * right + 0.4])[:many], free=ALL_FREE)
+    assert set(states[:40]) == {"good"}
+    assert "lost" in states[40:46]
