@@ -27,7 +27,9 @@ def summary_lines(
     seconds, metres = driven_s_m
     trees = int(np.count_nonzero(frame.trees.confirmed))
     scans = count(frame.index + 1, "scan")
-    lines = [f"{uri}: {scans}, {seconds:.1f} s, {metres:.1f} m driven, {count(trees, 'tree')}"]
+    told = int(np.count_nonzero(frame.trees.confirmed & np.isfinite(frame.trees.dbh)))
+    mapped = f"{count(trees, 'tree')}, {told} of them with a DBH"
+    lines = [f"{uri}: {scans}, {seconds:.1f} s, {metres:.1f} m driven, {mapped}"]
     if evaluation is not None:
         lines += evaluation_lines(evaluation)
     if error is not None:

@@ -167,7 +167,11 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         except OSError as error:
             raise _cannot_write(error, arguments.out) from None
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
-    times = f"median {outcome.scan_ms:.2f} ms a scan ({stages})" if outcome.scan_ms else NOT_TIMED
+    times = (
+        f"median {outcome.scan_ms:.2f} ms a scan; stages, where they ran: {stages}"
+        if outcome.scan_ms
+        else NOT_TIMED
+    )
     return _tell(
         [*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses, replaces=replaces
     )

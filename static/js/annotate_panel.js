@@ -33,9 +33,9 @@ function build() {
   byId("panel-annotate").replaceChildren(
     el("div", { class: "annotate-head" },
       el("p", { id: "annotate-count", class: "annotate-count" }),
-      button("annotate-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("annotate-redo", "Redo", "Do it again (Ctrl+Shift+Z)", redo)),
+      button("annotate-undo", "Undo", "Undo your last edit (Ctrl+Z)", thenByKeys(undo)), button("annotate-redo", "Redo", "Do it again (Ctrl+Shift+Z)", thenByKeys(redo))),
     el("div", { class: "annotate-tools" },
-      button("annotate-add", "Add", "Add trees by clicks on the map (a)", () => toggleAdding()),
+      button("annotate-add", "Add", "Add trees by clicks on the map (a)", thenByKeys(() => toggleAdding())),
       button("annotate-next", "Next", "The next found tree that nobody judged, the one that the decision trees doubt most first (Tab on the map)", thenByKeys(next)),
       button("annotate-yes", "Is a tree", "The selected found tree is one (y)", thenByKeys(() => judge("tree"))),
       button("annotate-no", "Is no tree", "The selected found tree is something else (n)", thenByKeys(() => judge(draft.kind))), el("label", { class: "annotate-as" }, "it is ", kind)),
@@ -167,6 +167,7 @@ function later() {
 export function startAnnotatePanel() {
   build();
   startLearning();
+  byId("tab-annotate").addEventListener("click", thenByKeys(() => {}));
   on("map", later);
   on("annotating", () => { if (draft.error || draft.adding) draft.said = ""; fill(); });
   on("tab annotations selection", fill);

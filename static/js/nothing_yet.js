@@ -3,4 +3,5 @@ import { state } from "./state.js";
 
 export const nothingYet = (what = "Nothing mapped") => state.status?.state === "starting"
   ? "stemmap gets ready; this fills with the first scan."
+  : state.status?.state === "playing" ? `${what} yet; this fills with the next scan.`
   : `${what} yet. Press play, or open a run.`;

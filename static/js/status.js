@@ -37,7 +37,7 @@ function budget({ scans, end_s: end }) {
 function ofScan() {
   if (state.evaluation?.warning) return "F1: is it this truth? see Scores";
   const { right, wrong } = state.map ?? {};
-  return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan ${right} of ${right + wrong}`;
+  return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan: ${right} of ${right + wrong} right`;
 }
 
 function reason({ health }) {

@@ -172,6 +172,11 @@ def test_whoever_clicks_next_goes_on_by_keys(person: Dashboard):
     person.eventually(lambda: bool(page.evaluate(nothing)), lambda: "a tree of the test before is selected")
     first, second = doubted(person)[:2]
     hint = page.locator("#annotate-hint")
+    page.locator("#tab-annotate").click()
+    page.keyboard.press("Tab")
+    expect(hint).to_contain_text(f"Tree {first['number']}, seen in")
+    page.evaluate("() => import('/static/js/live.js').then(({ select }) => select(null))")
+    person.eventually(lambda: bool(page.evaluate(nothing)), lambda: "a tree is selected")
     page.locator("#annotate-next").click()
     expect(hint).to_contain_text(f"Tree {first['number']}, seen in")
     page.keyboard.press("Tab")
