@@ -162,7 +162,7 @@ class Search:
         numbers are given one after the other, so that of two processes one alone sees the other's before its
         own."""
         before = [trial for trial in self._all() if trial.number <= number]
-        starts = [trial.number for trial in before if _FIXED in trial.system_attrs]
+        starts = [t.number for t in before if _FIXED in t.system_attrs and t.state.name != "FAIL"]
         return _counted(before) > self.plan.trials or number in starts[1:]
 
     def _drop(self, number: int) -> None:
@@ -228,7 +228,8 @@ class Search:
     def _enqueue_start(self) -> None:
         """Try what the search begins with first, where it lies within the bounds."""
         values = self._own_values()
-        if not self._all() and all(axis.holds(values[axis.name]) for axis in self.plan.axes):
+        begun = any(trial.state.name != "FAIL" for trial in self._all())
+        if not begun and all(axis.holds(values[axis.name]) for axis in self.plan.axes):
             self.study.enqueue_trial(values)
 
     def _sampler(self, number: int) -> Any:  # noqa: ANN401 - Optuna has no types
