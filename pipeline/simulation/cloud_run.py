@@ -151,9 +151,7 @@ def open_cloud_run(
 
 
 def _cut_short(way: float, lap: float) -> tuple[str]:
-    drives = (
-        f"duration={lap:.0f} drives all of it" if lap <= 3600.0 else "duration=3600 drives most of it"
-    )
+    drives = f"duration={lap:.0f} drives all of it" if lap <= 3600.0 else "duration=3600 drives most of it"
     return (f"the loop through the plot is {way:.0f} m long, of which {LONGEST:.0f} s are driven: {drives}",)
 
 
