@@ -16,7 +16,7 @@ from pipeline.saving import decode, encode, read_archive, write_archive
 from pipeline.saving.archive import damaged
 
 STATE = "state.zip"
-FORMAT = 7
+FORMAT = 8
 LARGEST_FILE = 4 << 30
 
 

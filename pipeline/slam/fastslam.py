@@ -23,7 +23,16 @@ from pipeline.slam.draws import draws
 from pipeline.slam.frame import NOISE, FrameMemory, at_least
 from pipeline.slam.gaussian import rows_of
 from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.health import Recent, ScanTold, disagreement, is_astray, judged, remembered, scan_of
+from pipeline.slam.health import (
+    Doubted,
+    Recent,
+    ScanTold,
+    disagreement,
+    is_astray,
+    judged,
+    remembered,
+    scan_of,
+)
 from pipeline.slam.leading import are_apart, heir, leader
 from pipeline.slam.loop import Loop, bent_landmarks, bent_path
 from pipeline.slam.maps import shared_map, take_ancestors
@@ -65,11 +74,12 @@ class FastSlam:
         ancestors, doubt = None, motion.doubt
         trees = self._by_trees(state, detections)
         used = index == 0 or state.since_update >= p.update_distance or trees.slipped
-        if trees.slipped or state.recent.slipped:
-            doubt = doubt or slip.why(state.motion)
+        slipped = trees.slipped or state.recent.slipped
+        doubted = Doubted(bool(doubt), slipped)
+        doubt = doubt or slip.why(state.motion, slipped, trees.unsure)
         if used:
             state, scan, weights = self._observed(
-                state, trees, detections, clear_range, noise, motion.measured, bool(doubt)
+                state, trees, detections, clear_range, noise, motion.measured, doubted
             )
         else:
             scan, weights = ScanTold(), normalised(state.log_weight)
@@ -205,7 +215,7 @@ class FastSlam:
         clear_range: Float,
         noise: Float,
         measured: PoseMeasurement | None,
-        doubted: bool,
+        doubted: Doubted,
     ) -> tuple[SlamState, ScanTold, Float]:
         """The state after a scan, what it told, and the weights."""
         rules, found = rules_of(self.parameters), len(detections.cluster)
@@ -228,7 +238,7 @@ class FastSlam:
             motion_covariance=np.zeros((3, 3)),
             since_update=0.0,
             detections=state.detections + found,
-            recent=remembered(recent, scan, state.since_update, doubted=doubted),
+            recent=remembered(recent, scan, state.since_update, doubted),
             shared=shared,
         )
         return state, scan, weights

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.health import Health, HealthState
 from pipeline.slam.motion import Noise, Wheels, wrapped
-from pipeline.slam.together import FAMILIAR
+from pipeline.slam.together import FAMILIAR, MANY
 
 # What a particle tells of a scan, columns of `told`.
 INNOVATION, RECOGNISED, AMBIGUOUS, FOUND, MISSED, SHIFT = 0, 1, 2, 3, 4, slice(5, 8)
@@ -38,7 +39,7 @@ FEWEST = 2.0  # trees; fewer say nothing about shares
 EXPECTED = 100.0  # hits in free view that are missed in a known place where few are recognised by chance:
 BY_CHANCE, STILL_BY_CHANCE = 0.15, 0.4  # share of those found that is so; of the scans after such a one
 NEARBY = 3.0  # m without a known tree, after which a place is a known one no more
-LEADING = 3.0  # well known trees tell the motion where no odometry is to be believed,
+LEADING = 3.0  # well known trees tell the motion where there is no odometry, MANY where there is one,
 LED = 20  # and are believed in that after so many scans;
 LED_MOST, LED_AGAIN = 60, 2  # what counts for more, so that a doubt that comes and goes does not begin anew
 SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad
@@ -58,6 +59,7 @@ class Recent:
         distrust: 1 when the trees overruled the odometry, fading.
         strange: Scans in a row that miss nearly all known trees in free view, and recognise none or, in a
             place that was well known, few.
+        missed: Most hits of known trees in free view that one of these scans missed.
         familiar: Fading share of the detections that are well known.
         led: Of scans in which trees told the motion as the odometry was doubted, LED_AGAIN for each; one less
             for each scan since then.
@@ -71,6 +73,7 @@ class Recent:
     mapped: bool = False
     distrust: float = 0.0
     strange: int = 0
+    missed: float = 0.0
     familiar: float = 0.0
     led: int = 0
 
@@ -82,6 +85,16 @@ class Recent:
     def wheels(self, noise: Noise) -> Wheels:
         """How far an odometry of this noise may lie from what the trees say now."""
         return Wheels(noise, self.distrust, self.alone, self.familiar)
+
+
+class Doubted(NamedTuple):
+    """Whether the odometry is not believed: as it came, or by the trees, now or just before."""
+
+    as_it_came: bool = False
+    by_trees: bool = False
+
+
+BELIEVED = Doubted()
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,10 +177,10 @@ def _mahalanobis2(shift: Float, covariance: Float) -> float:
     return square
 
 
-def remembered(recent: Recent, scan: ScanTold, driven: float, *, doubted: bool = False) -> Recent:
-    """The fading means after one scan more, `driven` metres after the one before it; `doubted` says whether
-    the odometry was."""
+def remembered(recent: Recent, scan: ScanTold, driven: float, doubted: Doubted = BELIEVED) -> Recent:
+    """The fading means after one scan more, `driven` metres after the one before it."""
     expected, told = scan.found + scan.missed, math.isfinite(scan.innovation)
+    strange = _strange(recent, scan, any(doubted) or recent.alone + driven < NEARBY)
     return Recent(
         innovation=_faded(recent.innovation, scan.innovation, FADING if told else 0),
         found=_faded(recent.found, scan.found / max(expected, 1e-9), FADING_FOUND if expected > 0 else 0),
@@ -176,11 +189,12 @@ def remembered(recent: Recent, scan: ScanTold, driven: float, *, doubted: bool =
             scan.ambiguous / max(scan.detections, 1),
             FADING if scan.detections >= FEWEST else 0,
         ),
-        odometry=max(0.0 if doubted else scan.odometry, (1.0 - FADING) * recent.odometry),
+        odometry=max(0.0 if any(doubted) else scan.odometry, (1.0 - FADING) * recent.odometry),
         alone=driven_alone(recent.alone, scan.recognised, driven),
         mapped=recent.mapped or scan.recognised > 0.5,
         distrust=fading_distrust(recent.distrust),
-        strange=_strange(recent, scan, doubted or recent.alone + driven < NEARBY),
+        strange=strange,
+        missed=max(recent.missed, scan.missed) if strange else 0.0,
         familiar=fading_familiar(recent.familiar, scan.recognised, scan.detections),
         led=_led(recent.led, scan, doubted),
     )
@@ -211,11 +225,12 @@ def is_astray(recent: Recent) -> bool:
     return recent.mapped and (recent.found < FOUND_LOST or recent.strange >= STRANGE_LOST)
 
 
-def _led(before: int, scan: ScanTold, doubted: bool) -> int:
+def _led(before: int, scan: ScanTold, doubted: Doubted) -> int:
     """Counted while trees tell what the odometry does not; forgotten when it is right for long."""
-    if not doubted:
+    if not any(doubted):
         return max(before - 1, 0)
-    return min(before + LED_AGAIN, LED_MOST) if scan.recognised >= LEADING else 0
+    leading = LEADING if doubted.as_it_came else MANY
+    return min(before + LED_AGAIN, LED_MOST) if scan.recognised >= leading else 0
 
 
 def _strange(recent: Recent, scan: ScanTold, here: bool) -> int:
@@ -231,7 +246,7 @@ def _strange(recent: Recent, scan: ScanTold, here: bool) -> int:
         # What was recognised has no more hits than what was begun since the first of these scans, and more
         # is missed than one tree, which may have fallen.
         young = scan.found <= (min(before, STRANGE_LOST) + 2) * scan.recognised
-        young = young and scan.missed >= FEWEST * STRANGE_MISSED
+        young = young and max(recent.missed, scan.missed) >= FEWEST * STRANGE_MISSED
         return before + 1 if told and (young or share < STILL_BY_CHANCE) else 0
     return int(
         told and here and recent.familiar >= FAMILIAR and scan.missed >= EXPECTED and share < BY_CHANCE

@@ -17,6 +17,7 @@ from pipeline.slam.frame import FrameMemory
 from pipeline.slam.health import (
     RECOGNISED,
     TOLD,
+    Doubted,
     disagreement,
     driven_alone,
     fading_distrust,
@@ -103,7 +104,8 @@ def drive(slam: FastSlam, first_index: int, recorded: Recorded) -> Driven:
         if told.used[t]:
             before = replace(recent, distrust=1.0) if told.slipped[t] else recent
             scan = scan_of(told.mean[t], told.odometry[t], int(found[t]))
-            recent = remembered(before, scan, told.driven[t], doubted=bool(told.slipped[t]) or recent.slipped)
+            doubted = Doubted(False, bool(told.slipped[t]) or recent.slipped)
+            recent = remembered(before, scan, told.driven[t], doubted)
         ancestors, best = told.ancestors[t] if told.ancestors[t, 0] >= 0 else None, int(told.best[t])
         shared = shared if ancestors is None else shared.drawn(ancestors)
         scans.append((told.particles[t], ancestors, best))

@@ -38,7 +38,7 @@ def against_slip(
         driven, wheels: How far the odometry may be wrong, see away_from_trees.
     """
     if centre.shape[0] < FEWEST_PAIRS:
-        return ByTrees(False, motion.copy(), motion_covariance.copy())
+        return ByTrees(False, motion.copy(), motion_covariance.copy(), False)
     at = moved_pose(pose[best], motion)
     known, spread, hits = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
     return motion_by_trees(

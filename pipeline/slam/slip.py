@@ -30,6 +30,7 @@ OWN = 2.0  # times their own sigma: the filter takes in the scan that told them 
 WIDE = 0.5  # m; with so unsure a motion trees are mixed up
 STOOD = (0.005, 0.002)  # m, rad; an odometry that moves less since a scan says that the robot stands
 STUCK = "the odometry says that the robot stands, but the trees go by: it is stuck, and the trees lead"
+UNSURE = "a few known trees go by, and the odometry passes none: it is wrong, or people walk there; it leads"
 SLIPPED = "the trees contradict the odometry (wheels that slip, or a jump): the trees lead"
 
 
@@ -39,17 +40,22 @@ class ByTrees(NamedTuple):
     Attributes:
         slipped: Whether the trees say that it was another one.
         motion: Then that one, else as it was, shape (3,); covariance: of it, shape (3, 3).
+        unsure: Whether they say so, but are so few that they may as well be people who walk off.
     """
 
     slipped: bool
     motion: Float
     covariance: Float
+    unsure: bool
 
 
-def why(motion: Float) -> str:
-    """Why a motion, shape (3,), that the trees have corrected is not believed, for people."""
+def why(motion: Float, corrected: bool, unsure: bool) -> str:
+    """Why a motion of the odometry, shape (3,), is not believed, for people; empty when it is. `corrected`:
+    the trees have, in this scan or one of the last ones; unsure: see ByTrees."""
     stood = np.hypot(motion[0], motion[1]) < STOOD[0] and abs(motion[2]) < STOOD[1]
-    return STUCK if stood else SLIPPED
+    if corrected:
+        return STUCK if stood else SLIPPED
+    return UNSURE if unsure else ""
 
 
 @compiled
@@ -83,14 +89,14 @@ def motion_by_trees(
     pose = moved_pose(before, motion)
     position, heading = away_from_trees(motion, driven, wheels)
     well_known = hits_of >= hits_to_weigh
-    sure, place, fitted = moved_together(
+    sure, unsure, place, fitted = moved_together(
         pose, position, heading, wheels, centre, R, known, spread, well_known
     )
     if sure:
         told = np.zeros((3, 3))
         told[0, 0] = told[1, 1] = FITTED[0] ** 2 + OWN * OWN * max(fitted[0, 0], fitted[1, 1])
         told[2, 2] = FITTED[2] ** 2 + OWN * OWN * fitted[2, 2]
-        return ByTrees(True, _from(before, place), told)
+        return ByTrees(True, _from(before, place), told, False)
     well = known[well_known]
     sigma = np.sqrt(0.5 * (R[:, 0] + R[:, 2]))
     hits, expected, by_chance = explained(pose, centre, sigma, well, position, heading, gate)
@@ -101,12 +107,12 @@ def motion_by_trees(
     if expected < FEWEST or hits >= EXPLAINED * expected:
         wide = covariance[0, 0] + covariance[1, 1] > 2.0 * WIDE * WIDE
         if wide and expected >= FEWEST and hits >= CONVINCING * expected:
-            return ByTrees(False, motion.copy(), told)  # what was feared did not happen
-        return ByTrees(False, motion.copy(), covariance.copy())
+            return ByTrees(False, motion.copy(), told, unsure)  # what was feared did not happen
+        return ByTrees(False, motion.copy(), covariance.copy(), unsure)
     agree, sure, place = offset(pose, centre, sigma, well)
     if not sure or hits > by_chance + agree // STANDING:
-        return ByTrees(False, motion.copy(), covariance.copy())
-    return ByTrees(True, _from(before, place), told)
+        return ByTrees(False, motion.copy(), covariance.copy(), unsure)
+    return ByTrees(True, _from(before, place), told, False)
 
 
 @compiled

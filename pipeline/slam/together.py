@@ -19,10 +19,12 @@ from pipeline.records import Bool, Int
 from pipeline.slam.motion import Wheels, inverted
 
 NEAR = 0.8  # m; farther from where it was seen the nearest tree may be another one
-FEWEST = 5  # pairs; fewer are a company that walks, or fit by chance
+FEWEST = 5  # pairs; fewer fit by chance, and so few may be a company that stood for long and walks off:
+SEVERAL = 8  # pairs overrule an odometry that was not wrong lately
 MANY = 10  # pairs, where none of them was known before: more than people walk side by side
 FAMILIAR = 0.6  # of the last detections were well known trees: what walks is new wherever it comes
 CONVINCING = 0.7  # of all that should be seen must agree
+CLEARLY = 6.0  # of twice the log-likelihood is a pair as the odometry has it that would agree otherwise too
 STANDING = 16  # agreeing pairs for each one that stands where the odometry has it, by chance or on the robot
 AGREE = 3.5  # sigma of a pair's distance after the motion
 ROUNDS = 5  # of leaving out what does not agree
@@ -43,9 +45,9 @@ def moved_together(
     known: Float,
     spread: Float,
     well: Bool,
-) -> tuple[bool, Float, Float]:
-    """Whether the trees tell that the robot is elsewhere; where, x, y [m], yaw [rad], shape (3,); and the
-    covariance of that, shape (3, 3).
+) -> tuple[bool, bool, Float, Float]:
+    """Whether the trees tell that the robot is elsewhere; whether they would if they were more; where, x, y
+    [m], yaw [rad], shape (3,); and the covariance of that, shape (3, 3).
 
     Args:
         pose: Where the odometry has it, shape (3,).
@@ -62,23 +64,23 @@ def moved_together(
     may = votes[landmark]
     kept, agree, misfit = may.copy(), may.sum(), 0.0
     if agree < fewest:
-        return False, place, N_inv
+        return False, False, place, N_inv
     for _ in range(ROUNDS):
         N, b = _normal_equations(lever, off, variance, kept)
         N_inv, det = inverted(N)
         if not det > 0.0:
-            return False, place, N_inv
+            return False, False, place, N_inv
         for i in range(3):
             motion[i] = N_inv[i, 0] * b[0] + N_inv[i, 1] * b[1] + N_inv[i, 2] * b[2]
         agree, misfit = _agreeing(lever, off, variance, motion, may, kept)
         if agree < fewest:
-            return False, place, N_inv
+            return False, False, place, N_inv
     away = motion[0] * motion[0] + motion[1] * motion[1] + (LEVER * motion[2]) ** 2
     least, expected = LEAST + wheels.distrust * (STILL_LEAST - LEAST), _expected(pose, centre, known, votes)
     if agree < CONVINCING * expected or misfit > MISFIT or away < least * least:
-        return False, place, N_inv
-    if _standing(lever, off, variance + position, heading, motion, kept) > agree // STANDING:
-        return False, place, N_inv
+        return False, False, place, N_inv
+    if _standing(lever, off, variance, position, heading, motion, kept) > agree // STANDING:
+        return False, False, place, N_inv
     N_inv *= max(1.0, misfit)
     S = N_inv.copy()
     S[0, 0] += position
@@ -90,7 +92,8 @@ def moved_together(
         for j in range(3):
             square += motion[i] * S_inv[i, j] * motion[j]
         place[i] += motion[i]
-    return square > beyond * beyond, place, N_inv
+    told, enough = square > beyond * beyond, agree >= SEVERAL or wheels.distrust > 0.0
+    return told and enough, told and not enough, place, N_inv
 
 
 @compiled
@@ -106,17 +109,25 @@ def _expected(pose: Float, centre: Float, known: Float, votes: Bool) -> int:
 
 
 @compiled
-def _standing(lever: Float, off: Float, variance: Float, heading: float, motion: Float, kept: Bool) -> int:
-    """How many pairs are as the odometry has it, and not as this motion does; `variance` with that of the
-    position by odometry, shape (K,) [m^2], heading: of its yaw [rad^2]."""
+def _standing(
+    lever: Float, off: Float, variance: Float, position: float, heading: float, motion: Float, kept: Bool
+) -> int:
+    """How many pairs are as the odometry has it, and not as this motion does. Beside people who stroll a tree
+    lies within the gate of their motion as well and is kept: it must tell clearly.
+
+    Args:
+        variance: Of the pairs, shape (K,) [m^2].
+        position, heading: Variances of the place by odometry [m^2, rad^2].
+        kept: Which pairs agree with the motion, shape (K,).
+    """
     standing = 0
     for k in range(lever.shape[0]):
         square, far2 = off[k, 0] ** 2 + off[k, 1] ** 2, lever[k, 0] ** 2 + lever[k, 1] ** 2
-        if kept[k] or square > AGREE * AGREE * (variance[k] + far2 * heading):
+        if square > AGREE * AGREE * (variance[k] + position + far2 * heading):
             continue
         ex = off[k, 0] - motion[0] + motion[2] * lever[k, 1]
         ey = off[k, 1] - motion[1] - motion[2] * lever[k, 0]
-        standing += ex * ex + ey * ey > square
+        standing += ex * ex + ey * ey > square + (CLEARLY * variance[k] if kept[k] else 0.0)
     return standing
 
 

@@ -25,6 +25,7 @@ from pipeline.slam.health import (
     SIGMA_WEAK,
     STRANGE_LOST,
     TOLD,
+    Doubted,
     Recent,
     ScanTold,
     is_astray,
@@ -32,6 +33,7 @@ from pipeline.slam.health import (
     remembered,
     scan_told,
 )
+from pipeline.slam.together import MANY
 from tests.pipeline.strategies import ALL_FREE, FEW, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam
@@ -153,16 +155,25 @@ def test_a_scan_that_says_nothing_leaves_the_means():
     assert after.alone == 1.0
 
 
+@pytest.mark.parametrize(("trees", "state"), [(MANY - 1, "weak"), (MANY, "good")])
+def test_trees_that_contradict_an_odometry_for_long_must_be_many(trees, state):
+    """Fewer may be people."""
+    recent, scan = Recent(mapped=True), ScanTold(detections=trees, recognised=float(trees))
+    for _ in range(2 * LED):
+        recent = remembered(recent, scan, 0.0, Doubted(by_trees=True))
+    assert judged(recent, scan, 50.0, 20, np.zeros((3, 3)), "stuck").state == state
+
+
 def test_trees_that_led_for_long_make_a_doubted_odometry_good():
     recent, states = Recent(mapped=True), []
     for _ in range(LED + 5):
-        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.0, doubted=True)
+        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.0, Doubted(True))
         states.append(judged(recent, ScanTold(), 50.0, 20, np.zeros((3, 3)), "no odometry").state)
     assert states == ["weak"] * (LED - 1) + ["good"] * 6
-    few = remembered(recent, ScanTold(detections=2, recognised=2.0), 0.0, doubted=True)
+    few = remembered(recent, ScanTold(detections=2, recognised=2.0), 0.0, Doubted(True))
     assert few.led == 0
     for k in range(2 * LED):
-        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.1, doubted=k % 2 == 1)
+        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.1, Doubted(k % 2 == 1))
         word = judged(recent, ScanTold(), 50.0, 20, np.zeros((3, 3)), "no odometry" if k % 2 else "").state
         assert word == "good", "a doubt that comes and goes does not begin anew"
     for _ in range(LED_MOST):
@@ -190,7 +201,7 @@ def test_a_known_place_whose_trees_are_all_missed_at_once_is_another_one(
     """Some trees are recognised there by chance."""
     recent, states = Recent(mapped=True, familiar=familiar, alone=alone), []
     for _ in range(STRANGE_LOST):
-        recent = remembered(recent, replace(CHANCE, missed=missed), 0.2, doubted=doubted)
+        recent = remembered(recent, replace(CHANCE, missed=missed), 0.2, Doubted(doubted))
         states.append(judged(recent, CHANCE, 50.0, 20, np.zeros((3, 3))).state)
     assert (recent.strange == STRANGE_LOST) == lost
     assert (states == ["weak"] * (STRANGE_LOST - 1) + ["lost"]) == lost

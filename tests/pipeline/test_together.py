@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from pipeline.geometry import Pose2, wrap_angle
 from pipeline.slam.motion import Noise, Wheels
-from pipeline.slam.slip import STUCK, motion_by_trees, why
-from pipeline.slam.together import FEWEST, MANY, moved_together
+from pipeline.slam.slip import SLIPPED, STUCK, UNSURE, motion_by_trees, why
+from pipeline.slam.together import AGREE, FEWEST, MANY, SEVERAL, moved_together
 from tests.pipeline.strategies import LAW, seeds
 
 SIGMA = 0.03
@@ -31,12 +31,17 @@ def scene(seed, trees=14):
 def asked(
     known, seen, *, pose=(0.0, 0.0, 0.0), position=0.0, heading=0.0, distrust=0.0, familiar=1.0, well=None
 ):
-    """`moved_together` with round covariances, in a place that is well known."""
+    """Of `moved_together` with round covariances, in a place that is well known: whether it moved, where it
+    is, and the covariance."""
     rows = np.array([SIGMA**2, 0.0, SIGMA**2])
     R, spread = np.tile(rows, (len(seen), 1)), np.tile(rows, (len(known), 1))
     well = np.ones(len(known), np.bool_) if well is None else well
     wheels = Wheels(SURE, distrust, 0.0, familiar)
-    return moved_together(np.array(pose), position, heading, wheels, seen, R, known, spread, well)
+    moved, unsure, place, C = moved_together(
+        np.array(pose), position, heading, wheels, seen, R, known, spread, well
+    )
+    assert not (moved and unsure)
+    return moved, place, C
 
 
 @LAW
@@ -129,7 +134,25 @@ def test_what_was_not_there_for_long_must_be_many(well, familiar):
     assert asked(known[1:], known[1:] - [0.3, 0.0])[0]
 
 
-@pytest.mark.parametrize("moving", [FEWEST, MANY, 15])
+@pytest.mark.parametrize("pairs", range(FEWEST, SEVERAL))
+def test_a_few_well_known_ones_tell_only_of_an_odometry_that_was_wrong(pairs):
+    """Else they are people who stood for long, and walk off: that is said, and nothing moved."""
+    known, _ = scene(16, trees=pairs)
+    seen = known - [0.3, 0.0]
+    assert not asked(known, seen)[0]
+    assert asked(known, seen, distrust=0.5)[0]
+    known, seen = known[:FEWEST], seen[:FEWEST]
+    told = told_of([0.0, 0.0, 0.0], known, seen)
+    assert not told.slipped
+    assert told.unsure
+    np.testing.assert_array_equal(told.motion, 0.0)
+    assert why(told.motion, told.slipped, told.unsure) == UNSURE
+    again = told_of([0.0, 0.0, 0.0], known, seen, distrust=0.5)
+    assert again.slipped
+    assert not again.unsure
+
+
+@pytest.mark.parametrize("moving", [SEVERAL, MANY, 15])
 def test_one_tree_that_stands_beside_is_enough(moving):
     known, _ = scene(13, trees=moving + 1)
     seen = known - [0.3, 0.0]
@@ -138,19 +161,29 @@ def test_one_tree_that_stands_beside_is_enough(moving):
     assert not asked(known, seen)[0]
 
 
+def test_a_tree_beside_people_who_stroll_counts_though_it_fits_their_motion_too():
+    known, _ = scene(17, trees=SEVERAL + 1)
+    seen = known - [0.09, 0.0]
+    assert asked(known, seen)[0]
+    seen[0] = known[0]
+    assert AGREE * SIGMA * np.sqrt(2.0) > 0.09
+    assert not asked(known, seen)[0]
+
+
 def test_what_is_seen_beside_and_known_to_nobody_counts_where_it_could_be_known():
-    known, rng = scene(14, trees=FEWEST + 8)
+    known, rng = scene(14, trees=SEVERAL + 8)
     seen = known - [0.3, 0.0]
-    others = seen[:FEWEST] + rng.uniform(0.9, 1.1, (FEWEST, 2))
-    assert asked(known[:FEWEST], np.concatenate([seen[:FEWEST], others]))[0], "no more are known"
+    others = seen[:SEVERAL] + rng.uniform(0.9, 1.1, (SEVERAL, 2))
+    assert asked(known[:SEVERAL], np.concatenate([seen[:SEVERAL], others]))[0], "no more are known"
     assert not asked(known, np.concatenate([seen[:FEWEST], others[:5]]))[0]
 
 
-def told_of(motion, known, seen, *, covariance=1e-4, alone=0.0, driven=0.0):
+def told_of(motion, known, seen, *, covariance=1e-4, alone=0.0, driven=0.0, distrust=0.0):
     """`motion_by_trees` of a robot at the origin; all landmarks were seen ten times."""
     rows = np.array([SIGMA**2, 0.0, SIGMA**2])
     return motion_by_trees(
-        np.zeros(3), np.array(motion), covariance * np.eye(3), driven, Wheels(SURE, 0.0, alone, 1.0), seen,
+        np.zeros(3), np.array(motion), covariance * np.eye(3), driven,
+        Wheels(SURE, distrust, alone, 1.0), seen,
         np.tile(rows, (len(seen), 1)), known, np.tile(rows, (len(known), 1)),
         np.full(len(known), 10, np.int32), 3, 3.5,
     )  # fmt: skip
@@ -162,8 +195,9 @@ def test_stuck_wheels_are_put_right_over_any_way(true):
     told = told_of([0.0, 0.0, 0.0], known, true.inverse().apply(known))
     assert told.slipped
     np.testing.assert_allclose(told.motion, true.as_array(), atol=0.15)
-    assert why(np.zeros(3)) == STUCK
-    assert why(np.array([0.1, 0.0, 0.0])) != STUCK
+    assert why(np.zeros(3), told.slipped, False) == STUCK
+    assert why(np.array([0.1, 0.0, 0.0]), told.slipped, False) == SLIPPED
+    assert why(np.zeros(3), False, False) == ""
 
 
 def test_a_motion_that_is_not_known_is_told_by_trees_that_agree_with_it():

@@ -93,8 +93,9 @@ def lived(place: str, seed: int, name: str, p: Parameters | None = None) -> Day:
     return Day(driven, rows)
 
 
-def assert_survived(name: str, day: Day, slower: int = 1) -> None:
-    """What is asked of every bad day; `slower`: so many scans pass for one that is used."""
+def assert_survived(name: str, day: Day, slower: int = 1, *, enough: bool = True) -> None:
+    """What is asked of every bad day; `slower`: so many scans pass for one that is used; enough: trees are
+    seen that contradict an odometry for long, else it is weak in the end."""
     trouble = TROUBLES[name]
     first, soon_by = 1 if trouble.from_start else KNOWN, slower * trouble.soon
     soon = [row for row in day.since(first) if row[0] <= first + soon_by]
@@ -111,8 +112,9 @@ def assert_survived(name: str, day: Day, slower: int = 1) -> None:
     before = max(day.drive.error(row[0], row[1].estimate.T_map_base) for row in day.rows if row[0] < KNOWN)
     error = day.drive.error(day.rows[-1][0], frame.estimate.T_map_base)
     lost = trouble.may_be_lost and state == "lost"
+    word = "good" if enough else "weak"
     assert lost or error < before + NO_WORSE
-    assert lost or {row[2] for row in day.since(first + WITHIN)} == {"good"}
+    assert lost or {row[2] for row in day.since(first + WITHIN)} == {word}
     trees = frame.trees.position[frame.trees.confirmed]
     assert day.drive.false_trees(trees, before + (0.0 if lost else error)) <= 1
 
@@ -126,7 +128,7 @@ def test_a_bad_day(name: str, place: str, seed: int) -> None:
 @pytest.mark.parametrize("name", ["stuck", "odometry ends", "jump of 0.5 m", "kidnapped"])
 @pytest.mark.parametrize(("place", "seed"), [("at 3 m/s", 3), ("few trees", 4), ("dense", 5)])
 def test_elsewhere(name: str, place: str, seed: int) -> None:
-    assert_survived(name, lived(place, seed, name))
+    assert_survived(name, lived(place, seed, name), enough=(name, place) != ("stuck", "few trees"))
 
 
 @pytest.mark.parametrize(("place", "seed"), [("at 3 m/s", 3), ("dense", 5)])

@@ -11,6 +11,7 @@ from pipeline.direction import bin_direction
 from pipeline.geometry import Pose2
 from pipeline.parameters import preset
 from pipeline.slam import FastSlam
+from pipeline.slam.slip import UNSURE
 from pipeline.visibility import BINS
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections
 
@@ -53,6 +54,50 @@ def test_people_who_walk_together_carry_no_robot_away(people, trees, stride):
                 told = walked(seed, people, trees, sigma=sigma, stride=stride, free=free)
                 assert worst(told) <= 0.1
                 assert not any("trees go by" in estimate.health.doubt for estimate, _ in told)
+
+
+def left_by(seed, people, trees, *, speed, stride=0.0, dropouts=0.0):
+    """Estimates and true poses of a robot with honest wheels that knows people who stood for long, since they
+    walk off; trees are missed in a share of the scans."""
+    rng = np.random.default_rng([9, seed])
+    direction = rng.uniform(-np.pi, np.pi)
+    velocity = speed / RATE * np.array([np.cos(direction), np.sin(direction)])
+    world = np.zeros((0, 2))
+    while len(world) < trees + people:
+        place = rng.uniform(-8.0, 8.0, 2)
+        if np.hypot(*place) > 0.8 and np.hypot(*(world - place).T).min(initial=9.0) > 1.3:
+            world = np.concatenate([world, [place]])
+    slam, pose, told = FastSlam(FOREST, seed), Pose2(), []
+    for k in range(2 * SCANS):
+        step = Pose2(stride if k else 0.0)
+        pose = pose @ step
+        now = world.copy()
+        now[trees:] += velocity * max(0, k - SCANS)
+        seen = rng.random(len(now)) >= np.where(np.arange(len(now)) < trees, dropouts, 0.0)
+        centre = pose.inverse().apply(now[seen])
+        centre = centre + rng.normal(0.0, SIGMA[0], centre.shape)
+        told.append((slam.process(k, step, detections(centre, sigma=SIGMA[0]), NOTHING_SEEN), pose))
+    return told[SCANS:]
+
+
+@pytest.mark.parametrize("speed", [1.0, WALK])
+@pytest.mark.parametrize(("trees", "dropouts"), [(0, 0.0), (2, 0.6), (3, 0.3), (3, 0.6)])
+def test_people_who_were_known_and_walk_off_carry_no_robot_away(trees, dropouts, speed):
+    for seed in range(4):
+        for stride in (0.0, STRIDE):
+            assert worst(left_by(seed, 5, trees, speed=speed, stride=stride, dropouts=dropouts)) <= 0.1
+
+
+def test_of_people_who_walk_off_it_is_said_that_nobody_can_tell():
+    told = [left_by(seed, 5, 0, speed=1.0) for seed in range(6)]
+    assert any(e.health.doubt == UNSURE and e.health.state == "weak" for one in told for e, _ in one)
+
+
+def test_more_of_them_may_carry_it_but_it_does_not_say_that_all_is_good():
+    for seed in range(4):
+        told = left_by(seed, 8, 0, speed=WALK)
+        assert all(e.health.state != "good" for e, _ in told if e.health.doubt)
+        assert worst(told) <= 0.1 or told[-1][0].health.state == "weak"
 
 
 @pytest.mark.parametrize("trees", [1, 2, 3])

@@ -19,7 +19,7 @@ from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
 from pipeline.slam.gaussian import rows_of
-from pipeline.slam.health import Recent, ScanTold, disagreement, is_astray, judged, remembered
+from pipeline.slam.health import Doubted, Recent, ScanTold, disagreement, is_astray, judged, remembered
 from pipeline.slam.loop import Loop
 from pipeline.slam.motion import Motion, accumulated, compound, moved_pose, noise_of
 from pipeline.slam.pose_graph.keyframe import observe, placed
@@ -47,8 +47,9 @@ class GraphSlam:
         due = state.since_update >= max(KEYFRAME, p.update_distance)
         due = due or motion.measured is not None or motion.slack != (0.0, 0.0)  # news that must not wait
         by_trees = self._by_trees(detections)
-        if by_trees.slipped or state.recent.slipped:
-            doubt = doubt or slip.why(state.motion)
+        slipped = by_trees.slipped or state.recent.slipped
+        doubted = Doubted(bool(doubt), slipped)
+        doubt = doubt or slip.why(state.motion, slipped, by_trees.unsure)
         if by_trees.slipped or (due and (len(detections.cluster) or motion.measured is not None)):
             driven = state.since_update if np.isfinite(state.since_update) else 0.0
             away = disagreement(by_trees.motion, state.motion, state.motion_covariance)
@@ -58,7 +59,7 @@ class GraphSlam:
             scan = observe(state, p, motion, detections, clear_range)
             if by_trees.slipped:
                 scan = replace(scan, odometry=away)
-            state.recent = remembered(state.recent, scan, driven, doubted=bool(doubt))
+            state.recent = remembered(state.recent, scan, driven, doubted)
         state.keyframe_of.append(state.keyframes - 1)
         state.since.append(state.motion)
         estimate = self._estimate()
