@@ -23,25 +23,18 @@ from pipeline.slam.draws import draws
 from pipeline.slam.frame import NOISE, FrameMemory, at_least
 from pipeline.slam.gaussian import rows_of
 from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.health import (
-    Doubted,
-    Recent,
-    ScanTold,
-    disagreement,
-    is_astray,
-    judged,
-    remembered,
-    scan_of,
-)
+from pipeline.slam.health import is_astray, judged
 from pipeline.slam.leading import are_apart, heir, leader
 from pipeline.slam.loop import Loop, bent_landmarks, bent_path
 from pipeline.slam.maps import shared_map, take_ancestors
 from pipeline.slam.motion import Motion, accumulated, noise_of, wrapped
+from pipeline.slam.recent import Doubted, Recent, remembered
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.scan import against_slip, estimated, use_scan
 from pipeline.slam.shared_errors import SharedErrors
 from pipeline.slam.slip import ByTrees
 from pipeline.slam.state import SlamState
+from pipeline.slam.told import ScanTold, disagreement, scan_of
 from pipeline.slam.update import Rules
 
 PLACED = 1  # tells the draws of a placing from those of a scan

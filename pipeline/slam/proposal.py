@@ -15,10 +15,10 @@ from pipeline.compiled import compiled_within
 from pipeline.geometry import Float
 from pipeline.records import Int, Int32
 from pipeline.slam.gaussian import Pose, corrected, expected_spread, keep_pose, pose_of, turned
-from pipeline.slam.health import AMBIGUOUS as DOUBTFUL
-from pipeline.slam.health import FOUND, INNOVATION, MOST_HITS, RECOGNISED
 from pipeline.slam.joint_choice import choose_jointly
 from pipeline.slam.pairs import LIKELY, Room, find_doubts, gather_doubts, likely_pairs
+from pipeline.slam.told import AMBIGUOUS as DOUBTFUL
+from pipeline.slam.told import FOUND, INNOVATION, MOST_HITS, RECOGNISED
 
 
 @compiled_within

@@ -14,23 +14,14 @@ from pipeline.records import Bool, Float32, Int
 from pipeline.slam.draws import draws
 from pipeline.slam.fastslam import FastSlam, rules_of
 from pipeline.slam.frame import FrameMemory
-from pipeline.slam.health import (
-    RECOGNISED,
-    TOLD,
-    Doubted,
-    disagreement,
-    driven_alone,
-    fading_distrust,
-    fading_familiar,
-    remembered,
-    scan_of,
-)
 from pipeline.slam.leading import are_apart, heir, leader
 from pipeline.slam.maps import Maps, take_ancestors
 from pipeline.slam.motion import UNKNOWN, Noise, Wheels, advanced, noise_of
+from pipeline.slam.recent import Doubted, driven_alone, fading_distrust, fading_familiar, remembered
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.scan import against_slip, estimated, use_scan
 from pipeline.slam.shared_errors import Measured, nothing_measured
+from pipeline.slam.told import RECOGNISED, TOLD, disagreement, scan_of
 from pipeline.slam.update import Rules
 
 

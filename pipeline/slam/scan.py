@@ -6,7 +6,6 @@ import numpy as np
 
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
-from pipeline.slam.health import TOLD, mean_told
 from pipeline.slam.maps import ROOM, Maps, blocks_in_reach, known_near, with_room
 from pipeline.slam.motion import Wheels, moved_pose, moved_poses, weighted_pose
 from pipeline.slam.pairs import room_for
@@ -14,6 +13,7 @@ from pipeline.slam.resampling import normalised
 from pipeline.slam.shared_errors import Measured
 from pipeline.slam.slip import SEARCH, ByTrees, motion_by_trees
 from pipeline.slam.together import FEWEST as FEWEST_PAIRS
+from pipeline.slam.told import TOLD, mean_told
 from pipeline.slam.update import Rules, near_for, observe, predict
 
 

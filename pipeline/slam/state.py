@@ -10,8 +10,8 @@ from pipeline.geometry import Float
 from pipeline.saving.codec import NOT_SAVED
 from pipeline.slam.frame import FrameMemory
 from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.health import Recent
 from pipeline.slam.maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
+from pipeline.slam.recent import Recent
 from pipeline.slam.resampling import normalised
 from pipeline.slam.shared_errors import SharedErrors
 

@@ -12,12 +12,12 @@ from pipeline.direction import direction_bin
 from pipeline.geometry import Float
 from pipeline.records import Bool, Float32, Int, Int32
 from pipeline.slam.gaussian import draw, rotated
-from pipeline.slam.health import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.maps import ROOM, Maps, own_block, widen
 from pipeline.slam.pairs import Room
 from pipeline.slam.proposal import recognise
 from pipeline.slam.shared_errors import Measured, corrected_by, learn_shared
+from pipeline.slam.told import MISSED, MOST_HITS, SHIFT
 from pipeline.visibility import BEHIND
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time

@@ -14,26 +14,16 @@ from pipeline.slam import FastSlam
 from pipeline.slam.genealogy import FOUNDED, Genealogy
 from pipeline.slam.health import (
     FOUND_LOST,
-    INNOVATION,
     INNOVATION_WEAK,
-    LED,
-    LED_MOST,
     ODOMETRY_WEAK,
-    RECOGNISED,
-    SHIFT,
     SIGMA_GOOD,
     SIGMA_WEAK,
-    STRANGE_LOST,
-    TOLD,
-    Doubted,
-    Recent,
-    ScanTold,
     is_astray,
     judged,
-    remembered,
-    scan_told,
 )
+from pipeline.slam.recent import LED, LED_MOST, STRANGE_LOST, Doubted, Recent, remembered
 from pipeline.slam.together import MANY
+from pipeline.slam.told import INNOVATION, RECOGNISED, SHIFT, TOLD, ScanTold, scan_told
 from tests.pipeline.strategies import ALL_FREE, FEW, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam

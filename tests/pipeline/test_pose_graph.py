@@ -13,9 +13,9 @@ from pipeline.parameters import Parameters, extras, preset
 from pipeline.records import PoseMeasurement
 from pipeline.saved_map import SavedMap
 from pipeline.slam import BackEnd, FastSlam, GraphState, Motion, SlamState
-from pipeline.slam.health import RECOGNISED, TOLD
 from pipeline.slam.pose_graph.joint import correct_by_pose, moved_joint, recognise_jointly
 from pipeline.slam.poses import composed, interpolated, inverse
+from pipeline.slam.told import RECOGNISED, TOLD
 from pipeline.sources import open_source
 from pipeline.steps import steps
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds

@@ -19,13 +19,15 @@ from pipeline.parameters.stages import Slam
 from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 from pipeline.slam import slip
 from pipeline.slam.gaussian import rows_of
-from pipeline.slam.health import Doubted, Recent, ScanTold, disagreement, is_astray, judged, remembered
+from pipeline.slam.health import is_astray, judged
 from pipeline.slam.loop import Loop
 from pipeline.slam.motion import Motion, accumulated, compound, moved_pose, noise_of
 from pipeline.slam.pose_graph.keyframe import observe, placed
 from pipeline.slam.pose_graph.smoother import Additions
 from pipeline.slam.pose_graph.state import NOTHING, GraphState
+from pipeline.slam.recent import Doubted, Recent, remembered
 from pipeline.slam.state import SlamState
+from pipeline.slam.told import ScanTold, disagreement
 
 KEYFRAME = 0.25  # m; views from nearer places share their errors and cost as much
 

@@ -11,8 +11,8 @@ import numpy as np
 from pipeline.compiled import compiled
 from pipeline.geometry import Float
 from pipeline.records import Int, Int32
-from pipeline.slam.health import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
 from pipeline.slam.pairs import LIKELY
+from pipeline.slam.told import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
 
 
 def moved_joint(m: Float, Sigma: Float, motion: Float, Q: Float) -> None:

@@ -9,12 +9,12 @@ import numpy as np
 from pipeline.geometry import Float, Pose2, wrap_angle
 from pipeline.parameters.stages import Slam
 from pipeline.records import Bool, Detections, Int
-from pipeline.slam.health import MISSED, MOST_HITS, SHIFT, TOLD, ScanTold, scan_told
 from pipeline.slam.motion import Motion
 from pipeline.slam.pose_graph.joint import correct_by_pose, moved_joint, recognise_jointly
 from pipeline.slam.pose_graph.landmarks import Landmarks, Sightings, sharpened, turned
 from pipeline.slam.pose_graph.smoother import Additions
 from pipeline.slam.pose_graph.state import GraphState
+from pipeline.slam.told import MISSED, MOST_HITS, SHIFT, TOLD, ScanTold, scan_told
 from pipeline.slam.update import SCORE_MAX
 from pipeline.visibility import in_free_view
 

@@ -8,11 +8,11 @@ import numpy as np
 
 from pipeline.geometry import Float, wrap_angle
 from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.health import Recent
 from pipeline.slam.maps import MapColumns
 from pipeline.slam.pose_graph.landmarks import Landmarks, Sightings, no_sightings
 from pipeline.slam.pose_graph.smoother import Additions, Smoother
 from pipeline.slam.poses import interpolated
+from pipeline.slam.recent import Recent
 from pipeline.slam.resampling import normalised
 from pipeline.slam.state import SlamState
 
