@@ -4,27 +4,24 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from pipeline.geometry import Pose2, Pose3, interpolate, wrap_angle
+from pipeline.geometry import Pose2, Pose3, wrap_angle
 from pipeline.gyro import Gyro
 from pipeline.measured_in_time import MeasuredInTime
+from pipeline.odometry_in_time import KEEP_NS, STILL, Jump, OdometryInTime, Tilt
 from pipeline.records import Imu, Learnt, Notice, Odometry, PoseMeasurement, Record, Scan, Step, Turn
 
 OdometryChoice = Literal["auto", "wheels", "static"]
 WAIT = 5  # scans that wait for the odometry that follows them before they go without
-KEEP_NS = 2_000_000_000
 STALE_NS = 250_000_000  # a reading farther away in time than this says nothing of a scan
-JUMP_SPEED, JUMP_TURN = 15.0, 6.0  # m/s, rad/s; nothing that maps trees moves this fast
-STILL = (0.0, 0.0, 0.0)
 JUMP_SLACK = (0.2, 0.05)  # m, rad; what the robot may have moved while its odometry jumped
 PAUSE_NS = 10_000_000_000  # without a scan; trees that were in view may be out of it
 WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion that no odometry told
 WALK_MOST = (3.0, 0.5)  # m, rad; beyond it the trees around are others
-STANDS = (0.005, 0.002)  # m, rad; a robot that stands stays within it
 SETTLES_NS = 300_000_000
 AHEAD_NS = 1_000_000_000
 TILTS_NS = 90_000_000
@@ -64,15 +61,6 @@ def steps(
     yield from joiner.ready(end=True)
 
 
-@dataclass(frozen=True, slots=True)
-class _Reading:
-    """Odometry as it is used: in the plane, without jumps; tilt None where it knows the plane alone."""
-
-    stamp_ns: int
-    pose: Pose2
-    tilt: tuple[float, float] | None
-
-
 class Joiner:
     """Takes records one by one, in the order in which they came, and gives the steps that are ready.
 
@@ -90,14 +78,12 @@ class Joiner:
         self._use_odometry = use_odometry
         self._index = index
         self._scans: deque[Scan] = deque()
-        self._odometry: deque[_Reading] = deque()
-        self._T_odom_jumped = Pose2()
+        self._odometry = OdometryInTime()
         self._imu: deque[Imu] = deque()
         self._gyro = Gyro()
         self._after = after
         if after is not None:
             self._gyro.go_on_from(after)
-        self._stands: tuple[int, Pose2] | None = None  # since when the robot has been standing, and where
         self._stepped: Pose2 | None = None  # the odometry of the step before
         self._turned_ns: int | None = None
         self._gyro_tilt = (0, 0.0, 0.0)  # when [ns], roll and pitch [rad]
@@ -133,37 +119,20 @@ class Joiner:
         T = odometry.T_odom_base
         if not (np.all(np.isfinite(T.t)) and np.all(np.isfinite(T.R))):
             self._leave_out("odometry readings without finite numbers")
-        elif self._odometry and odometry.stamp_ns <= self._odometry[-1].stamp_ns:
+        elif (newest := self._odometry.newest) is not None and odometry.stamp_ns <= newest.stamp_ns:
             self._leave_out("odometry readings that were not later than the one before")
         elif self._use_odometry:
-            self._odometry.append(self._without_jump(odometry))
-            self._watch_standing(self._odometry[-1])
-            self._forget(self._odometry, odometry.stamp_ns)
+            jump = self._odometry.add(odometry)
+            if jump is not None:
+                self._tell_jump(jump)
+            self._odometry.forget(self._needed_ns(odometry.stamp_ns))
 
-    def _without_jump(self, odometry: Odometry) -> _Reading:
-        """The reading's pose as if every jump so far had been no motion at all."""
-        raw = odometry.T_odom_base.planar()
-        if self._odometry:
-            last = self._odometry[-1]
-            pose = self._T_odom_jumped @ raw
-            step = last.pose.inverse() @ pose
-            span = (odometry.stamp_ns - last.stamp_ns) * 1e-9
-            distance = float(np.hypot(step.x, step.y))
-            if distance > JUMP_SPEED * max(span, 0.1) or abs(step.yaw) > JUMP_TURN * max(span, 0.1):
-                self._warn(
-                    f"the odometry jumped by {distance:.1f} m and {abs(np.degrees(step.yaw)):.0f} degrees; "
-                    "that is not taken as motion"
-                )
-                self._T_odom_jumped = last.pose @ raw.inverse()
-                self._suspect("the odometry jumped", JUMP_SLACK)
-        return _Reading(odometry.stamp_ns, self._T_odom_jumped @ raw, _tilt(odometry.T_odom_base))
-
-    def _watch_standing(self, reading: _Reading) -> None:
-        if self._stands is not None:
-            away = self._stands[1].inverse() @ reading.pose
-            if np.hypot(away.x, away.y) < STANDS[0] and abs(away.yaw) < STANDS[1]:
-                return
-        self._stands = (reading.stamp_ns, reading.pose)
+    def _tell_jump(self, jump: Jump) -> None:
+        self._warn(
+            f"the odometry jumped by {jump.distance:.1f} m and {np.degrees(jump.turn):.0f} degrees; "
+            "that is not taken as motion"
+        )
+        self._suspect("the odometry jumped", JUMP_SLACK)
 
     def _add_pose(self, pose: PoseMeasurement) -> None:
         if not pose.is_sound():
@@ -174,12 +143,6 @@ class Joiner:
     def _suspect(self, why: str, slack: tuple[float, float]) -> None:
         self._doubt = why
         self._slack = (float(np.hypot(self._slack[0], slack[0])), float(np.hypot(self._slack[1], slack[1])))
-
-    def _odometry_at(self, stamp_ns: int) -> Pose2:
-        before, after = _around(self._odometry, stamp_ns)
-        span = after.stamp_ns - before.stamp_ns
-        fraction = (stamp_ns - before.stamp_ns) / span if span > 0 else 1.0
-        return interpolate(before.pose, after.pose, min(max(fraction, 0.0), 1.0))
 
     def _add_imu(self, imu: Imu) -> None:
         if (
@@ -196,13 +159,15 @@ class Joiner:
         if self._imu and imu.stamp_ns <= self._imu[-1].stamp_ns:
             return
         self._imu.append(imu)
-        self._forget(self._imu, imu.stamp_ns)
+        while len(self._imu) > 2 and self._imu[1].stamp_ns < self._needed_ns(imu.stamp_ns) - KEEP_NS:
+            self._imu.popleft()
 
     def _was_ahead(self, stamp_ns: int) -> bool:
         """Whether the IMU's reading before was of no such time, so that this one counts in its place: then it
         lies farther from all else than this one does, by more than the order of messages can be mixed up."""
         last = self._turned_ns
-        others = [*(s.stamp_ns for s in self._scans), *(r.stamp_ns for r in self._odometry)]
+        newest = self._odometry.newest
+        others = [s.stamp_ns for s in self._scans] + ([] if newest is None else [newest.stamp_ns])
         if last is None or last - stamp_ns < AHEAD_NS or not others:
             return False
         if abs(stamp_ns - max(others)) >= abs(last - max(others)):
@@ -219,19 +184,19 @@ class Joiner:
         if np.abs(imu.angular_velocity).max() > FASTEST:
             self._leave_out("readings of the gyroscope that no robot turns as fast as")
             return
-        settled = self._stands is not None and imu.stamp_ns - self._stands[0] > SETTLES_NS
-        fresh = bool(self._odometry) and imu.stamp_ns - self._odometry[-1].stamp_ns < STALE_NS
+        stands, newest = self._odometry.stands, self._odometry.newest
+        settled = stands is not None and imu.stamp_ns - stands[0] > SETTLES_NS
+        fresh = newest is not None and imu.stamp_ns - newest.stamp_ns < STALE_NS
         still = settled and fresh and self._after is None
-        oldest = self._scans[0].stamp_ns if self._scans else imu.stamp_ns
+        oldest = self._needed_ns(imu.stamp_ns)
         # A tilt changes the rate by its square alone; counted so that it does not hang on the first reading.
         if imu.stamp_ns // TILTS_NS != self._gyro_tilt[0] // TILTS_NS:
             self._gyro_tilt = (imu.stamp_ns, *(_tilt_of(imu) or (0.0, 0.0)))
         self._gyro.add(imu, self._gyro_tilt[1:], standing=still, needed_ns=oldest)
 
-    def _forget(self, kept: deque[_Reading] | deque[Imu], now_ns: int) -> None:
-        oldest = self._scans[0].stamp_ns if self._scans else now_ns
-        while len(kept) > 2 and kept[1].stamp_ns < oldest - KEEP_NS:
-            kept.popleft()
+    def _needed_ns(self, now_ns: int) -> int:
+        """From when on readings may still be asked for: that of the oldest scan that waits."""
+        return self._scans[0].stamp_ns if self._scans else now_ns
 
     def ready(self, *, end: bool = False) -> Iterator[Step]:
         """Steps whose odometry has come, in order."""
@@ -241,9 +206,8 @@ class Joiner:
     def _is_ready(self, scan: Scan) -> bool:
         if len(self._scans) > WAIT:
             return True
-        if not self._odometry:
-            return not self._use_odometry
-        return self._odometry[-1].stamp_ns >= scan.stamp_ns
+        newest = self._odometry.newest
+        return not self._use_odometry if newest is None else newest.stamp_ns >= scan.stamp_ns
 
     def _join(self, scan: Scan) -> Step:
         if self._stepped_ns is None and self._after is not None and self._after.stamp_ns < scan.stamp_ns:
@@ -252,6 +216,7 @@ class Joiner:
         pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
         turn = self._turn_to(scan.stamp_ns, pose)
+        odometry_at = None if self._odometry.newest is None else self._odometry.pose_at
         step = Step(
             index=self._index,
             scan=scan,
@@ -263,15 +228,18 @@ class Joiner:
             warnings=tuple(self._warnings),
             doubt=self._doubt,
             slack=self._slack,
-            measured=self._measured.at(scan.stamp_ns, pose, self._odometry_at if self._odometry else None),
+            measured=self._measured.at(scan.stamp_ns, pose, odometry_at),
             turn=turn if self._gyro.proven else None,
             turn_rate=self._gyro.rate(scan.stamp_ns) if self._gyro.proven or pose is None else None,
-            learnt=replace(self._gyro.learnt(scan.stamp_ns), stands=self._stands, tilt=self._gyro_tilt),
+            learnt=replace(
+                self._gyro.learnt(scan.stamp_ns), stands=self._odometry.stands, tilt=self._gyro_tilt
+            ),
         )
         if self._after is not None and scan.stamp_ns >= self._after.stamp_ns:
             step = replace(step, learnt=self._after)
             self._gyro.go_on_from(self._after)
-            self._stands, self._gyro_tilt, self._after = self._after.stands, self._after.tilt, None
+            self._odometry.stands, self._gyro_tilt = self._after.stands, self._after.tilt
+            self._after = None
         self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
         self._stepped = pose
         self._index += 1
@@ -286,28 +254,17 @@ class Joiner:
         self._gyro.compare(float(wrap_angle(pose.yaw - self._stepped.yaw)), turn)
         return turn
 
-    def _motion_at(
-        self, stamp_ns: int
-    ) -> tuple[Pose2 | None, tuple[float, float, float], tuple[float, float] | None]:
+    def _motion_at(self, stamp_ns: int) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None]:
         """Pose, velocity in the base frame, and tilt where the odometry is of the whole pose."""
-        if not self._odometry:
+        newest = self._odometry.newest
+        if newest is None:
             if self._use_odometry:
-                self._warn(NO_ODOMETRY)
                 self._bridge(stamp_ns)
             return None, STILL, None
-        before, after = _around(self._odometry, stamp_ns)
-        if stamp_ns > after.stamp_ns + STALE_NS:
-            self._warn(NO_ODOMETRY)
+        if stamp_ns > newest.stamp_ns + STALE_NS:
             self._bridge(stamp_ns)
-            return after.pose, STILL, None
-        span = (after.stamp_ns - before.stamp_ns) * 1e-9
-        if span <= 0.0:
-            return after.pose, STILL, after.tilt
-        fraction = float(np.clip((stamp_ns - before.stamp_ns) * 1e-9 / span, 0.0, 1.0))
-        step = before.pose.inverse() @ after.pose
-        twist = (step.x / span, step.y / span, step.yaw / span)
-        tilt = _tilt_between(before, after, fraction)
-        return interpolate(before.pose, after.pose, fraction), twist, tilt
+            return newest.pose, STILL, None
+        return self._odometry.motion_at(stamp_ns)
 
     def _tell_pause(self, stamp_ns: int) -> None:
         """Of a long time without a scan the odometry alone tells; the trees after it may contradict that."""
@@ -318,6 +275,7 @@ class Joiner:
 
     def _bridge(self, stamp_ns: int) -> None:
         """Nothing told the motion since the scan before: it may have been any walk of a robot."""
+        self._warn(NO_ODOMETRY)
         since = self._stepped_ns if self._stepped_ns is not None else stamp_ns
         seconds = (stamp_ns - since) * 1e-9
         self._suspect(
@@ -341,28 +299,6 @@ class Joiner:
     def _warn(self, text: str) -> None:
         if text not in self._warnings:
             self._warnings.append(text)
-
-
-def _around(readings: deque[_Reading], stamp_ns: int) -> tuple[_Reading, _Reading]:
-    """The readings before and after a time; the two nearest ones where it lies outside."""
-    after = next((k for k, r in enumerate(readings) if r.stamp_ns >= stamp_ns), len(readings) - 1)
-    after = max(after, min(1, len(readings) - 1))
-    return readings[max(after - 1, 0)], readings[after]
-
-
-def _tilt_between(before: _Reading, after: _Reading, fraction: float) -> tuple[float, float] | None:
-    """Roll and pitch between two readings; a reading in the plane beside one in space is level by chance."""
-    if before.tilt is None and after.tilt is None:
-        return None
-    (roll, pitch), (roll_after, pitch_after) = before.tilt or (0.0, 0.0), after.tilt or (0.0, 0.0)
-    turn = float(wrap_angle(roll_after - roll))
-    return roll + fraction * turn, pitch + fraction * (pitch_after - pitch)
-
-
-def _tilt(T_odom_base: Pose3) -> tuple[float, float] | None:
-    """Roll and pitch of a pose in space; None for wheel odometry, which knows the plane alone."""
-    roll, pitch, _ = T_odom_base.euler()
-    return None if roll == 0.0 and pitch == 0.0 else (roll, pitch)
 
 
 def _tilt_of(imu: Imu) -> tuple[float, float] | None:

@@ -37,6 +37,7 @@ FOUNDATION = (
     "resolution",
     "gyro",
     "measured_in_time",
+    "odometry_in_time",
     "watch",
     "late",
 )
