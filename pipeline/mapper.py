@@ -263,6 +263,8 @@ class Mapper:
                 estimate.relative,
             )
             tracker.anchor(*located.landmarks, estimate.T_map_base, view_range)
+            if seen.looked.overview is None:  # else the columns are judged anew, and all tracks by them
+                tracker.learn_between(self._gathering.columns)
 
     def _map(self, step: Step, looked: Looked, estimate: PoseEstimate) -> None:
         """What is not taken from every scan (see turns): the columns that judge the trees, and the ground."""
@@ -310,16 +312,9 @@ class Mapper:
     def _mapped(self, estimate: PoseEstimate, motion: Float) -> loops.Mapped:
         path, noise = self._slam.path(), noise_of(self._parameters.slam)
         return loops.Mapped(
-            self._path.stamp_ns,
-            path,
-            self._trees,
-            self._slam.begun_since,
-            estimate,
-            noise,
-            motion,
-            self._placed,
-            self._closed,
-        )
+            self._path.stamp_ns, path, self._trees, self._slam.begun_since, estimate, noise, motion,
+            self._placed, self._closed,
+        )  # fmt: skip
 
     def _bend(self, index: int, loop: Loop) -> None:
         """Close a loop: path and map are bent."""

@@ -135,6 +135,28 @@ def _learn(
             rows.verdict[t] = OTHER
 
 
+@compiled
+def learn_between(rows: Rows, count: int, place: Float, verdict: Int32) -> None:
+    """Give tracks that nothing was told of yet the verdict of the column that is known at their place:
+    between two scans that are gathered their hits alone would make trees of them, beside a column of none.
+
+    Args:
+        rows: The first `count` are tracks, in place.
+        place: Of the columns, x, y first, shape (C, 2 or more) [m]; verdict: shape (C,), as `judge` left it.
+    """
+    for t in range(count):
+        if rows.verdict[t] >= 0 or rows.hits[t] == 0:
+            continue
+        nearest, least = -1, REACH * REACH
+        for c in range(verdict.shape[0]):
+            dx, dy = place[c, 0] - rows.x[t, 0], place[c, 1] - rows.x[t, 1]
+            if dx * dx + dy * dy < least:
+                nearest, least = c, dx * dx + dy * dy
+        if nearest >= 0:
+            told = np.int64(verdict[nearest])
+            rows.verdict[t] = OTHER if told == TREE else told  # another track is that tree
+
+
 @compiled_within
 def _is_due(rows: Rows, t: int, sight: Sight, reach: float) -> bool:
     """Whether a track would have a column by now if it were a tree."""

@@ -11,7 +11,7 @@ from pipeline.compiled import compiled, compiled_borrowing
 from pipeline.geometry import Float
 from pipeline.parameters import Parameters
 from pipeline.records import Bool, Int, Int32, Trees
-from pipeline.tracking.judging import judge
+from pipeline.tracking.judging import judge, learn_between
 from pipeline.tracking.kalman import update_rows
 from pipeline.tracking.observation import WIDTH, Telling, diameter, is_confirmed, sides_of
 from pipeline.tracking.scan import hold, recognise, take
@@ -110,6 +110,7 @@ class Tracking:
         self._rows, self._count, self.next_number = TrackTable.empty().with_room(_ROOM), 0, 1
         self._since: Int = np.full(_ROOM, -1, np.int64)  # scan at which a tree was first confirmed, by number
         self.verdict: Int32 = np.zeros(0, np.int32)
+        self._place: Float = np.zeros((0, 2))  # of the same columns
 
     def track(self, recorded: Recorded, verdict: Int32, first: int, last: int, index: int) -> Seen:
         """Take some of the recorded scans.
@@ -128,7 +129,7 @@ class Tracking:
         while True:
             at, self._count, self.next_number, told = _track(
                 self._rows, self._count, self.next_number, self._since, recorded, verdict, at, last, index,
-                self._rules, seen, told,
+                self._rules, seen, told, self._place, self.verdict,
             )  # fmt: skip
             if at == last:
                 break
@@ -136,7 +137,8 @@ class Tracking:
         gathered = np.flatnonzero(recorded.gathered[first:last])
         if len(gathered):
             newest = first + int(gathered[-1])
-            self.verdict = verdict[recorded.columns[newest] : recorded.columns[newest + 1]].copy()
+            columns = slice(recorded.columns[newest], recorded.columns[newest + 1])
+            self.verdict, self._place = verdict[columns].copy(), recorded.axis[columns].copy()
         return seen.first(told)
 
     def confirmed_since(self, index: int) -> tuple[Int, Int]:
@@ -182,9 +184,15 @@ def _track(
     rules: _Rules,
     seen: Seen,
     told: int,
+    place_before: Float,
+    verdict_before: Int32,
 ) -> tuple[int, int, int, int]:
     """Returns the first scan for which there is no room, or `last`; the number of trees and that of the next
-    new one; and the rows of `seen` that are filled."""
+    new one; and the rows of `seen` that are filled. `place_before`, `verdict_before`: of the columns before
+    the first recorded scan that was gathered."""
+    known = -1  # the newest scan that was gathered
+    for t in range(at):
+        known = t if recorded.gathered[t] else known
     for t in range(at, last):
         new = _most_new(recorded, t)
         if count + new > rows.number.shape[0] or number + new > since.shape[0]:
@@ -209,6 +217,12 @@ def _track(
                 rows, count, number, sight, recorded.axis[c], recorded.votes[c], verdict[c], rules.tree_share,
                 rules.range_max, rules.limits.velocity_sigma,
             )  # fmt: skip
+            known = t
+        elif known >= 0:
+            c = slice(recorded.columns[known], recorded.columns[known + 1])
+            learn_between(rows, count, recorded.axis[c], verdict[c])
+        else:
+            learn_between(rows, count, place_before, verdict_before)
         told = _tell(rows, count, sight.stamp_ns, index + t, rules.telling, since, seen, told)
     return last, count, number, told
 

@@ -11,7 +11,7 @@ from pipeline.geometry import Float, Pose2
 from pipeline.parameters.stages import Gathering, Tracking
 from pipeline.records import Columns, Detections, Int, Landmarks, Trees
 from pipeline.tracking.bending import bent, held
-from pipeline.tracking.judging import SCORE_STANDING, judge
+from pipeline.tracking.judging import SCORE_STANDING, judge, learn_between
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.scan import hold, recognise, take
 from pipeline.tracking.sight import Found, Limits, Sight
@@ -129,6 +129,10 @@ class Tracker:
             self.parameters.velocity_sigma,
         )  # fmt: skip
         return replace(columns, verdict=verdict)
+
+    def learn_between(self, columns: Columns) -> None:
+        """Take the verdicts of columns as `judge` left them, for tracks that came since."""
+        learn_between(self._rows, self._count, columns.axis, columns.verdict)
 
     def trees(self) -> Trees:
         """The map as it stands (Table 2)."""

@@ -55,3 +55,24 @@ def test_none_that_is_both_nearer_and_seen_more_often_is_left_for_another(tracks
     away, hits = tracks[chosen]
     assert not [t for t in tracks if t[0] < away - 1e-6 and t[1] > hits]
     assert away <= 1e-6 or not [t for t in tracks if t[0] < away - 1e-6 and t[1] == hits]
+
+
+def between(verdict: Verdict, away: float, hits: int = 3):
+    """The verdict of a track that came since its column was judged, and whether it is a tree of the map."""
+    tracker = Tracker(FOREST.tracking)
+    table = TrackTable.empty(1)
+    table.number[0], table.hits[0], table.score[0] = 1, hits, 3.0
+    table.x[0, :2] = PLACE + np.array([away, 0.0])
+    tracker.tracks, tracker.next_number = table, 2
+    tracker.learn_between(column(verdict))
+    return int(tracker.tracks.verdict[0]), bool(tracker.trees().confirmed[0])
+
+
+@pytest.mark.parametrize("verdict", [Verdict.BUSH, Verdict.PERSON, Verdict.POLE, Verdict.OTHER])
+def test_hits_make_no_tree_where_the_column_is_known_to_be_none(verdict):
+    assert between(verdict, REACH - 0.01) == (int(verdict), False)
+    assert between(verdict, REACH + 0.01) == (-1, True), "of a place where nothing is known hits tell"
+
+
+def test_what_comes_beside_a_tree_is_no_second_one_until_it_is_judged():
+    assert between(Verdict.TREE, 0.3) == (int(Verdict.OTHER), False)
