@@ -20,6 +20,7 @@ Float = NDArray[np.float64]
 _NS = 1_000_000_000
 # A tenth of a millimetre: finer than any sensor, and short on the wire.
 _DIGITS = 4
+JUST_BEGUN = 20  # scans
 
 
 def map_payload(shown: Shown) -> dict[str, Any]:
@@ -62,6 +63,18 @@ def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
         return None
     ahead, beside = _known(clearance.ahead), _known(clearance.beside)
     return {"zone": clearance.zone.label, "ahead_m": ahead, "beside_m": beside, "within_m": clearance.within}
+
+
+def health_word(frame: Frame | None) -> str:
+    """How far the map can be trusted, in a word or two. "good" says that nothing speaks against the pose,
+    which is no praise before there is a map that could."""
+    if frame is None:
+        return "no scan yet"
+    if frame.health.state != "good":
+        return frame.health.state
+    if not frame.trees.confirmed.any():
+        return "no trees yet"
+    return "just begun" if frame.index < JUST_BEGUN else "good"
 
 
 def health_payload(health: Health) -> dict[str, Any]:

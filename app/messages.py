@@ -35,7 +35,7 @@ class Status:
         scans_behind: Scans that wait to be mapped.
         trees: Confirmed trees.
         distance_m: Distance driven.
-        health: "good", "weak" or "lost".
+        health: "good", "weak" or "lost", or why it is too soon to say (see `health_word`).
         warnings: The newest last, each once.
         revision: Of the parameters in force.
         going_to: The sought time or scan in words while it is not reached yet, else empty.
@@ -63,7 +63,7 @@ class Status:
     scans_behind: int = 0
     trees: int = 0
     distance_m: float = 0.0
-    health: str = "good"
+    health: str = "no scan yet"
     warnings: list[str] = field(default_factory=list)
     revision: int = 0
     going_to: str = ""

@@ -8,6 +8,7 @@ import numpy as np
 
 from app.camera import has_camera
 from app.driven import driven
+from app.live_payload import health_word
 from app.messages import State, Status
 from app.robot.source import LiveSource
 from app.run import Run
@@ -85,7 +86,7 @@ def _of_run(run: Run, said: Said) -> Status:
         stage_ms={stage: round(ms, 3) for stage, ms in run.stopwatch.stage_ms.items()},
         trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
         distance_m=round(driven(run.path)[1], 3),
-        health="good" if frame is None else frame.health.state,
+        health=health_word(frame),
         warnings=[*said.warnings, *losses, *([run.not_kept] if run.not_kept else [])],
         going_to=said.going_to,
         camera=has_camera(description),

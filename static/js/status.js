@@ -13,7 +13,7 @@ const OLD_AFTER = 3000; // [ms] without a word while a run plays
 // name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
 const FIGURES = {
   trees: ["trees", "", (s) => [String(s.trees), ...anew(s)]],
-  health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health], reason(s)]],
+  health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health] ?? "soon", reason(s)]],
   rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
   mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `mapping, of ${figure(budget(s))} ms`], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
@@ -40,7 +40,11 @@ function ofScan() {
   return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan: ${right} of ${right + wrong} right`;
 }
 
+// Why nothing is said of the map yet.
+const SOON = { "no trees yet": "SLAM: by odometry alone", "just begun": "SLAM: in its first scans" };
+
 function reason({ health }) {
+  if (SOON[health]) return SOON[health];
   const told = state.map?.health;
   return told && told.state === health && told.reason ? told.reason : "SLAM health";
 }

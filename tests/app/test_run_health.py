@@ -5,10 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-from app.live_payload import health_payload
+import numpy as np
+import pytest
+
+from app.live_payload import JUST_BEGUN, health_payload, health_word
 from app.run_health import MOST_SPANS, RunHealth
 from pipeline.health import Health, HealthState
 from pipeline.records import Frame
+from tests.app import fakes
 from tests.scene.frames import make_frame
 
 
@@ -54,3 +58,22 @@ def test_the_page_gets_plain_numbers_and_null_for_what_is_not_known() -> None:
     assert payload["innovation"] is None
     assert payload["sigma_xy_m"] == 0.123
     assert (payload["state"], payload["reason"]) == ("good", "")
+
+
+@pytest.mark.parametrize(
+    ("index", "trees", "state", "word"),
+    [
+        (500, 0, "good", "no trees yet"),
+        (JUST_BEGUN - 1, 3, "good", "just begun"),
+        (JUST_BEGUN, 3, "good", "good"),
+        (2, 0, "lost", "lost"),
+        (500, 3, "weak", "weak"),
+    ],
+)
+def test_nothing_is_called_good_before_there_is_a_map_that_could_be(
+    index: int, trees: int, state: HealthState, word: str
+) -> None:
+    shot = a_frame(index, Health(state=state))
+    confirmed = np.ones(trees, np.bool_)
+    assert health_word(replace(shot, trees=replace(fakes.trees(trees), confirmed=confirmed))) == word
+    assert health_word(None) == "no scan yet"
