@@ -3,15 +3,19 @@
 Two points of one cell are always neighbours, so a cell with `min_points` is all core, all cores of
 a cell are one cluster, and clusters grow by joining cells. That saves nearly all distances where
 trunks are dense, which is where the others are slow.
+
+Points are laid cell by cell, the last axis running fastest: what can be near a cell lies in few rows of
+cells, and each row is one stretch of memory.
 """
 
 from __future__ import annotations
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
+from pipeline.compiled import compiled, compiled_borrowing
 from pipeline.geometry import Float
 from pipeline.records import Bool, Int, Int32
 
@@ -20,6 +24,22 @@ _FARTHEST = float(1 << _AXIS_BITS)
 _DIGIT_BITS = 10  # of a counting sort: its table stays in the nearest cache
 _DIGIT = 1 << _DIGIT_BITS
 _ROUNDING = 1.0 - 1e-9  # keeps the diagonal of a cell below eps in floating point
+_REACH = 2  # cells along each axis
+_AXES = 3
+
+
+class Cores(NamedTuple):
+    """The cores, cell by cell.
+
+    Attributes:
+        place: shape (_AXES, cores) [m].
+        bounds: shape (cells + 1,): where those of each cell begin.
+        box: shape (cells, 2 * _AXES): least and greatest coordinates of each cell's [m].
+    """
+
+    place: Float
+    bounds: Int
+    box: Float
 
 
 def dbscan_grid(
@@ -45,24 +65,21 @@ def dbscan_grid(
     cells = _cells(points, side)
     if int(cells.max()) + 2 >= 1 << _AXIS_BITS:
         raise ValueError("the cloud is too wide for cells of this eps")
-    offsets, opposite = _neighbour_offsets(dimensions)
+    rows, offsets = _offsets(dimensions)
     weight = np.ones(n, np.int32) if weight is None else weight
-    return _cluster(points, cells, offsets, opposite, eps * eps, min_points, weight)
+    return _cluster(points, cells, rows, offsets, eps * eps, min_points, weight)
 
 
 @cache
-def _neighbour_offsets(dimensions: int) -> tuple[Int, Int]:
-    """Key differences of the cells that can hold a neighbour, nearest first, the cell itself left out; and
-    where the opposite of each stands in that list."""
-    reach = np.arange(-2, 3)
+def _offsets(dimensions: int) -> tuple[Int, Int]:
+    """Key differences of the cells that can hold a neighbour: the middles of their rows along the last axis,
+    the cell's own row first; and all of them, nearest first, without the cell itself."""
+    reach = np.arange(-_REACH, _REACH + 1)
     grid = np.stack(np.meshgrid(*([reach] * dimensions), indexing="ij"), axis=-1).reshape(-1, dimensions)
-    gap = np.maximum(np.abs(grid) - 1, 0)
-    near = ((gap**2).sum(axis=1) <= dimensions) & (np.abs(grid).sum(axis=1) > 0)
-    grid = grid[near][np.argsort((grid[near] ** 2).sum(axis=1), kind="stable")]
+    grid = grid[np.argsort((grid**2).sum(axis=1), kind="stable")]
     weights = np.array([1 << (_AXIS_BITS * (dimensions - 1 - axis)) for axis in range(dimensions)], np.int64)
-    offsets: Int = grid @ weights
-    opposite = np.argmax(offsets[:, None] == -offsets[None, :], axis=0)
-    return offsets, opposite
+    keys: Int = grid @ weights
+    return keys[grid[:, -1] == 0], keys[1:]
 
 
 @compiled
@@ -113,36 +130,157 @@ def _by_key(cells: Int32) -> Int:
 
 @compiled
 def _cluster(
-    points: Float, cells: Int32, offsets: Int, opposite: Int, eps2: float, min_points: int, weight: Int32
+    points: Float, cells: Int32, rows: Int, offsets: Int, eps2: float, min_points: int, weight: Int32
 ) -> tuple[Int32, Bool]:
     """Lay the points cell by cell, and label them there."""
     n = points.shape[0]
     order = _by_key(cells)
     keys, bounds = np.empty(n, np.int64), np.empty(n + 1, np.int64)
-    laid, weight_laid = np.empty_like(points), np.empty_like(weight)
+    # A third axis of zeros adds nothing to a distance in the plane.
+    laid, weight_laid = np.zeros((_AXES, n)), np.empty_like(weight)
     last, filled = np.int64(-1), 0
     for k in range(n):
         i = order[k]
         key = np.int64(0)
         for a in range(points.shape[1]):
             key = (key << _AXIS_BITS) | np.int64(cells[i, a])
-            laid[k, a] = points[i, a]
+            laid[a, k] = points[i, a]
         weight_laid[k] = weight[i]
         if key != last:
             keys[filled], bounds[filled], last = key, k, key
             filled += 1
     bounds[filled] = n
-    near = _neighbours(keys[:filled], offsets, opposite)
-    return _label(laid, bounds[: filled + 1], near, eps2, min_points, order, weight_laid)
+    keys, bounds = keys[:filled], bounds[: filled + 1]
+    reach = _in_reach(keys, rows)
+    core = _find_cores(laid, bounds, reach, eps2, min_points, weight_laid)
+    cores = _lay_cores(laid, bounds, core)
+    parent = _join(cores, rows, reach, eps2)
+    label, core_out = np.full(n, -1, np.int32), np.empty(n, np.bool_)
+    for c in range(filled):
+        root = _root(parent, c)
+        for i in range(bounds[c], bounds[c + 1]):
+            core_out[order[i]] = core[i]
+            if core[i]:
+                label[order[i]] = root
+                continue
+            d = _cell_of_nearest_core(laid, i, cores, keys, c, reach, offsets, eps2)
+            if d >= 0:
+                label[order[i]] = _root(parent, d)
+    _number(label, filled)
+    return label, core_out
 
 
 @compiled
-def _close(points: Float, i: int, j: int, eps2: float) -> bool:
-    d2 = 0.0
-    for a in range(points.shape[1]):
-        d = points[i, a] - points[j, a]
-        d2 += d * d
-    return d2 <= eps2
+def _number(label: Int32, most: int) -> None:
+    """Number the labels, which are less than `most`, in the order of first points."""
+    number, clusters = np.full(most, -1, np.int32), 0
+    for k in range(label.shape[0]):
+        root = label[k]
+        if root >= 0:
+            if number[root] < 0:
+                number[root] = clusters
+                clusters += 1
+            label[k] = number[root]
+
+
+@compiled
+def _in_reach(keys: Int, rows: Int) -> Int32:
+    """In each row of cells around each cell, the first that can hold a neighbour and the one after the last;
+    shape (cells, rows, 2)."""
+    cells = keys.shape[0]
+    reach = np.empty((cells, rows.shape[0], 2), np.int32)
+    for r in range(rows.shape[0]):
+        first = after = 0
+        for c in range(cells):  # keys ascend, so the wanted keys do too: one sweep
+            least = keys[c] + rows[r] - _REACH
+            while first < cells and keys[first] < least:
+                first += 1
+            while after < cells and keys[after] <= least + 2 * _REACH:
+                after += 1
+            reach[c, r, 0], reach[c, r, 1] = first, after
+    return reach
+
+
+@compiled
+def _find_cores(laid: Float, bounds: Int, reach: Int32, eps2: float, min_points: int, weight: Int32) -> Bool:
+    core = np.zeros(laid.shape[1], np.bool_)
+    x, y, z = laid[0], laid[1], laid[2]
+    for c in range(reach.shape[0]):
+        begin, end = bounds[c], bounds[c + 1]
+        here = 0
+        for i in range(begin, end):
+            here += weight[i]
+        for i in range(begin, end):
+            count = here
+            for r in range(reach.shape[1]):
+                if count >= min_points:
+                    break
+                first, after = bounds[reach[c, r, 0]], bounds[reach[c, r, 1]]
+                if r > 0:
+                    count += _weight_within(x, y, z, weight, first, after, i, eps2)
+                else:  # the cell itself lies in the middle of its row, and is counted
+                    count += _weight_within(x, y, z, weight, first, begin, i, eps2)
+                    count += _weight_within(x, y, z, weight, end, after, i, eps2)
+            core[i] = count >= min_points
+    return core
+
+
+@compiled_borrowing
+def _weight_within(
+    x: Float, y: Float, z: Float, weight: Int32, first: int, after: int, i: int, eps2: float
+) -> int:
+    """What the points of a stretch that are near to point i count together."""
+    count = 0
+    # An index without a sign needs no look whether it counts from the end.
+    for j in range(np.uint64(first), np.uint64(after)):
+        dx, dy, dz = x[i] - x[j], y[i] - y[j], z[i] - z[j]
+        if dx * dx + dy * dy + dz * dz <= eps2:
+            count += weight[j]
+    return count
+
+
+@compiled
+def _lay_cores(laid: Float, bounds: Int, core: Bool) -> Cores:
+    cells = bounds.shape[0] - 1
+    place, first = np.empty((_AXES, core.sum())), np.empty(cells + 1, np.int64)
+    box = np.empty((cells, 2 * _AXES))
+    n = 0
+    for c in range(cells):
+        first[c] = n
+        for a in range(_AXES):
+            box[c, a], box[c, _AXES + a] = np.inf, -np.inf
+        for i in range(bounds[c], bounds[c + 1]):
+            if core[i]:
+                for a in range(_AXES):
+                    at = laid[a, i]
+                    place[a, n] = at
+                    box[c, a], box[c, _AXES + a] = min(box[c, a], at), max(box[c, _AXES + a], at)
+                n += 1
+    first[cells] = n
+    return Cores(place, first, box)
+
+
+@compiled
+def _join(cores: Cores, rows: Int, reach: Int32, eps2: float) -> Int:
+    """A tree of cells for each cluster: the parent of each cell, the least cell of a cluster being its own.
+
+    Rows near by first: after them nearly all that belong together are, and need no distance.
+    """
+    cells = cores.box.shape[0]
+    parent = np.arange(cells)
+    for r in range(rows.shape[0]):
+        if rows[r] < 0:
+            continue  # joined from the other cell
+        for c in range(cells):
+            if cores.bounds[c] == cores.bounds[c + 1]:
+                continue
+            for d in range(max(reach[c, r, 0], c + 1), reach[c, r, 1]):
+                if cores.bounds[d] == cores.bounds[d + 1]:
+                    continue
+                a, b = _root(parent, c), _root(parent, d)
+                if a != b and _touch(cores, c, d, eps2):
+                    parent[max(a, b)] = min(a, b)
+    return parent
 
 
 @compiled
@@ -153,114 +291,51 @@ def _root(parent: Int, c: int) -> int:
     return c
 
 
-@compiled
-def _neighbours(keys: Int, offsets: Int, opposite: Int) -> Int32:
-    """Row of the neighbouring cell at each offset, -1 where it is empty; shape (cells, offsets)."""
-    found = np.full((keys.shape[0], offsets.shape[0]), -1, np.int32)
-    for o in range(offsets.shape[0]):
-        if offsets[o] < 0:
-            continue  # found from the other cell
-        j = 0
-        for c in range(keys.shape[0]):  # keys ascend, so the wanted keys do too: one sweep
-            wanted = keys[c] + offsets[o]
-            while j < keys.shape[0] and keys[j] < wanted:
-                j += 1
-            if j == keys.shape[0]:
-                break
-            if keys[j] == wanted:
-                found[c, o], found[j, opposite[o]] = j, c
-    return found
-
-
-@compiled
-def _find_cores(points: Float, bounds: Int, near: Int32, eps2: float, min_points: int, weight: Int32) -> Bool:
-    core = np.zeros(points.shape[0], np.bool_)
-    for c in range(near.shape[0]):
-        count_here = 0
-        for i in range(bounds[c], bounds[c + 1]):
-            count_here += weight[i]
-        for i in range(bounds[c], bounds[c + 1]):
-            count = count_here
-            for o in range(near.shape[1]):
-                if count >= min_points:
-                    break
-                d = near[c, o]
-                if d >= 0:
-                    for j in range(bounds[d], bounds[d + 1]):
-                        if _close(points, i, j, eps2):
-                            count += weight[j]
-            core[i] = count >= min_points
-    return core
-
-
-@compiled
-def _touch(points: Float, bounds: Int, core: Bool, c: int, d: int, eps2: float) -> bool:
-    for i in range(bounds[c], bounds[c + 1]):
-        if core[i]:
-            for j in range(bounds[d], bounds[d + 1]):
-                if core[j] and _close(points, i, j, eps2):
-                    return True
+@compiled_borrowing
+def _touch(cores: Cores, c: int, d: int, eps2: float) -> bool:
+    """Whether a core of one cell is near to one of the other."""
+    place, box = cores.place, cores.box
+    for i in range(cores.bounds[c], cores.bounds[c + 1]):
+        x, y, z = place[0, i], place[1, i], place[2, i]
+        # Rounding keeps the order of numbers: nothing in the box is nearer than the box.
+        dx = max(max(box[d, 0] - x, x - box[d, 3]), 0.0)
+        dy = max(max(box[d, 1] - y, y - box[d, 4]), 0.0)
+        dz = max(max(box[d, 2] - z, z - box[d, 5]), 0.0)
+        if dx * dx + dy * dy + dz * dz > eps2:
+            continue
+        for j in range(cores.bounds[d], cores.bounds[d + 1]):
+            dx, dy, dz = x - place[0, j], y - place[1, j], z - place[2, j]
+            if dx * dx + dy * dy + dz * dz <= eps2:
+                return True
     return False
 
 
-@compiled
-def _label(
-    points: Float, bounds: Int, near: Int32, eps2: float, min_points: int, order: Int, weight: Int32
-) -> tuple[Int32, Bool]:
-    core = _find_cores(points, bounds, near, eps2, min_points, weight)
-    cells = near.shape[0]
-    parent = np.arange(cells)
-    for c in range(cells):
-        for o in range(near.shape[1]):
-            d = near[c, o]
-            if d > c:
-                a, b = _root(parent, c), _root(parent, d)
-                if a != b and _touch(points, bounds, core, c, d, eps2):
-                    parent[max(a, b)] = min(a, b)
-
-    n = points.shape[0]
-    cell_of = np.full(n, -1, np.int64)  # the cell whose cluster a point joins
-    for c in range(cells):
-        for i in range(bounds[c], bounds[c + 1]):
-            if core[i]:
-                cell_of[i] = c
-            else:
-                cell_of[i] = _cell_of_nearest_core(points, bounds, core, near, c, i, eps2)
-
-    at = np.empty(n, np.int64)
-    for i in range(n):
-        at[order[i]] = i
-    number = np.full(cells, -1, np.int32)
-    label = np.full(n, -1, np.int32)
-    core_out = np.empty(n, np.bool_)
-    clusters = 0
-    for k in range(n):
-        i = at[k]
-        core_out[k] = core[i]
-        if cell_of[i] >= 0:
-            root = _root(parent, cell_of[i])
-            if number[root] < 0:
-                number[root] = clusters
-                clusters += 1
-            label[k] = number[root]
-    return label, core_out
-
-
-@compiled
+@compiled_borrowing
 def _cell_of_nearest_core(
-    points: Float, bounds: Int, core: Bool, near: Int32, c: int, i: int, eps2: float
+    laid: Float, i: int, cores: Cores, keys: Int, c: int, reach: Int32, offsets: Int, eps2: float
 ) -> int:
+    """The cell of the core that is nearest to point i of cell c, -1 where none is near; of cells that are as
+    near the first in the order of `offsets`."""
     best, best2 = -1, eps2
-    for o in range(-1, near.shape[1]):
-        d = c if o < 0 else near[c, o]
-        if d < 0:
-            continue
-        for j in range(bounds[d], bounds[d + 1]):
-            if core[j]:
-                d2 = 0.0
-                for a in range(points.shape[1]):
-                    step = points[i, a] - points[j, a]
-                    d2 += step * step
-                if d2 < best2 or (d2 == best2 and best < 0):
+    x, y, z = laid[0, i], laid[1, i], laid[2, i]
+    for r in range(reach.shape[1]):
+        for d in range(reach[c, r, 0], reach[c, r, 1]):
+            for j in range(cores.bounds[d], cores.bounds[d + 1]):
+                dx, dy, dz = x - cores.place[0, j], y - cores.place[1, j], z - cores.place[2, j]
+                d2 = dx * dx + dy * dy + dz * dz
+                if d2 < best2 or (
+                    d2 == best2
+                    and d != best
+                    and (best < 0 or _turn(offsets, keys[d] - keys[c]) < _turn(offsets, keys[best] - keys[c]))
+                ):
                     best, best2 = d, d2
     return best
+
+
+@compiled_borrowing
+def _turn(offsets: Int, offset: int) -> int:
+    """When a cell is asked: the cell itself first."""
+    for k in range(offsets.shape[0]):
+        if offsets[k] == offset:
+            return k + 1
+    return 0

@@ -133,6 +133,18 @@ def test_a_border_point_goes_to_its_nearest_core_whatever_the_order():
         assert np.array_equal(core, points[:, 0] < 0.1) or np.all(core)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_border_point_as_near_to_two_clusters_goes_to_the_lower_cell_whatever_the_order(axis):
+    left, right = [[-0.25, 0.0]] * 3 + [[-0.5, 0.0]] * 6, [[0.25, 0.0]] * 3 + [[0.5, 0.0]] * 6
+    border = [[0.0, 0.0]]
+    for rows in (left + right + border, border + right + left, right + border + left):
+        points = np.roll(np.array(rows), axis, axis=1)
+        label, core = dbscan_grid(points, 0.25, 9)
+        at = points[:, axis]
+        np.testing.assert_array_equal(core, at != 0.0)
+        np.testing.assert_array_equal(label == label[at == -0.5][0], at <= 0.0)
+
+
 @pytest.mark.parametrize("dimensions", [2, 3])
 @pytest.mark.parametrize(("eps", "min_points"), [(0.15, 8), (0.25, 20)])
 @pytest.mark.parametrize("other", ["sklearn", "open3d"])
