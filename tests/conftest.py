@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -21,6 +22,13 @@ settings.load_profile("stemmap")
 ROOT = Path(__file__).resolve().parents[1]
 _WORKERS = 2
 _WITH_OTHER_PROCESSES = {"app", "browser", "cli", "fleet", "robot", "sweeping", "tuning"}
+
+# Where Python is told to keep no bytecode beside the sources, it is kept apart: a server and its worker would
+# compile all that they import at each start, which is half of what a start costs, and the tests start dozens.
+if sys.dont_write_bytecode:
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(ROOT / ".pytest_cache" / "bytecode")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # The machine is shared: a test that takes every core slows the others down and proves nothing.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):

@@ -50,18 +50,26 @@ with on_compiling(lambda: told.append(1)):
 """
 
 
+def environment(folder: Path) -> dict[str, str]:
+    """Of a process that keeps its kernels in this folder."""
+    told = {
+        "PYTHONPATH": f"{folder}:{ROOT}",
+        "NUMBA_CACHE_DIR": str(folder / "kept"),
+        # Python itself takes a file of the same second and size for the one of before.
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    if sys.pycache_prefix:  # numba's own is read from there: it need not be compiled in each process
+        told["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    return told
+
+
 def call(folder: Path, factor: float, more: float, program: str = CALL) -> list[str]:
     """What a new process gets from the kernel, and how often it took what was kept."""
     (folder / "wood" / "leaf.py").write_text(LEAF.format(factor=factor, more=more))
     told = subprocess.run(
         [sys.executable, "-c", program],
         cwd=folder,
-        env={
-            "PYTHONPATH": f"{folder}:{ROOT}",
-            "NUMBA_CACHE_DIR": str(folder / "kept"),
-            # Python itself takes a file of the same second and size for the one of before.
-            "PYTHONDONTWRITEBYTECODE": "1",
-        },
+        env=environment(folder),
         capture_output=True,
         text=True,
         timeout=120,
@@ -95,7 +103,6 @@ def test_processes_that_compile_a_kernel_for_other_types_at_once_keep_all_of_the
     (tmp_path / "wood" / "__init__.py").touch()
     (tmp_path / "wood" / "tree.py").write_text(CALLER)
     (tmp_path / "wood" / "leaf.py").write_text(LEAF.format(factor=2.0, more=1.0))
-    environment = {"PYTHONPATH": f"{tmp_path}:{ROOT}", "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
     values = ["1", "1.0", "numpy.ones(1)", "numpy.ones((1, 1))"]
 
     def begun(*values: str) -> subprocess.Popen[str]:
@@ -103,7 +110,11 @@ def test_processes_that_compile_a_kernel_for_other_types_at_once_keep_all_of_the
         program = f"import numpy; from wood.tree import twice; {calls}"
         program += "print(sum(twice.stats.cache_hits.values()))"
         return subprocess.Popen(
-            [sys.executable, "-c", program], cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", program],
+            cwd=tmp_path,
+            env=environment(tmp_path),
+            stdout=subprocess.PIPE,
+            text=True,
         )
 
     first = [begun(value) for value in values]
