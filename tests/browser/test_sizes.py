@@ -46,10 +46,23 @@ def test_nothing_spills_over_the_edge(chromium: Browser, server: Server, size: t
         assert dashboard.page.evaluate(CUT) == []
         for name in ("runs-link", "palette-button", "share-button", "theme-button", "keys-button"):
             expect(dashboard.page.locator(f"#{name}")).to_be_in_viewport(ratio=1)
+        if size[0] == 1280:
+            check_map_stays(dashboard)
         if size[0] == 1024:
             check_drawer(dashboard)
         if size[0] == 390:
             check_scene_on_demand(dashboard)
+
+
+def check_map_stays(dashboard: Dashboard) -> None:
+    frame = dashboard.page.locator(".map-frame")
+    for size in ((1280, 757), (1920, 1080), (1280, 800)):
+        dashboard.page.set_viewport_size({"width": size[0], "height": size[1]})
+        heights = set()
+        for tab in ("Trees", "Clusters", "Story", "Tune", "Annotate", "Scores", "Plots"):
+            dashboard.tab(tab)
+            heights.add((frame.bounding_box() or {}).get("height"))
+        assert len(heights) == 1, f"at {size} the map jumps with the tab: {heights}"
 
 
 def check_drawer(dashboard: Dashboard) -> None:
