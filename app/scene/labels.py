@@ -14,6 +14,10 @@ from pipeline.records import Frame, Verdict
 
 MOST_LABELS = 60  # more than 200 halve the frame rate of a browser, and nobody reads 60
 STEM_HEIGHT = 2.0  # m; drawn where no height was measured
+# Two labels nearer to one another than this lie upon one another for who looks over the robot's shoulder,
+# from BEHIND metres behind it: a part of how far away they are, as a text keeps its size on the screen.
+BEHIND = 6.0  # m
+NUMBER_WIDTH, WORDS_WIDTH = 0.05, 0.11
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +76,30 @@ class Labels:
         node.text, node.position, node.visible = label.text, label.place, True
 
 
+def apart(
+    places: NDArray[np.float64], order: NDArray[np.int64], robot: NDArray[np.float64], width: float, most: int
+) -> list[int]:
+    """Rows of places whose labels do not lie upon one another, the first ones of an order, at most so many.
+
+    Args:
+        places: x, y in the frame of the map, shape (N, 2) [m].
+        order: Rows, the most wanted first.
+        robot: Its x, y, shape (2,) [m].
+        width: Of a label, as a part of its distance.
+        most: Labels.
+    """
+    kept: list[int] = []
+    for row in order.tolist():
+        room = width * (BEHIND + float(np.hypot(*(places[row] - robot))))
+        if all(math.dist(places[row], places[other]) >= room for other in kept):
+            kept.append(row)
+            if len(kept) == most:
+                break
+    return kept
+
+
 def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Label]:
-    """Labels for the clusters of a scan, trees first, then the nearest.
+    """Labels for the clusters of a scan, trees first, then the nearest, none upon another.
 
     Args:
         frame: The scan's results.
@@ -87,10 +113,12 @@ def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Lab
     places = pose.apply(base[:, :2])
     tops = frame.base_z + base[:, 2] + 0.5 * shown_height(clusters.extent[:, 2]) + 0.1
     order = np.lexsort((np.linalg.norm(base[:, :2], axis=1), clusters.verdict != Verdict.TREE))
+    texts = [_cluster_text(frame, k, label_by) for k in range(len(order))]
+    named = order[[bool(texts[k]) for k in order.tolist()]] if len(order) else order
+    robot = np.array([pose.x, pose.y])
     return [
-        Label(int(numbers[k]), text, (float(places[k, 0]), float(places[k, 1]), float(tops[k])))
-        for k in order[:MOST_LABELS]
-        if (text := _cluster_text(frame, int(k), label_by))
+        Label(int(numbers[k]), texts[k], (float(places[k, 0]), float(places[k, 1]), float(tops[k])))
+        for k in apart(places, named, robot, WORDS_WIDTH, MOST_LABELS)
     ]
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from app.scene import colours, meshes
 from app.scene.batch import Batch
 from app.scene.ground_node import GroundNode
-from app.scene.labels import Label, Labels
+from app.scene.labels import NUMBER_WIDTH, Label, Labels, apart
 from app.scene.lines import Circles
 from app.scene.view import View
 from pipeline.records import Frame, Trees, TruthTrees
@@ -125,21 +125,21 @@ def confirmed(trees: Trees) -> Trees:
 def tree_labels(
     trees: Trees, robot: NDArray[np.float64], selected: int | None, foot: NDArray[np.float64]
 ) -> list[Label]:
-    """Numbers for the selected tree and those nearest to the robot at (x, y) [m]; `foot` is the height of the
-    ground at each tree, shape (T,) [m]."""
+    """Numbers for the selected tree and those nearest to the robot at (x, y) [m], none upon another; `foot`
+    is the height of the ground at each tree, shape (T,) [m]."""
     distance = np.linalg.norm(trees.position - robot, axis=1)
     order = np.lexsort((distance, trees.number != (-1 if selected is None else selected)))
     return [
         Label(
             int(trees.number[row]),
-            _tree_text(trees, int(row), int(trees.number[row]) == selected),
+            _tree_text(trees, row, int(trees.number[row]) == selected),
             (
                 float(trees.position[row, 0]),
                 float(trees.position[row, 1]),
                 round(float(foot[row]), 1) + TREE_HEIGHT + 0.15,
             ),
         )
-        for row in order[:NUMBERS]
+        for row in apart(trees.position, order, robot, NUMBER_WIDTH, NUMBERS)
     ]
 
 

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from app.scene import Scene
-from app.scene.labels import MOST_LABELS, Label, Labels, cluster_labels, short
+from app.scene.labels import BEHIND, MOST_LABELS, Label, Labels, apart, cluster_labels, short
 from tests.scene.frames import make_frame
 
 PATH = np.zeros((1, 2))
@@ -31,9 +33,26 @@ def test_labels_say_what_was_chosen(scene: Scene, label_by: str, expected: str |
 
 def test_trees_come_first_when_there_are_too_many():
     frame = make_frame(0, clusters=200)
+    wide = 20.0 + 20.0 * (np.arange(200) // 2 % 2)  # on two rings, so that none lies upon another
+    centroid = frame.clusters.centroid * np.column_stack([wide, wide, np.ones(200)])
+    frame = replace(frame, clusters=replace(frame.clusters, centroid=centroid))
     labels = cluster_labels(frame, np.arange(200), "verdict")
     assert len(labels) == MOST_LABELS
     assert {label.text for label in labels} == {"tree"}
+
+
+@given(st.lists(st.tuples(st.floats(-40, 40), st.floats(-40, 40)), min_size=1, max_size=40), st.randoms())
+def test_no_label_lies_upon_another_and_none_is_left_out_without_one_that_covers_it(at, rng):
+    places, robot, width = np.array(at), np.array([1.0, 2.0]), 0.1
+    order = np.array(rng.sample(range(len(at)), len(at)))
+    kept = apart(places, order, robot, width, 100)
+    assert kept[0] == order[0]
+    for k, row in enumerate(order.tolist()):
+        room = width * (BEHIND + np.linalg.norm(places[row] - robot))
+        before = [other for other in kept if other in order[:k]]
+        is_free = all(np.linalg.norm(places[row] - places[other]) >= room for other in before)
+        assert (row in kept) == is_free
+    assert apart(places, order, robot, width, 3) == kept[:3]
 
 
 async def test_a_label_that_says_the_same_costs_nothing(scene: Scene):
