@@ -21,6 +21,16 @@ function load() {
   frame.src = address();
 }
 
+// In light or dark without loading it anew, which would lose the camera: viser has its colours from this attribute, and
+// sets its ground once.
+function paint() {
+  const inner = frame.contentDocument;
+  inner.documentElement.dataset.mantineColorScheme = isDark() ? "dark" : "light";
+  let node = inner.querySelector("canvas");
+  while (node && !node.style.backgroundColor) node = node.parentElement;
+  if (node) node.style.backgroundColor = isDark() ? "var(--mantine-color-dark-9)" : "#fff";
+}
+
 // viser's client reconnects only while it has the focus. Taking the focus from a person who types is
 // worse than a lost scene, so the frame is told that it has it.
 function keepReconnecting() {
@@ -39,10 +49,12 @@ export function pressInScene(key) {
 export function startScene() {
   frame.addEventListener("load", () => {
     if (!frame.src || !frame.contentDocument) return;
+    // It was loaded in the other theme, or loads itself anew as it was at first.
+    if (frame.contentWindow.location.search.includes("darkMode") !== isDark()) return void load();
     keepReconnecting();
     for (const listener of loaders) listener(frame.contentWindow);
   });
-  on("theme", () => frame.src && load());
+  on("theme", () => frame.src && paint());
   byId("scene-show").addEventListener("click", () => {
     frame.closest(".scene").classList.add("on");
     load();

@@ -160,12 +160,23 @@ def test_a_layer_is_switched_off(dashboard: Dashboard):
 
 def test_light_and_dark_are_remembered(dashboard: Dashboard):
     page = dashboard.page
+    dashboard.scene.evaluate("() => { window.isTheSame = true; }")
     page.get_by_role("button", name="Light or dark").click()
     expect(page.locator("html")).to_have_attribute("data-theme", "light")
+    assert dashboard.scene.evaluate(GROUND) == "rgb(255, 255, 255)"
     assert page.evaluate("localStorage.getItem('stemmap.theme')") == "light"
     page.get_by_role("button", name="Light or dark").click()
     expect(page.locator("html")).to_have_attribute("data-theme", "dark")
-    dashboard.scene.wait_for_function("() => window.__viserSceneTree?.getState()['/world/robot/scan/raw']")
+    assert dashboard.scene.evaluate("() => window.isTheSame"), "the scene and its camera stay"
+    assert dashboard.scene.evaluate(GROUND) != "rgb(255, 255, 255)"
+
+
+# The colour behind the scene.
+GROUND = """() => {
+  let node = document.querySelector('canvas');
+  while (node && !node.style.backgroundColor) node = node.parentElement;
+  return getComputedStyle(node).backgroundColor;
+}"""
 
 
 def test_nothing_was_complained_about(dashboard: Dashboard):
