@@ -2,7 +2,7 @@
 
 import { callMe, change, choose, doubtInWords, draft, importTable, judge, KINDS, myName, NAME, next, redo, remove, rows, scoreAgainst, toggleAdding, truthInWords, undo, unjudged, warnedInWords } from "./annotate.js";
 import { byId, el, setText } from "./dom.js";
-import { count, figure, fixed } from "./format.js";
+import { count, figure, fixed, isAssumed } from "./format.js";
 import { learnSection, startLearning } from "./learn.js";
 import { on, state } from "./state.js";
 import { visible } from "./tabs.js";
@@ -140,7 +140,7 @@ function hint() {
   if (draft.adding) return "Click on the map where a tree stands; the ring shows where it will be. Esc ends.";
   if (draft.said) return draft.said;
   const tree = unjudged().find(({ number }) => number === state.selected);
-  if (tree) return `Tree ${tree.number}, seen in ${count(tree.observations, "scan")}, ${tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm`}${doubtInWords(tree)}: is it one? y or n; Tab leaves it and goes to the next.`;
+  if (tree) return `Tree ${tree.number}, seen in ${isAssumed(tree) ? "no single scan, in all together" : count(tree.observations, "scan")}, ${tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm`}${doubtInWords(tree)}: is it one? y or n; Tab leaves it and goes to the next.`;
   if (!rows().length) return "Say which trees really stand here: press Next and judge what was found, or Add and click on the map what was missed (or shift-click in the 3D scene).";
   return truthInWords();
 }

@@ -26,3 +26,6 @@ export function clock(seconds) {
 }
 
 export const count = (number, one, many = `${one}s`) => `${number} ${number === 1 ? one : many}`;
+
+// Whether a tree's sigma is assumed: no single scan measured where it stands, all together found it.
+export const isAssumed = (tree) => tree.observations === 0;

@@ -4,7 +4,7 @@ import { draft } from "./annotate.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "./annotate_map.js";
 import { byId, setText } from "./dom.js";
 import { saveCanvas, saveCsv } from "./download.js";
-import { figure, NONE } from "./format.js";
+import { figure, isAssumed, NONE } from "./format.js";
 import { select, selectCluster } from "./live.js";
 import { measureAt, measuredText, measureTowards, measuring } from "./measure.js";
 import { drawMap, symbolRadius } from "./map_draw.js";
@@ -87,7 +87,7 @@ function describe(tree, truth, cluster) {
   const lines = [];
   if (tree) {
     const dbh = tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm${tree.sigma_dbh_cm === null ? "" : ` ± ${figure(tree.sigma_dbh_cm, 2)}`}`;
-    lines.push(`Tree ${tree.number}, ${dbh}`, `seen in ${tree.observations} scans, e ${figure(tree.eccentricity)}`);
+    lines.push(`Tree ${tree.number}, ${dbh}`, isAssumed(tree) ? "seen in no single scan, in all together; ± assumed" : `seen in ${tree.observations} scans, e ${figure(tree.eccentricity)}`);
   }
   if (cluster !== null && !tree) lines.push(`Cluster: ${state.map.clusters.verdict[cluster]}, ${state.map.clusters.size[cluster]} points`);
   if (truth) lines.push(`Truth: ${truth.kind}${truth.dbh_cm === null ? "" : `, ${figure(truth.dbh_cm)} cm`}`);

@@ -1,5 +1,6 @@
 // Paints the 2D map of Fig. 5: path grey, robot a red triangle, trees as circles with their number.
 
+import { isAssumed } from "./format.js";
 import { drawNumbers } from "./map_labels.js";
 import { measuredText } from "./measure.js";
 import { verdictOf } from "./verdicts.js";
@@ -177,7 +178,9 @@ export function drawTree(pen, view, tree, selected, colours) {
     Object.assign(pen, { strokeStyle: colours.text, lineWidth: 1 });
     pen.beginPath();
     pen.ellipse(px, py, major * view.scale, Math.max(minor * view.scale, 0.5), -angle, 0, TURN);
+    pen.setLineDash(isAssumed(tree) ? [2, 3] : []);
     pen.stroke();
+    pen.setLineDash([]);
   }
   if (selected) {
     Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });

@@ -1,7 +1,7 @@
 // The story of a tree: what it is and why, how thick, from which sides it was seen, and where it was thought to be.
 
 import { el } from "./dom.js";
-import { clock, figure, NONE } from "./format.js";
+import { clock, figure, isAssumed, NONE } from "./format.js";
 import { gathered } from "./story_gathered.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "./svg.js";
 import { verdictOf } from "./verdicts.js";
@@ -18,13 +18,18 @@ function verdict(story) {
   return el("div", { class: "verdict", "data-verdict": label },
     el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" }),
     el("div", {}, el("b", { text: story.confirmed ? "tree" : `not in the map: ${label}` }),
-      el("p", { text: `Seen in ${story.observations} scans, first at ${clock(story.first_seen_s)}, last at ${clock(story.last_seen_s)}.` })));
+      el("p", { text: seen(story) })));
+}
+
+function seen(story) {
+  if (isAssumed(story)) return "No single scan detected it, all scans together did: its place is where their returns stand, and how well that is known is assumed, not measured.";
+  return `Seen in ${story.observations} scans, first at ${clock(story.first_seen_s)}, last at ${clock(story.last_seen_s)}.`;
 }
 
 function overview(story, showCluster) {
   const dbh = story.dbh === null ? NONE : `${figure(100 * story.dbh)} ± ${figure(100 * story.dbh_sigma, 2)} cm`;
   const rows = [["DBH", dbh], ["covered", `${figure(story.coverage_deg)}° of 360°`], ["x, y", `${story.position[0].toFixed(2)}, ${story.position[1].toFixed(2)} m`],
-    ["position ±", `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["mean λ1/λ2", figure(story.eccentricity)]];
+    ["position ±", isAssumed(story) ? `≈ ${figure(100 * story.ellipse[0], 2)} cm, assumed` : `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["mean λ1/λ2", figure(story.eccentricity)]];
   return el("div", { class: "story-fit" }, covered(story), el("div", {},
     el("dl", { class: "list" }, ...rows.flatMap(([title, value]) => [el("dt", { text: title }), el("dd", { text: value })])),
     story.dbh === null ? el("p", { class: "dim note", text: `A DBH is told from ${figure(story.dbh_arc_deg)}° on.` }) : "",

@@ -2,7 +2,7 @@
 
 import { byId, el, setText } from "./dom.js";
 import { saveCanvas } from "./download.js";
-import { count, figure, fixed, NONE } from "./format.js";
+import { count, figure, fixed, isAssumed, NONE } from "./format.js";
 import { select } from "./live.js";
 import { nothingYet } from "./nothing_yet.js";
 import { on, state } from "./state.js";
@@ -18,11 +18,12 @@ const COLUMNS = [
   ["number", "tree", "Number of the tree", (t) => String(t.number), (t) => t.number],
   ["x", "x m", "Along the first heading, from the start", (t) => fixed(t.x, 2), (t) => t.x],
   ["y", "y m", "To the left of the first heading, from the start", (t) => fixed(t.y, 2), (t) => t.y],
-  ["sigma", "± cm", "Standard deviation of the position", (t) => figure(sigma(t), 2), sigma],
+  ["sigma", "± cm", "Standard deviation of the position; ≈: assumed, for no single scan measured it", sigmaText, sigma],
   ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm ?? -1],
   ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity],
   ["seen", "seen", "Number of scans that detected it; 0: found only in what the scans gathered together", (t) => String(t.observations), (t) => t.observations],
 ];
+const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
 const rows = new Map();
 let order = { key: "number", descending: false };
 let filledAt = 0, planned = 0;
@@ -30,6 +31,10 @@ let filledAt = 0, planned = 0;
 function dbh(tree) {
   if (tree.dbh_cm === null) return NONE;
   return tree.sigma_dbh_cm === null ? figure(tree.dbh_cm) : `${figure(tree.dbh_cm)} ± ${figure(tree.sigma_dbh_cm, 2)}`;
+}
+
+function sigmaText(tree) {
+  return (isAssumed(tree) ? "≈ " : "") + figure(sigma(tree), 2);
 }
 
 function head() {
@@ -66,6 +71,7 @@ function rowOf(tree) {
   }
   const row = rows.get(tree.number);
   COLUMNS.forEach(([, , , text], place) => setText(row.cells[place], text(tree)));
+  row.cells[SIGMA].title = isAssumed(tree) ? "Assumed, not measured: no single scan detected this tree, all together did" : "";
   row.setAttribute("aria-selected", String(tree.number === state.selected));
   return row;
 }
@@ -92,8 +98,19 @@ function fill() {
   setText(byId("tree-count"), wanted ? `${trees.length} of ${all.length}` : count(all.length, "tree"));
   byId("trees").hidden = !trees.length;
   byId("trees-png").disabled = !trees.length;
+  offerCsv(all.length);
   byId("find").setAttribute("aria-invalid", String(Boolean(refused)));
   setText(byId("trees-empty"), trees.length ? "" : emptyText(all.length, wanted, refused));
+}
+
+const csv = byId("trees-csv"), csvTitle = csv.title;
+
+// A link takes no "disabled": without an address it is none.
+function offerCsv(any) {
+  if (any) csv.setAttribute("href", "/api/trees.csv");
+  else csv.removeAttribute("href");
+  csv.setAttribute("aria-disabled", String(!any));
+  csv.title = any ? csvTitle : "No tree yet";
 }
 
 function emptyText(all, wanted, refused) {

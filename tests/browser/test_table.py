@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -189,3 +190,27 @@ def test_a_picture_of_a_stand_of_any_size_is_made(dashboard: Dashboard):
         assert width > 30
         assert 10_000 < height <= 16_000
         assert size > 1000
+
+
+ASSUMED = """async number => {
+  const { state, changed } = await import('/static/js/state.js');
+  const { treeStory } = await import('/static/js/story_tree.js');
+  const story = await (await fetch(`/api/story/tree/${number}`)).json();
+  state.map.trees.find(tree => tree.number === number).observations = 0;
+  changed('map');
+  const texts = treeStory({ ...story, observations: 0 }, () => {}).map(node => node.textContent);
+  return texts.join(' ');
+}"""
+
+
+def test_a_sigma_that_nobody_measured_is_called_assumed(dashboard: Dashboard):
+    number = trees(dashboard)[0]["number"]
+    cell = dashboard.page.locator(f"#trees tr[data-tree='{number}'] td").nth(list(COLUMNS).index("sigma"))
+    assert "≈" not in (cell.text_content() or "")
+    told = dashboard.page.evaluate(ASSUMED, number)
+    assert "No single scan detected it" in told
+    assert "cm, assumed" in told
+    expect(cell).to_have_text(re.compile("^≈ "))
+    expect(cell).to_have_attribute("title", re.compile("^Assumed"))
+    dashboard.stand(23.05)  # takes the true map again
+    expect(cell).not_to_have_text(re.compile("≈"))

@@ -1,6 +1,6 @@
 // Paints one finished map, or two laid upon one another.
 
-import { figure } from "../format.js";
+import { figure, isAssumed } from "../format.js";
 import { drawLine, drawTree, drawTruth, symbolRadius } from "../map_draw.js";
 import { drawNumbers } from "../map_labels.js";
 
@@ -75,5 +75,5 @@ export function nearest(trees, px, py, view) {
 
 export function treeWords(tree) {
   const dbh = tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm`;
-  return `Tree ${tree.number}, ${dbh}\nseen in ${tree.observations} scans`;
+  return `Tree ${tree.number}, ${dbh}\n${isAssumed(tree) ? "seen in no single scan, in all together" : `seen in ${tree.observations} scans`}`;
 }
