@@ -39,9 +39,11 @@ class Status:
         warnings: The newest last, each once.
         revision: Of the parameters in force.
         going_to: The sought time or scan in words while it is not reached yet, else empty.
+        going_to_s: The sought time where it is known, else None.
         live: Whether the source is a robot that is heard live.
         robot: Its namespace, empty for none.
         robots: The namespaces of all robots that publish scans where it is heard.
+        compiling_since_s: When this machine began to compile what it does now [Unix time], else None.
         remapped: How much of the run is mapped again (see `SetParameters`), from 0 to 1; None when it is not.
         camera: Whether there are pictures of a camera.
         recording: Where a live run is recorded to, or why it is no more; empty where it is not.
@@ -67,12 +69,14 @@ class Status:
     warnings: list[str] = field(default_factory=list)
     revision: int = 0
     going_to: str = ""
+    going_to_s: float | None = None
     live: bool = False
     robot: str = ""
     robots: list[str] = field(default_factory=list)
     recording: str = ""
     camera: bool = False
     remapped: float | None = None
+    compiling_since_s: float | None = None
 
 
 class Play(msgspec.Struct, frozen=True, tag="play"):

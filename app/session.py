@@ -339,6 +339,7 @@ class Session:
             warnings=tuple(self._warnings),
             revision=self._revision,
             going_to=self._way.words(self._run),
+            going_to_s=self._way.time_s(self._run),
         )
         return describe(self._run, self._robot, said)
 

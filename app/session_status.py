@@ -27,7 +27,7 @@ class Said:
         time_s: Of the standing scan.
         warnings: The newest last.
         revision: Of the parameters in force.
-        going_to: The sought scan in words.
+        going_to: The sought scan in words; going_to_s: its time [s], where that is known.
     """
 
     state: State
@@ -37,6 +37,7 @@ class Said:
     warnings: tuple[str, ...]
     revision: int
     going_to: str
+    going_to_s: float | None
 
 
 def describe(run: Run | None, robot: LiveSource | None, said: Said) -> Status:
@@ -47,7 +48,9 @@ def describe(run: Run | None, robot: LiveSource | None, said: Said) -> Status:
 
 def _live(status: Status, robot: LiveSource) -> Status:
     """The same with what is heard of the robot."""
-    silent = robot.waiting_for() if status.state in ("playing", "waiting") else ""
+    # While scans wait the robot was heard, whatever its link had no time to note while a machine compiled.
+    is_asked = status.state in ("playing", "waiting") and not robot.scans_waiting
+    silent = robot.waiting_for() if is_asked else ""
     return replace(
         status,
         state="waiting" if silent else status.state,
@@ -89,6 +92,7 @@ def _of_run(run: Run, said: Said) -> Status:
         health=health_word(frame),
         warnings=[*said.warnings, *losses, *([run.not_kept] if run.not_kept else [])],
         going_to=said.going_to,
+        going_to_s=said.going_to_s,
         camera=has_camera(description),
         remapped=run.remapped,
     )

@@ -66,8 +66,15 @@ class Way:
         """The sought scan in words; empty when none is."""
         if run is None or not self.sought:
             return ""
+        time_s = self.time_s(run)
+        return f"scan {self._index}" if time_s is None else clock(time_s)
+
+    def time_s(self, run: Run | None) -> float | None:
+        """Of the sought scan, since the run's first one; None when none is, or nobody knows."""
+        if run is None:
+            return None
         if self._stamp_ns is not None:
-            return clock((self._stamp_ns - run.start_ns) / _NS)
+            return (self._stamp_ns - run.start_ns) / _NS
         if self._index is not None and self._index < run.known:
-            return clock((run.stamp_ns(self._index) - run.start_ns) / _NS)
-        return f"scan {self._index}"
+            return (run.stamp_ns(self._index) - run.start_ns) / _NS
+        return None

@@ -22,6 +22,7 @@ from app.messages import Advance, Command, Open, Pause, Play, Seek, SetParameter
 from app.opening import options_of
 from app.pacer import Pacer
 from app.session import Session
+from app.session_status import clock
 from app.story.recent import Recent
 from app.words import COMPILING
 from app.worker_messages import (
@@ -47,6 +48,7 @@ T = TypeVar("T")
 _REPORT_S = 0.25
 _GLIMPSE_S = 0.5
 _COMPILING = COMPILING.capitalize()
+_COMPILES_ON_S = 60.0  # a kernel compiled so soon after another is of the same wait
 # How often a robot is asked for what came: a little of a scan's time, and less than 1 % of a core.
 _LISTEN_S = 0.005
 # About how long scans are mapped again between two looks at the commands, and how many scans of a run that
@@ -91,6 +93,7 @@ class Driver:
         self._reported: tuple[Status, float] | None = None
         self._glimpse_at = 0.0
         self._long_way_at = 0.0
+        self._compiling_since_s, self._compiled_at = 0.0, -math.inf
         self._mapped = 0  # scans since a scan was mapped again
         self._at_once = 1
 
@@ -293,10 +296,14 @@ class Driver:
     def compiling(self) -> None:
         """Say that work waits for a kernel that is being compiled; called while it works."""
         self._session.disturb()
+        now = self._clock()
+        if now > self._compiled_at + _COMPILES_ON_S:
+            self._compiling_since_s = time.time()
+        self._compiled_at = now
         if self._reported is None or self._says_compiling:
             return
         # What was told last, because the session is in the middle of its work.
-        status = replace(self._reported[0], detail=_COMPILING)
+        status = replace(self._reported[0], detail=_COMPILING, compiling_since_s=self._compiling_since_s)
         if status.state == "playing":
             status = replace(status, state="waiting")
         self._reported = (status, -math.inf)  # so that what comes of it is told at once
@@ -321,7 +328,8 @@ class Driver:
         playing = self._session.pace in ("replay", "live")
         status = self._session.status()
         if status.going_to and now >= self._long_way_at:  # a short way would only flicker
-            status = replace(status, detail=f"Going to {status.going_to} …")
+            at = clock(status.time_s)
+            status = replace(status, detail=f"Going to {status.going_to}: mapped up to {at} …")
         status = replace(
             status,
             speed=self._pacer.speed,

@@ -9,6 +9,7 @@ const WORDS = {
 };
 const NO_FIGURES = ["starting", "failed"];
 const OLD_AFTER = 3000; // [ms] without a word while a run plays
+const COMPILED_FOR = 20_000; // [ms] in which what was just compiled is loaded, and the first scans take longer
 
 // name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
 const FIGURES = {
@@ -90,8 +91,12 @@ function show() {
 
 const shortSource = (uri) => (uri ?? "").split("?")[0].split("/").filter(Boolean).pop() ?? "";
 
+// On a long way to a scan that was sought nothing plays, and nothing stands.
+const isGoing = (status) => Boolean(status?.going_to) && status.detail.startsWith("Going");
+
 // "Live robot1": a robot is heard now; its name stands in every state but the failed one.
 function stateWord(status) {
+  if (isGoing(status)) return "On the way";
   const word = status.live && status.state === "playing" ? "Live" : (WORDS[status.state] ?? status.state);
   return status.live && status.robot && status.state !== "failed" ? `${word} ${status.robot}` : word;
 }
@@ -107,6 +112,7 @@ function showState() {
     box.dataset.state = name;
     changed("phase");
   }
+  box.classList.toggle("going", state.connected && isGoing(state.status));
   setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.lostAt ? "No connection" : "Connecting");
   box.title = robotsTitle(state.status);
   const recording = state.status?.recording ?? "";
@@ -115,7 +121,7 @@ function showState() {
   setText(byId("recording"), `${recording.startsWith("not") ? "⚠" : "●"} ${recording.split(",")[0].split(":")[0]}`);
   byId("recording").title = recording;
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
-  const quiet = state.status?.state === "playing" && performance.now() - state.heardAt > OLD_AFTER;
+  const quiet = state.status?.state === "playing" && performance.now() - state.heardAt > (performance.now() - compiledAt < COMPILED_FOR ? 4 : 1) * OLD_AFTER;
   byId("figures").classList.toggle("old", quiet);
   showNotice(quiet);
 }
@@ -133,12 +139,22 @@ function showWay() {
   setText(byId("way-distance"), clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
 }
 
-let compilingAt = 0; // since when this machine compiles [ms], 0 when it does not
+let ahead = null; // of this machine's clock is the server's [ms], null while that is not asked for
+let compiledAt = -Infinity; // when it was last seen to compile [ms]
 
-function compilingFor(detail) {
-  if (!detail.startsWith("Compiling")) compilingAt = 0;
-  else compilingAt ||= performance.now();
-  return compilingAt && seconds(compilingAt) >= 10 ? ` (${seconds(compilingAt)} s so far; a machine that is busy or small takes longer)` : "";
+function compilingFor({ compiling_since_s: since }) {
+  if (!since) return "";
+  compiledAt = performance.now();
+  if (ahead === null) askClock();
+  const passed = Math.floor((Date.now() + ahead) / 1000 - since);
+  return passed >= 10 ? ` (${passed} s so far; a machine that is busy or small takes longer)` : "";
+}
+
+// Of two machines each may have a clock of its own: an answer says the server's.
+async function askClock() {
+  ahead = 0;
+  const date = Date.parse((await fetch("/api/status")).headers.get("date"));
+  if (Number.isFinite(date)) ahead = date - Date.now();
 }
 
 function showNotice(quiet) {
@@ -147,7 +163,7 @@ function showNotice(quiet) {
   const text = !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. This is the last picture; it goes on by itself when stemmap answers again.`
     : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
-    : status?.detail ? status.detail + compilingFor(status.detail) : "";
+    : status?.detail ? status.detail + compilingFor(status) : "";
   notice.hidden = !text;
   const failed = state.connected && status?.state === "failed";
   notice.classList.toggle("failed", failed);

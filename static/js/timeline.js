@@ -50,7 +50,7 @@ function show() {
   line.disabled = !(status.end_s > 0);
   if (!dragging && !seeking) {
     line.max = String(status.end_s ?? 1);
-    line.value = String(status.time_s);
+    line.value = String(status.going_to_s ?? status.time_s); // it waits where it was put, and does not creep there
     setText(byId("time-now"), clock(status.time_s));
   }
   line.setAttribute("aria-valuetext", clock(Number(line.value)));

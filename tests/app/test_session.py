@@ -5,12 +5,15 @@ scan was mapped with, and on nothing else.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.session import Session
+from app.session_status import Said, describe
 from pipeline.errors import SourceError
 from pipeline.parameters import Parameters
 from pipeline.records import Frame, Step
@@ -355,7 +358,7 @@ def test_a_seek_after_a_fault_starts_from_a_sound_state() -> None:
 def test_the_status_says_where_a_seek_goes_until_it_is_there() -> None:
     session = opened()
     session.seek(6.55)
-    assert session.status().going_to == "0:06"
+    assert (session.status().going_to, session.status().going_to_s) == ("0:06", pytest.approx(6.55))
     session.work()
     assert (session.status().state, session.status().going_to) == ("paused", "0:06")
     settle(session)
@@ -363,9 +366,9 @@ def test_the_status_says_where_a_seek_goes_until_it_is_there() -> None:
     session.advance(-55)
     assert session.status().going_to == "0:01"
     session.advance(100)
-    assert session.status().going_to == "scan 110"
+    assert (session.status().going_to, session.status().going_to_s) == ("scan 110", None)
     settle(session)
-    assert session.status().going_to == ""
+    assert (session.status().going_to, session.status().going_to_s) == ("", None)
 
 
 def test_what_the_odometry_means_is_a_warning_or_a_failure() -> None:
@@ -455,3 +458,16 @@ def test_status_tells_the_figures_of_the_run() -> None:
     assert status.health == "no trees yet"
     assert "chain" in status.stage_ms
     assert session.next_ns() == scan(3).stamp_ns
+
+
+@pytest.mark.parametrize(("waiting", "state"), [(0, "waiting"), (3, "playing")])
+def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str) -> None:
+    robot = SimpleNamespace(
+        waiting_for=lambda: "Nothing heard for 3 s",
+        scans_waiting=waiting,
+        robot="a",
+        robots=["a"],
+        recording="",
+    )
+    told = describe(None, cast(Any, robot), Said("playing", "", "zenoh:", 0.0, (), 0, "", None))
+    assert (told.state, told.detail) == (state, "" if waiting else "Nothing heard for 3 s")

@@ -6,7 +6,9 @@ import io
 import itertools
 import os
 import queue
+import re
 import threading
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -113,6 +115,8 @@ def test_a_kernel_that_is_compiled_is_said_once_and_no_silence_follows() -> None
     (waits,) = (k for k, status in enumerate(reports) if status.state == "waiting")
     assert reports[waits].detail == COMPILING.capitalize()
     assert reports[waits].source == "fake:"
+    assert time.time() - 60.0 < (reports[waits].compiling_since_s or 0.0) <= time.time()
+    assert reports[waits + 1].compiling_since_s is None
     assert (reports[waits + 1].state, reports[waits + 1].detail) == ("playing", "")
 
 
@@ -180,7 +184,9 @@ def test_a_sought_scan_is_shown() -> None:
 def test_on_a_long_way_the_status_says_where_it_goes() -> None:
     said = driven(FakeSource(900), Open("fake:"), Seek(85.0))
     on_the_way = [m.status for m in said if isinstance(m, Report) and m.status.detail.startswith("Going")]
-    assert {status.detail for status in on_the_way} == {"Going to 1:25 …"}
+    assert on_the_way
+    assert all(re.match(r"Going to 1:25: mapped up to \d:\d\d …", s.detail) for s in on_the_way)
+    assert {status.going_to_s for status in on_the_way} == {85.0}
     assert (last_status(said).detail, last_status(said).going_to) == ("", "")
     said = driven(FakeSource(90), Open("fake:"), Advance(3))
     assert not [m for m in said if isinstance(m, Report) and m.status.detail.startswith("Going")]
