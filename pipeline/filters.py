@@ -52,8 +52,8 @@ def _voxel_means(points: Float32, size: float) -> Float32:
     while slots < 2 * n:
         slots *= 2
     shift = np.uint64(64 - int(np.log2(slots) + 0.5))
-    keys = np.full(slots, -1, np.int64)
-    row_of = np.empty(slots, np.int64)
+    # The table has rows alone, and their keys stand one after another: most cubes are new, and ask for none.
+    row_of, keys = np.full(slots, -1, np.int32), np.empty(n, np.int64)
     sums = np.zeros((n, 3))
     counts = np.zeros(n, np.int64)
     rows = 0
@@ -62,13 +62,13 @@ def _voxel_means(points: Float32, size: float) -> Float32:
         for a in range(3):
             key = (key << 21) | (np.int64(np.floor(points[i, a] / size)) + _AXIS_CELLS // 2)
         slot = np.int64((np.uint64(key) * _SPREAD) >> shift)
-        while keys[slot] != -1 and keys[slot] != key:
+        while row_of[slot] >= 0 and keys[row_of[slot]] != key:
             slot = (slot + 1) & (slots - 1)
-        if keys[slot] == -1:
-            keys[slot] = key
-            row_of[slot] = rows
-            rows += 1
         row = row_of[slot]
+        if row < 0:
+            row_of[slot] = row = rows
+            keys[row] = key
+            rows += 1
         counts[row] += 1
         for a in range(3):
             sums[row, a] += points[i, a]

@@ -129,7 +129,9 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
         g[4] += told * (p[4] - width)
         factorise(H, L)
         solve(L, g, step)
-        gain = (g * step).sum()  # squared length of the step in its own sigma
+        gain = 0.0  # squared length of the step in its own sigma
+        for a in range(5):
+            gain += g[a] * step[a]
         # A step longer than the trunk itself would throw the circle to its other side.
         longest = max(abs(step[0]), abs(step[1]), abs(step[4]))
         limit = 0.5 * p[4] + 0.02
