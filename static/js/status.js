@@ -96,7 +96,7 @@ const isGoing = (status) => Boolean(status?.going_to) && status.detail.startsWit
 
 // "Live robot1": a robot is heard now; its name stands in every state but the failed one.
 function stateWord(status) {
-  if (isGoing(status)) return "On the way";
+  if (isGoing(status)) return "Seeking";
   const word = status.live && status.state === "playing" ? "Live" : (WORDS[status.state] ?? status.state);
   return status.live && status.robot && status.state !== "failed" ? `${word} ${status.robot}` : word;
 }

@@ -61,7 +61,7 @@ def check_map_stays(dashboard: Dashboard) -> None:
         heights = set()
         for tab in ("Trees", "Clusters", "Story", "Tune", "Annotate", "Scores", "Plots"):
             dashboard.tab(tab)
-            heights.add((frame.bounding_box() or {}).get("height"))
+            heights.add(frame.evaluate("node => node.getBoundingClientRect().height"))
         assert len(heights) == 1, f"at {size} the map jumps with the tab: {heights}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 
 from playwright.sync_api import expect
 
@@ -77,3 +78,43 @@ def test_a_distance_is_measured_between_two_trees(dashboard: Dashboard):
     expect(page.locator("#map-measure")).to_have_attribute("aria-pressed", "false")
     page.evaluate(RESET)
     assert dashboard.errors == []
+
+
+# The strip, the notice, the timeline's thumb and its time under another status, which is then taken back.
+UNDER = """async changes => {
+  const { state, changed } = await import('/static/js/state.js');
+  const text = selector => document.querySelector(selector).textContent;
+  const before = state.status;
+  const tell = async () => {
+    for (const _ of [1, 2]) { // the first one asks for the server's clock
+      state.status = { ...before, ...changes };
+      changed('status');
+      await new Promise(done => setTimeout(done, 400));
+    }
+    return [text('#state b'), text('#notice span'), Number(document.querySelector('#timeline').value)];
+  };
+  const told = await tell();
+  state.status = before;
+  changed('status');
+  return told;
+}"""
+
+
+def test_a_seek_says_that_it_goes_there_and_compiling_counts_from_its_start(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand()
+    going = {
+        "going_to": "0:40",
+        "going_to_s": 40.0,
+        "time_s": 12.0,
+        "detail": "Going to 0:40: mapped up to 0:12 …",
+    }
+    word, notice, thumb = page.evaluate(UNDER, going)
+    assert (word, notice, thumb) == ("Seeking", going["detail"], 40.0)
+    compiling = {"state": "waiting", "detail": "Compiling", "compiling_since_s": time.time() - 100.0}
+    word, notice, _ = page.evaluate(UNDER, compiling)
+    assert word == "Waiting"
+    passed = re.search(r"\((\d+) s so far", notice)
+    assert passed is not None, notice
+    assert 98 <= int(passed[1]) <= 120
+    expect(page.locator("#state b")).to_have_text("Paused")
