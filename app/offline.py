@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path as FilePath
@@ -20,7 +20,6 @@ from app.preset_words import changed_values, preset_words
 from app.saved_run import FORMAT, SavedRun
 from app.stopwatch import Stopwatch
 from app.summary import start_lines, summary_lines
-from app.tally import Tally
 from app.tree_pictures import FOLDER as PICTURES
 from app.tree_pictures import keep_pictures
 from app.version import version
@@ -31,7 +30,7 @@ from pipeline.evaluation import Evaluation, PathError, evaluate, path_error
 from pipeline.export import RunFiles, terrain_text
 from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
-from pipeline.records import Frame, Path, Trees, Truth, TruthTrees
+from pipeline.records import Frame, Path, Step, Trees, Truth, TruthTrees
 from pipeline.saved_map import SavedMap
 from pipeline.sources.base import Source
 
@@ -145,25 +144,12 @@ def _map(
         forests=kept_forests(),
     )
     begun = _beginning(plan, mapper, chosen)
-    tally, start_ns, frame = begun.tally, begun.start_ns, None
     left_out = Counter[str]()
     to_map = begun.steps(plan.source, chosen.steps, left_out)
-    for step in islice(to_map, plan.stop_after):
-        _use_revisions(plan, mapper, step.index)
-        # The first scan loads the kernels, which takes many times longer than to map it.
-        with stopwatch.aside() if frame is None else stopwatch.whole_scan():
-            frame = mapper.process(step)
-        if plan.on_frame is not None:
-            plan.on_frame(frame, mapper)
-        start_ns = frame.stamp_ns if start_ns is None else start_ns
-        files.add(frame, start_ns)
-        tally.add(frame)
-        progress.update(1)
-    if frame is None or start_ns is None:
-        what = (
-            "there is no scan in it" if not begun.scans else "there is no scan in it that was not mapped yet"
-        )
-        raise SourceError(what, where=description.uri)
+    frame, start_ns = _map_scans(
+        plan, mapper, begun, islice(to_map, plan.stop_after), files, progress, stopwatch
+    )
+    tally = begun.tally
     path, truth = mapper.path, _truth(plan, begun)
     evaluation = _evaluate(*as_written(frame.trees, path, start_ns), truth, plan.parameters)
     error = path_error(path, truth.path) if truth.path else None
@@ -174,12 +160,8 @@ def _map(
     if plan.parameters.gathering.method == "none":  # else a track is judged by more than its hits
         tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     seconds, metres = driven(path, breaks_of(begun.sources))
-    record = _run_record(plan, tally, frame, (seconds, metres), start_ns, evaluation, error, losses)
+    record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
     record["odometry_used"] = chosen.words
-    if len(begun.sources) > 1:
-        first, *others = begun.sources
-        record["source"].update(uri=first.uri, sha256=first.digest)
-        record["continued"] = [asdict(other) for other in others]
     outcome = Outcome(
         summary=[
             *summary_lines(description.uri, frame, (seconds, metres), evaluation, error),
@@ -196,6 +178,34 @@ def _map(
     further = {"terrain.csv": terrain_text(mapper.height_map)}
     files.finish(frame.trees, path, start_ns, record, state, further)
     return outcome, _Mapped(plan.source, frame.trees, path)
+
+
+def _map_scans(
+    plan: OfflineRun,
+    mapper: Mapper,
+    begun: Beginning,
+    to_map: Iterable[Step],
+    files: RunFiles,
+    progress: Progress,
+    stopwatch: Stopwatch,
+) -> tuple[Frame, int]:
+    """Map scan by scan; the last frame, and the stamp [ns] that times are told from."""
+    start_ns, frame = begun.start_ns, None
+    for step in to_map:
+        _use_revisions(plan, mapper, step.index)
+        # The first scan loads the kernels, which takes many times longer than to map it.
+        with stopwatch.aside() if frame is None else stopwatch.whole_scan():
+            frame = mapper.process(step)
+        if plan.on_frame is not None:
+            plan.on_frame(frame, mapper)
+        start_ns = frame.stamp_ns if start_ns is None else start_ns
+        files.add(frame, start_ns)
+        begun.tally.add(frame)
+        progress.update(1)
+    if frame is None or start_ns is None:
+        mapped = " that was not mapped yet" if begun.scans else ""
+        raise SourceError(f"there is no scan in it{mapped}", where=plan.source.description.uri)
+    return frame, start_ns
 
 
 def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: Outcome) -> None:
@@ -268,7 +278,7 @@ def _evaluate(trees: Trees, path: Path, truth: Truth, parameters: Parameters) ->
 
 def _run_record(
     plan: OfflineRun,
-    tally: Tally,
+    begun: Beginning,
     frame: Frame,
     driven_s_m: tuple[float, float],
     start_ns: int,
@@ -277,15 +287,17 @@ def _run_record(
     losses: dict[str, int],
 ) -> dict[str, Any]:
     """run.json: no time of day and no time taken, so that the same run gives the same bytes."""
-    description = plan.source.description
+    description, tally = plan.source.description, begun.tally
+    first, *others = begun.sources
     return {
         "stemmap": version(),
         "source": {
-            "uri": description.uri,
+            "uri": first.uri if others else description.uri,
             "kind": description.kind,
-            "sha256": description.digest,
+            "sha256": first.digest if others else description.digest,
             "sensor": asdict(description.sensor),
         },
+        **({"continued": [asdict(other) for other in others]} if others else {}),
         "seed": plan.seed,
         "odometry": plan.odometry,
         **({} if plan.chosen is None else {"chosen": plan.chosen}),
