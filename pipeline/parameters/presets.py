@@ -27,6 +27,7 @@ _PAPER: dict[str, object] = {
     "clustering.stem_area": 0.0,
     "shape.plane": 2,
     "shape.centre": "centroid",
+    "shape.slices": 0,
     "detection.whole": False,
     "detection.e_min": 1.0,
     "detection.e_max": 20.0,
@@ -65,6 +66,7 @@ _LASER2D: dict[str, object] = {
     "clustering.method": "range_jump",
     "clustering.eps": 1.0,
     "clustering.min_points": 1,
+    "shape.slices": 0,  # one ring has no height
     # One ring meets no ground: where returns end says little of where the laser looks.
     "detection.whole": False,
     "detection.e_max": 1000.0,

@@ -120,7 +120,7 @@ class Shape(Stage):
         "circle", "Centre of a trunk", "The centroid of the visible arc, as in the paper, or a fitted circle."
     )
     slices: int = count(
-        0,
+        4,
         "Slices that agree",
         "",
         0,
