@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Playwright, expect, sync_playwright
 
-from tests.browser.dashboard import PATIENCE_S, Dashboard
+from tests.browser.dashboard import FEW_FRAMES, PATIENCE_S, Dashboard
 from tests.browser.flags import FLAGS
 from tests.browser.serving import Server
 
@@ -68,6 +68,7 @@ def opened(
     context = chromium.new_context(viewport={"width": width, "height": height})
     try:
         context.set_default_timeout(PATIENCE_MS)
+        context.add_init_script(FEW_FRAMES)
         page = context.new_page()
         dashboard = Dashboard(page, scene)
         page.goto(f"{link}&fixedDpr=0.3")

@@ -90,9 +90,7 @@ class Dashboard:
 
     def drawn(self) -> None:
         """Wait until what was planned to be drawn on the page is drawn."""
-        self.page.evaluate(
-            "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
-        )
+        self.page.evaluate(NEXT_FRAME)
 
     # --- playing ---------------------------------------------------------------------------------
 
@@ -204,6 +202,7 @@ class Dashboard:
 
         def rest() -> bool:
             nonlocal before
+            self.scene.evaluate(NEXT_FRAME)  # within one of them everything rests
             earlier, before = before, self.places_in_scene(name)
             return len(before) == len(earlier) > 0 and all(
                 abs(a - b) < 0.5
@@ -241,6 +240,25 @@ class Dashboard:
 def _leave_empty(route: Route) -> None:
     route.fulfill(body="<!doctype html><title>3D scene</title>", content_type="text/html")
 
+
+NEXT_FRAME = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+
+# The scene is drawn ten times a second instead of sixty: it shows the same, and leaves the core to the tests.
+FEW_FRAMES = """if (location.pathname.startsWith('/viser/')) {
+  const draw = requestAnimationFrame.bind(window), drop = cancelAnimationFrame.bind(window);
+  const planned = new Map();
+  let last = 0;
+  window.requestAnimationFrame = (act) => {
+    const id = ++last;
+    const timer = setTimeout(() => {
+      const frame = draw((now) => { planned.delete(id); act(now); });
+      planned.set(id, () => drop(frame));
+    }, 100);
+    planned.set(id, () => clearTimeout(timer));
+    return id;
+  };
+  window.cancelAnimationFrame = (id) => { planned.get(id)?.(); planned.delete(id); };
+}"""
 
 PRESET = """name => fetch('/api/parameters/preset', { method: 'POST', body: JSON.stringify({ name }),
   headers: { 'Content-Type': 'application/json' } })"""

@@ -65,7 +65,8 @@ NAMELESS = """() => [...document.querySelectorAll('button, input, select, a[href
 
 def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
     page = dashboard.page
-    dashboard.pause()
+    dashboard.stand()  # where there are trees
+    dashboard.tab("Trees")
     dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
     page.locator("#map").press("Control+k")
     find = page.get_by_role("combobox", name="What do you want to do?")
