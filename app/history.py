@@ -48,6 +48,11 @@ class Snapshots(Generic[S]):
         self._size_of = size_of
         self._spacing = _SPACING
 
+    @property
+    def nbytes(self) -> int:
+        """Of all states."""
+        return sum(self._sizes[n] for n in self._states)
+
     def offer(self, scans: int, state: S) -> None:
         """Keep a state if it is due."""
         if not self.is_due(scans):
@@ -58,7 +63,7 @@ class Snapshots(Generic[S]):
             self._states = {n: s for n, s in self._states.items() if n % self._spacing == 0}
 
     def _are_too_many(self) -> bool:
-        return len(self._states) > _MOST_STATES or sum(self._sizes[n] for n in self._states) > _MOST_BYTES
+        return len(self._states) > _MOST_STATES or self.nbytes > _MOST_BYTES
 
     def is_due(self, scans: int) -> bool:
         """Whether `offer` would keep a state of so many scans."""

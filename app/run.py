@@ -15,6 +15,7 @@ from app.abreast import abreast
 from app.ahead import looked_ahead, looked_at_once
 from app.cursor import Cursor
 from app.history import ParameterHistory, Snapshots
+from app.left_behind import Left, LeftBehind, basis_of
 from app.live_cursor import LiveCursor
 from app.remapping import Remapping, Told
 from app.stopwatch import Stopwatch
@@ -22,11 +23,9 @@ from app.story.history import TreeHistory
 from pipeline.errors import SourceError, StemmapError
 from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
-from pipeline.perception import Looked
 from pipeline.records import Float, Frame, Path, Step, Trees
 from pipeline.rerun import (
     Basis,
-    DamagedError,
     Journal,
     KeptScans,
     Reread,
@@ -105,6 +104,8 @@ class Run:
         self.is_bare = self._hurried = False
         self._key = look_key(parameters)
         self._remapping: Remapping | None = None
+        self._left = LeftBehind()
+        self._returning: tuple[Left, Parameters] | None = None
         self._journal, self._sample = Journal(), Sample()
         self._rough: Trees | None = None
         if isinstance(mapper, Mapper):
@@ -144,6 +145,7 @@ class Run:
         step = self._cursor.take()
         if step is None:
             return None
+        self._left.forget(self._kept)
         self._before = self._mapper.snapshot()
         self._snapshots.offer(step.index, self._before)
         self._hurried = hurried
@@ -199,22 +201,11 @@ class Run:
         mapper = self._mapper
         if not isinstance(mapper, Mapper):
             return mapper.process(step)
-        looked = self._remembered(step) if self._hurried else None
+        looked = self._kept.looked(step, self._key) if self._hurried else None
         self.is_bare = looked is not None
         looked = looked or mapper.look(step)
         self._kept.put(step, looked, self._key)
         return mapper.take(step, looked)
-
-    def _remembered(self, step: Step) -> Looked | None:
-        """What is kept of a scan, if these parameters look at it in the same way."""
-        if not self._kept.has(step.index, self._key):
-            return None
-        try:
-            known, looked = self._kept.scan(step.index)
-        except DamagedError:
-            self._kept.forget_from(step.index)
-            return None
-        return looked if known.scan.stamp_ns == step.scan.stamp_ns else None
 
     def remap(self, parameters: Parameters) -> None:
         """Begin to map the run again from its first scan; what was begun before is given up. Nothing is begun
@@ -222,6 +213,13 @@ class Run:
         self.stay()
         if self._parameters.were_always(parameters, _NO_PART_OF_THE_MAP):
             return
+        left = self._left.find(parameters, _NO_PART_OF_THE_MAP)
+        if left is not None:
+            self._returning = (left, parameters)
+        else:
+            self._begin(parameters)
+
+    def _begin(self, parameters: Parameters) -> None:
         mapper = self._remake(parameters) if self._remake else None
         if not isinstance(mapper, Mapper):
             return
@@ -245,15 +243,13 @@ class Run:
         """What the scans so far were mapped to with one set of parameters."""
         if not isinstance(self._mapper, Mapper) or self._broken:
             return None
-        notes = self._journal.first(self._parameters.until(max(self.standing, 0)))
-        states = self._snapshots.first(len(notes))
-        if self._before is not None and self._before.path_length <= len(notes):
-            states[self._before.path_length] = self._before
-        path, motion = self._mapper.path, self._mapper.motion
-        return Basis.of(self._parameters.at(0), notes, states, path, motion)
+        return basis_of(
+            self._parameters, self.standing, self._mapper, self._before, self._snapshots, self._journal
+        )
 
     def stay(self) -> None:
         """Give up what `remap` began; the map stays as it is."""
+        self._returning = None
         if self._remapping is not None:
             self._remapping.rerun.close()
             self._remapping = None
@@ -262,6 +258,8 @@ class Run:
     def remapped(self) -> float | None:
         """How much of the run is mapped again, up to the standing scan; None when nothing is."""
         r = self._remapping
+        if self._returning is not None and self.is_whole:
+            return 1.0
         if r is None or not self.is_whole:
             return None
         return min(r.rerun.done / max(self.standing, 1), 1.0)
@@ -284,7 +282,11 @@ class Run:
             StemmapError: A scan cannot be looked at again. The map stays as it is.
         """
         remapping = self._remapping
-        if remapping is None or self._step is None or self._broken:  # on the way to another scan
+        if self._step is None or self._broken:  # on the way to another scan
+            return None
+        if self._returning is not None:
+            return self._returned(*self._returning)
+        if remapping is None:
             return None
         try:
             with self.stopwatch.aside():
@@ -295,16 +297,42 @@ class Run:
         if not there:
             return None
         self._remapping = None
-        remapping.rerun.stop_reading()  # its mapper holds it as long as the run goes on
-        if remapping.rerun.kept is not self._kept:
-            self._kept.close()
-            self._kept = remapping.rerun.kept
-        self._mapper, self._snapshots = remapping.rerun.mapper, remapping.snapshots
-        self._told, self._journal = remapping.told, remapping.rerun.journal
-        self._parameters = ParameterHistory(remapping.parameters)
-        self._key = look_key(remapping.parameters)
-        self._before = self._mapper.snapshot()
+        new = Left.of(remapping, self.standing)
+        return self._take_over(new, new.parameters)
+
+    def _returned(self, left: Left, parameters: Parameters) -> tuple[Frame, dict[int, float]] | None:
+        """The map that was left behind, if it still is of the standing scan; else that is mapped again."""
+        self._returning = None
+        if left not in self._left:
+            self._begin(parameters)
+            return None
+        left.mapper.restore(left.before)
+        return self._take_over(left, parameters)
+
+    def _take_over(self, new: Left, parameters: Parameters) -> tuple[Frame, dict[int, float]]:
+        """Go on with another map of the scans before the standing one, and leave the present one behind."""
+        assert self._step is not None  # noqa: S101 - who asks has looked
+        old = self._present()
+        self._mapper, self._snapshots, self._before = new.mapper, new.snapshots, new.before
+        self._told, self._journal = new.told, new.journal
+        kept, self._kept = self._kept, new.kept
+        self._left.take(new, self._kept)
+        if old is not None:
+            self._left.add(old, self._kept)
+        self._left.close_unused(kept, self._kept)
+        self._parameters = ParameterHistory(parameters)
+        self._key = look_key(parameters)
         return self._map(self._step), self._told.confirmed_s
+
+    def _present(self) -> Left | None:
+        """The map of the scans before the standing one; None where they were mapped with several sets."""
+        mapper, scans = self._mapper, self.standing
+        if not isinstance(mapper, Mapper) or not 0 < scans <= self._parameters.until(scans):
+            return None
+        return Left(
+            self._parameters.at(0), scans, mapper, self._before, self._snapshots, self._told, self._journal,
+            self._kept,
+        )  # fmt: skip
 
     def parameters_at(self, index: int) -> Parameters:
         """What a scan was or will be mapped with."""
@@ -350,6 +378,7 @@ class Run:
         scans, state = self._snapshots.newest(min(index, self._cursor.known))
         if not self._broken and self.standing < index and scans <= self.standing + 1:
             return
+        self._left.forget(self._kept)
         self._broken = True  # until all of it has worked
         self._cursor.go_to(scans)
         self._mapper.restore(state)
@@ -365,5 +394,6 @@ class Run:
     def close(self) -> None:
         """Let go of the source."""
         self.stay()
+        self._left.forget(self._kept)
         self._kept.close()
         self.source.close()

@@ -33,6 +33,11 @@ class Journal:
     def __len__(self) -> int:
         return len(self._notes) + len(self._newest)
 
+    @property
+    def nbytes(self) -> int:
+        """Of what is laid together."""
+        return self._notes.nbytes
+
     def note(self, noted: Noted, slam: Slam) -> None:
         """Take a scan, which is the next one or one that is there; later ones are forgotten."""
         self.cut(noted.index)

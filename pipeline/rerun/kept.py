@@ -113,6 +113,21 @@ class KeptScans:
         """Whether a scan is kept that was looked at with these parameters."""
         return index < self._count and self.key_of(index) == key
 
+    def looked(self, step: Step, key: bytes) -> Looked | None:
+        """What a scan showed, if it is kept and was looked at with these parameters."""
+        if not self.has(step.index, key):
+            return None
+        try:
+            known, looked = self.scan(step.index)
+        except DamagedError:
+            self.forget_from(step.index)
+            return None
+        return looked if known.scan.stamp_ns == step.scan.stamp_ns else None
+
+    def holds(self, scans: int, key: bytes) -> bool:
+        """Whether all of the first scans are kept that were looked at with these parameters."""
+        return self._count >= scans and all(self.key_of(k) == key for k in range(scans))
+
     def forget_from(self, index: int) -> None:
         """Keep the scans before it alone."""
         self._count = min(self._count, index)

@@ -86,6 +86,40 @@ def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters)
     assert not any(thread.name.startswith("look") for thread in threading.enumerate()), "none is left"
 
 
+@pytest.mark.parametrize("parameters", [FEWER, WIDER])
+def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parameters, monkeypatch):
+    begun: list[Parameters] = []
+    begin = session._run._begin
+    monkeypatch.setattr(session._run, "_begin", lambda wanted: (begun.append(wanted), begin(wanted))[1])
+    maps: dict[int, object] = {}
+    for revision, (wanted, anew) in enumerate(
+        [(parameters, 1), (BASE, 0), (parameters, 0), (LATER, 1), (parameters, 0), (BASE, 0), (FEWER, None)]
+    ):
+        begun.clear()
+        session.set_parameters(wanted, revision, whole=True)
+        frame, changes = remapped(session)
+        assert anew is None or len(begun) == anew, "what is there is not mapped again"
+        assert changes.revision == revision
+        now = (told(frame), told(session.path))
+        assert maps.setdefault(id(wanted), now) == now
+        assert session._run.confirmed_s(frame.trees).tolist() == pytest.approx(
+            [session._run._told.confirmed_s.get(n, np.nan) for n in frame.trees.number.tolist()], nan_ok=True
+        )
+    for wanted in (parameters, BASE, LATER):
+        assert maps[id(wanted)] == mapped_with(wanted, LAST - 1)
+
+
+def test_once_the_run_goes_on_a_map_that_was_left_is_made_again(session):
+    session.set_parameters(FEWER, 1, whole=True)
+    remapped(session)
+    session.set_parameters(BASE, 2, whole=True)
+    session.advance(1)
+    settle(session)
+    session.set_parameters(BASE, 3, whole=True)
+    frame, _ = remapped(session)
+    assert (told(frame), told(session.path)) == mapped_with(BASE, frame.index)
+
+
 @pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER])
 def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parameters):
     session.set_parameters(parameters, 1, whole=True)
