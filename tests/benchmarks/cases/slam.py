@@ -27,6 +27,7 @@ SPACING = 3.0  # m between landmarks on their lattice
 SIGMA = 0.05
 AROUND = 25.0  # m
 STRIDE = 0.05  # m a step
+TIMES = 4  # seen so often, all landmarks weigh
 
 
 def run() -> list[Table]:
@@ -47,7 +48,7 @@ def run() -> list[Table]:
 
 def growth() -> Table:
     """How a step's time grows with a map of the same density: CPU time of this thread, in turns."""
-    sides = {str(n): Driven(_ours(100), n) for n in SAME_DENSITY}
+    sides = {str(n): Driven(_ours(100, n), n, known=True) for n in SAME_DENSITY}
     times = in_turns(sides, GROWTH_STEPS, clock=time.thread_time)
     rows = tuple((n, middle(t), sum(t) / len(t)) for n, t in zip(SAME_DENSITY, times.values(), strict=True))
     return Table(
@@ -103,7 +104,9 @@ def loop(steps: int = LOOP_STEPS, rounds: int = LOOP_ROUNDS) -> Table:
 
 def row(particles: int, landmarks: int, steps: int, peer_steps: int) -> tuple[Cell, ...]:
     """Time steps of one size."""
-    sides: dict[str, Callable[[], object]] = {"ours": Driven(_ours(particles), landmarks)}
+    sides: dict[str, Callable[[], object]] = {
+        "ours": Driven(_ours(particles, landmarks), landmarks, known=True)
+    }
     if peer_steps:
         sides["peer"] = Driven(_peer(particles), landmarks)
     side_by_side = in_turns(sides, peer_steps) if peer_steps else {"peer": []}
@@ -124,20 +127,23 @@ Feed = Callable[[int, float, "Float"], None]
 
 
 class Driven:
-    """A filter that knows a lattice of landmarks and drives on through it with every call."""
+    """A filter that knows a lattice of landmarks and drives on through it with every call.
 
-    def __init__(self, feed: Feed, landmarks: int) -> None:
+    Args:
+        feed: Is given the scans.
+        landmarks: Of the lattice.
+        known: Whether the filter knows them; else they are shown to it first, ten at a time.
+    """
+
+    def __init__(self, feed: Feed, landmarks: int, *, known: bool = False) -> None:
         import numpy as np
 
-        columns = max(1, round(landmarks**0.5))
-        k = np.arange(landmarks)
-        self._lattice = SPACING * np.stack([k // columns, k % columns - columns // 2], axis=1).astype(float)
-        self._lattice[:, 0] -= 5.0
+        self._lattice = _lattice(landmarks)
         # What can be among the nearest on ten metres of way, so that the search for them costs alike.
         self._around = self._lattice[np.hypot(self._lattice[:, 0], self._lattice[:, 1]) < AROUND]
         self._feed, self._x, self._index = feed, 0.0, 0
         self._random = np.random.default_rng(0)
-        for _ in range(4):  # seen so often, all of them weigh
+        for _ in range(0 if known else TIMES):
             for first in range(0, landmarks, OBSERVED):
                 self._observe(self._lattice[first : first + OBSERVED], 0.0)
 
@@ -158,13 +164,36 @@ class Driven:
         self._index += 1
 
 
-def _ours(particles: int) -> Feed:
+def _lattice(landmarks: int) -> Float:
+    """Where the landmarks stand, shape (L, 2) [m]."""
+    import numpy as np
+
+    columns = max(1, round(landmarks**0.5))
+    k = np.arange(landmarks)
+    lattice: Float = SPACING * np.stack([k // columns, k % columns - columns // 2], axis=1).astype(float)
+    lattice[:, 0] -= 5.0
+    return lattice
+
+
+def _ours(particles: int, landmarks: int) -> Feed:
+    """It is given its map. Shown to it from one place, ten of a lattice look like ten others that lie a step
+    of the lattice off, and the map would have many of them twice."""
     import numpy as np
 
     from pipeline.geometry import Pose2
+    from pipeline.slam.maps import MapColumns
+    from pipeline.slam.state import SlamState
     from pipeline.visibility import BINS
 
     slam = _filter(particles)
+    known = MapColumns(
+        _lattice(landmarks),
+        np.tile([SIGMA**2 / TIMES, 0.0, SIGMA**2 / TIMES], (landmarks, 1)),
+        np.full(landmarks, TIMES, np.int32),
+        np.full(landmarks, TIMES, np.float32),
+        np.arange(landmarks),
+    )
+    slam.state = SlamState.in_map(np.zeros((particles, 3)), known)
     nothing_missed = np.zeros(BINS)
 
     def feed(index: int, motion: float, seen: Float) -> None:
