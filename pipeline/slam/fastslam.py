@@ -65,24 +65,23 @@ class FastSlam:
         motion = Motion(motion) if isinstance(motion, Pose2) else motion
         state = self._moved(self.state.with_particles(p.particles), motion)
         ancestors, doubt = None, motion.doubt
-        trees = self._by_trees(state, detections)
+        R, rules = rows_of(detections.covariance), rules_of(p)
+        trees = self._by_trees(state, detections.centre, R, rules)
         used = index == 0 or state.since_update >= p.update_distance or trees.slipped
         slipped = trees.slipped or state.recent.slipped
         doubted = Doubted(bool(doubt), slipped)
         doubt = doubt or slip.why(state.motion, slipped, trees.unsure)
         if used:
             state, scan, weights = self._observed(
-                state, trees, detections, clear_range, noise, motion.measured, doubted
+                state, trees, detections.centre, R, clear_range, noise, motion.measured, doubted, rules
             )
         else:
             scan, weights = ScanTold(), normalised(state.log_weight)
-        if used:
-            state = replace(state, best=leader(weights, state.best, state.pose, p.distance_max))
         estimate, frame, by_trees = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
         if used:
             at = estimate.T_map_base.as_array()
             corrected = state.shared.corrected(at, estimate.covariance if by_trees else None)
-            state = replace(state, shared=corrected)
+            state = state if corrected is state.shared else replace(state, shared=corrected)
         if used and len(detections.cluster):
             serial = state.detections - len(detections.cluster)
             at = estimate.T_map_base.as_array()
@@ -204,15 +203,16 @@ class FastSlam:
         self,
         state: SlamState,
         trees: ByTrees,
-        detections: Detections,
+        centre: Float,
+        R: Float,
         clear_range: Float,
         noise: Float,
         measured: PoseMeasurement | None,
         doubted: Doubted,
+        rules: Rules,
     ) -> tuple[SlamState, ScanTold, Float]:
         """The state after a scan, what it told, and the weights."""
-        rules, found = rules_of(self.parameters), len(detections.cluster)
-        centre, R = detections.centre, rows_of(detections.covariance)
+        found = len(centre)
         motion, covariance, recent = trees.motion, trees.covariance, state.recent
         if trees.slipped:
             recent = replace(recent, distrust=1.0)
@@ -231,16 +231,16 @@ class FastSlam:
             motion_covariance=np.zeros((3, 3)),
             since_update=0.0,
             detections=state.detections + found,
+            best=leader(weights, state.best, state.pose, rules.distance_max),
             recent=remembered(recent, scan, state.since_update, doubted),
             shared=shared,
         )
         return state, scan, weights
 
-    def _by_trees(self, state: SlamState, detections: Detections) -> ByTrees:
+    def _by_trees(self, state: SlamState, centre: Float, R: Float, rules: Rules) -> ByTrees:
         return against_slip(
             state.pose, state.maps, state.best, state.motion, state.motion_covariance, state.since_update,
-            state.recent.wheels(noise_of(self.parameters)), detections.centre,
-            rows_of(detections.covariance), rules_of(self.parameters),
+            state.recent.wheels(noise_of(self.parameters)), centre, R, rules,
         )  # fmt: skip
 
     def _shared(
