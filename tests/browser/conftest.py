@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Playwright, expect, sync_playwright
 
-from tests.browser.dashboard import FEW_FRAMES, PATIENCE_S, Dashboard
+from tests.browser.dashboard import FEW_FRAMES, MIDDLE_S, PATIENCE_S, Dashboard
 from tests.browser.flags import FLAGS
 from tests.browser.serving import Server
 
@@ -89,8 +89,9 @@ def calm(dashboard: Dashboard) -> Iterator[None]:
     """Each test begins on a standing scan in the middle of the run, with the parameters of the preset."""
     dashboard.pause()
     # To a place between two scans, so that the one before it is not taken for the end of the way.
-    dashboard.command({"type": "seek", "time_s": 22.55})
-    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 22.47 && it.time_s < 22.56")
+    dashboard.command({"type": "seek", "time_s": MIDDLE_S})
+    there = f"it.time_s > {MIDDLE_S} - 0.08 && it.time_s < {MIDDLE_S} + 0.01"
+    dashboard.until_server("/api/status", f"it.state === 'paused' && {there}")
     yield
     for dialog in dashboard.page.locator("dialog[open]").all():
         dialog.press("Escape")
