@@ -14,6 +14,7 @@ import glob
 import hashlib
 import re
 import sys
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
@@ -117,7 +118,8 @@ def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
     # Of other sources nothing but this is read: what they left may name classes that are no more.
     file._version = f"{file._version} {digest}"
     base = file._index_name.removesuffix(".nbi")
-    file._data_name_pattern = f"{base}.{digest}.{{number:d}}.nbc"
+    # Nor do two types: who has read an index, while sources change to and fro, finds its own code or none.
+    file._data_name = lambda _number: f"{base}.{digest}.{uuid.uuid4().hex[:16]}.nbc"
     file.save = _saved_by_one(file, base, digest)
 
 

@@ -180,3 +180,26 @@ def test_a_kernel_that_took_a_class_which_is_called_otherwise_now_is_compiled_an
     for name in ("Leaf", "Needle"):
         (tmp_path / "wood" / "tree.py").write_text(OF_A_CLASS.format(name=name))
         assert call(tmp_path, 2.0, 1.0, "import wood.tree") == ["2.0"]
+
+
+KEEP = """
+import pathlib
+from wood.tree import twice
+
+print(twice({value}))
+print(*(file.name for file in pathlib.Path("kept").rglob("*twice-*.nbc")))
+"""
+
+
+def test_who_has_read_an_index_finds_its_own_machine_code_or_none(tmp_path):
+    """Sources that change to and fro while a process runs: what it has read is gone, and no other types' code
+    stands under its name."""
+    (tmp_path / "wood").mkdir()
+    (tmp_path / "wood" / "__init__.py").touch()
+    (tmp_path / "wood" / "tree.py").write_text(CALLER)
+    told, of_whole_numbers = call(tmp_path, 2.0, 1.0, KEEP.format(value="1"))
+    assert told == "4.0"
+    call(tmp_path, 5.0, 1.0, KEEP.format(value="1"))
+    told, of_floats = call(tmp_path, 2.0, 1.0, KEEP.format(value="1.0"))
+    assert told == "4.0"
+    assert of_floats != of_whole_numbers
