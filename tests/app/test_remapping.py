@@ -90,7 +90,12 @@ def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters)
 def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parameters, monkeypatch):
     begun: list[Parameters] = []
     begin = session._run._begin
-    monkeypatch.setattr(session._run, "_begin", lambda wanted: (begun.append(wanted), begin(wanted))[1])
+
+    def beginning(wanted: Parameters) -> None:
+        begun.append(wanted)
+        begin(wanted)
+
+    monkeypatch.setattr(session._run, "_begin", beginning)
     maps: dict[int, object] = {}
     for revision, (wanted, anew) in enumerate(
         [(parameters, 1), (BASE, 0), (parameters, 0), (LATER, 1), (parameters, 0), (BASE, 0), (FEWER, None)]
