@@ -19,6 +19,7 @@ from pipeline.errors import StemmapError
 from pipeline.files import write_beside
 from pipeline.gathering.forest import (
     ALL_AROUND,
+    FREE_END,
     ONE_WAY,
     PACKAGE,
     Forest,
@@ -32,13 +33,14 @@ DECIDES = (
     "classes",
     ALL_AROUND,
     ONE_WAY,
-)  # what the name is the digest of; the rest tells where it came from
+)  # what the name is the digest of, with FREE_END where it is there; the rest tells where it came from
 _NAME = re.compile(r"[0-9a-f]{16}")
 
 
 def name_of(data: dict[str, Any]) -> str:
     """The name of a forest out of what its JSON holds."""
-    text = json.dumps([data.get(key) for key in DECIDES], sort_keys=True, separators=(",", ":"))
+    decides = [data.get(key) for key in DECIDES] + ([data[FREE_END]] if FREE_END in data else [])
+    text = json.dumps(decides, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

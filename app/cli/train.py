@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("there is no file to write to", remedy="Name it with --out FILE")
     arguments.labelled = [Path(place) for place in arguments.places]
     from app.forests import write_forest
-    from app.training.growing import PLANS, as_json, can_grow, grow
+    from app.training.growing import as_json, grow_all
     from app.training.judging import leave_one_out
     from pipeline.parameters import preset
 
@@ -81,11 +81,11 @@ def run(arguments: argparse.Namespace) -> int:
     examples = _examples(arguments)
     if not examples:
         raise StemmapError("there is nothing to learn from", remedy="Name scenes, or folders with labels")
-    for line in leave_one_out(examples, preset("forest").gathering.tree_share):
+    pasted = _pasted(arguments)
+    for line in leave_one_out(examples, pasted, preset("forest").gathering.tree_share):
         print(line)
     scenes = _scenes(arguments)
-    grown = {kind: grow(examples, kind, arguments.seed) for kind in PLANS if can_grow(examples, kind)}
-    write_forest(as_json(grown, scenes), arguments.out)
+    write_forest(as_json(grow_all(examples, pasted, seed=arguments.seed), scenes), arguments.out)
     print(f"{len(examples)} sets of examples, written to {arguments.out}")
     return 0
 
@@ -135,4 +135,23 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
         found += kept_or_made(
             arguments.examples, str(folder), partial(labelled_examples, folder, forest, REACH)
         )
+    return found
+
+
+def _pasted(arguments: argparse.Namespace) -> list[Examples]:
+    """The labelled scans of sensors that look one way once more, with poles pasted into them."""
+    from functools import partial
+
+    from app.training.keeping import kept_or_made
+    from app.training.pasting import COPIES, FOLDER, name_of_copy, pasted_examples
+    from app.training.scenes import looks_all_around
+    from pipeline.parameters import preset
+
+    kept = None if arguments.examples is None else arguments.examples / FOLDER
+    found: list[Examples] = []
+    for folder in arguments.labelled:
+        if not looks_all_around(folder):
+            for copy in range(COPIES):
+                make = partial(pasted_examples, folder, copy, preset("forest"), REACH)
+                found += kept_or_made(kept, name_of_copy(str(folder), copy), make)
     return found

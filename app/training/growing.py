@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pipeline.gathering.features import NAMES, RAYS
-from pipeline.gathering.forest import ALL_AROUND, CLASSES, ONE_WAY
+from pipeline.gathering.forest import ALL_AROUND, CLASSES, FREE_END, ONE_WAY, ends_in_free_air
 from pipeline.records import Float, Int, Verdict
 
 DOUBTFUL = -1
 TREE = CLASSES.index(Verdict.TREE)
-UPRIGHT = (CLASSES.index(Verdict.POLE), CLASSES.index(Verdict.PERSON))
+POLE = CLASSES.index(Verdict.POLE)
+UPRIGHT = (POLE, CLASSES.index(Verdict.PERSON))
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +57,11 @@ PLANS = {
         "best", 40, 18, 6, 150, 0.3, same=5.0, other=1.0, simulated=1.0, tree=0.67, upright=2.0, rays=True
     ),
     ONE_WAY: Plan(
-        "extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.25, upright=1.0, rays=False
+        "extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.75, upright=1.0, rays=False
     ),
 }
+# What tells a pole that ends in free air from a tree that does; poles count together as much as trees do.
+FREE_END_TREES, FREE_END_DEPTH, FREE_END_LEAST, FREE_END_FIGURES = 40, 8, 5, 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,6 +123,42 @@ def grow(examples: list[Examples], kind: str, seed: int = 0) -> Grown:
         random_state=seed,
     ).fit(figures, label == TREE, weight)
     return Grown(trees, [_shares(tree, figures, label, weight) for tree in trees.estimators_])
+
+
+def grow_free_end(pasted: list[Examples], seed: int = 0) -> Grown | None:
+    """Trees and poles that end in free air, told from one another; None where there are not both.
+
+    Args:
+        pasted: Real scenes with poles pasted into them, see `pasting`.
+        seed: Of the choices made at random.
+    """
+    from sklearn.ensemble import ExtraTreesClassifier
+
+    figures = np.concatenate([np.zeros((0, len(NAMES))), *(e.figures for e in pasted)])
+    label = np.concatenate([np.zeros(0, np.int64), *(e.label for e in pasted)])
+    used = np.isin(label, (TREE, POLE)) & ends_in_free_air(figures)
+    figures, label = figures[used, :RAYS].astype(np.float32), label[used]
+    tree = label == TREE
+    if not tree.any() or tree.all():
+        return None
+    weight = np.where(tree, 1.0, np.count_nonzero(tree) / np.count_nonzero(~tree))
+    trees = ExtraTreesClassifier(
+        FREE_END_TREES,
+        max_depth=FREE_END_DEPTH,
+        min_samples_leaf=FREE_END_LEAST,
+        max_features=FREE_END_FIGURES,
+        random_state=seed,
+    ).fit(figures, tree, weight)
+    return Grown(trees, [_shares(each, figures, label, weight) for each in trees.estimators_])
+
+
+def grow_all(
+    examples: list[Examples], pasted: list[Examples], kinds: Iterable[str] = PLANS, seed: int = 0
+) -> dict[str, Grown]:
+    """All that can be grown for these kinds of sensors, by the key under which the JSON holds it."""
+    grown = {kind: grow(examples, kind, seed) for kind in kinds if can_grow(examples, kind)}
+    free_end = grow_free_end(pasted, seed) if ONE_WAY in grown else None
+    return grown if free_end is None else {**grown, FREE_END: free_end}
 
 
 def can_grow(examples: list[Examples], kind: str) -> bool:

@@ -6,25 +6,28 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from app.training.growing import DOUBTFUL, TREE, Examples, can_grow, grow, shares
+from app.training.growing import DOUBTFUL, TREE, Examples, as_json, can_grow, grow_all
+from app.training.pasting import is_of
 from pipeline.evaluation.matching import match
-from pipeline.gathering.forest import ALL_AROUND, ONE_WAY
+from pipeline.gathering.forest import ALL_AROUND, ONE_WAY, forest_of, vote
 from pipeline.records import Float
 
 APART = 0.5  # m
 
 
-def leave_one_out(examples: list[Examples], share: float) -> Iterator[str]:
+def leave_one_out(examples: list[Examples], pasted: list[Examples], share: float) -> Iterator[str]:
     """A line for each real scene: trees found, of how many, and false ones, by trees grown from all others.
 
-    The last set of a scene is judged: all its scans together.
+    The last set of a scene is judged: all its scans together. `pasted`: the scenes with poles pasted in.
     """
     for scene in dict.fromkeys(e.scene for e in examples if not e.simulated):
         others = [e for e in examples if e.scene != scene]
         last = [e for e in examples if e.scene == scene][-1]
         kind = ALL_AROUND if last.all_around else ONE_WAY
         if can_grow(others, kind):
-            hit, of, false = count(last, shares(grow(others, kind), last.figures)[:, TREE], share)
+            grown = grow_all(others, [e for e in pasted if not is_of(e.scene, scene)], (kind,))
+            votes = vote(last.figures, forest_of(as_json(grown, []), kind))
+            hit, of, false = count(last, votes[:, TREE], share)
             yield f"left out {scene}: {hit} of {of} trees, {false} false"
 
 

@@ -17,7 +17,7 @@ from pipeline.gathering import Gathering, View, depth_image, steepest_by_directi
 from pipeline.gathering.forest import CLASSES, Forest
 from pipeline.geometry import Pose2, Pose3
 from pipeline.parameters import Parameters
-from pipeline.records import Columns, Float, Int, Sensor, Step, TruthTrees, Verdict
+from pipeline.records import Columns, Float, Float32, Int, Sensor, Step, TruthTrees, Verdict
 from pipeline.simulation.run import open_run
 from pipeline.simulation.uri import parse_uri
 from pipeline.sources import open_source
@@ -86,7 +86,7 @@ def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: flo
     for columns in gathered(street.steps, street.sensor, street.T_base_lidar, parameters):
         near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
-        label = _label_by_points(axis, street.points, street.label, sure, any_trunk)
+        label = label_by_points(axis, street.points, street.label, sure, any_trunk)
         yield Examples(name, True, not one_way, axis, figures, label)
 
 
@@ -124,30 +124,43 @@ def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
 def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Iterator[Examples]:
     """Of a folder of scans from one place (`velodyne/*.bin`, `labels/*.label`), or one such pair of files."""
     points, label = labelled_points(folder)
-    with closing(open_source(str(folder))) as source:
-        all_around = source.description.sensor.rings > 0
+    all_around = looks_all_around(folder)
     sure, any_trunk = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
     for columns in _gathered_from_place(folder, parameters):
         near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
-        kind = _label_by_points(axis, points, label, sure, any_trunk)
+        kind = label_by_points(axis, points, label, sure, any_trunk)
         yield Examples(str(folder), False, all_around, axis, figures, kind)
+
+
+def looks_all_around(folder: Path) -> bool:
+    """Whether the sensor of labelled scans does."""
+    with closing(open_source(str(folder))) as source:
+        return source.description.sensor.rings > 0
 
 
 def labelled_points(folder: Path) -> tuple[Float, Int]:
     """All points (N, 3) [m] of a place and their classes; returns at the origin are left out."""
+    scans = labelled_scans(folder)
+    cloud = np.concatenate([points for points, _ in scans]).astype(np.float64)
+    return cloud, np.concatenate([label for _, label in scans])
+
+
+def labelled_scans(folder: Path) -> list[tuple[Float32, Int]]:
+    """The points (N, 3) [m] of each scan of a place, and their classes, as `labelled_points`."""
     if folder.is_file():
-        scans = [(folder, folder.with_suffix(".label"))]
+        files = [(folder, folder.with_suffix(".label"))]
     else:
-        scans = [
+        files = [
             (scan, folder / "labels" / f"{scan.stem}.label")
             for scan in sorted((folder / "velodyne").glob("*.bin"))
         ]
-    points = [np.fromfile(scan, "<f4").reshape(-1, 4)[:, :3].astype(np.float64) for scan, _ in scans]
-    labels = [np.fromfile(label, "<u4").astype(np.int64) & 0xFFFF for _, label in scans]
-    cloud, kinds = np.concatenate(points), np.concatenate(labels)
-    there = np.abs(cloud).max(axis=1) > 0.0
-    return cloud[there], kinds[there]
+    scans = []
+    for scan, label in files:
+        points = np.fromfile(scan, "<f4").reshape(-1, 4)[:, :3]
+        there = np.abs(points).max(axis=1) > 0.0
+        scans.append((points[there], (np.fromfile(label, "<u4").astype(np.int64) & 0xFFFF)[there]))
+    return scans
 
 
 def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
@@ -163,7 +176,7 @@ def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
     return np.asarray(middle[(size >= least) & (np.hypot(middle[:, 0], middle[:, 1]) <= reach)])
 
 
-def _label_by_points(axis: Float, points: Float, label: Int, sure: Float, any_trunk: Float) -> Int:
+def label_by_points(axis: Float, points: Float, label: Int, sure: Float, any_trunk: Float) -> Int:
     """What stands at each column, as places in CLASSES: a trunk, or what most points around it are.
 
     Args:

@@ -16,13 +16,18 @@ from pipeline.errors import StemmapError
 from pipeline.gathering.features import NAMES
 from pipeline.geometry import Float
 from pipeline.records import CLASSES as CLASSES
-from pipeline.records import Int32
+from pipeline.records import Bool, Int32, Verdict
 
 ALL_AROUND, ONE_WAY = "all around", "one way"
+FREE_END = "one way, ends in free air"  # trees that tell what ends there from a pole
 PACKAGE = "package"  # the name of the trees that come with the package
 FILE = Path(__file__).with_name("forest.json")
 _MOST_BYTES = 4_000_000
 _MOST_NODES = 100_000
+
+_TREE, _POLE = CLASSES.index(Verdict.TREE), CLASSES.index(Verdict.POLE)
+_TOP, _FREE = NAMES.index("highest return"), NAMES.index("free above the highest return")
+_TALL, _SEEN_FREE = 2.0 - 1e-6, 1.0 - 1e-6  # m; so high is what ends in free air, so much of it was seen
 
 _Row = tuple[int, float, int, int, list[float]]
 
@@ -36,6 +41,7 @@ class Forest:
         feature: int32: which figure is asked for, -1 at a leaf.
         threshold: At most this goes to `left`, more to `right` (int32, nodes).
         share: shape (N, classes): at a leaf the shares of the kinds among what it was trained on.
+        free_end: Asked whether a tree that ends in free air is a pole; None: nobody is asked.
     """
 
     root: Int32
@@ -44,6 +50,7 @@ class Forest:
     left: Int32
     right: Int32
     share: Float
+    free_end: Forest | None = None
 
 
 # By a name, as the parameter `gathering.forest` gives it, and whether the sensor sees all around.
@@ -101,7 +108,8 @@ def _damaged(path: Path, why: str) -> StemmapError:
 
 
 def forest_of(data: dict[str, Any], kind: str) -> Forest:
-    """The forest for a kind of sensor out of what JSON holds.
+    """The forest for a kind of sensor out of what JSON holds, for one that looks one way with the trees of
+    FREE_END where there are any: forests of before have none.
 
     Raises:
         ValueError, TypeError, KeyError: It holds something else.
@@ -120,6 +128,7 @@ def forest_of(data: dict[str, Any], kind: str) -> Forest:
         np.array(left, np.int32),
         np.array(right, np.int32),
         np.array(share, np.float64),
+        forest_of(data, FREE_END) if kind == ONE_WAY and FREE_END in data else None,
     )
 
 
@@ -142,9 +151,25 @@ def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
 
 
 def vote(figures: Float, forest: Forest) -> Float:
-    """Shares of the kinds in the order of CLASSES, mean over the trees, shape (K, figures) -> (K, 6)."""
+    """Shares of the kinds in the order of CLASSES, mean over the trees, shape (K, figures) -> (K, 6).
+
+    Of what ends in free air the votes for a tree are a pole's where `free_end` has less than half for a
+    tree: beside all else that is no tree poles are too few to be learned (docs/trunks.md).
+    """
     f = forest
-    return _vote(figures, f.root, f.feature, f.threshold, f.left, f.right, f.share)
+    votes = _vote(figures, f.root, f.feature, f.threshold, f.left, f.right, f.share)
+    if f.free_end is not None:
+        ends = np.flatnonzero(ends_in_free_air(figures))
+        poles = ends[vote(figures[ends], f.free_end)[:, _TREE] < 0.5]
+        votes[poles, _POLE] += votes[poles, _TREE]
+        votes[poles, _TREE] = 0.0
+    return votes
+
+
+def ends_in_free_air(figures: Float) -> Bool:
+    """Columns above whose highest return, that of a thing of some height, rays went on, shape (K,)."""
+    ends: Bool = (figures[:, _TOP] >= _TALL) & (figures[:, _FREE] >= _SEEN_FREE)
+    return ends
 
 
 @compiled

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from app.stopwatch import Stopwatch
-from app.training.growing import PLANS, Examples, as_json, can_grow, grow
+from app.training.growing import Examples, as_json, can_grow, grow_all
 from app.training.keeping import read_examples
+from app.training.pasting import FOLDER, is_of
 from app.training.scenes import labelled_points, trunks
 from pipeline.evaluation import evaluate
 from pipeline.evaluation.matching import match
@@ -56,13 +57,22 @@ def main() -> None:
     parser.add_argument("--scenes", default="stand,slope,dense")
     parser.add_argument("--seeds", default="1,2,3,4,5")
     parser.add_argument("--every", type=int, default=1, help="make every so many-th simulated scan")
+    parser.add_argument("--draw", type=int, default=0, help="seed of the decision trees that are grown")
     arguments = parser.parse_args()
-    examples = [] if arguments.examples is None else read_examples(arguments.examples)
+    examples, pasted = [], []
+    if arguments.examples is not None:
+        examples = read_examples(arguments.examples)
+        pasted = read_examples(arguments.examples / FOLDER)
     for part in arguments.parts:
         if part == "park":
-            _real([DATA / "park_trunks" / name for name in ("00", "02", "04", "06")], examples)
+            _real(
+                [DATA / "park_trunks" / name for name in ("00", "02", "04", "06")],
+                examples,
+                pasted,
+                arguments.draw,
+            )
         elif part == "street":
-            _real([DATA / "semantickitti" / "000000.bin"], examples)
+            _real([DATA / "semantickitti" / "000000.bin"], examples, pasted, arguments.draw)
         elif part == "dbh":
             _dbh()
         else:
@@ -98,11 +108,11 @@ def mapped(
     return frame, np.stack([mapper.path.x, mapper.path.y], axis=1), watch
 
 
-def _real(scenes: Iterable[Path], examples: list[Examples]) -> None:
+def _real(scenes: Iterable[Path], examples: list[Examples], pasted: list[Examples], draw: int) -> None:
     total, by_class = np.zeros(4, np.int64), ByClass()
     by_ring = np.zeros((len(RINGS), 3), np.int64)
     for scene in scenes:
-        forest = _grown_without(scene, examples) if examples else None
+        forest = _grown_without(scene, examples, pasted, draw) if examples else None
         frame, _, watch = mapped(str(scene), odometry="static", forest=forest)
         place = frame.trees.position[frame.trees.confirmed]
         place = place[np.hypot(place[:, 0], place[:, 1]) <= REACH]
@@ -155,7 +165,7 @@ def _away(place: Float, other: Float) -> Float:
     return distance
 
 
-def _grown_without(scene: Path, examples: list[Examples]) -> Forest:
+def _grown_without(scene: Path, examples: list[Examples], pasted: list[Examples], draw: int) -> Forest:
     """Decision trees from all scenes but this one."""
     others = [e for e in examples if e.scene.rstrip("/") != str(scene)]
     if len(others) == len(examples):
@@ -163,9 +173,8 @@ def _grown_without(scene: Path, examples: list[Examples]) -> Forest:
     kind = ALL_AROUND if next(e for e in examples if e not in others).all_around else ONE_WAY
     if not can_grow(others, kind):
         raise SystemExit(f"no other scene teaches a sensor that looks {kind}")
-    return forest_of(
-        as_json({kind: grow(others, kind) for kind in PLANS if can_grow(others, kind)}, []), kind
-    )
+    beside = [e for e in pasted if not is_of(e.scene, str(scene))]
+    return forest_of(as_json(grow_all(others, beside, (kind,), draw), []), kind)
 
 
 def _simulated(scene: str, seeds: list[int], every: int) -> None:

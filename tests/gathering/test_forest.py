@@ -7,13 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from app.training.growing import DOUBTFUL, PLANS, Examples, as_json, grow, shares
+from app.training.growing import DOUBTFUL, PLANS, Examples, as_json, grow, grow_free_end, shares
 from pipeline.errors import StemmapError
 from pipeline.gathering.features import COUNT, NAMES
 from pipeline.gathering.forest import (
     ALL_AROUND,
     CLASSES,
     FILE,
+    FREE_END,
     ONE_WAY,
     forest_of,
     read_forest,
@@ -105,3 +106,50 @@ def test_the_same_examples_grow_the_same_trees():
         Examples("a", False, True, np.zeros((100, 5)), figures, (figures[:, 0] > 0.5).astype(np.int64))
     ]
     assert as_json({"k": grow(examples, ALL_AROUND)}, []) == as_json({"k": grow(examples, ALL_AROUND)}, [])
+
+
+def ending(top: float, free: float):
+    figures = np.zeros((1, COUNT))
+    figures[0, NAMES.index("highest return")], figures[0, NAMES.index("free above the highest return")] = (
+        top,
+        free,
+    )
+    return figures
+
+
+def test_what_ends_in_free_air_is_asked_whether_it_is_a_pole(tmp_path):
+    pole = {"share": [0.3, 0.7, 0, 0, 0, 0]}
+    forest = read_forest(written(tmp_path, **{FREE_END: [pole]}), ONE_WAY)
+    assert vote(ending(3.0, 1.0), forest)[0].tolist() == [0.0, 1.0, 0, 0, 0, 0]
+    # What is low, or may go on above what was seen, keeps its votes.
+    assert vote(ending(1.8, 3.0), forest)[0].tolist() == LEAF["share"]
+    assert vote(ending(5.0, 0.8), forest)[0].tolist() == LEAF["share"]
+    assert vote(np.zeros((0, COUNT)), forest).shape == (0, len(CLASSES))
+
+
+def test_a_tree_that_ends_in_free_air_stays_one(tmp_path):
+    tree = {"share": [0.5, 0.5, 0, 0, 0, 0]}
+    forest = read_forest(written(tmp_path, **{FREE_END: [tree]}), ONE_WAY)
+    assert vote(ending(3.0, 1.0), forest)[0].tolist() == LEAF["share"]
+
+
+def test_sensors_that_see_all_around_and_older_files_ask_nobody(tmp_path):
+    pole = {"share": [0.0, 1.0, 0, 0, 0, 0]}
+    assert read_forest(written(tmp_path, **{FREE_END: [pole]}), ALL_AROUND).free_end is None
+    assert read_forest(written(tmp_path), ONE_WAY).free_end is None
+    with pytest.raises(StemmapError, match="decision trees cannot be read"):
+        read_forest(written(tmp_path, **{FREE_END: []}), ONE_WAY)
+
+
+def test_poles_that_end_in_free_air_are_told_by_what_was_pasted():
+    rng = np.random.default_rng(2)
+    figures = np.repeat(ending(3.0, 2.0), 200, axis=0)
+    figures[:, NAMES.index("thick")] = rng.uniform(0.0, 0.2, 200)
+    label = (figures[:, NAMES.index("thick")] < 0.1).astype(np.int64)
+    pasted = Examples("a with poles 0", True, False, np.zeros((200, 5)), figures, label)
+    grown = grow_free_end([pasted])
+    assert grown is not None
+    assert np.mean((shares(grown, figures)[:, 0] >= 0.5) == (label == 0)) > 0.95
+    assert grow_free_end([]) is None
+    low = Examples("a with poles 1", True, False, np.zeros((200, 5)), np.zeros((200, COUNT)), label)
+    assert grow_free_end([low]) is None
