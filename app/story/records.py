@@ -66,6 +66,8 @@ class Gathered(msgspec.Struct, frozen=True):
         distance: From what was asked for to the column [m].
         votes: Share of each kind, by its name.
         tree_share: Needed for a tree.
+        tree_in_free_air: Of the decision trees that tell a tree that ends in free air from a pole, the share
+            for a tree; None where they are not asked. `told` is of them where they say pole.
         by_votes: Whether the votes decided; else a rule did, which `verdict` names.
         present, absent: In how many gathered scans something, or nothing, stood there in free view.
         viewed: How high above the ground any scan looked there [m].
@@ -76,6 +78,7 @@ class Gathered(msgspec.Struct, frozen=True):
     distance: float
     votes: dict[str, float]
     tree_share: float
+    tree_in_free_air: float | None
     by_votes: bool
     present: int
     absent: int

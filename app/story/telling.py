@@ -10,7 +10,7 @@ from app.story.history import TreeHistory, half_axes
 from app.story.records import Asked, Circle, ClusterStory, Gathered, Told, TreeStory
 from pipeline.detection import checks
 from pipeline.gathering.features import NAMES
-from pipeline.gathering.forest import CLASSES, standard_forest
+from pipeline.gathering.forest import CLASSES, TREE_IN_FREE_AIR, standard_forest, tree_in_free_air
 from pipeline.gathering.telling import what_told
 from pipeline.parameters import Parameters, field_specs
 from pipeline.records import Clusters, Frame, Sensor, Verdict
@@ -143,19 +143,23 @@ def gathered(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor)
         return None
     share, verdict = columns.share[row], Verdict(int(columns.verdict[row]))
     forest = kept_forests()(parameters.gathering.forest, sensor.rings > 0)
-    effect = what_told(columns.figures[row], forest, Verdict.TREE)
+    figures = columns.figures[row]
+    in_free_air = float(tree_in_free_air(figures[None], forest)[0])
+    refused = forest.free_end if in_free_air < TREE_IN_FREE_AIR else None
+    effect = what_told(figures, refused or forest, Verdict.TREE)
     strongest = np.argsort(-np.abs(effect), kind="stable")[:_MOST_TOLD]
     return Gathered(
         verdict=verdict.label,
         distance=float(distance[row]),
         votes={kind.label: float(share[k]) for k, kind in enumerate(CLASSES)},
         tree_share=parameters.gathering.tree_share,
+        tree_in_free_air=None if np.isnan(in_free_air) else in_free_air,
         by_votes=verdict in _decided_by(share, parameters.gathering.tree_share),
         present=int(columns.present[row]),
         absent=int(columns.absent[row]),
         viewed=float(columns.viewed[row]),
         told=[
-            Told(NAMES[k], float(columns.figures[row, k]), float(effect[k]))
+            Told(NAMES[k], float(figures[k]), float(effect[k]))
             for k in strongest.tolist()
             if effect[k] != 0.0
         ],

@@ -8,6 +8,7 @@ them and what they hide.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from zlib import crc32
 
@@ -27,13 +28,10 @@ from pipeline.sources import open_source
 COPIES = 24  # of each scene
 FOLDER = "pasted"  # in that of the kept examples
 LEAST_RETURNS = 8  # of a trunk that counts as one: copies have fewer scans, and small trees end in free air
-GROUND = (40, 72)
+GROUND = (40, 72)  # road and terrain, as the labels number them
 NEAR, FAR, ASIDE = 5.0, 24.0, 0.5  # m and rad; where things are put
-CLEAR, APART, GROUND_REACH = (
-    0.9,
-    2.0,
-    0.8,
-)  # m from a trunk, from one another, and of ground that is looked at
+CLEAR, APART = 0.9, 2.0  # m from a trunk, and from one another
+GROUND_REACH = 0.8  # m; of the ground that is looked at
 STEP = float(np.radians(0.4))  # of the directions in which what is nearer hides what is farther
 HIDDEN, BEHIND = 0.2, 0.3  # m
 _FLAT = Terrain.grow(0.0, 0.0, 10.0, np.random.default_rng(0))
@@ -62,9 +60,8 @@ def pasted_examples(folder: Path, copy: int, parameters: Parameters, reach: floa
     points = _to_map(np.concatenate([points for points, _ in scans]), pose)
     label = np.concatenate([label for _, label in scans])
     sure, any_trunk = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
-    source = open_source(str(folder))
-    about = source.description
-    source.close()
+    with closing(open_source(str(folder))) as source:
+        about = source.description
     for columns in gathered(run, about.sensor, about.T_base_lidar, parameters):
         near = np.hypot(columns.axis[:, 0] - pose.x, columns.axis[:, 1] - pose.y) < reach
         axis, figures = columns.axis[near], columns.figures[near]

@@ -29,6 +29,8 @@ _TREE, _POLE = CLASSES.index(Verdict.TREE), CLASSES.index(Verdict.POLE)
 _TOP, _FREE = NAMES.index("highest return"), NAMES.index("free above the highest return")
 _TALL, _SEEN_FREE = 2.0 - 1e-6, 1.0 - 1e-6  # m; so high is what ends in free air, so much of it was seen
 
+TREE_IN_FREE_AIR = 0.5  # with a smaller share of `free_end` it is a pole
+
 _Row = tuple[int, float, int, int, list[float]]
 
 
@@ -153,17 +155,25 @@ def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
 def vote(figures: Float, forest: Forest) -> Float:
     """Shares of the kinds in the order of CLASSES, mean over the trees, shape (K, figures) -> (K, 6).
 
-    Of what ends in free air the votes for a tree are a pole's where `free_end` has less than half for a
-    tree: beside all else that is no tree poles are too few to be learned (docs/trunks.md).
+    Of what ends in free air the votes for a tree are a pole's where `free_end` says so: beside all else that
+    is no tree poles are too few to be learned (docs/trunks.md).
     """
     f = forest
     votes = _vote(figures, f.root, f.feature, f.threshold, f.left, f.right, f.share)
-    if f.free_end is not None:
-        ends = np.flatnonzero(ends_in_free_air(figures))
-        poles = ends[vote(figures[ends], f.free_end)[:, _TREE] < 0.5]
-        votes[poles, _POLE] += votes[poles, _TREE]
-        votes[poles, _TREE] = 0.0
+    poles = np.flatnonzero(tree_in_free_air(figures, forest) < TREE_IN_FREE_AIR)
+    votes[poles, _POLE] += votes[poles, _TREE]
+    votes[poles, _TREE] = 0.0
     return votes
+
+
+def tree_in_free_air(figures: Float, forest: Forest) -> Float:
+    """The share of `free_end` for a tree, of what ends in free air, shape (K,); NaN of all else, and where
+    nobody is asked."""
+    share = np.full(len(figures), np.nan)
+    if forest.free_end is not None:
+        ends = ends_in_free_air(figures)
+        share[ends] = vote(figures[ends], forest.free_end)[:, _TREE]
+    return share
 
 
 def ends_in_free_air(figures: Float) -> Bool:

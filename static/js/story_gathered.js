@@ -49,7 +49,15 @@ function sentence(story) {
   const seen = `Something stood there in ${story.present} of ${story.present + story.absent} gathered scans with free view.`;
   const rule = RULES[story.verdict];
   if (!story.by_votes && rule) return `Taken for ${story.verdict}: ${rule(story)}`;
-  return `Taken for ${story.verdict}; a tree needs ${percent(story.tree_share)} of the votes. ${seen}`;
+  const end = freeEnd(story.tree_in_free_air);
+  return `Taken for ${story.verdict}; a tree needs ${percent(story.tree_share)} of the votes. ${end}${seen}`;
+}
+
+// Of what ends in free air other decision trees are asked whether it is a pole; the votes are those after that.
+function freeEnd(share) {
+  if (share === null) return "";
+  const asked = `It ends in free air: of the decision trees that tell a tree there from a pole, ${percent(share)} say tree`;
+  return share < 0.5 ? `${asked}, so the votes for a tree are a pole's. ` : `${asked}. `;
 }
 
 function told(figures) {

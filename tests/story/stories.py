@@ -16,6 +16,7 @@ GATHERED = Gathered(
     distance=0.1,
     votes={"tree": 0.9, "pole": 0.1},
     tree_share=0.45,
+    tree_in_free_air=None,
     by_votes=True,
     present=9,
     absent=1,
