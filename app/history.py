@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
+from copy import copy
 from dataclasses import fields, is_dataclass
 from typing import Generic, TypeVar
 
@@ -52,6 +53,15 @@ class Snapshots(Generic[S]):
     def nbytes(self) -> int:
         """Of all states."""
         return sum(self._sizes[n] for n in self._states)
+
+    def within(self, most_bytes: int) -> Snapshots[S]:
+        """The same with fewer of them: every second goes until they take no more than so much."""
+        fewer = copy(self)
+        while len(fewer._states) > 1 and fewer.nbytes > most_bytes:
+            fewer._spacing *= 2
+            fewer._states = {n: s for n, s in fewer._states.items() if n % fewer._spacing == 0}
+        fewer._states, fewer._sizes = dict(fewer._states), {n: self._sizes[n] for n in fewer._states}
+        return fewer
 
     def offer(self, scans: int, state: S) -> None:
         """Keep a state if it is due."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from app.history import ParameterHistory, Snapshots
+from app.history import ParameterHistory, Snapshots, nbytes
 from app.remapping import Remapping, Told
 from pipeline.mapper import Mapper
 from pipeline.parameters import Parameters
@@ -13,6 +13,7 @@ from pipeline.rerun import Basis, Journal, KeptScans, look_key
 
 MOST = 2
 MOST_BYTES = 256 << 20
+MOST_STATES = 64 << 20  # of it, for the states of one map: with fewer it takes longer to go back in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +53,7 @@ class Left:
     @property
     def nbytes(self) -> int:
         """About what it takes."""
-        return self.journal.nbytes + self.snapshots.nbytes
+        return self.journal.nbytes + self.snapshots.nbytes + nbytes(self.before)
 
     def is_sound(self) -> bool:
         """Whether what is kept of its scans is still what these parameters look at."""
@@ -77,7 +78,8 @@ class LeftBehind:
 
     def add(self, left: Left, used: KeptScans) -> None:
         """Keep one; `used`: what the run keeps of its scans now."""
-        self._left.append(left)
+        left.mapper.restore(left.before)  # it lets go of what it made of the standing scan
+        self._left.append(replace(left, snapshots=left.snapshots.within(MOST_STATES)))
         while len(self._left) > MOST or sum(one.nbytes for one in self._left) > MOST_BYTES:
             self.take(self._left[0], used)
 

@@ -40,6 +40,7 @@ class Status:
         revision: Of the parameters in force.
         going_to: The sought time or scan in words while it is not reached yet, else empty.
         going_to_s: The sought time where it is known, else None.
+        going_far: Whether the way there takes long enough to speak of it.
         live: Whether the source is a robot that is heard live.
         robot: Its namespace, empty for none.
         robots: The namespaces of all robots that publish scans where it is heard.
@@ -70,6 +71,7 @@ class Status:
     revision: int = 0
     going_to: str = ""
     going_to_s: float | None = None
+    going_far: bool = False
     live: bool = False
     robot: str = ""
     robots: list[str] = field(default_factory=list)

@@ -22,7 +22,6 @@ from app.messages import Advance, Command, Open, Pause, Play, Seek, SetParameter
 from app.opening import options_of
 from app.pacer import Pacer
 from app.session import Session
-from app.session_status import clock
 from app.story.recent import Recent
 from app.words import COMPILING
 from app.worker_messages import (
@@ -328,8 +327,7 @@ class Driver:
         playing = self._session.pace in ("replay", "live")
         status = self._session.status()
         if status.going_to and now >= self._long_way_at:  # a short way would only flicker
-            at = clock(status.time_s)
-            status = replace(status, detail=f"Going to {status.going_to}: mapped up to {at} …")
+            status = replace(status, detail=f"Going to {status.going_to} …", going_far=True)
         status = replace(
             status,
             speed=self._pacer.speed,

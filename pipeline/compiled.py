@@ -120,13 +120,13 @@ def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
     base = file._index_name.removesuffix(".nbi")
     # Nor do two types: who has read an index, while sources change to and fro, finds its own code or none.
     file._data_name = lambda _number: f"{base}.{digest}.{uuid.uuid4().hex[:16]}.nbc"
-    file.save = _saved_by_one(file, base, digest)
+    file.save = _saved_by_one(file, base)
 
 
-def _saved_by_one(file: Any, base: str, digest: str) -> Callable[[Any, Any], None]:  # noqa: ANN401
+def _saved_by_one(file: Any, base: str) -> Callable[[Any, Any], None]:  # noqa: ANN401
     """Let one process at a time write what is kept of a kernel: two that compile it for other types at once
     would give both the same file, and the index would lead one of them to the other's machine code. What
-    other sources left behind goes."""
+    no index names goes."""
     save: Callable[[Any, Any, Any], None] = type(file).save
 
     def save_alone(key: Any, data: Any) -> None:  # noqa: ANN401
@@ -134,8 +134,7 @@ def _saved_by_one(file: Any, base: str, digest: str) -> Callable[[Any, Any], Non
         with locked(index):
             if not file._load_index():
                 for other in index.parent.glob(f"{glob.escape(base)}.*.nbc"):
-                    if f".{digest}." not in other.name:
-                        other.unlink(missing_ok=True)
+                    other.unlink(missing_ok=True)
             save(file, key, data)
 
     return save_alone

@@ -263,7 +263,8 @@ class Mapper:
                 estimate.relative,
             )
             tracker.anchor(*located.landmarks, estimate.T_map_base, view_range)
-            if seen.looked.overview is None:  # else the columns are judged anew, and all tracks by them
+            # Of a scan that is gathered the columns are judged anew, and all tracks by them.
+            if seen.looked.overview is None and self._parameters.gathering.method == "columns":
                 tracker.learn_between(self._gathering.columns)
 
     def _map(self, step: Step, looked: Looked, estimate: PoseEstimate) -> None:

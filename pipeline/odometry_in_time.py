@@ -56,10 +56,6 @@ class OdometryInTime:
         self._T_odom_jumped = Pose2()
         self.stands: tuple[int, Pose2] | None = None
 
-    def __len__(self) -> int:
-        """How many readings are kept."""
-        return len(self._readings)
-
     @property
     def newest(self) -> Reading | None:
         """The last reading, None before the first."""

@@ -25,6 +25,7 @@ function load() {
 // sets its ground once.
 function paint() {
   const inner = frame.contentDocument;
+  if (!inner) return; // a page of an error, which is not ours to paint
   inner.documentElement.dataset.mantineColorScheme = isDark() ? "dark" : "light";
   let node = inner.querySelector("canvas");
   while (node && !node.style.backgroundColor) node = node.parentElement;

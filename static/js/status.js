@@ -1,7 +1,7 @@
 // The strip that is read from two metres, and the notice below it.
 
 import { byId, el, setText } from "./dom.js";
-import { NONE, figure } from "./format.js";
+import { NONE, clock, figure } from "./format.js";
 import { changed, on, state } from "./state.js";
 
 const WORDS = {
@@ -92,7 +92,7 @@ function show() {
 const shortSource = (uri) => (uri ?? "").split("?")[0].split("/").filter(Boolean).pop() ?? "";
 
 // On a long way to a scan that was sought nothing plays, and nothing stands.
-const isGoing = (status) => Boolean(status?.going_to) && status.detail.startsWith("Going");
+const isGoing = (status) => Boolean(status?.going_far);
 
 // "Live robot1": a robot is heard now; its name stands in every state but the failed one.
 function stateWord(status) {
@@ -147,14 +147,24 @@ function compilingFor({ compiling_since_s: since }) {
   compiledAt = performance.now();
   if (ahead === null) askClock();
   const passed = Math.floor((Date.now() + ahead) / 1000 - since);
-  return passed >= 10 ? ` (${passed} s so far; a machine that is busy or small takes longer)` : "";
+  return passed >= 10 ? ` ${passed} s so far; a machine that is busy or small takes longer.` : "";
+}
+
+// What counts on while the notice stands: to be seen, but not to be read out again and again.
+function progressOf(status) {
+  if (!state.connected || !status?.detail) return "";
+  return isGoing(status) ? ` Mapped up to ${clock(status.time_s)}.` : compilingFor(status);
 }
 
 // Of two machines each may have a clock of its own: an answer says the server's.
 async function askClock() {
   ahead = 0;
-  const date = Date.parse((await fetch("/api/status")).headers.get("date"));
-  if (Number.isFinite(date)) ahead = date - Date.now();
+  try {
+    const date = Date.parse((await fetch("/api/status")).headers.get("date"));
+    if (Number.isFinite(date)) ahead = date - Date.now();
+  } catch {
+    ahead = null; // no answer: it is asked again while it compiles
+  }
 }
 
 function showNotice(quiet) {
@@ -163,7 +173,7 @@ function showNotice(quiet) {
   const text = !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. This is the last picture; it goes on by itself when stemmap answers again.`
     : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
-    : status?.detail ? status.detail + compilingFor(status) : "";
+    : status?.detail ?? "";
   notice.hidden = !text;
   const failed = state.connected && status?.state === "failed";
   notice.classList.toggle("failed", failed);
@@ -171,6 +181,7 @@ function showNotice(quiet) {
   notice.classList.toggle("starting", status?.state === "starting");
   document.body.classList.toggle("failed", failed);
   setText(notice.querySelector("span"), sentence(text));
+  setText(byId("notice-progress"), text && text === status?.detail ? progressOf(status) : "");
   byId("notice-open").hidden = !failed;
 }
 

@@ -41,6 +41,20 @@ def test_large_states_are_fewer_and_the_first_stays() -> None:
     assert len(held) > 1
 
 
+def test_fewer_states_are_kept_of_a_map_that_was_left() -> None:
+    kept: Snapshots[int] = Snapshots(0, lambda _scans: 1 << 20)
+    for scans in range(1_001):
+        kept.offer(scans, scans)
+    fewer = kept.within(6 << 20)
+    assert fewer.nbytes <= 6 << 20
+    assert sorted(fewer.first(1_000)) == [0, 200, 400, 600, 800, 1_000]
+    assert len(kept.first(1_000)) == 21
+    fewer.offer(1_200, 1_200)
+    assert fewer.newest(1_300)[0] == 1_200
+    assert kept.newest(1_300)[0] == 1_000
+    assert sorted(kept.within(0).first(1_000)) == [0]
+
+
 def test_a_state_beyond_all_bounds_is_not_kept_and_harms_nothing() -> None:
     kept: Snapshots[int] = Snapshots(0, lambda scans: scans << 40)
     for scans in range(2001):

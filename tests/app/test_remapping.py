@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import fields, is_dataclass
 
 import numpy as np
@@ -54,13 +54,20 @@ def session() -> Iterator[Session]:
         yield opened
 
 
-def mapped_with(parameters: Parameters, last: int) -> tuple[object, object]:
-    """The scan and the path of a run that was mapped with some parameters from the start."""
+@contextmanager
+def mapped_from_start(parameters: Parameters, last: int) -> Iterator[Session]:
+    """A run that was mapped with some parameters from the start."""
     with closing(new_session()) as opened:
         opened.open(URI, "auto", 3)
         opened.set_parameters(parameters, 0)
         opened.advance(last + 1)
         settle(opened)
+        yield opened
+
+
+def mapped_with(parameters: Parameters, last: int) -> tuple[object, object]:
+    """The scan and the path of such a run."""
+    with mapped_from_start(parameters, last) as opened:
         return told(opened.frame), told(opened.path)
 
 
@@ -105,13 +112,23 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
         frame, changes = remapped(session)
         assert anew is None or len(begun) == anew, "what is there is not mapped again"
         assert changes.revision == revision
-        now = (told(frame), told(session.path))
+        now: tuple[object, ...] = (told(frame), told(session.path))
+        now += (told(session._run.confirmed_s(frame.trees)),)
         assert maps.setdefault(id(wanted), now) == now
-        assert session._run.confirmed_s(frame.trees).tolist() == pytest.approx(
-            [session._run._told.confirmed_s.get(n, np.nan) for n in frame.trees.number.tolist()], nan_ok=True
-        )
     for wanted in (parameters, BASE, LATER):
-        assert maps[id(wanted)] == mapped_with(wanted, LAST - 1)
+        with mapped_from_start(wanted, LAST - 1) as other:
+            assert other.frame is not None
+            since = told(other._run.confirmed_s(other.frame.trees))
+            assert maps[id(wanted)] == (told(other.frame), told(other.path), since)
+
+
+def test_where_there_is_no_room_a_map_that_was_left_is_made_again(session, monkeypatch):
+    monkeypatch.setattr("app.left_behind.MOST_BYTES", 1)
+    standing = session.status().scan_index
+    for revision, wanted in enumerate([FEWER, BASE]):
+        session.set_parameters(wanted, revision, whole=True)
+        frame, _ = remapped(session)
+        assert (told(frame), told(session.path)) == mapped_with(wanted, standing)
 
 
 def test_once_the_run_goes_on_a_map_that_was_left_is_made_again(session):

@@ -200,7 +200,7 @@ def test_memory_does_not_grow_with_the_run():
     for _ in range(500):
         next(stream)
     joiner = stream.gi_frame.f_locals["joiner"]
-    assert len(joiner._odometry) < 300
+    assert len(joiner._odometry._readings) < 300
     assert len(joiner._imu) < 300
 
 
