@@ -118,7 +118,8 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
     for wanted in (parameters, BASE, LATER):
         with mapped_from_start(wanted, LAST - 1) as other:
             assert other.frame is not None
-            since = told(other._run.confirmed_s(other.frame.trees))
+            assert other.run is not None
+            since = told(other.run.confirmed_s(other.frame.trees))
             assert maps[id(wanted)] == (told(other.frame), told(other.path), since)
 
 

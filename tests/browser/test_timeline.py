@@ -111,7 +111,7 @@ def test_a_seek_says_that_it_goes_there_and_compiling_counts_from_its_start(dash
         "detail": "Going to 0:40 …",
     }
     word, notice, thumb = page.evaluate(UNDER, going)
-    assert (word, notice, thumb) == ("Seeking", "Going to 0:40 … Mapped up to 0:12.", 40.0)
+    assert (word, notice, thumb) == ("Seeking", "Going to 0:40 … Mapped up to 0:12.0.", 40.0)
     compiling = {"state": "waiting", "detail": "Compiling", "compiling_since_s": time.time() - 100.0}
     word, notice, _ = page.evaluate(UNDER, compiling)
     assert word == "Waiting"
