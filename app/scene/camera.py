@@ -6,6 +6,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from app.scene.posed import add_posed
 from pipeline.geometry import Pose2
 
 WORLD = "/world"  # the parent of all nodes; its children are in the frame of the map
@@ -25,7 +26,7 @@ class Follower:
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self._world = server.scene.add_frame(WORLD, show_axes=False)
+        self._world = add_posed(server.scene, WORLD)
         self._server = server
         server.initial_camera.position = BEHIND
         server.initial_camera.look_at = (0.0, 0.0, 0.5)

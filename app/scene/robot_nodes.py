@@ -10,6 +10,7 @@ from app.scene import colours
 from app.scene.cloud import Cloud
 from app.scene.ground_node import GroundNode
 from app.scene.lines import Line
+from app.scene.posed import add_posed
 from app.scene.view import View
 from pipeline.geometry import Pose2
 from pipeline.records import Frame
@@ -24,7 +25,7 @@ class RobotNodes:
     """The robot's mesh and frame, its particles, its path and the path by odometry alone."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._frame = scene.add_frame(ROBOT, show_axes=False)
+        self._frame = add_posed(scene, ROBOT)
         _add_body(scene)
         self._particles = Cloud(scene, "/world/particles", 0.06, precision="float32")
         self._path = Line(scene, "/world/path", colours.PATH, 0.05)

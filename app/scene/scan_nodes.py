@@ -16,6 +16,7 @@ from app.scene.colours import Colours
 from app.scene.companions import Companions
 from app.scene.labels import Labels, cluster_labels, shown_height
 from app.scene.picking import meant
+from app.scene.posed import add_posed
 from app.scene.view import View
 from pipeline.records import Frame
 
@@ -40,7 +41,7 @@ class ScanNodes:
     """
 
     def __init__(self, scene: viser.SceneApi, robot: str, on_cluster: OnCluster) -> None:
-        self._sensor = scene.add_frame(f"{robot}/scan", show_axes=False)
+        self._sensor = add_posed(scene, f"{robot}/scan")
         self._raw = Cloud(scene, f"{robot}/scan/raw", 0.02)
         self._filtered = Cloud(scene, f"{robot}/scan/filtered", 0.03)
         self._clusters = Cloud(scene, f"{robot}/scan/clusters", 0.045)

@@ -14,6 +14,7 @@ from app.scene.cloud import Cloud
 from pipeline.geometry import Pose2
 from pipeline.records import TruthTrees
 from tests.scene.frames import make_frame, make_trees
+from tests.scene.recorder import buffered
 
 PATH = np.column_stack([0.05 * np.arange(1000), np.zeros(1000)])
 
@@ -196,6 +197,18 @@ def test_clear_forgets_the_run_and_keeps_the_panel(scene: Scene):
     assert len(scene._server.gui._gui_input_handle_from_uuid) == widgets
     scene.show(make_frame(1), PATH[:1])
     assert node(scene, "/world/trees").visible
+
+
+def test_a_run_that_never_moves_is_not_shown_in_the_last_runs_frame(scene: Scene):
+    scene.show(make_frame(0, pose=Pose2(3.0, -2.0, 1.3)), PATH[:1])
+    scene.clear()
+    scene.show(make_frame(0, pose=Pose2()), PATH[:1])
+    sent = buffered(scene)  # a browser that had the last run still has its poses: unsaid is not the origin
+    for name in ("/world", "/world/robot", "/world/robot/scan"):
+        handle = node(scene, name)
+        np.testing.assert_allclose(sent[f"SetOrientationMessage {name}"].wxyz, handle.wxyz)
+        np.testing.assert_allclose(sent[f"SetPositionMessage {name}"].position, handle.position)
+    np.testing.assert_allclose(sent["SetOrientationMessage /world/robot"].wxyz, [1.0, 0.0, 0.0, 0.0])
 
 
 def test_the_server_is_renewed_before_message_numbers_hurt(scene: Scene, monkeypatch: pytest.MonkeyPatch):
