@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from app.training.growing import PLANS, TREE, UPRIGHT, Plan, node_of
+from app.training.growing import FREE_END_PLAN, PLANS, TREE, UPRIGHT, Plan, node_of, of_free_end
 from pipeline.gathering.features import NAMES, RAYS
-from pipeline.gathering.forest import CLASSES
+from pipeline.gathering.forest import CLASSES, FREE_END, ONE_WAY
 from pipeline.records import Float, Int
 
 PRIOR = 3.0  # things that a leaf's shares count as
@@ -22,20 +22,38 @@ LEAST = 2.0  # things in a new leaf
 DEEPER = 4  # questions more at most
 
 
+def all_expanded(
+    base: dict[str, Any], kind: str, figures: Float, label: Int, thing: Int, seed: int
+) -> dict[str, list[dict[str, Any]]]:
+    """All decision trees for a kind of sensor that have learned from examples more, by their key in the JSON:
+    for one that looks one way also those that are asked about what ends in free air, which else would
+    overrule what was learned.
+
+    Args:
+        base: JSON of the forest that learns.
+        kind: Of the sensor, a key of PLANS.
+        figures, label, thing, seed: See `expanded`.
+    """
+    grown = {kind: expanded(base[kind], PLANS[kind], figures, label, thing, seed)}
+    if kind == ONE_WAY and FREE_END in base:
+        of = of_free_end(figures, label)
+        grown[FREE_END] = expanded(base[FREE_END], FREE_END_PLAN, figures[of], label[of], thing[of], seed)
+    return grown
+
+
 def expanded(
-    trees: list[dict[str, Any]], kind: str, figures: Float, label: Int, thing: Int, seed: int
+    trees: list[dict[str, Any]], plan: Plan, figures: Float, label: Int, thing: Int, seed: int
 ) -> list[dict[str, Any]]:
     """A forest that has learned from examples more.
 
     Args:
-        trees: As the JSON holds them, for a kind of sensor.
-        kind: Of the sensor, a key of PLANS.
+        trees: As the JSON holds them.
+        plan: By which they were grown.
         figures: shape (N, figures).
         label: Place in CLASSES, shape (N,).
         thing: What the example is one of, shape (N,): each thing counts once, however many examples it gave.
         seed: Of the choices made at random.
     """
-    plan = PLANS[kind]
     _, of, number = np.unique(thing, return_inverse=True, return_counts=True)
     weight = 1.0 / number[of]
     weight[label == TREE] *= plan.tree

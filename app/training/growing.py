@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.gathering.features import NAMES, RAYS
 from pipeline.gathering.forest import ALL_AROUND, CLASSES, FREE_END, ONE_WAY, ends_in_free_air
-from pipeline.records import Float, Int, Verdict
+from pipeline.records import Bool, Float, Int, Verdict
 
 DOUBTFUL = -1
 TREE = CLASSES.index(Verdict.TREE)
@@ -60,8 +60,11 @@ PLANS = {
         "extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.75, upright=1.0, rays=False
     ),
 }
-# What tells a pole that ends in free air from a tree that does; poles count together as much as trees do.
-FREE_END_TREES, FREE_END_DEPTH, FREE_END_LEAST, FREE_END_FIGURES = 40, 8, 5, 0.3
+# What tells a pole that ends in free air from a tree that does. It learns from copies alone, in which poles
+# count together as much as trees do (see `grow_free_end`).
+FREE_END_PLAN = Plan(
+    "extra", 40, 8, 5, None, 0.3, same=0.0, other=0.0, simulated=1.0, tree=1.0, upright=1.0, rays=False
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,27 +132,34 @@ def grow_free_end(pasted: list[Examples], seed: int = 0) -> Grown | None:
     """Trees and poles that end in free air, told from one another; None where there are not both.
 
     Args:
-        pasted: Real scenes with poles pasted into them, see `pasting`.
+        pasted: Real scenes with poles and trees pasted into them, see `pasting`.
         seed: Of the choices made at random.
     """
     from sklearn.ensemble import ExtraTreesClassifier
 
     figures = np.concatenate([np.zeros((0, len(NAMES))), *(e.figures for e in pasted)])
     label = np.concatenate([np.zeros(0, np.int64), *(e.label for e in pasted)])
-    used = np.isin(label, (TREE, POLE)) & ends_in_free_air(figures)
+    used = of_free_end(figures, label)
     figures, label = figures[used, :RAYS].astype(np.float32), label[used]
     tree = label == TREE
     if not tree.any() or tree.all():
         return None
     weight = np.where(tree, 1.0, np.count_nonzero(tree) / np.count_nonzero(~tree))
+    plan = FREE_END_PLAN
     trees = ExtraTreesClassifier(
-        FREE_END_TREES,
-        max_depth=FREE_END_DEPTH,
-        min_samples_leaf=FREE_END_LEAST,
-        max_features=FREE_END_FIGURES,
+        plan.trees,
+        max_depth=plan.depth,
+        min_samples_leaf=plan.least,
+        max_features=plan.figures,
         random_state=seed,
     ).fit(figures, tree, weight)
     return Grown(trees, [_shares(each, figures, label, weight) for each in trees.estimators_])
+
+
+def of_free_end(figures: Float, label: Int) -> Bool:
+    """Which examples tell a pole that ends in free air from a tree that does, shape (N,)."""
+    of: Bool = np.isin(label, (TREE, POLE)) & ends_in_free_air(figures)
+    return of
 
 
 def grow_all(

@@ -12,7 +12,7 @@ import numpy as np
 
 from app.training.annotated import things_of
 from app.training.annotated_runs import AnnotatedRun, Progress, examples_of
-from app.training.expanding import expanded
+from app.training.expanding import all_expanded
 from app.training.growing import Examples
 from app.training.validating import Validated, groups_of, validate
 from app.version import version
@@ -84,7 +84,8 @@ def learn(runs: Sequence[AnnotatedRun], asked: Asked) -> Learned:
     warnings: list[str] = []
     of_run = _gathered(runs, asked, warnings)
     base, _ = read_forests(FILE, ALL_AROUND, ONE_WAY)
-    grown, validated, things, used = {}, dict[str, Validated](), Counter[str](), list[AnnotatedRun]()
+    grown, validated = dict[str, list[dict[str, Any]]](), dict[str, Validated]()
+    things, used = Counter[str](), list[AnnotatedRun]()
     for kind in (ALL_AROUND, ONE_WAY):
         some = [(run, e) for run, e in of_run if e.all_around == (kind == ALL_AROUND) and len(e.label)]
         examples = [e for _, e in some]
@@ -99,7 +100,7 @@ def learn(runs: Sequence[AnnotatedRun], asked: Asked) -> Learned:
         figures, label = (
             np.concatenate([getattr(e, name) for e in examples]) for name in ("figures", "label")
         )
-        grown[kind] = expanded(base[kind], kind, figures, label, things_of(examples), asked.seed)
+        grown |= all_expanded(base, kind, figures, label, things_of(examples), asked.seed)
         things += things_by_class(examples)
         used += [run for run, _ in some]
     if not validated:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from app.training.annotated import things_of
-from app.training.expanding import expanded
+from app.training.expanding import all_expanded
 from app.training.growing import TREE, Examples
 from pipeline.evaluation import Rate
 from pipeline.gathering.forest import Forest, forest_of, vote
@@ -74,8 +74,8 @@ def validate(
     folds = fold_of(group, label == TREE, thing, seed)
     for fold in np.unique(folds):
         rest, judged = folds != fold, folds == fold
-        trees = expanded(base[kind], kind, figures[rest], label[rest], thing[rest], seed)
-        forest = forest_of({**base, kind: trees}, kind)
+        grown = all_expanded(base, kind, figures[rest], label[rest], thing[rest], seed)
+        forest = forest_of({**base, **grown}, kind)
         accepted_new[judged] = _accepted(figures[judged], forest, share)
     tree = label[last] == TREE
     return Validated(

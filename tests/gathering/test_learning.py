@@ -4,6 +4,7 @@ forest is the one that its name tells or is refused."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,14 +18,14 @@ from app.parameter_state import ParameterState
 from app.store.records import Author, Content
 from app.store.store import Store
 from app.training.annotated import CLASS_OF_KIND, SEEN, Judged, things_of
-from app.training.expanding import PRIOR, expanded
+from app.training.expanding import PRIOR, all_expanded, expanded
 from app.training.growing import PLANS, TREE, Examples
 from app.training.learning import LEAST_OTHERS, LEAST_TREES, seen_by, what_lacks
-from app.training.validating import SAME_PLACE, Rates, fold_of, groups_of
+from app.training.validating import SAME_PLACE, Rates, fold_of, groups_of, validate
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.gathering import no_columns
 from pipeline.gathering.features import COUNT, NAMES
-from pipeline.gathering.forest import ALL_AROUND, CLASSES, FILE, ONE_WAY, forest_of, vote
+from pipeline.gathering.forest import ALL_AROUND, CLASSES, FILE, FREE_END, ONE_WAY, forest_of, vote
 from pipeline.parameters import Parameters, assign, preset
 from pipeline.records import Columns
 
@@ -90,15 +91,15 @@ def test_two_annotations_never_share_a_column():
 def test_a_leaf_says_what_it_said_and_what_is_new_by_their_weights(kind):
     n, share = 4, np.array(LEAF["share"])
     label = np.full(n, POLE)
-    (leaf,) = expanded([LEAF], kind, np.zeros((n, COUNT)), label, np.arange(n), seed=0)
+    (leaf,) = expanded([LEAF], PLANS[kind], np.zeros((n, COUNT)), label, np.arange(n), seed=0)
     said = n * PLANS[kind].upright * np.eye(len(CLASSES))[POLE]
     assert leaf["share"] == pytest.approx((PRIOR * share + said) / (PRIOR + said.sum()), abs=0.006)
 
 
 def test_a_thing_counts_once_however_many_examples_it_gave():
     figures, label = np.zeros((6, COUNT)), np.array([POLE] * 5 + [TREE])
-    once = expanded([LEAF], ALL_AROUND, figures[4:], label[4:], np.array([0, 1]), seed=0)
-    assert expanded([LEAF], ALL_AROUND, figures, label, np.array([0, 0, 0, 0, 0, 1]), seed=0) == once
+    once = expanded([LEAF], PLANS[ALL_AROUND], figures[4:], label[4:], np.array([0, 1]), seed=0)
+    assert expanded([LEAF], PLANS[ALL_AROUND], figures, label, np.array([0, 0, 0, 0, 0, 1]), seed=0) == once
 
 
 def test_what_nothing_new_is_known_of_stays_and_what_contradicts_is_told_apart():
@@ -108,12 +109,56 @@ def test_what_nothing_new_is_known_of_stays_and_what_contradicts_is_told_apart()
     figures = np.zeros((40, COUNT))
     figures[:, tilt] = rng.uniform(0.0, 5.0, 40)
     label = np.where(figures[:, tilt] > 2.5, POLE, TREE)
-    trees = expanded([tree] * 60, ALL_AROUND, figures, label, np.arange(40), seed=0)
+    trees = expanded([tree] * 60, PLANS[ALL_AROUND], figures, label, np.arange(40), seed=0)
     assert all(each["no"] == LEAF for each in trees)
     forest = forest_of(data(**{ALL_AROUND: trees}), ALL_AROUND)
     votes = vote(figures, forest)[:, 0]
     assert votes[label == TREE].min() > votes[label == POLE].max()
-    assert trees == expanded([tree] * 60, ALL_AROUND, figures, label, np.arange(40), seed=0)
+    assert trees == expanded([tree] * 60, PLANS[ALL_AROUND], figures, label, np.arange(40), seed=0)
+
+
+def ending_in_free_air(n: int):
+    figures = np.zeros((n, COUNT))
+    figures[:, NAMES.index("highest return")] = 3.0
+    figures[:, NAMES.index("free above the highest return")] = 2.0
+    figures[:, NAMES.index("voxels to 3 m")] = 100.0
+    return figures
+
+
+@pytest.mark.parametrize(("kind", "said"), [(TREE, POLE), (POLE, TREE)])
+def test_enough_annotations_turn_what_ends_in_free_air(kind, said):
+    """A few do not; and where nobody annotated, all is as it was."""
+    one = {"share": (0.9 * np.eye(len(CLASSES))[said] + 0.1 * np.eye(len(CLASSES))[kind]).tolist()}
+    base = data(**{ONE_WAY: [{"share": [0.8, 0.2, 0, 0, 0, 0]}], FREE_END: [one]})
+
+    def tree(n: int) -> float:
+        grown = all_expanded(base, ONE_WAY, ending_in_free_air(n), np.full(n, kind), np.arange(n), seed=0)
+        return float(vote(ending_in_free_air(1), forest_of({**base, **grown}, ONE_WAY))[0, TREE])
+
+    assert tree(1) == pytest.approx(tree(0), abs=0.4)
+    assert (tree(1) > 0.5) == (tree(0) > 0.5) == (said == TREE)
+    assert (tree(12) > 0.5) == (kind == TREE)
+    assert all_expanded(base, ONE_WAY, np.zeros((9, COUNT)), np.full(9, kind), np.arange(9), seed=0)[
+        FREE_END
+    ] == [one]
+
+
+def test_sensors_that_see_all_around_and_older_forests_have_nothing_more_to_expand():
+    base = data(**{FREE_END: [LEAF]})
+    some = ending_in_free_air(2), np.array([TREE, POLE]), np.arange(2)
+    assert set(all_expanded(base, ALL_AROUND, *some, seed=0)) == {ALL_AROUND}
+    assert set(all_expanded(data(), ONE_WAY, *some, seed=0)) == {ONE_WAY}
+
+
+def test_what_is_validated_asks_the_expanded_trees_too():
+    """Each place left out is judged with what others tell of things that end in free air."""
+    places = [(5.0 * k, 0.0) for k in range(30)]
+    seen = replace(examples(places, [True] * 30, figures=ending_in_free_air(30)), all_around=False)
+    base = data(
+        **{ONE_WAY: [{"share": [0.9, 0.1, 0, 0, 0, 0]}], FREE_END: [{"share": [0.1, 0.9, 0, 0, 0, 0]}]}
+    )
+    told = validate([seen], base, ONE_WAY, forest_of(base, ONE_WAY), 0.4, seed=0)
+    assert (told.old.TA.count, told.new.TA.count, told.new.TA.of) == (0, 30, 30)
 
 
 # --- what it is worth -----------------------------------------------------------------------------
