@@ -87,7 +87,7 @@ class Events:
         """The map is another one.
 
         Args:
-            confirmed: Number of each of its trees, and when it was confirmed [s].
+            confirmed: Number of each tree that was confirmed on the way to it, and when [s].
             time_s: Of the standing scan, up to which it was mapped again.
         """
         self._set_aside(lambda event: event.time_s > time_s)

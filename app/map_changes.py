@@ -46,7 +46,8 @@ class MapChanges(msgspec.Struct, frozen=True):
         renamed: Old and new number of each tree that stayed.
         followed: The same of the trees that were shown last, where that is another map than the one before.
         changes: The others, and those that moved.
-        confirmed: New number of each tree, and when it was confirmed [s since the run's first scan].
+        confirmed: New number of each tree that ever was confirmed, also of one that went again later, and when
+            that was [s since the run's first scan]: what a run marks that was mapped so from its start.
     """
 
     revision: int
@@ -76,7 +77,7 @@ def changes_between(
         shown: The same of the map that was shown last.
         revision: Of the parameters of `after`.
         time_s: Of both frames, since the run's first scan.
-        confirmed_s: When trees of `after` were confirmed.
+        confirmed_s: When each tree on the way to `after` was confirmed.
     """
     old, new = np.flatnonzero(before.trees.confirmed), np.flatnonzero(after.trees.confirmed)
     old_at, new_at = before.trees.position[old], after.trees.position[new]
@@ -107,7 +108,7 @@ def changes_between(
         renamed=renamed,
         followed=renamed if shown is before else _renamed(shown.trees, after.trees),
         changes=changes,
-        confirmed=[(n, confirmed_s[n]) for n in after.trees.number[new].tolist() if n in confirmed_s],
+        confirmed=sorted(confirmed_s.items(), key=lambda item: (item[1], item[0])),
     )
 
 

@@ -104,6 +104,7 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
 
     monkeypatch.setattr(session._run, "_begin", beginning)
     maps: dict[int, object] = {}
+    marks: dict[int, dict[int, float]] = {}
     for revision, (wanted, anew) in enumerate(
         [(parameters, 1), (BASE, 0), (parameters, 0), (LATER, 1), (parameters, 0), (BASE, 0), (FEWER, None)]
     ):
@@ -114,12 +115,14 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
         assert changes.revision == revision
         now: tuple[object, ...] = (told(frame), told(session.path))
         now += (told(session._run.confirmed_s(frame.trees)),)
+        assert marks.setdefault(id(wanted), dict(changes.confirmed)) == dict(changes.confirmed)
         assert maps.setdefault(id(wanted), now) == now
     for wanted in (parameters, BASE, LATER):
         with mapped_from_start(wanted, LAST - 1) as other:
             assert other.frame is not None
             assert other.run is not None
             since = told(other.run.confirmed_s(other.frame.trees))
+            assert marks[id(wanted)] == other.run._told.confirmed_s, "those that went again too"
             assert maps[id(wanted)] == (told(other.frame), told(other.path), since)
 
 
@@ -287,6 +290,7 @@ def test_it_tells_which_trees_came_and_went_and_why():
         assert frame is not None
         known = int(np.count_nonzero(frame.trees.confirmed))
         assert known >= 2
+        marked = dict(session._run._told.confirmed_s)
         # No column is ever a tree now; then all are back.
         session.set_parameters(BASE.replace({"gathering.tree_share": 1.0}), 1, whole=True)
         _, none = remapped(session)
@@ -299,8 +303,10 @@ def test_it_tells_which_trees_came_and_went_and_why():
     assert [(c.x, c.y) for c in back.changes if c.kind == "appeared"] == [(c.x, c.y) for c in gone]
     assert back.after == known
     assert told(again) == told(frame)
-    assert sorted(number for number, _ in back.confirmed) == sorted(frame.trees.number[frame.trees.confirmed])
+    assert dict(back.confirmed) == marked, "also of those that went again, where each was confirmed first"
+    assert set(marked) >= set(frame.trees.number[frame.trees.confirmed].tolist())
     assert all(0.0 <= time_s <= 12.0 for _, time_s in back.confirmed)
+    assert [time_s for _, time_s in back.confirmed] == sorted(marked.values())
 
 
 @pytest.mark.parametrize("begun_before", [False, True])
