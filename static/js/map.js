@@ -104,7 +104,7 @@ function hover(px, py) {
   const tip = byId("map-tip");
   const [tree, truth, cluster] = [nearest(px, py), truthAt(px, py), clusterAt(px, py)];
   tip.hidden = !(tree || truth || cluster !== null) || pointers.size > 0 || draft.adding;
-  canvas.classList.toggle("over", Boolean(tree) || cluster !== null);
+  canvas.classList.toggle("hits", Boolean(tree) || cluster !== null);
   if (tip.hidden) return;
   setText(tip, describe(tree, truth, cluster));
   tip.style.left = `${Math.min(px + 14, view.width - tip.offsetWidth - 6)}px`;

@@ -3,6 +3,7 @@
 import { byId, el, setText } from "./dom.js";
 import { NONE, clock, figure } from "./format.js";
 import { changed, on, state } from "./state.js";
+import { titleOf } from "./titles.js";
 
 const WORDS = {
   starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
@@ -84,12 +85,11 @@ function show() {
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.title = state.evaluation?.warning || "F1 of the map against the truth; clusters of the standing scan that were taken for trees, and how many of them stand at true ones";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
-  setText(byId("source-name"), shortSource(status.source) || NONE);
+  const title = titleOf(status.source, show);
+  setText(byId("source-name"), title || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
-  document.title = `${shortSource(status.source)} · stemmap`;
+  document.title = `${title} · stemmap`;
 }
-
-const shortSource = (uri) => (uri ?? "").split("?")[0].split("/").filter(Boolean).pop() ?? "";
 
 // On a long way to a scan that was sought nothing plays, and nothing stands.
 const isGoing = (status) => Boolean(status?.going_far);
@@ -132,7 +132,9 @@ const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "
 
 function showWay() {
   const clearance = state.map?.clearance;
-  const text = clearance && !NO_FIGURES.includes(state.status?.state) && WAY[clearance.zone];
+  // A run that is over drives nowhere: that nobody sees the way there is no news.
+  const quiet = NO_FIGURES.includes(state.status?.state) || (state.status?.state === "finished" && clearance?.zone === "unknown");
+  const text = clearance && !quiet && WAY[clearance.zone];
   byId("way").hidden = !text;
   byId("way").dataset.zone = clearance?.zone ?? "";
   if (text) setText(byId("way-zone"), text);

@@ -21,11 +21,14 @@ export function clusterStory(story) {
     gathered(story.gathered, "What all scans gathered at this place")];
 }
 
+// A stem of one scan is no tree where what all scans gathered says otherwise: then both are said, and the map's is shown.
 function verdict(story) {
-  const [letter, meaning, reason] = verdictOf(story.verdict);
-  return el("div", { class: "verdict", "data-verdict": story.verdict },
+  const told = story.verdict === "tree" ? (story.gathered?.verdict ?? "tree") : story.verdict;
+  const [letter, meaning] = verdictOf(told);
+  const title = told === story.verdict ? told : `In this scan a stem; the map: ${told}, no tree`;
+  return el("div", { class: "verdict", "data-verdict": told },
     el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" }),
-    el("div", {}, el("b", { text: story.verdict }), el("p", { text: why(story) || reason })));
+    el("div", {}, el("b", { text: title }), el("p", { text: why(story) || verdictOf(story.verdict)[2] })));
 }
 
 function why(story) {

@@ -49,7 +49,9 @@ function show() {
   const line = byId("timeline");
   line.disabled = !(status.end_s > 0);
   if (!dragging && !seeking) {
-    line.max = String(status.end_s ?? 1);
+    const end = status.end_s || 1;
+    line.max = String(end);
+    line.step = String(end / Math.max(1000, Math.ceil(10 * end))); // its last step is the end, of a run of any length
     line.value = String(status.going_to_s ?? status.time_s); // it waits where it was put, and does not creep there
     setText(byId("time-now"), clock(status.time_s));
   }

@@ -31,7 +31,14 @@ function lead(told) {
   const parts = Object.keys(SIGNS).map((kind) => number(kind) && `${number(kind)} ${kind}`).filter(Boolean);
   const others = renumbered(told).length;
   const numbers = others ? ` Numbers follow the new run: ${others === 1 ? "one tree that stayed has" : `${others} trees that stayed have`} another one.` : "";
-  return `${count(scans, "scan")} mapped again: ${before} → ${count(after, "tree")}${parts.length ? `, ${parts.join(", ")}` : ", all where they were"}.${numbers}`;
+  return `${count(scans, "scan")} mapped again: ${before} → ${count(after, "tree")}${parts.length ? `, ${parts.join(", ")}` : ", all where they were"}.${upTo(scans)}${numbers}`;
+}
+
+// The map is made anew up to where the run stands; what comes after it is mapped when the run gets there.
+function upTo(scans) {
+  const all = state.status?.scans ?? null;
+  const stands = all === null ? state.status?.state !== "finished" : scans < all;
+  return stands ? " That is up to the standing scan: the rest follows as the run goes on." : "";
 }
 
 const FIRST = 2; // [s] that tell nothing yet: kernels are loaded, and the standing scan is mapped
@@ -85,9 +92,12 @@ const treeLink = (number, words) => el("button", { class: "link", type: "button"
 
 function showChanges() {
   const { changes = [], renamed = [] } = state.remapped ?? {};
-  const lines = [
-    ...changes.map(({ kind, number, why }) => lineOf(kind, SIGNS[kind], kind === "vanished" ? el("span", { text: `Tree ${number} vanished` }) : treeLink(number, ` ${kind}`), why)),
-    ...renumbered({ renamed }).map(([before, now]) => lineOf("renumbered", "#", treeLink(now, ""), `was tree ${before}`))];
+  const was = new Map(renumbered({ renamed }).map(([before, now]) => [now, `was tree ${before}`]));
+  const moved = new Set(changes.filter(({ kind }) => kind === "moved").map(({ number }) => number));
+  const lines = [ // one a tree: one that moved and has another number says both in one
+    ...changes.map(({ kind, number, why }) => lineOf(kind, SIGNS[kind], kind === "vanished" ? el("span", { text: `Tree ${number} vanished` }) : treeLink(number, ` ${kind}`),
+      kind === "moved" && was.has(number) ? `${why}, ${was.get(number)}` : why)),
+    ...[...was].filter(([now]) => !moved.has(now)).map(([now, before]) => lineOf("renumbered", "#", treeLink(now, ""), before))];
   setText(folded, `${count(lines.length, "tree")} not as before`);
   if (lines.length !== known) all.open = lines.length < FOLDED_FROM;
   known = lines.length;
