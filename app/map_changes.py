@@ -46,8 +46,8 @@ class MapChanges(msgspec.Struct, frozen=True):
         renamed: Old and new number of each tree that stayed.
         followed: The same of the trees that were shown last, where that is another map than the one before.
         changes: The others, and those that moved.
-        confirmed: New number of each tree that ever was confirmed, also of one that went again later, and when
-            that was [s since the run's first scan]: what a run marks that was mapped so from its start.
+        confirmed: New number of each tree that ever was confirmed, also of one that went again later, and
+            when that was [s since the run's first scan]: what a run marks that was mapped so from its start.
     """
 
     revision: int

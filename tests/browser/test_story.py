@@ -77,12 +77,18 @@ def test_a_cluster_is_clicked_on_the_map(dashboard: Dashboard):
         places = page.evaluate(SQUARES)
     assert places, "no cluster that is no tree is drawn"
     page.locator("#map").click(position={"x": places[0][0], "y": places[0][1]})
+    assert page.evaluate(COVERS_FIT) == "map-fit", "what is pointed at must not cover the map's buttons"
     panel = page.locator("#panel-story")
     expect(panel).to_be_visible()
     expect(panel.locator("table.checks .decides")).to_be_visible()
     expect(panel.locator("[data-verdict]")).not_to_have_attribute("data-verdict", "tree")
     assert dashboard.errors == []
 
+
+COVERS_FIT = """() => {
+  const { x, y } = document.querySelector('#map-fit').getBoundingClientRect();
+  return document.elementFromPoint(x + 6, y + 6).id;
+}"""
 
 # Middles of the squares of clusters that are no trees.
 SQUARES = """() => {

@@ -21,6 +21,12 @@ DROP = """([name, content]) => {
 }"""
 
 
+AT_THE_END = """() => {
+  const { value, max } = document.querySelector('#timeline');
+  return value === max;
+}"""
+
+
 def test_a_dropped_recording_is_opened_and_a_picture_is_refused(chromium: Browser, tmp_path: Path):
     run = tmp_path / "north stand.mcap"
     assert main(["simulate", "stand", "--duration", "1", "--out", str(run)]) == 0
@@ -37,5 +43,7 @@ def test_a_dropped_recording_is_opened_and_a_picture_is_refused(chromium: Browse
         dashboard.until_server(
             "/api/status", "it.source.includes('/recordings/upload-') && it.scan_index >= 0"
         )
+        dashboard.until_server("/api/status", "it.state === 'finished'")
+        dashboard.until(AT_THE_END)
         page.locator("#source-button").click()
         expect(page.locator("#source-list").get_by_text("north stand.mcap")).to_be_visible()
