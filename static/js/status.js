@@ -86,9 +86,17 @@ function show() {
   cells.f1.cell.title = state.evaluation?.warning || "F1 of the map against the truth; clusters of the standing scan that were taken for trees, and how many of them stand at true ones";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   const title = titleOf(status.source, show);
-  setText(byId("source-name"), title || NONE);
+  showName(title || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
   document.title = `${title} · stemmap`;
+}
+
+// Of folder/number the folder is cut where there is no room: the number tells one run from the next.
+function showName(title) {
+  const name = byId("source-name"), cut = title.lastIndexOf("/");
+  name.classList.toggle("numbered", cut > 0);
+  if (cut <= 0) setText(name, title);
+  else if (name.textContent !== title) name.replaceChildren(el("span", { text: title.slice(0, cut) }), el("i", { text: title.slice(cut) }));
 }
 
 // On a long way to a scan that was sought nothing plays, and nothing stands.
