@@ -290,7 +290,8 @@ def test_it_tells_which_trees_came_and_went_and_why():
         assert frame is not None
         known = int(np.count_nonzero(frame.trees.confirmed))
         assert known >= 2
-        marked = dict(session._run._told.confirmed_s)
+        assert session.run is not None
+        marked = dict(session.run._told.confirmed_s)
         # No column is ever a tree now; then all are back.
         session.set_parameters(BASE.replace({"gathering.tree_share": 1.0}), 1, whole=True)
         _, none = remapped(session)
