@@ -105,9 +105,13 @@ def _look_for(arguments: argparse.Namespace) -> None:
 
 def _scenes(arguments: argparse.Namespace) -> list[str]:
     """What was learned from, in a few lines of the JSON."""
+    from app.training.pasting import COPIES
+
     stands = [name for name in arguments.scenes.split(",") if name]
     names = [f"sim:{name}, seeds {arguments.seeds}, every second one furnished" for name in stands]
-    return [*names, f"{arguments.streets} streets and parks", *(folder.name for folder in arguments.labelled)]
+    copied = [f"{folder.name}, {COPIES} copies with things pasted in" for folder in _one_way(arguments)]
+    labelled = [folder.name for folder in arguments.labelled]
+    return [*names, f"{arguments.streets} streets and parks", *labelled, *copied]
 
 
 def _examples(arguments: argparse.Namespace) -> list[Examples]:
@@ -139,19 +143,17 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
 
 
 def _pasted(arguments: argparse.Namespace) -> list[Examples]:
-    """The labelled scans of sensors that look one way once more, with poles pasted into them."""
-    from functools import partial
-
-    from app.training.keeping import kept_or_made
-    from app.training.pasting import COPIES, FOLDER, name_of_copy, pasted_examples
-    from app.training.scenes import looks_all_around
+    """The labelled scans of sensors that look one way once more, with poles and trees pasted into them."""
+    from app.training.pasting import FOLDER, copies
     from pipeline.parameters import preset
 
     kept = None if arguments.examples is None else arguments.examples / FOLDER
-    found: list[Examples] = []
-    for folder in arguments.labelled:
-        if not looks_all_around(folder):
-            for copy in range(COPIES):
-                make = partial(pasted_examples, folder, copy, preset("forest"), REACH)
-                found += kept_or_made(kept, name_of_copy(str(folder), copy), make)
-    return found
+    forest = preset("forest")
+    return [e for folder in _one_way(arguments) for e in copies(folder, kept, forest, REACH)]
+
+
+def _one_way(arguments: argparse.Namespace) -> list[Path]:
+    """The labelled scans of sensors that look one way."""
+    from app.training.scenes import looks_all_around
+
+    return [folder for folder in arguments.labelled if not looks_all_around(folder)]

@@ -60,10 +60,10 @@ PLANS = {
         "extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.75, upright=1.0, rays=False
     ),
 }
-# What tells a pole that ends in free air from a tree that does. It learns from copies alone, in which poles
-# count together as much as trees do (see `grow_free_end`).
+# What tells a pole that ends in free air from a tree that does. It learns from copies alone; in them all
+# poles together count so many times as much as all trees (see `grow_free_end`).
 FREE_END_PLAN = Plan(
-    "extra", 40, 8, 5, None, 0.3, same=0.0, other=0.0, simulated=1.0, tree=1.0, upright=1.0, rays=False
+    "extra", 60, 8, 15, None, 0.3, same=0.0, other=0.0, simulated=1.0, tree=1.0, upright=1.5, rays=False
 )
 
 
@@ -144,8 +144,8 @@ def grow_free_end(pasted: list[Examples], seed: int = 0) -> Grown | None:
     tree = label == TREE
     if not tree.any() or tree.all():
         return None
-    weight = np.where(tree, 1.0, np.count_nonzero(tree) / np.count_nonzero(~tree))
     plan = FREE_END_PLAN
+    weight = np.where(tree, plan.tree, plan.upright * np.count_nonzero(tree) / np.count_nonzero(~tree))
     trees = ExtraTreesClassifier(
         plan.trees,
         max_depth=plan.depth,

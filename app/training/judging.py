@@ -18,7 +18,8 @@ APART = 0.5  # m
 def leave_one_out(examples: list[Examples], pasted: list[Examples], share: float) -> Iterator[str]:
     """A line for each real scene: trees found, of how many, and false ones, by trees grown from all others.
 
-    The last set of a scene is judged: all its scans together. `pasted`: the scenes with poles pasted in.
+    The last set of a scene is judged: all its scans together. `pasted`: copies of scenes with things
+    pasted in; those of the scene that is judged are left out with it.
     """
     for scene in dict.fromkeys(e.scene for e in examples if not e.simulated):
         others = [e for e in examples if e.scene != scene]

@@ -15,9 +15,10 @@ from pipeline.errors import StemmapError
 from pipeline.files import write_beside
 
 
-def kept_or_made(folder: Path | None, scene: str, make: Callable[[], Iterable[Examples]]) -> list[Examples]:
-    """The examples of a scene from the folder, or made now and put there (None: kept nowhere)."""
-    file = None if folder is None else folder / f"{hashlib.sha256(scene.encode()).hexdigest()[:16]}.npz"
+def kept_or_made(folder: Path | None, name: str, make: Callable[[], Iterable[Examples]]) -> list[Examples]:
+    """The examples of a scene from the folder, where a name stands for them, or made now and put there (None:
+    kept nowhere)."""
+    file = None if folder is None else folder / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
     if file is not None and file.is_file():
         return _read(file)
     made = list(make())
@@ -31,7 +32,7 @@ def kept_or_made(folder: Path | None, scene: str, make: Callable[[], Iterable[Ex
         with write_beside(file) as partial, partial.open("wb") as out:
             np.savez(
                 out,
-                scene=scene,
+                scene=made[0].scene,
                 simulated=made[0].simulated,
                 all_around=made[0].all_around,
                 sets=len(made),

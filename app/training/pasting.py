@@ -1,64 +1,105 @@
-"""Pasting: labelled scans of a sensor that looks one way, once more with poles that never stood there.
+"""Pasting: labelled scans of a sensor that looks one way, once more with things that never stood there.
 
 Parks hold a pole in every second scene, too few to learn from, and whole simulated parks teach other trees
 than real ones. So simulated poles are put among what is real: where the ground was seen, with what hides
-them and what they hide.
+them and what they hide. As many young trees are put there by the same caster: else decision trees would
+learn to tell what is simulated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
-from zlib import crc32
 
 import numpy as np
 
 from app.training.furniture import POLE, SIGN, Furniture
 from app.training.growing import Examples
+from app.training.keeping import kept_or_made
+from app.training.saplings import sapling
 from app.training.scenes import gathered, label_by_points, labelled_scans, trunks
 from app.training.streets import CONE, PERIOD_NS, SolidStateLidar
 from pipeline.geometry import Pose2
 from pipeline.parameters import Parameters
-from pipeline.records import Float, Float32, Int, Scan, Step
+from pipeline.records import Bool, Float, Float32, Int, Scan, Step
+from pipeline.simulation.along import first_along
 from pipeline.simulation.lidar import sweep_scene
+from pipeline.simulation.solids import Solids
 from pipeline.simulation.terrain import Terrain
 from pipeline.sources import open_source
 
-COPIES = 24  # of each scene
+FORMAT = 2  # of what is made here: raise it with every change that makes other copies
+COPIES = 48  # of each scene
 FOLDER = "pasted"  # in that of the kept examples
 LEAST_RETURNS = 8  # of a trunk that counts as one: copies have fewer scans, and small trees end in free air
 GROUND = (40, 72)  # road and terrain, as the labels number them
 NEAR, FAR, ASIDE = 5.0, 24.0, 0.5  # m and rad; where things are put
 CLEAR, APART = 0.9, 2.0  # m from a trunk, and from one another
 GROUND_REACH = 0.8  # m; of the ground that is looked at
-STEP = float(np.radians(0.4))  # of the directions in which what is nearer hides what is farther
-HIDDEN, BEHIND = 0.2, 0.3  # m
+BESIDE = float(np.radians(0.4))  # so near to its direction a real return tells whether a new one was hidden
+HIDDEN, BEHIND = 0.2, 0.1  # m
+LIFTED = 1000.0  # m, so high above all ground rays are cast: what is real has its own
 _FLAT = Terrain.grow(0.0, 0.0, 10.0, np.random.default_rng(0))
 
 _Scans = list[tuple[Float32, Int]]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Copy:
+    """Labelled scans with things pasted in.
+
+    Attributes:
+        scans: Points (N, 3) [m] in the frame of the sensor and their classes, of each scan.
+        pose: Of all of them in the map.
+        place: Of the things in the map, x and y, shape (M, 2) [m]; tree: which are trees, shape (M,).
+    """
+
+    scans: _Scans
+    pose: Pose2
+    place: Float
+    tree: Bool
+
+
+def copies(
+    folder: Path, kept: Path | None, parameters: Parameters, reach: float, number: int = COPIES
+) -> list[Examples]:
+    """The examples of all copies of labelled scans; they are kept in a folder by what they are made from."""
+    digest, found = digest_of(folder), list[Examples]()
+    for copy in range(number):
+        make = partial(pasted_examples, folder, copy, parameters, reach)
+        found += kept_or_made(kept, f"{name_of_copy(str(folder), copy)}, {digest}", make)
+    return found
+
+
 def name_of_copy(scene: str, copy: int) -> str:
-    """Under which the examples of a copy are kept."""
-    return f"{scene} with poles {copy}"
+    """The scene that examples of a copy are of."""
+    return f"{scene.rstrip('/')} with things {copy}"
 
 
 def is_of(name: str, scene: str) -> bool:
     """Whether a name is that of a copy of a scene."""
-    return name.startswith(f"{scene.rstrip('/')} with poles ")
+    return name.startswith(f"{scene.rstrip('/')} with things ")
+
+
+def digest_of(folder: Path) -> str:
+    """Of all that decides what copies of labelled scans are: the scans, their labels, and FORMAT."""
+    digest = sha256(f"{FORMAT}".encode())
+    for points, label in labelled_scans(folder):
+        digest.update(points.tobytes() + label.tobytes())
+    return digest.hexdigest()[:16]
 
 
 def pasted_examples(folder: Path, copy: int, parameters: Parameters, reach: float) -> Iterator[Examples]:
-    """Of a copy of labelled scans with poles: some of the scans, larger or smaller, mirrored or not, with
-    some of the returns, on another place of the map so that the voxels lie otherwise."""
-    rng = np.random.default_rng([crc32(folder.name.encode()), copy, 0x9A57ED])
-    scans = _changed(_without_repeats(labelled_scans(folder)), rng)
-    _paste(scans, int(rng.integers(4, 9)), rng)
-    pose = Pose2(*(float(v) for v in rng.uniform([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi])))
-    run = [Step(k, Scan(k * PERIOD_NS, points), pose) for k, (points, _) in enumerate(scans)]
-    points = _to_map(np.concatenate([points for points, _ in scans]), pose)
-    label = np.concatenate([label for _, label in scans])
+    """Of a copy of labelled scans with things pasted in, see `paste`."""
+    made = paste(folder, copy)
+    pose = made.pose
+    run = [Step(k, Scan(k * PERIOD_NS, points), pose) for k, (points, _) in enumerate(made.scans)]
+    points = _to_map(np.concatenate([points for points, _ in made.scans]), pose)
+    label = np.concatenate([label for _, label in made.scans])
     sure, any_trunk = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
     with closing(open_source(str(folder))) as source:
         about = source.description
@@ -66,7 +107,22 @@ def pasted_examples(folder: Path, copy: int, parameters: Parameters, reach: floa
         near = np.hypot(columns.axis[:, 0] - pose.x, columns.axis[:, 1] - pose.y) < reach
         axis, figures = columns.axis[near], columns.figures[near]
         kind = label_by_points(axis, points, label, sure, any_trunk)
-        yield Examples(name_of_copy(str(folder).rstrip("/"), copy), True, False, axis, figures, kind)
+        yield Examples(name_of_copy(str(folder), copy), True, False, axis, figures, kind)
+
+
+def paste(folder: Path, copy: int) -> Copy:
+    """Some of the labelled scans, larger or smaller, mirrored or not, with some of the returns, with things
+    that never stood there, on another place of the map so that the voxels lie otherwise."""
+    rng = np.random.default_rng([int(digest_of(folder), 16), copy])
+    scans = _changed(_without_repeats(labelled_scans(folder)), rng)
+    points, label = (np.concatenate(each) for each in zip(*scans, strict=True))
+    poles, trees = (int(n) for n in rng.integers(4, 9, 2))
+    place = _places(points, label, poles + trees, rng)
+    tree = rng.permutation(np.arange(len(place)) % 2 == 0)
+    solids, classes = _things(place, tree, rng)
+    scans = [_seen_with(*scan, solids, classes, rng) for scan in scans]
+    pose = Pose2(*(float(v) for v in rng.uniform([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi])))
+    return Copy(scans, pose, _to_map(place, pose)[:, :2], tree)
 
 
 def _without_repeats(scans: _Scans) -> _Scans:
@@ -87,25 +143,53 @@ def _changed(scans: _Scans, rng: np.random.Generator) -> _Scans:
     return changed
 
 
-def _paste(scans: _Scans, number: int, rng: np.random.Generator) -> None:
-    """Put so many poles into the scans, in place."""
-    points, label = (np.concatenate(each) for each in zip(*scans, strict=True))
-    for place in _places(points, label, number, rng):
-        x, y, ground = (float(v) for v in place)
-        furniture = Furniture(_FLAT, rng)
-        _stand(furniture, x, y, rng)
-        solids, classes = furniture.solids(), np.array(furniture.classes)
-        classes[classes == SIGN] = POLE  # the plate is of the pole
-        height = float(_FLAT.height(np.array([x]), np.array([y]))[0]) - ground
-        for k, (points, label) in enumerate(scans):
-            lidar = SolidStateLidar(range_sigma=0.02, draw=int(rng.integers(0, 2**31)))
-            level = np.tile(np.eye(3), (lidar.columns, 1, 1))
-            above = np.tile([0.0, 0.0, height], (lidar.columns, 1))
-            sweep = sweep_scene(lidar, solids, _FLAT, level, above, k * PERIOD_NS, rng)
-            seen, solid = sweep.scan.points, sweep.solid
-            hit = (solid >= 0) & (seen[:, 0] > np.cos(CONE) * np.linalg.norm(seen, axis=1))
-            if hit.any():
-                scans[k] = _merged(points, label, seen[hit], classes[solids.owner[solid[hit]]])
+def _things(place: Float, tree: Bool, rng: np.random.Generator) -> tuple[Solids, Int]:
+    """What is put at places x, y, z, shape (M, 3) [m] in the sensor's frame, and the class of each owner."""
+    solids, classes = Furniture(_FLAT, rng).solids(), list[int]()
+    for (x, y, ground), is_tree in zip(place.tolist(), tree.tolist(), strict=True):
+        one = Furniture(_FLAT, rng)
+        (sapling if is_tree else _stand)(one, x, y, rng)
+        height = float(_FLAT.height(np.array([x]), np.array([y]))[0])
+        thing = one.solids().placed(np.array([0.0, 0.0, ground - height]), 0.0)
+        solids = solids.join(replace(thing, owner=(thing.owner + len(classes)).astype(np.int32)))
+        classes += [POLE if kind == SIGN else kind for kind in one.classes]  # the plate is of the pole
+    return solids, np.array(classes, np.int64)
+
+
+def _seen_with(
+    points: Float32, label: Int, solids: Solids, classes: Int, rng: np.random.Generator
+) -> tuple[Float32, Int]:
+    """A scan as if these things stood there: without what they hide, with what is seen of them."""
+    lidar = SolidStateLidar(range_sigma=0.02, draw=int(rng.integers(0, 2**31)))
+    level = np.tile(np.eye(3), (lidar.columns, 1, 1))
+    above = np.tile([0.0, 0.0, LIFTED], (lidar.columns, 1))
+    sweep = sweep_scene(lidar, solids.placed(above[0], 0.0), _FLAT, level, above, 0, rng)
+    new, solid = sweep.scan.points, sweep.solid
+    hit = (solid >= 0) & (new[:, 0] > np.cos(CONE) * np.linalg.norm(new, axis=1))
+    new, kind = new[hit], classes[solids.owner[solid[hit]]]
+    to_real, towards = _directions(points)
+    key = int(rng.integers(0, 2**62))
+    kept = to_real < first_along(solids.kind, solids.shape, solids.capsule, towards, key) + BEHIND
+    seen = ~_hidden(new, points)
+    return np.concatenate([points[kept], new[seen]]), np.concatenate([label[kept], kind[seen]])
+
+
+def _hidden(new: Float32, real: Float32) -> Bool:
+    """Which of the new points lie behind the real one that is nearest in direction, shape (N,)."""
+    from scipy.spatial import cKDTree
+
+    (to_new, towards), (to_real, known) = _directions(new), _directions(real)
+    if not len(new) or not len(real):
+        return np.zeros(len(new), np.bool_)
+    beside, nearest = cKDTree(known).query(towards, distance_upper_bound=BESIDE)
+    hidden: Bool = np.isfinite(beside) & (to_new > np.append(to_real, np.inf)[nearest] + HIDDEN)
+    return hidden
+
+
+def _directions(points: Float32) -> tuple[Float, Float]:
+    """How far points are away [m], shape (N,), and unit vectors towards them, shape (N, 3)."""
+    away = np.linalg.norm(points.astype(np.float64), axis=1)
+    return away, points / np.maximum(away, 1e-9)[:, None]
 
 
 def _stand(furniture: Furniture, x: float, y: float, rng: np.random.Generator) -> None:
@@ -134,30 +218,7 @@ def _places(points: Float32, label: Int, number: int, rng: np.random.Generator) 
     return found
 
 
-def _merged(real: Float32, label: Int, new: Float32, kind: Int) -> tuple[Float32, Int]:
-    """Both without what the other hides, and the classes."""
-    (to_real, bin_real), (to_new, bin_new) = _directions(real), _directions(new)
-    last = max(bin_real.max(initial=0), bin_new.max()) + 1
-    nearest = np.full((2, last), np.inf)
-    np.minimum.at(nearest[0], bin_real, to_real)
-    np.minimum.at(nearest[1], bin_new, to_new)
-    seen_new, seen_real = to_new < nearest[0, bin_new] + HIDDEN, to_real < nearest[1, bin_real] + BEHIND
-    return (
-        np.concatenate([real[seen_real], new[seen_new]]),
-        np.concatenate([label[seen_real], kind[seen_new]]),
-    )
-
-
-def _directions(points: Float32) -> tuple[Float, Int]:
-    """How far points are away [m], and a number for the direction in which."""
-    x, y, z = points.astype(np.float64).T
-    away = np.sqrt(x * x + y * y + z * z)
-    across = np.floor((np.arctan2(y, x) + np.pi) / STEP).astype(np.int64)
-    up = np.floor((np.arctan2(z, np.hypot(x, y)) + 0.5 * np.pi) / STEP).astype(np.int64)
-    return away, across * 1000 + up
-
-
-def _to_map(points: Float32, pose: Pose2) -> Float:
+def _to_map(points: Float32 | Float, pose: Pose2) -> Float:
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     moved: Float = points.astype(np.float64) @ turn + np.array([pose.x, pose.y, 0.0])

@@ -21,7 +21,7 @@ import numpy as np
 from app.stopwatch import Stopwatch
 from app.training.growing import Examples, as_json, can_grow, grow_all
 from app.training.keeping import read_examples
-from app.training.pasting import FOLDER, is_of
+from app.training.pasting import FOLDER, copies, is_of
 from app.training.scenes import labelled_points, trunks
 from pipeline.evaluation import evaluate
 from pipeline.evaluation.matching import match
@@ -36,6 +36,7 @@ from pipeline.steps import steps
 from tests.benchmarks.classes import ByClass
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
+PARKS = [DATA / "park_trunks" / name for name in ("00", "02", "04", "06")]
 REACH, MATCH = 25.0, 0.5
 TOLERANCE, REACH_OF_A_SLICE, RADIUS_MIN, RADIUS_MAX = 0.02, 0.1, 0.03, 0.6  # m; of circles in merged slices
 RINGS = ((0.0, 10.0), (10.0, 15.0), (15.0, 20.0), (20.0, 25.0))
@@ -62,15 +63,12 @@ def main() -> None:
     examples, pasted = [], []
     if arguments.examples is not None:
         examples = read_examples(arguments.examples)
-        pasted = read_examples(arguments.examples / FOLDER)
+        kept = arguments.examples / FOLDER
+        if "park" in arguments.parts:
+            pasted = [e for park in PARKS for e in copies(park, kept, preset("forest"), REACH)]
     for part in arguments.parts:
         if part == "park":
-            _real(
-                [DATA / "park_trunks" / name for name in ("00", "02", "04", "06")],
-                examples,
-                pasted,
-                arguments.draw,
-            )
+            _real(PARKS, examples, pasted, arguments.draw)
         elif part == "street":
             _real([DATA / "semantickitti" / "000000.bin"], examples, pasted, arguments.draw)
         elif part == "dbh":
