@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from app.live_payload import health_word
 from app.session import Session
 from pipeline.geometry import Pose3
 from pipeline.mapper import Mapper
@@ -87,8 +88,8 @@ def lived(place: str, seed: int, name: str, p: Parameters | None = None) -> Day:
         status = session.status()
         assert set(frame.warnings) <= set(status.warnings), "each warning reaches the page"
         at = (frame.stamp_ns // 1_000_000 - (trouble.pause_ms if frame.index >= KNOWN else 0)) // 100
-        rows.append((at, frame, status.health, frame.warnings))
-        assert status.health == frame.health.state
+        rows.append((at, frame, frame.health.state, frame.warnings))
+        assert status.health == health_word(frame)
     session.close()
     return Day(driven, rows)
 
