@@ -83,7 +83,7 @@ def lived(place: str, seed: int, name: str, p: Parameters | None = None) -> Day:
     )
     session.open("told:", "auto", seed)
     session.play()
-    rows = []
+    rows: list[tuple[int, Frame, str, tuple[str, ...]]] = []
     while (frame := session.work()) is not None:
         status = session.status()
         assert set(frame.warnings) <= set(status.warnings), "each warning reaches the page"
