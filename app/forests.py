@@ -29,11 +29,8 @@ from pipeline.gathering.forest import (
 from pipeline.parameters import Parameters
 
 FOLDER = "forests"
-DECIDES = (
-    "classes",
-    ALL_AROUND,
-    ONE_WAY,
-)  # what the name is the digest of, with FREE_END where it is there; the rest tells where it came from
+# What the name is the digest of, with FREE_END where it is there; the rest tells where it came from.
+DECIDES = ("classes", ALL_AROUND, ONE_WAY)
 _NAME = re.compile(r"[0-9a-f]{16}")
 
 
