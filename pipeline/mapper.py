@@ -8,23 +8,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline import loops
-from pipeline.gathering import ForestOf, Gathering, View, package_alone
-from pipeline.geometry import Float, Pose2, Pose3
-from pipeline.growing_path import GrowingPath
-from pipeline.gyro import fused
-from pipeline.height_map import HeightMapper
-from pipeline.innovation import REFUSED, within_gate
+from pipeline.classification import ForestOf, Gathering, View, package_alone
+from pipeline.config import Parameters
+from pipeline.front_end import Looked, decide, look
+from pipeline.geometry.poses import Float, Pose2, Pose3
+from pipeline.ground.terrain_map import HeightMapper
 from pipeline.late import after
+from pipeline.loop_closure import detection
+from pipeline.loop_closure.kidnapped_robot import Mapped, Recovery, RecoveryState
 from pipeline.mapper_records import Located, MapperState, Noted
-from pipeline.parameters import Parameters
-from pipeline.perception import Looked, decide, look
-from pipeline.records import Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step, Trees
-from pipeline.recovery import Mapped, Recovery, RecoveryState
+from pipeline.odometry.gyro import fused
 from pipeline.slam import BackEnd, Loop, Motion
 from pipeline.slam.motion import noise_of, step_variances
+from pipeline.slam.pose_gate import REFUSED, within_gate
+from pipeline.slam.trajectory_buffer import GrowingPath
+from pipeline.stage_timer import Watch, no_watch
 from pipeline.tracking import Tracker
-from pipeline.watch import Watch, no_watch
+from pipeline.types.records import Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step, Trees
 
 LOOP = "a loop is closed: path and map since the place was left are bent, so that the trees there stand once"
 
@@ -168,7 +168,7 @@ class Mapper:
             landmarks=landmarks,
             searching=searching,
             asked_trees=self._asked_trees,
-            may_close=sought and loops.is_due(step.index, self._path.sigma_xy),
+            may_close=sought and detection.is_due(step.index, self._path.sigma_xy),
         )
 
     def map(self, located: Located) -> Frame:
@@ -294,12 +294,12 @@ class Mapper:
 
     def _close_loop(self, located: Located) -> tuple[Located, bool]:
         """What is known of the scan after a loop was looked for, and whether it closed one: see
-        `pipeline.loops`."""
+        `pipeline.loop_closure.detection`."""
         index, estimate = located.step.index, located.estimate
         self._asked_trees = located.asked_trees
         with self._watch("slam"):
             run = self._mapped(estimate, self._path.motion)
-            loop = loops.find_loop(run, self._parameters.relocalisation)
+            loop = detection.find_loop(run, self._parameters.relocalisation)
             if loop is not None:
                 self._bend(index, loop)
                 self._recovery.forget()
@@ -310,9 +310,9 @@ class Mapper:
         )
         return known, loop is not None
 
-    def _mapped(self, estimate: PoseEstimate, motion: Float) -> loops.Mapped:
+    def _mapped(self, estimate: PoseEstimate, motion: Float) -> detection.Mapped:
         path, noise = self._slam.path(), noise_of(self._parameters.slam)
-        return loops.Mapped(
+        return detection.Mapped(
             self._path.stamp_ns, path, self._trees, self._slam.begun_since, estimate, noise, motion,
             self._placed, self._closed,
         )  # fmt: skip

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from pipeline.gathering import GatheringState
-from pipeline.geometry import Float, Pose2
-from pipeline.height_map import HeightMapState
-from pipeline.perception import Seen
-from pipeline.records import Columns, PoseEstimate, Step
-from pipeline.recovery import RecoveryState
+from pipeline.classification import GatheringState
+from pipeline.front_end import Seen
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.ground.terrain_map import HeightMapState
+from pipeline.loop_closure.kidnapped_robot import RecoveryState
 from pipeline.slam import BackEndState
-from pipeline.tracking.table import TrackTable
+from pipeline.tracking.track_table import TrackTable
+from pipeline.types.records import Columns, PoseEstimate, Step
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ settings.load_profile("stemmap")
 
 ROOT = Path(__file__).resolve().parents[1]
 _WORKERS = 2
-_WITH_OTHER_PROCESSES = {"app", "browser", "cli", "fleet", "robot", "sweeping", "tuning"}
+_WITH_OTHER_PROCESSES = {"app", "browser"}
 
 # Where Python is told to keep no bytecode beside the sources, it is kept apart: a server and its worker would
 # compile all that they import at each start, which is half of what a start costs, and the tests start dozens.
@@ -38,7 +38,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
 def pytest_sessionstart(session: pytest.Session) -> None:
     """The whole suite compiles the mapper once, on both cores, before its two processes would do so each."""
     if getattr(session.config.option, "numprocesses", None):
-        from app.compiling_ahead import compile_ahead
+        from app.common.compile_ahead import compile_ahead
 
         compile_ahead()
 
@@ -78,8 +78,8 @@ def _compiling_is_not_said(monkeypatch: pytest.MonkeyPatch) -> None:
     def unheard(_tell: Callable[[], None]) -> AbstractContextManager[None]:
         return nullcontext()
 
-    # `app.cli.waiting` takes it from there each time; workers have their own name for it.
-    monkeypatch.setattr("pipeline.compiled.on_compiling", unheard)
+    # `app.cli.progress` takes it from there each time; workers have their own name for it.
+    monkeypatch.setattr("pipeline.jit.on_compiling", unheard)
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.cli import FAILED, WRONG_USAGE, bench, main
+from pipeline.config import preset
 from pipeline.errors import StemmapError
-from pipeline.parameters import preset
 from tests.benchmarks import process, recorded, runner
 from tests.benchmarks.cases.peer import Comparison, compare
 from tests.benchmarks.peer.fastslam import FastSlam, Landmark, Particle, resample
@@ -233,8 +233,8 @@ def test_both_sides_map_the_same_scans() -> None:
 
 
 def test_a_recording_gives_back_what_was_written(tmp_path: Path) -> None:
-    from pipeline.sources import open_source
-    from pipeline.steps import steps
+    from pipeline.io.readers import open_source
+    from pipeline.odometry.synchroniser import steps
 
     recorded.write("sim:paper", tmp_path, stride=3, scans=2)
     read = recorded.Recording.read(tmp_path)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.parameters import PRESETS, Parameters, field_specs, markdown_table, preset
-from pipeline.parameters.model import FieldSpec
+from pipeline.config import PRESETS, Parameters, field_specs, markdown_table, preset
+from pipeline.config.model import FieldSpec
 
 ROOT = Path(__file__).resolve().parents[1]
 OPENS, CLOSES = "<!-- parameters -->", "<!-- /parameters -->"

@@ -17,7 +17,7 @@ import threading
 from collections.abc import Iterator
 from typing import NoReturn
 
-from app.version import version
+from app.common.version import version
 from pipeline.errors import ParameterError, StemmapError, UsageError
 
 COMMANDS = (

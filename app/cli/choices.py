@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from pipeline.errors import ParameterError
 
 if TYPE_CHECKING:
-    from pipeline.parameters import Parameters
-    from pipeline.sources import SourceOptions
+    from pipeline.config import Parameters
+    from pipeline.io.readers import SourceOptions
 
 SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of scans (.bin, .pcd, .ply, "
@@ -135,7 +135,7 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
         return ""
     if arguments.record:
         return str(Path(arguments.record).expanduser().absolute())
-    from app.settings import from_environment, recordings_place
+    from app.common.settings import from_environment, recordings_place
 
     return str(recordings_place(from_environment(), time.time()))
 
@@ -174,8 +174,8 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
     """What the flags say about the source."""
     from math import radians
 
-    from pipeline.geometry import Pose3
-    from pipeline.sources import SourceOptions
+    from pipeline.geometry.poses import Pose3
+    from pipeline.io.readers import SourceOptions
 
     mount = arguments.mount
     return SourceOptions(
@@ -217,7 +217,7 @@ def chosen_parameters(
         ParameterError: A name, value or file does not fit.
         StemmapError: The decision trees that are named are not here.
     """
-    from pipeline.parameters import assign, from_toml, preset
+    from pipeline.config import assign, from_toml, preset
 
     name = arguments.preset or suggested
     parameters = present if present is not None and not arguments.preset else preset(name)
@@ -232,7 +232,7 @@ def chosen_parameters(
         parameters = from_toml(text, parameters, str(arguments.config))
     parameters = assign(parameters, arguments.assignments)
     if parameters.gathering.forest != "package":
-        from app.forests import kept_forests
+        from app.training.learned_forests import kept_forests
 
         kept_forests().check(parameters)
     return name, parameters

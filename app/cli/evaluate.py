@@ -14,9 +14,9 @@ from app.cli.grid import add_grid_flags, distances, refuse_without_grid, run_gri
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
-    from app.finished import FinishedRun
+    from app.batch.run_folder import FinishedRun
     from pipeline.evaluation import Evaluation
-    from pipeline.records import TruthTrees
+    from pipeline.types.records import TruthTrees
 
 HELP = "judge mapped runs by ground truth trees, or compare many sets of parameters on runs"
 
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print(arguments: argparse.Namespace, evaluation: Evaluation, whole: bool) -> int:
-    from app.summary import evaluation_lines
+    from app.batch.summary import evaluation_lines
 
     if arguments.json:
         print(json.dumps(asdict(evaluation), indent=1))
@@ -94,11 +94,11 @@ def _judged(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, boo
     """The scores of a run, and whether all of the truth was asked for."""
     import numpy as np
 
-    from app.finished import read_run
-    from app.tally import far_truth
-    from app.words import count
+    from app.batch.run_folder import read_run
+    from app.batch.run_totals import far_truth
+    from app.common.text import count
+    from pipeline.config import assign
     from pipeline.evaluation import evaluate
-    from pipeline.parameters import assign
 
     folder = Path(arguments.runs[number])
     finished = read_run(folder)
@@ -122,8 +122,8 @@ def _judged(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, boo
 def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) -> TruthTrees:
     from contextlib import closing
 
-    from pipeline.sources import SourceOptions, open_source
-    from pipeline.truth_table import read_truth_trees
+    from pipeline.io.ground_truth import read_truth_trees
+    from pipeline.io.readers import SourceOptions, open_source
 
     if arguments.truth:
         file = arguments.truth[number if len(arguments.truth) > 1 else 0]

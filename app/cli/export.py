@@ -33,9 +33,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write it."""
-    from app.finished import read_run
-    from app.words import count
-    from pipeline.exchange import write_tree_manager
+    from app.batch.run_folder import read_run
+    from app.common.text import count
+    from pipeline.io.tree_manager_writer import write_tree_manager
 
     finished = read_run(arguments.run)
     if finished.of_cloud:

@@ -22,13 +22,13 @@ from app.cli.choices import (
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
-    from app.sweeping.asking import Plan, Ready
-    from app.sweeping.comparing import Comparison
-    from app.sweeping.sweep import Outcome
-    from app.sweeping.workers import Workers
-    from pipeline.parameters import Parameters
-    from pipeline.parameters.model import Value
-    from pipeline.records import TruthTrees
+    from app.tuning.sweep.asking import Plan, Ready
+    from app.tuning.sweep.comparing import Comparison
+    from app.tuning.sweep.sweep import Outcome
+    from app.tuning.sweep.workers import Workers
+    from pipeline.config import Parameters
+    from pipeline.config.model import Value
+    from pipeline.types.records import TruthTrees
 
 MOST_JOBS = 20_000
 
@@ -97,7 +97,7 @@ def distances(arguments: argparse.Namespace) -> list[str]:
 
 def run_grid(arguments: argparse.Namespace) -> int:
     """Score all sets on all runs and compare."""
-    from app.sweeping.grid import combinations, read_axes
+    from app.tuning.sweep.grid import combinations, read_axes
 
     sets = combinations(read_axes(arguments.param_grid))
     arguments.assignments = [*arguments.assignments, *distances(arguments)]
@@ -111,8 +111,8 @@ def run_grid(arguments: argparse.Namespace) -> int:
     if not runs:
         return 1
 
-    from app.sweeping.asking import planned
-    from app.sweeping.comparing import compared
+    from app.tuning.sweep.asking import planned
+    from app.tuning.sweep.comparing import compared
 
     plan = planned(runs, sets, lambda run, changes: _base(arguments, run, changes))
     numbers = list(plan.jobs)
@@ -123,7 +123,7 @@ def run_grid(arguments: argparse.Namespace) -> int:
 
 def _ready(arguments: argparse.Namespace) -> tuple[list[Ready], int]:
     """The runs that can be mapped and judged; the others are said."""
-    from app.sweeping.asking import Named, ready
+    from app.tuning.sweep.asking import Named, ready
 
     runs, refused = [], 0
     for number, name in enumerate(arguments.runs):
@@ -140,7 +140,7 @@ def _ready(arguments: argparse.Namespace) -> tuple[list[Ready], int]:
 
 
 def _truth(arguments: argparse.Namespace, number: int) -> TruthTrees | None:
-    from pipeline.truth_table import read_truth_trees
+    from pipeline.io.ground_truth import read_truth_trees
 
     if not arguments.truth:
         return None
@@ -150,8 +150,8 @@ def _truth(arguments: argparse.Namespace, number: int) -> TruthTrees | None:
 
 def _base(arguments: argparse.Namespace, run: Ready, changes: dict[str, Value]) -> Parameters:
     """What a set is laid over: the preset of the set or that which suits the run, and the flags."""
-    from app.sweeping.grid import PRESET
-    from pipeline.parameters import preset
+    from app.tuning.sweep.grid import PRESET
+    from pipeline.config import preset
 
     suits = str(changes.get(PRESET, run.preset))
     present = preset(suits) if PRESET in changes else None
@@ -161,9 +161,9 @@ def _base(arguments: argparse.Namespace, run: Ready, changes: dict[str, Value]) 
 def _swept(arguments: argparse.Namespace, plan: Plan) -> Outcome:
     from tqdm import tqdm
 
-    from app.settings import from_environment
-    from app.sweeping.kept_answers import KeptAnswers
-    from app.sweeping.sweep import sweep
+    from app.common.settings import from_environment
+    from app.tuning.sweep.kept_answers import KeptAnswers
+    from app.tuning.sweep.sweep import sweep
 
     folder = from_environment().folder
     kept = KeptAnswers(arguments.keep or (folder and folder / "results"))
@@ -178,11 +178,11 @@ def _swept(arguments: argparse.Namespace, plan: Plan) -> Outcome:
 
 @contextlib.contextmanager
 def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
-    from app.sweeping.processes import Processes
+    from app.tuning.sweep.processes import Processes
 
     workers: Workers
     if arguments.dask is not None:
-        from app.sweeping.dask_workers import DaskWorkers
+        from app.tuning.sweep.dask_workers import DaskWorkers
 
         workers = DaskWorkers(arguments.dask)
     else:
@@ -196,8 +196,8 @@ def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
 
 def _tell(arguments: argparse.Namespace, comparison: Comparison, outcome: Outcome, *, refused: int) -> int:
     """Print what came of it; the exit code."""
-    from app.sweeping.report import files, json_text, lines
-    from app.words import count
+    from app.common.text import count
+    from app.tuning.sweep.report import files, json_text, lines
 
     if arguments.json:
         print(json_text(comparison), end="")

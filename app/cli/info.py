@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from app.cli.choices import SOURCE_HELP, add_source_flags, plain, program, seed, source, source_options
 
 if TYPE_CHECKING:
-    from pipeline.records import Sensor, Truth
-    from pipeline.sources import Source, SourceDescription
-    from pipeline.sources.base import RecordedTopic
+    from pipeline.io.readers import Source, SourceDescription
+    from pipeline.io.readers.base import RecordedTopic
+    from pipeline.types.records import Sensor, Truth
 
 HELP = "say what is in a recording and what can be done with it"
 
@@ -27,8 +27,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Open it, look, print."""
-    from pipeline.sources import open_source
-    from pipeline.sources.clouds import is_cloud, open_cloud
+    from pipeline.io.readers import open_source
+    from pipeline.io.readers.clouds import is_cloud, open_cloud
 
     if is_cloud(arguments.source):
         from app.cli.info_cloud import say
@@ -68,8 +68,8 @@ def _record(opened: Source) -> dict[str, Any]:
 
 
 def _lines(opened: Source) -> list[str]:
-    from app.odometry import choose_odometry
-    from app.words import count
+    from app.common.text import count
+    from app.sources.odometry import choose_odometry
 
     d, truth = opened.description, opened.truth()
     x, y, z = d.T_base_lidar.t

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from app.cli.choices import plain, program
-from app.words import count
-from pipeline.plot.cloud import CloudDescription
+from app.common.text import count
+from pipeline.inventory.cloud import CloudDescription
 
 SQUARE_M = 1.0  # least area over which points are counted [m^2]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli.choices import plain
-from app.words import count
+from app.common.text import count
 from pipeline.errors import StemmapError, UsageError
 
 if TYPE_CHECKING:
@@ -26,12 +26,12 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
     """
     from contextlib import closing
 
-    from app.forests import Forests, name_of, write_forest
-    from app.settings import from_environment
+    from app.common.settings import from_environment
     from app.store.store import Store
+    from app.training.learned_forests import Forests, name_of, write_forest
     from app.training.learning import Asked, learn
     from app.training.table import table_lines
-    from pipeline.parameters import preset
+    from pipeline.config import preset
 
     settings = from_environment()
     if settings.folder is None and not settings.database:

@@ -21,11 +21,11 @@ from app.cli.choices import (
     source,
     source_options,
 )
-from app.cli.waiting import compiling_is_said
+from app.cli.progress import compiling_is_said
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
-    from app.continuing import Start
+    from app.batch.continue_map import Start
 
 NOT_TIMED = "not timed: the first scan loads the compiled code, and there is no other"
 HELP = "map a run without a browser and write its files"
@@ -86,8 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--start is of a continued map", remedy="Name it with --continue DIR")
     chosen_parameters(arguments, "forest")  # a mistyped flag is said before anything heavy is loaded
 
-    from app.unfinished import left_in
-    from pipeline.sources.clouds import is_cloud
+    from app.batch.partial_outputs import left_in
+    from pipeline.io.readers.clouds import is_cloud
 
     for line in left_in(arguments.out):
         print(f"warning: {line}", file=sys.stderr)
@@ -102,10 +102,10 @@ def _run_plot(arguments: argparse.Namespace) -> int:
         raise ParameterError(
             "a whole cloud has no scans to go on with", remedy="Leave --continue and --stop-after away"
         )
-    from app.overwriting import check_folder
-    from app.plot_run import map_plot_run
-    from pipeline.sources.clouds import open_cloud
-    from pipeline.truth_table import read_truth_trees
+    from app.batch.map_cloud import map_plot_run
+    from app.batch.output_folder import check_folder
+    from pipeline.io.ground_truth import read_truth_trees
+    from pipeline.io.readers.clouds import open_cloud
 
     truth = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     name, parameters = chosen_parameters(arguments, "forest")
@@ -119,16 +119,16 @@ def _run_plot(arguments: argparse.Namespace) -> int:
 
 
 def _run_scans(arguments: argparse.Namespace) -> int:
-    from app.chosen import plain_of_options
-    from app.cli.listening import begin_recording, heard, recording_of, told_of_frames
-    from app.compiling_ahead import compile_ahead
-    from app.continuing import Continued
-    from app.offline import OfflineRun, map_run
-    from app.opening import open_any
-    from app.overwriting import check_folder
-    from app.replaying import recorded_parameters
-    from app.saved_run import read_saved_run
-    from pipeline.truth_table import read_truth_trees
+    from app.batch.continue_map import Continued
+    from app.batch.map_run import OfflineRun, map_run
+    from app.batch.output_folder import check_folder
+    from app.batch.saved_run import read_saved_run
+    from app.cli.live_commands import begin_recording, heard, recording_of, told_of_frames
+    from app.common.compile_ahead import compile_ahead
+    from app.sources.opening import open_any
+    from app.sources.source_options import plain_of_options
+    from app.worker.replaying import recorded_parameters
+    from pipeline.io.ground_truth import read_truth_trees
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     saved = read_saved_run(arguments.continued) if arguments.continued else None
@@ -196,7 +196,7 @@ def _tell(
 
 
 def _in_the_map(start: str | tuple[float, float, float] | None) -> Start:
-    from pipeline.geometry import Pose2
+    from pipeline.geometry.poses import Pose2
 
     if isinstance(start, tuple):
         return Pose2(*start)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from app.cli.choices import add_force_flag
-from app.cli.waiting import compiling_is_said
+from app.cli.progress import compiling_is_said
 from pipeline.errors import StemmapError
 
 HELP = "merge two mapped runs of one stand into one map"
@@ -37,10 +37,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Merge the runs."""
     import numpy as np
 
-    from app.merging import merge_runs
-    from app.saved_run import read_saved_run
-    from app.words import count
-    from pipeline.parameters import assign
+    from app.batch.merge import merge_runs
+    from app.batch.saved_run import read_saved_run
+    from app.common.text import count
+    from pipeline.config import assign
 
     parameters = None
     if arguments.assignments:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from app.cli.choices import add_parameter_flags, chosen_parameters
 
 if TYPE_CHECKING:
-    from pipeline.parameters import Parameters
+    from pipeline.config import Parameters
 
 HELP = "list every parameter, or print a preset as a TOML file"
 
@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print them."""
-    from pipeline.parameters import PRESETS, markdown_table, preset, to_toml
+    from pipeline.config import PRESETS, markdown_table, preset, to_toml
 
     name, parameters = chosen_parameters(arguments, "forest")
     if arguments.format == "toml":
@@ -39,8 +39,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print_table(name: str, parameters: Parameters) -> None:
-    from app.preset_words import preset_words
-    from pipeline.parameters import field_specs
+    from app.common.preset_text import preset_words
+    from pipeline.config import field_specs
 
     words = preset_words(name, parameters)
     print(f"{words[0].upper()}{words[1:]}. Change a value with --set stage.name=value.\n")

@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Mend it."""
     from pipeline.errors import StemmapError
-    from pipeline.recording.mending import mend
+    from pipeline.io.recording.recovery import mend
 
     if arguments.out.exists() and arguments.file.exists() and arguments.out.samefile(arguments.file):
         raise StemmapError(

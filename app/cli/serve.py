@@ -16,12 +16,12 @@ from app.cli.choices import (
     recording_place,
     source,
 )
-from app.settings import DEFAULT_PORT, VARIABLES, Settings, from_environment
+from app.common.settings import DEFAULT_PORT, VARIABLES, Settings, from_environment
 from pipeline.errors import SourceError
 
 if TYPE_CHECKING:
-    from app.messages import Open
     from app.robot.address import ZenohAddress
+    from app.worker.protocol import Open
 
 HELP = "open the dashboard in a browser"
 
@@ -75,9 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
     record = recording_place(arguments, *uris)
     chosen_parameters(arguments, "forest")  # a mistyped flag is said now, not on the page
 
-    from app.messages import Open
-    from app.parameter_state import ParameterState
-    from app.serving import serve
+    from app.dashboard.parameter_state import ParameterState
+    from app.web.serving import serve
+    from app.worker.protocol import Open
 
     sources = [Open(uri, arguments.odometry, arguments.seed, record, arguments.publish) for uri in uris]
 
@@ -127,8 +127,8 @@ def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
 
 
 def _tell_of_unfinished(settings: Settings) -> None:
-    from app.unfinished import unfinished
-    from app.words import count
+    from app.batch.partial_outputs import unfinished
+    from app.common.text import count
 
     if left := unfinished(settings):
         they = count(len(left), "run was", "runs were")

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli.choices import seed
-from app.cli.waiting import compiling_is_said
+from app.cli.progress import compiling_is_said
 
 if TYPE_CHECKING:
-    from pipeline.records import Record
-    from pipeline.sources.camera import Picture
-    from pipeline.sources.simulated import SimulatedSource
+    from pipeline.io.readers.camera import Picture
+    from pipeline.io.readers.simulated import SimulatedSource
+    from pipeline.types.records import Record
 
 HELP = "write a simulated run as an MCAP of ROS 2 messages, with its ground truth"
 
@@ -41,10 +41,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @compiling_is_said()
 def run(arguments: argparse.Namespace) -> int:
     """Write the recording and the table of trees beside it."""
-    from app.words import count
-    from pipeline.recording import write_recording
-    from pipeline.recording.rendering import CAMERA, with_pictures
-    from pipeline.sources.simulated import open_simulated
+    from app.common.text import count
+    from pipeline.io.readers.simulated import open_simulated
+    from pipeline.io.recording import write_recording
+    from pipeline.io.recording.rendering import CAMERA, with_pictures
 
     out: Path = arguments.out
     table = out.with_suffix(".trees.csv")
@@ -98,7 +98,7 @@ def _refuse_to_overwrite(paths: list[Path], force: bool) -> None:
 def _with_progress(source: SimulatedSource) -> Iterator[Record]:
     from tqdm import tqdm
 
-    from pipeline.records import Scan
+    from pipeline.types.records import Scan
 
     # disable=None: a bar on a terminal only, nothing in a log.
     with tqdm(total=source.description.scans, unit=" scans", disable=None) as bar:
@@ -108,7 +108,7 @@ def _with_progress(source: SimulatedSource) -> Iterator[Record]:
 
 
 def _write_trees(path: Path, source: SimulatedSource) -> None:
-    from pipeline.files import write_beside
+    from pipeline.io.atomic_files import write_beside
 
     trees = source.run.scene.truth
     with write_beside(path) as partial, partial.open("w", encoding="utf-8", newline="\n") as file:

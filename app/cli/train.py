@@ -10,7 +10,7 @@ from app.cli.choices import seed as whole_seed
 from pipeline.errors import StemmapError, UsageError
 
 if TYPE_CHECKING:
-    from app.training.growing import Examples
+    from app.training.fit_forest import Examples
 
 HELP = "make the decision trees anew that say what is a tree"
 SCENES = "stand,slope,dense"
@@ -72,10 +72,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise UsageError("there is no file to write to", remedy="Name it with --out FILE")
     arguments.labelled = [Path(place) for place in arguments.places]
-    from app.forests import write_forest
-    from app.training.growing import as_json, grow_all
-    from app.training.judging import leave_one_out
-    from pipeline.parameters import preset
+    from app.training.fit_forest import as_json, grow_all
+    from app.training.learned_forests import write_forest
+    from app.training.leave_one_out import leave_one_out
+    from pipeline.config import preset
 
     _look_for(arguments)
     examples = _examples(arguments)
@@ -105,7 +105,7 @@ def _look_for(arguments: argparse.Namespace) -> None:
 
 def _scenes(arguments: argparse.Namespace) -> list[str]:
     """What was learned from, in a few lines of the JSON."""
-    from app.training.pasting import COPIES
+    from app.training.augmentation import COPIES
 
     stands = [name for name in arguments.scenes.split(",") if name]
     names = [f"sim:{name}, seeds {arguments.seeds}, every second one furnished" for name in stands]
@@ -119,7 +119,7 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
 
     from app.training.keeping import kept_or_made
     from app.training.scenes import labelled_examples, stand_examples, stand_name, street_examples
-    from pipeline.parameters import preset
+    from pipeline.config import preset
 
     forest = preset("forest")
     names = [name for name in arguments.scenes.split(",") if name]
@@ -144,8 +144,8 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
 
 def _pasted(arguments: argparse.Namespace) -> list[Examples]:
     """The labelled scans of sensors that look one way once more, with poles and trees pasted into them."""
-    from app.training.pasting import FOLDER, copies
-    from pipeline.parameters import preset
+    from app.training.augmentation import FOLDER, copies
+    from pipeline.config import preset
 
     kept = None if arguments.examples is None else arguments.examples / FOLDER
     forest = preset("forest")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli.choices import add_parameter_flags, add_run_flags, chosen_parameters, source
-from app.cli.waiting import compiling_is_said
+from app.cli.progress import compiling_is_said
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @compiling_is_said()
 def run(arguments: argparse.Namespace) -> int:
     """Search, and write the best set."""
-    from app.compiling_ahead import compile_ahead
+    from app.common.compile_ahead import compile_ahead
     from app.tuning.search import Search
 
     plan = _plan(arguments)
@@ -140,8 +140,8 @@ def _suggested(uri: str) -> str:
     """The preset that suits the first run."""
     from contextlib import closing
 
-    from pipeline.sources import open_source
-    from pipeline.sources.clouds import is_cloud
+    from pipeline.io.readers import open_source
+    from pipeline.io.readers.clouds import is_cloud
 
     if is_cloud(uri):
         return "forest"
@@ -151,7 +151,7 @@ def _suggested(uri: str) -> str:
 
 def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
     from app.tuning.plan import PlannedRun, TruthColumns
-    from pipeline.truth_table import read_truth_trees
+    from pipeline.io.ground_truth import read_truth_trees
 
     uris = [*arguments.runs, *arguments.held_out]
     files = files_of(uris, arguments.truths)
@@ -198,7 +198,7 @@ def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
 
 
 def _storage(arguments: argparse.Namespace) -> str:
-    from app.settings import from_environment
+    from app.common.settings import from_environment
     from app.tuning.storage import is_server
 
     if arguments.storage is None:
@@ -249,9 +249,9 @@ def _search(search: Search, workers: int) -> tuple[bool, int]:
 def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool, lost: int) -> int:
     from datetime import date
 
+    from app.common.text import count
     from app.tuning.result import lines_of, result_of, toml_of, warning_of
-    from app.words import count
-    from pipeline.files import write_beside
+    from pipeline.io.atomic_files import write_beside
 
     plan, result = search.plan, result_of(search)
     text = toml_of(plan, result, date.today().isoformat())

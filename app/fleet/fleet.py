@@ -8,17 +8,17 @@ from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Any
 
+from app.common.settings import Settings
+from app.dashboard.broadcast import Live
+from app.dashboard.parameter_state import ParameterState
 from app.fleet.frames import Frames
 from app.fleet.member import Member, next_port
 from app.fleet.payload import card, drawn, shown_map
 from app.fleet.tasks import end
 from app.fleet.warming import COMPILING
-from app.live import Live
-from app.messages import Open
-from app.parameter_state import ParameterState
-from app.places import Places
-from app.server import MakeScene, MakeWorker, OfFleet, build
-from app.settings import Settings
+from app.web.app import MakeScene, MakeWorker, OfFleet, build
+from app.web.connection_limits import Places
+from app.worker.protocol import Open
 from pipeline.errors import StemmapError
 
 _log = logging.getLogger(__name__)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from app.comparing import laid
-from pipeline.geometry import Pose2
+from app.batch.compare import laid
+from pipeline.geometry.poses import Pose2
 
 #: So many trees more than at the last try make another worth its second of computing.
 MORE_TREES = 4

@@ -16,8 +16,8 @@ from app.fleet.results import TOPICS, UNREADABLE, Results
 from app.robot.address import ZenohAddress, parse_address
 from app.robot.inbox import Inbox
 from app.robot.zenoh_link import ZenohLink
-from pipeline.recording import outputs
-from pipeline.sources.container import Channel
+from pipeline.io.readers.container import Channel
+from pipeline.io.recording import outputs
 
 _log = logging.getLogger(__name__)
 

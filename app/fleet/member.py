@@ -11,10 +11,10 @@ from collections.abc import Iterator
 import uvicorn
 from fastapi import FastAPI
 
-from app.dashboard import Dashboard
-from app.messages import Open
-from app.serving import bound, uvicorn_config
-from app.settings import Settings
+from app.common.settings import Settings
+from app.dashboard.dashboard import Dashboard
+from app.web.serving import bound, uvicorn_config
+from app.worker.protocol import Open
 from pipeline.errors import StemmapError
 
 #: Ports tried after the fleet's own, so that who opens a firewall knows which.

@@ -8,8 +8,8 @@ from urllib.parse import urlencode
 
 import msgspec
 
-from app.messages import Open
 from app.robot.address import ROOT, ZenohAddress
+from app.worker.protocol import Open
 
 #: The name of a robot that has no namespace; with its spaces it is no namespace of another.
 NAMELESS = "robot (no namespace)"

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from app.dashboard import Dashboard
-from app.live_payload import clearance_payload, trees_payload
-from pipeline.geometry import Pose2
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.payload import clearance_payload, trees_payload
+from pipeline.geometry.poses import Pose2
 
 #: Of a path as many points as a picture of some hundred pixels shows.
 MOST_POINTS = 400

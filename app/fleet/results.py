@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.clearance import Zone
-from pipeline.recording import outputs
+from pipeline.io.recording import outputs
+from pipeline.types.clearance import Zone
 
 #: What is looked at of a message: more trees or poses no page shows.
 MOST_TREES, MOST_POSES = 5000, 400

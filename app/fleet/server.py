@@ -10,14 +10,14 @@ from fastapi import APIRouter, FastAPI, Request
 from starlette.responses import Response
 from starlette.websockets import WebSocket
 
-from app.browser_feed import telling
+from app.common.settings import Settings
 from app.fleet.fleet import Fleet
-from app.replies import error_reply
-from app.routes.page import access, lead_on, page_answer, page_file
-from app.security import role_of
-from app.server import guarded
-from app.settings import Settings
-from app.static_files import page_folder
+from app.web.app import guarded
+from app.web.auth import role_of
+from app.web.responses import error_reply
+from app.web.routes.page import access, lead_on, page_answer, page_file
+from app.web.static_files import page_folder
+from app.web.websocket_feed import telling
 
 _TRY_AGAIN_LATER, _REFUSED = 1013, 1003
 

@@ -7,17 +7,17 @@ import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+from app.common.settings import Settings
+from app.dashboard.parameter_state import ParameterState
 from app.fleet.fleet import Fleet
 from app.fleet.remote import RemoteRobots
 from app.fleet.server import build_fleet
 from app.fleet.warming import warmed
 from app.fleet.watching import Watching
-from app.messages import Open
-from app.parameter_state import ParameterState
 from app.robot.address import ZenohAddress
-from app.security import new_token, viewer_token
-from app.serving import LinkedServer, bind, link_of, uvicorn_config
-from app.settings import Settings
+from app.web.auth import new_token, viewer_token
+from app.web.serving import LinkedServer, bind, link_of, uvicorn_config
+from app.worker.protocol import Open
 
 
 def serve_fleet(

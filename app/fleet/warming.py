@@ -7,9 +7,9 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from app.compiling_ahead import PATIENCE_S
+from app.common.compile_ahead import PATIENCE_S
 
-WARMING = (sys.executable, "-P", "-c", "from app.warming import warm_up; warm_up()")
+WARMING = (sys.executable, "-P", "-c", "from app.worker.numba_warmup import warm_up; warm_up()")
 COMPILING = "Getting ready; on a new machine this compiles for some minutes, and only the first time"
 
 

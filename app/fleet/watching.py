@@ -10,10 +10,10 @@ import msgspec
 from app.fleet.fleet import Fleet
 from app.fleet.names import NAMELESS, address_of, recorded_apart
 from app.fleet.tasks import end
-from app.messages import Open
 from app.robot.address import ZenohAddress
 from app.robot.inbox import Inbox
 from app.robot.zenoh_link import ZenohLink
+from app.worker.protocol import Open
 
 _LOOK_S = 0.5
 #: A router tells who is there within milliseconds; a robot's nodes come up one after another.

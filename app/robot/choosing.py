@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from app.robot.address import ROOT
 from app.robot.ros_graph import Publisher
 from pipeline.errors import SourceError
-from pipeline.sources.camera import shared_parts
-from pipeline.sources.container import Channel
-from pipeline.sources.rostypes import (
+from pipeline.io.readers.camera import shared_parts
+from pipeline.io.readers.container import Channel
+from pipeline.io.readers.rostypes import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMU,
@@ -20,7 +20,7 @@ from pipeline.sources.rostypes import (
     TRANSFORMS,
     VELODYNE_SCAN,
 )
-from pipeline.sources.topics import TYPES_BY_ROLE
+from pipeline.io.readers.topics import TYPES_BY_ROLE
 
 SCAN_TYPES, PICTURE_TYPES = TYPES_BY_ROLE["scan"], TYPES_BY_ROLE["camera"]
 #: As `?camera=`: pictures stay on the robot, where the radio link is thin.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
-from pipeline.sources.container import Channel, Message
-from pipeline.sources.rostypes import READ_TYPES
+from pipeline.io.readers.container import Channel, Message
+from pipeline.io.readers.rostypes import READ_TYPES
 
 
 @dataclass(slots=True)

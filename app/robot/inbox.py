@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from pipeline.sources.container import Message, count_loss
+from pipeline.io.readers.container import Message, count_loss
 
 #: Two seconds of a usual LiDAR: what is older no picture needs any more.
 MOST_SCANS = 20

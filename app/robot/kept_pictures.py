@@ -8,10 +8,10 @@ from collections.abc import Collection, Iterator
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
-from pipeline.records import Path
-from pipeline.rerun.kept import SPARE_BYTES, room
-from pipeline.sources.camera import Picture
-from pipeline.sources.container import count_loss
+from pipeline.io.readers.camera import Picture
+from pipeline.io.readers.container import count_loss
+from pipeline.remapping.scan_cache import SPARE_BYTES, room
+from pipeline.types.records import Path
 
 #: A picture each metre or a quarter of a turn shows every tree from near; the disk that they may take.
 STEP_M, TURN_RAD = 1.0, math.radians(22.5)

@@ -11,7 +11,7 @@ from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
 from app.robot.velodyne_link import VelodyneLink
 from app.robot.zenoh_link import ZenohLink
-from pipeline.sources.container import Channel
+from pipeline.io.readers.container import Channel
 
 KIND, VELODYNE_KIND, DDS_KIND = "ROS 2 over Zenoh", "Velodyne sensor", "ROS 2 over DDS"
 

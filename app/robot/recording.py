@@ -9,10 +9,10 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from pipeline.errors import SourceError
-from pipeline.recording import outputs
-from pipeline.recording.live_writer import LiveWriter
-from pipeline.records import Frame, Path
-from pipeline.sources.container import Channel, Message
+from pipeline.io.readers.container import Channel, Message
+from pipeline.io.recording import outputs
+from pipeline.io.recording.live_writer import LiveWriter
+from pipeline.types.records import Frame, Path
 
 _FLUSH_S = 0.5
 _MAP_PAUSE_S = 1.0

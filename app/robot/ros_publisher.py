@@ -8,8 +8,8 @@ import time
 from typing import Any
 
 from app.robot.ros_graph import ADMIN, PUBLISHER, data_key
-from pipeline.recording import outputs
-from pipeline.records import Frame, Path
+from pipeline.io.recording import outputs
+from pipeline.types.records import Frame, Path
 
 NODE = "stemmap"
 #: The map is said anew at most so often; the pose at every scan.

@@ -18,14 +18,14 @@ from app.robot.recording import Recording
 from app.robot.ros_graph import Publisher
 from app.robot.ros_publisher import RosPublisher
 from app.robot.zenoh_link import ZenohLink
+from pipeline.config import Parameters
 from pipeline.errors import SourceError
-from pipeline.parameters import Parameters
-from pipeline.records import Frame, Path, Record, Truth
-from pipeline.sources.arrivals import ArrivalReader
-from pipeline.sources.base import SourceDescription, SourceOptions
-from pipeline.sources.camera import SAME_TIME_NS, Camera, Picture
-from pipeline.sources.live_camera import LiveCamera
-from pipeline.sources.live_recording import camera_topics
+from pipeline.io.readers.base import SourceDescription, SourceOptions
+from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
+from pipeline.io.readers.live_camera import LiveCamera
+from pipeline.io.readers.live_reader import ArrivalReader
+from pipeline.io.readers.live_recording import camera_topics
+from pipeline.types.records import Frame, Path, Record, Truth
 
 #: A robot's nodes come up one after another: so long after its LiDAR its topics are counted.
 _SETTLE_S = 1.0

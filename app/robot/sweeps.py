@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.sources.rostypes import VELODYNE_SCAN, standard_types
-from pipeline.sources.velodyne import PACKET_BYTES
+from pipeline.io.readers.rostypes import VELODYNE_SCAN, standard_types
+from pipeline.io.readers.velodyne import PACKET_BYTES
 
 #: A longer silence between packets ends a sweep.
 GAP_NS = 50_000_000

@@ -12,9 +12,9 @@ from app.robot.arrival_times import ArrivalTimes
 from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
 from app.robot.sweeps import Sweeps
-from pipeline.sources.container import Channel, Message, count_loss
-from pipeline.sources.rostypes import VELODYNE_SCAN
-from pipeline.sources.velodyne import PACKET_BYTES, PRODUCT, is_data_packet
+from pipeline.io.readers.container import Channel, Message, count_loss
+from pipeline.io.readers.rostypes import VELODYNE_SCAN
+from pipeline.io.readers.velodyne import PACKET_BYTES, PRODUCT, is_data_packet
 
 TOPIC = "/velodyne_packets"
 #: The kernel keeps a second of the fastest sensor's packets while Python is busy.

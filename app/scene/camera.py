@@ -7,7 +7,7 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene.posed import add_posed
-from pipeline.geometry import Pose2
+from pipeline.geometry.poses import Pose2
 
 WORLD = "/world"  # the parent of all nodes; its children are in the frame of the map
 BEHIND = (-8.0, -4.5, 6.0)  # of a camera, seen from what it looks at [m]

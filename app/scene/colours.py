@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.records import Verdict
+from pipeline.types.records import Verdict
 
 Colours = NDArray[np.uint8]
 Rgb = tuple[int, int, int]

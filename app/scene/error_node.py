@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from app.scene import colours, meshes
 from app.scene.ground_node import GroundNode
-from pipeline.parameters.stages import Evaluation
-from pipeline.records import Trees, TruthTrees
+from pipeline.config.stages import Evaluation
+from pipeline.types.records import Trees, TruthTrees
 
 Float = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene import colours
-from pipeline.records import HeightMap
+from pipeline.types.records import HeightMap
 
 Float = NDArray[np.float64]
 

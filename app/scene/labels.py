@@ -10,7 +10,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from pipeline.records import Frame, Verdict
+from pipeline.types.records import Frame, Verdict
 
 MOST_LABELS = 60  # more than 200 halve the frame rate of a browser, and nobody reads 60
 STEM_HEIGHT = 2.0  # m; drawn where no height was measured

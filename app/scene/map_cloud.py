@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from app.scene import colours
 from app.scene.cloud import Cloud
-from pipeline.records import Frame
+from pipeline.types.records import Frame
 
 SIDE = 0.1  # of a cell that is shown as one point [m]
 MOST_POINTS = 200_000

@@ -15,7 +15,7 @@ from app.scene.ground_node import GroundNode
 from app.scene.labels import NUMBER_WIDTH, Label, Labels, apart
 from app.scene.lines import Circles
 from app.scene.view import View
-from pipeline.records import Frame, Trees, TruthTrees
+from pipeline.types.records import Frame, Trees, TruthTrees
 
 Ring = tuple[float, float, float] | None
 

@@ -12,8 +12,8 @@ from app.scene.ground_node import GroundNode
 from app.scene.lines import Line
 from app.scene.posed import add_posed
 from app.scene.view import View
-from pipeline.geometry import Pose2
-from pipeline.records import Frame
+from pipeline.geometry.poses import Pose2
+from pipeline.types.records import Frame
 
 Float = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from app.scene.labels import Labels, cluster_labels, shown_height
 from app.scene.picking import meant
 from app.scene.posed import add_posed
 from app.scene.view import View
-from pipeline.records import Frame
+from pipeline.types.records import Frame
 
 Float = NDArray[np.float64]
 Vector = tuple[float, float, float]

@@ -26,9 +26,9 @@ from app.scene.tuning import SceneCommands, Tuning, Value
 from app.scene.view import View
 from app.scene.voxel_node import VoxelNode
 from app.scene.way_node import WayNode
-from pipeline.geometry import Pose2
-from pipeline.parameters import Parameters, preset
-from pipeline.records import Frame, TruthTrees
+from pipeline.config import Parameters, preset
+from pipeline.geometry.poses import Pose2
+from pipeline.types.records import Frame, TruthTrees
 
 Float = NDArray[np.float64]
 

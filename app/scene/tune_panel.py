@@ -8,7 +8,7 @@ from typing import Any
 import viser
 
 from app.scene.widgets import set_value
-from pipeline.parameters import PRESETS, FieldSpec, Parameters, field_specs, preset
+from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs, preset
 
 Value = float | int | bool | str
 CHANGED = "● "

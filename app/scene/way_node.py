@@ -7,8 +7,8 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene import colours, meshes
-from pipeline.clearance import Clearance, Zone
-from pipeline.parameters.stages import Obstacles
+from pipeline.config.stages import Obstacles
+from pipeline.types.clearance import Clearance, Zone
 
 Float = NDArray[np.float64]
 

@@ -23,7 +23,7 @@ _ONE_MOVE_NS = 3_000_000_000
 @dataclass(frozen=True, slots=True)
 class Beginning:
     """How a run begins: number of its source in the store, and as in `Open` and `Opened`; `chosen` as of
-    `app.chosen`."""
+    `app.sources.source_options`."""
 
     run: int
     name: str

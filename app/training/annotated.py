@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from app.store.records import Content
-from app.training.growing import Examples
-from pipeline.gathering.features import COUNT
-from pipeline.gathering.forest import CLASSES
-from pipeline.records import Columns, Float, Int, Verdict
+from app.training.fit_forest import Examples
+from pipeline.classification.features import COUNT
+from pipeline.classification.forest import CLASSES
+from pipeline.types.records import Columns, Float, Int, Verdict
 
 # Scans that saw a thing after which it is an example: a map is judged from its first scan on.
 SEEN = (3, 10, 30)

@@ -11,22 +11,22 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from app.odometry import with_odometry
-from app.opening import open_any
+from app.common.version import version
 from app.robot.source import LiveSource
+from app.sources.odometry import with_odometry
+from app.sources.opening import open_any
 from app.store.annotated import AnnotatedSource
 from app.store.records import Content
 from app.training.annotated import REACH, SEEN, Judged
-from app.training.growing import Examples
+from app.training.fit_forest import Examples
 from app.training.keeping import kept_or_made
-from app.version import version
+from pipeline.classification.features import NAMES
+from pipeline.classification.forest import PACKAGE
+from pipeline.config import PRESETS, Parameters, preset
 from pipeline.errors import ParameterError, SourceError
-from pipeline.gathering.features import NAMES
-from pipeline.gathering.forest import PACKAGE
+from pipeline.io.readers import SourceOptions
 from pipeline.mapper import Mapper
-from pipeline.parameters import PRESETS, Parameters, preset
-from pipeline.sources import SourceOptions
-from pipeline.steps import steps
+from pipeline.odometry.synchroniser import steps
 
 Progress = Callable[[str], None]
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from app.training.growing import FREE_END_PLAN, PLANS, TREE, UPRIGHT, Plan, node_of, of_free_end
-from pipeline.gathering.features import NAMES, RAYS
-from pipeline.gathering.forest import CLASSES, FREE_END, ONE_WAY
-from pipeline.records import Float, Int
+from app.training.fit_forest import FREE_END_PLAN, PLANS, TREE, UPRIGHT, Plan, node_of, of_free_end
+from pipeline.classification.features import NAMES, RAYS
+from pipeline.classification.forest import CLASSES, FREE_END, ONE_WAY
+from pipeline.types.records import Float, Int
 
 PRIOR = 3.0  # things that a leaf's shares count as
 LEAST = 2.0  # things in a new leaf

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from app.training.growing import Examples
+from app.training.fit_forest import Examples
 from pipeline.errors import StemmapError
-from pipeline.files import write_beside
+from pipeline.io.atomic_files import write_beside
 
 
 def kept_or_made(folder: Path | None, name: str, make: Callable[[], Iterable[Examples]]) -> list[Examples]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.training.furniture import Furniture
-from pipeline.records import Float
+from app.training.scene_objects import Furniture
+from pipeline.types.records import Float
 
 LENGTH = 42.0  # m to each side along the street
 # How often each thing stands on a lawn beside the trees.

@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from app.common.text import count
+from app.common.version import version
 from app.training.annotated import things_of
 from app.training.annotated_runs import AnnotatedRun, Progress, examples_of
 from app.training.expanding import all_expanded
-from app.training.growing import Examples
+from app.training.fit_forest import Examples
 from app.training.validating import Validated, groups_of, validate
-from app.version import version
-from app.words import count
-from pipeline.errors import SourceError, StemmapError
-from pipeline.gathering.forest import (
+from pipeline.classification.forest import (
     ALL_AROUND,
     CLASSES,
     FILE,
@@ -27,7 +26,8 @@ from pipeline.gathering.forest import (
     ForestOf,
     read_forests,
 )
-from pipeline.parameters.stages import Gathering as GatheringParameters
+from pipeline.config.stages import Gathering as GatheringParameters
+from pipeline.errors import SourceError, StemmapError
 
 LEAST_TREES, LEAST_OTHERS = 10, 5
 

@@ -8,23 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
-from app.training.growing import DOUBTFUL, Examples
+from app.training.fit_forest import DOUBTFUL, Examples
 from app.training.stands import furnished_stand
 from app.training.streets import simulate_street
 from pipeline import ground
-from pipeline.acquisition import acquire
-from pipeline.gathering import Gathering, View, depth_image, steepest_by_direction
-from pipeline.gathering.forest import CLASSES, Forest
-from pipeline.geometry import Pose2, Pose3
-from pipeline.parameters import Parameters
-from pipeline.records import Columns, Float, Float32, Int, Sensor, Step, TruthTrees, Verdict
+from pipeline.classification import Gathering, View, depth_image, steepest_by_direction
+from pipeline.classification.forest import CLASSES, Forest
+from pipeline.config import Parameters
+from pipeline.detection.free_space import clear_range
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.ground.terrain import height_above
+from pipeline.io.readers import open_source
+from pipeline.io.readers.simulated import SimulatedSource
+from pipeline.odometry.synchroniser import steps
+from pipeline.preprocessing.acquisition import acquire
 from pipeline.simulation.run import open_run
 from pipeline.simulation.uri import parse_uri
-from pipeline.sources import open_source
-from pipeline.sources.simulated import SimulatedSource
-from pipeline.steps import steps
-from pipeline.terrain import height_above
-from pipeline.visibility import clear_range
+from pipeline.types.records import Columns, Float, Float32, Int, Sensor, Step, TruthTrees, Verdict
 
 MARKS = (
     1,

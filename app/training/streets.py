@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.training.furniture import GROUND, Furniture
 from app.training.layout import lay_park, lay_street
-from pipeline.geometry import Pose2, Pose3
-from pipeline.records import Float, Float32, Int, Int32, Scan, Sensor, Step
+from app.training.scene_objects import GROUND, Furniture
+from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
 from pipeline.simulation.terrain import Terrain
+from pipeline.types.records import Float, Float32, Int, Int32, Scan, Sensor, Step
 
 CONE = float(np.radians(35.0))  # half of a solid-state sensor's field of view
 PERIOD_NS = 100_000_000

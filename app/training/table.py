@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from app.common.text import count
 from app.training.learning import Learned
 from app.training.validating import Rates
-from app.words import count
 from pipeline.evaluation import Rate
 
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from app.training.annotated import things_of
 from app.training.expanding import all_expanded
-from app.training.growing import TREE, Examples
+from app.training.fit_forest import TREE, Examples
+from pipeline.classification.decision_rule import too_few
+from pipeline.classification.forest import Forest, forest_of, vote
 from pipeline.evaluation import Rate
-from pipeline.gathering.forest import Forest, forest_of, vote
-from pipeline.gathering.judged import too_few
-from pipeline.records import Bool, Float, Int
+from pipeline.types.records import Bool, Float, Int
 
 FOLDS = 5
 LEAST_RUNS = 3  # from which on whole runs are left out

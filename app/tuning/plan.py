@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from app.messages import Open
+from app.common.version import version
 from app.tuning.goal import Goal, GoalName
 from app.tuning.space import Axis
-from app.version import version
-from pipeline.parameters import Parameters
-from pipeline.parameters.model import validated
-from pipeline.records import TruthTrees
+from app.worker.protocol import Open
+from pipeline.config import Parameters
+from pipeline.config.model import validated
+from pipeline.types.records import TruthTrees
 
 FORMAT = 1
 
@@ -70,7 +70,7 @@ class Plan(msgspec.Struct, frozen=True):
         preset: Name of that from which the parameters come.
         start: All parameters with which the search begins, by stage; those of the axes are tried first.
         seed: Of the mapping and of the sampler.
-        odometry: Where the motion of each run comes from, see `app.odometry`.
+        odometry: Where the motion of each run comes from, see `app.sources.odometry`.
         trials: So many in all, those of earlier times counted.
         seconds: Stop after this time; 0 for none.
         storage: Path of a journal, or address of a PostgreSQL database.

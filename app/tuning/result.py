@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import tomli_w
 
-from app.parameter_sets import file_of
+from app.common.text import count
+from app.common.version import version
+from app.dashboard.parameter_sets import file_of
 from app.tuning.goal import RunScore, pool
 from app.tuning.plan import Plan
 from app.tuning.trial import Trial
-from app.version import version
-from app.words import count
-from pipeline.parameters import Parameters
-from pipeline.parameters.model import Value
+from pipeline.config import Parameters
+from pipeline.config.model import Value
 
 if TYPE_CHECKING:
     from app.tuning.search import Search

@@ -9,28 +9,28 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from app.finished import as_written
-from app.forests import kept_forests
-from app.history import Snapshots
-from app.mappers import mapper_of
-from app.messages import Open
-from app.odometry import with_odometry
-from app.opening import options_of
+from app.batch.run_folder import as_written
+from app.batch.run_totals import far_truth
+from app.common.text import count
+from app.dashboard.ground_truth import contents_of, laid_over
+from app.sources.odometry import with_odometry
+from app.sources.opening import options_of
 from app.store.records import Annotation
-from app.tally import far_truth
-from app.truths import contents_of, laid_over
+from app.training.learned_forests import kept_forests
 from app.tuning.goal import RunScore, score_of
 from app.tuning.plan import PlannedRun, digest_with_truth
-from app.words import count
+from app.worker.mapper_factory import mapper_of
+from app.worker.protocol import Open
+from app.worker.snapshots import Snapshots
+from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import Evaluation, evaluate
+from pipeline.io.readers import open_source
+from pipeline.io.readers.clouds import is_cloud, open_cloud
 from pipeline.mapper import Mapper
-from pipeline.parameters import Parameters
-from pipeline.records import Path, Step, Trees, TruthTrees
-from pipeline.rerun import Basis, Journal, KeptScans, Rerun, look_key
-from pipeline.sources import open_source
-from pipeline.sources.clouds import is_cloud, open_cloud
-from pipeline.steps import steps
+from pipeline.odometry.synchroniser import steps
+from pipeline.remapping import Basis, Journal, KeptScans, Rerun, look_key
+from pipeline.types.records import Path, Step, Trees, TruthTrees
 
 _HELD_BYTES = 512 << 20  # of points; a longer run is read again for what looks at its points anew
 _KEPT_IN = FilePath("/var/tmp")  # noqa: S108 - the system's other place may be memory; the file has no name
@@ -197,7 +197,7 @@ class _Plot:
         """Map the cloud as `stemmap map` does, and score its map."""
         from dataclasses import replace
 
-        from pipeline.plot import map_plot
+        from pipeline.inventory import map_plot
 
         cloud = open_cloud(self.uri)
         trees = map_plot(cloud, parameters, kept_forests()).trees

@@ -21,9 +21,9 @@ from app.tuning.runs import ScoredRun, check_start, open_runs, scores_of
 from app.tuning.space import check, values_of
 from app.tuning.storage import close_storage, open_study
 from app.tuning.trial import Trial
+from pipeline.config import Parameters
+from pipeline.config.model import Value
 from pipeline.errors import ParameterError
-from pipeline.parameters import Parameters
-from pipeline.parameters.model import Value
 
 _ABANDONED_S = 1800.0  # after which a trial of another machine that tells nothing is made again
 _UNNAMED_S = 60.0  # the same, of one whose process ended before it said which it was

@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import msgspec
 
+from pipeline.config import FieldSpec, Parameters, field_specs
+from pipeline.config.model import Value
 from pipeline.errors import ParameterError
-from pipeline.parameters import FieldSpec, Parameters, field_specs
-from pipeline.parameters.model import Value
 
 # What decides most about which clusters and columns are trees, within bounds in which trunks can be found.
 SENSIBLE = (

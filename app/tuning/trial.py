@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from app.tuning.goal import RunScore
-from pipeline.parameters.model import Value
+from pipeline.config.model import Value
 
 
 class Trial(msgspec.Struct, frozen=True):

@@ -12,7 +12,7 @@ import sys
 
 import msgspec
 
-from app.parent import is_gone
+from app.common.parent_watch import is_gone
 from app.tuning.plan import Plan
 from app.tuning.search import Search, StoppedError
 from pipeline.errors import StemmapError

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry import Float
-from pipeline.records import Int, Trees, TruthTrees
+from pipeline.geometry.poses import Float
+from pipeline.types.records import Int, Trees, TruthTrees
 
 
 def match(found: Float, truth: Float, distance_max: float) -> Int:

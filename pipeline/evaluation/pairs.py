@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import Float
+from pipeline.geometry.poses import Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

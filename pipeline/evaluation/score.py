@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.config.stages import Evaluation as Parameters
 from pipeline.evaluation.matching import match
 from pipeline.evaluation.pairs import pair_errors
-from pipeline.geometry import Float
-from pipeline.parameters.stages import Evaluation as Parameters
-from pipeline.records import Bool, Trees, TruthTrees
+from pipeline.geometry.poses import Float
+from pipeline.types.records import Bool, Trees, TruthTrees
 
 _LEAST_TREES = 4
 _DOUBTFUL = 0.25  # share of the trees that match

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import Float, Pose2
-from pipeline.records import Int, Path, TruthPath
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.types.records import Int, Path, TruthPath
 
 
 @dataclass(frozen=True, slots=True)

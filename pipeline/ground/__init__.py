@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.ground.cells import evidence, forget_what_overhangs, lowest_returns
+from pipeline.config.stages import Ground
+from pipeline.ground.ground_candidates import evidence, forget_what_overhangs, lowest_returns
 from pipeline.ground.surface import smooth_surface, trend
-from pipeline.parameters.stages import Ground
-from pipeline.records import Float32
-from pipeline.terrain import Terrain, height_above
+from pipeline.ground.terrain import Terrain, height_above
+from pipeline.jit import compiled
+from pipeline.types.records import Float32
 
 __all__ = ["Terrain", "find_terrain", "height_above", "in_band"]
 

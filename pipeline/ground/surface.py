@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.records import Bool, Float
-from pipeline.terrain import SECTORS, ring_distance
+from pipeline.ground.terrain import SECTORS, ring_distance
+from pipeline.jit import compiled
+from pipeline.types.records import Bool, Float
 
 FAR = 12.0  # m; candidates farther away say less of the trend
 LEVEL = 4.0  # m^2; how surely the trend is level, in candidates a metre away

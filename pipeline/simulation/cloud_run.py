@@ -12,24 +12,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import SourceError
-from pipeline.geometry import Pose3
-from pipeline.plot import find_ground
-from pipeline.plot.cloud import Cloud
-from pipeline.plot.height_map import HeightMap
-from pipeline.records import Float, Float32, Scan, TruthTrees
+from pipeline.geometry.poses import Pose3
+from pipeline.inventory import find_ground
+from pipeline.inventory.cloud import Cloud
+from pipeline.inventory.terrain_raster import HeightMap
 from pipeline.simulation import run as simulated
-from pipeline.simulation.drive import drive_course, lap_time, lay_course
 from pipeline.simulation.inertial import inertial_readings
 from pipeline.simulation.lidar import SpinningLidar, Sweep
 from pipeline.simulation.motion import lay_on_terrain
+from pipeline.simulation.primitives import SolidsBuilder
 from pipeline.simulation.receiver import pack_returns
+from pipeline.simulation.route_planning import loop_through
 from pipeline.simulation.run import MOUNTING, SimulatedRun, odometry_of, stream
 from pipeline.simulation.scene import Scene
-from pipeline.simulation.solids import SolidsBuilder
 from pipeline.simulation.surfels import Surfels, first_surfels, lay_surfels
 from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.trajectory import drive_course, lap_time, lay_course
 from pipeline.simulation.uri import RunRequest
-from pipeline.simulation.way import loop_through
+from pipeline.types.records import Float, Float32, Scan, TruthTrees
 
 # Raise it with every change that changes the bytes of runs through clouds and of no others.
 VERSION = 3

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import Pose3
-from pipeline.records import Float
-from pipeline.simulation.drive import RATE_HZ
+from pipeline.geometry.poses import Pose3
 from pipeline.simulation.motion import Motion
+from pipeline.simulation.trajectory import RATE_HZ
+from pipeline.types.records import Float
 
 IMU_HZ = 100
 GRAVITY = 9.81

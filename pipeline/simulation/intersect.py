@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.records import Float
+from pipeline.jit import compiled
 from pipeline.simulation.terrain import gradient_at, sine_of_turns
+from pipeline.types.records import Float
 
 MISS = np.inf
 

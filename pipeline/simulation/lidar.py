@@ -13,11 +13,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from pipeline.records import Float, Int32, Scan, Sensor
-from pipeline.simulation.cast import first_returns, ray_directions
+from pipeline.simulation.primitives import Solids
+from pipeline.simulation.ray_casting import first_returns, ray_directions
 from pipeline.simulation.receiver import measure, pack_returns
-from pipeline.simulation.solids import Solids
 from pipeline.simulation.terrain import Terrain
+from pipeline.types.records import Float, Int32, Scan, Sensor
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from pipeline.geometry import Pose3
-from pipeline.records import Float
-from pipeline.simulation.drive import RATE_HZ, Drive
+from pipeline.geometry.poses import Pose3
+from pipeline.simulation.trajectory import RATE_HZ, Drive
+from pipeline.types.records import Float
 
 _VIBRATION_HZ = np.array([1.3, 2.9, 5.3, 8.7])
 _VIBRATION_ANGLE = np.radians(np.array([0.20, 0.10, 0.06, 0.03]))

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.records import Float
-from pipeline.simulation.solids import Solids
+from pipeline.simulation.primitives import Solids
+from pipeline.simulation.scene_objects import person
 from pipeline.simulation.terrain import Terrain
-from pipeline.simulation.things import person
+from pipeline.types.records import Float
 
 _STEP_HZ = 0.9
 _STRIDE = 0.42

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.errors import SourceError
-from pipeline.records import Float
-from pipeline.simulation.drive import Course
+from pipeline.simulation.trajectory import Course
+from pipeline.types.records import Float
 
 # Places are drawn few at a time while there is room, and many when the plot grows full.
 _BATCHES = (8, 16, 32, 64, 128, *[256] * 36)

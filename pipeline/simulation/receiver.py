@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.records import Float, Float32, Int32
-from pipeline.simulation.cast import GROUND, NOTHING, meet_solid, random_unit
+from pipeline.jit import compiled
 from pipeline.simulation.intersect import ground_incidence, solid_incidence
+from pipeline.simulation.ray_casting import GROUND, NOTHING, meet_solid, random_unit
+from pipeline.types.records import Float, Float32, Int32
 
 
 @compiled

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import Pose3
-from pipeline.records import Float, Imu, Int, Odometry, TruthPath
-from pipeline.simulation.drive import RATE_HZ, drive_course, lay_course
+from pipeline.geometry.poses import Pose3
 from pipeline.simulation.inertial import IMU_HZ, Inertial, inertial_readings
 from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
 from pipeline.simulation.motion import Motion, lay_on_terrain
-from pipeline.simulation.obeying import ObeyingDrive
+from pipeline.simulation.obstacle_aware_driver import ObeyingDrive
+from pipeline.simulation.odometry_quality import QUALITIES
 from pipeline.simulation.scene import Scene, build_scene
+from pipeline.simulation.trajectory import RATE_HZ, drive_course, lay_course
 from pipeline.simulation.uri import EXACT, RunRequest
-from pipeline.simulation.wheel_qualities import QUALITIES
 from pipeline.simulation.wheels import ODOMETRY_HZ, wheel_odometry
+from pipeline.types.records import Float, Imu, Int, Odometry, TruthPath
 
 # Raise it with every change that changes a run's bytes.
 VERSION = 1

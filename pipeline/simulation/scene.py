@@ -6,14 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.records import Float, TruthTrees
-from pipeline.simulation.drive import Course
 from pipeline.simulation.persons import Person
 from pipeline.simulation.planting import Plot
+from pipeline.simulation.primitives import Solids, SolidsBuilder
 from pipeline.simulation.scenarios import Placed, Scenario
-from pipeline.simulation.solids import Solids, SolidsBuilder
-from pipeline.simulation.terrain import Terrain
-from pipeline.simulation.things import (
+from pipeline.simulation.scene_objects import (
     TreeShape,
     add_box,
     add_bush,
@@ -21,6 +18,9 @@ from pipeline.simulation.things import (
     add_tree,
     add_undergrowth,
 )
+from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.trajectory import Course
+from pipeline.types.records import Float, TruthTrees
 
 
 @dataclass(frozen=True, slots=True, eq=False)

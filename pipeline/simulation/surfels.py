@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.records import Float, Float32, Int
+from pipeline.jit import compiled
+from pipeline.types.records import Float, Float32, Int
 
 NEIGHBOURS = 10
 SURFACE, FLAT = 0.35, 0.03  # smallest against middle eigenvalue of the neighbours' covariance

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.records import Float
+from pipeline.jit import compiled
+from pipeline.types.records import Float
 
 TWO_PI = 2.0 * np.pi
 

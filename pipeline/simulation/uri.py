@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from urllib.parse import parse_qsl
 
 from pipeline.errors import UsageError
+from pipeline.simulation.odometry_quality import QUALITIES
 from pipeline.simulation.scenarios import SCENARIOS, Scenario
-from pipeline.simulation.wheel_qualities import QUALITIES
 
 SCHEME = "sim:"
 EXACT = "exact"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.records import Float
-from pipeline.simulation.drive import RATE_HZ
 from pipeline.simulation.motion import Motion
-from pipeline.simulation.wheel_qualities import WheelQuality
+from pipeline.simulation.odometry_quality import WheelQuality
+from pipeline.simulation.trajectory import RATE_HZ
+from pipeline.types.records import Float
 
 ODOMETRY_HZ = 50
 

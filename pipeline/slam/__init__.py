@@ -2,9 +2,9 @@
 
 from pipeline.slam.back_end import BackEnd, BackEndState
 from pipeline.slam.fastslam import FastSlam
-from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.loop import Loop
+from pipeline.slam.loop_correction import Loop
 from pipeline.slam.motion import Motion
+from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.pose_graph import GraphState, Smoother
 from pipeline.slam.state import SlamState
 

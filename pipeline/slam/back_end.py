@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from pipeline.bend import Bend
-from pipeline.geometry import Float, Pose2
-from pipeline.health import Health
-from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
+from pipeline.config.stages import Slam
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.loop_closure.map_correction import Bend
 from pipeline.slam.fastslam import FastSlam
-from pipeline.slam.loop import Loop
+from pipeline.slam.loop_correction import Loop
 from pipeline.slam.motion import Motion
 from pipeline.slam.pose_graph import GraphSlam, GraphState
 from pipeline.slam.state import SlamState
+from pipeline.types.pose_health import Health
+from pipeline.types.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 
 BackEndState = SlamState | GraphState
 

@@ -13,29 +13,29 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.bend import Bend
-from pipeline.geometry import Float, Pose2, wrap_angle
-from pipeline.health import Health
-from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
-from pipeline.slam import slip
-from pipeline.slam.draws import draws
-from pipeline.slam.frame import NOISE, FrameMemory, at_least
-from pipeline.slam.gaussian import rows_of
-from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.health import is_astray, judged
-from pipeline.slam.leading import are_apart, heir, leader
-from pipeline.slam.loop import Loop, bent_landmarks, bent_path
-from pipeline.slam.maps import shared_map, take_ancestors
+from pipeline.config.stages import Slam
+from pipeline.geometry.gaussian import rows_of
+from pipeline.geometry.poses import Float, Pose2, wrap_angle
+from pipeline.loop_closure.map_correction import Bend
+from pipeline.slam import slip_detection
+from pipeline.slam.best_particle import are_apart, heir, leader
+from pipeline.slam.frame_uncertainty import NOISE, FrameMemory, at_least
+from pipeline.slam.loop_correction import Loop, bent_landmarks, bent_path
+from pipeline.slam.measurement_update import against_slip, estimated, use_scan
 from pipeline.slam.motion import Motion, accumulated, noise_of, wrapped
-from pipeline.slam.recent import Doubted, Recent, remembered
+from pipeline.slam.particle_ancestry import Genealogy
+from pipeline.slam.particle_maps import shared_map, take_ancestors
+from pipeline.slam.particle_update import Rules
+from pipeline.slam.pose_quality import is_astray, judged
+from pipeline.slam.random_draws import draws
 from pipeline.slam.resampling import low_variance_ancestors, normalised
-from pipeline.slam.scan import against_slip, estimated, use_scan
+from pipeline.slam.running_statistics import Doubted, Recent, remembered
+from pipeline.slam.scan_statistics import ScanTold, disagreement, scan_of
 from pipeline.slam.shared_errors import SharedErrors
-from pipeline.slam.slip import ByTrees
+from pipeline.slam.slip_detection import ByTrees
 from pipeline.slam.state import SlamState
-from pipeline.slam.told import ScanTold, disagreement, scan_of
-from pipeline.slam.update import Rules
+from pipeline.types.pose_health import Health
+from pipeline.types.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 
 PLACED = 1  # tells the draws of a placing from those of a scan
 
@@ -70,7 +70,7 @@ class FastSlam:
         used = index == 0 or state.since_update >= p.update_distance or trees.slipped
         slipped = trees.slipped or state.recent.slipped
         doubted = Doubted(bool(doubt), slipped)
-        doubt = doubt or slip.why(state.motion, slipped, trees.unsure)
+        doubt = doubt or slip_detection.why(state.motion, slipped, trees.unsure)
         if used:
             state, scan, weights = self._observed(
                 state, trees, detections.centre, R, clear_range, noise, motion.measured, doubted, rules

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cells import Cells, holds_unseen
-from pipeline.compiled import compiled_within
-from pipeline.geometry import Float
-from pipeline.records import Bool, Float32, Int, Int32
+from pipeline.geometry.hash_grid import Cells, holds_unseen
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled_within
+from pipeline.types.records import Bool, Float32, Int, Int32
 
 VARIANCE_MIN = 1e-4  # m^2; views of one trunk share an error of about a centimetre
 

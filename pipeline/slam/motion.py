@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.geometry import Float, Pose2
-from pipeline.parameters.stages import Slam
-from pipeline.records import PoseMeasurement
+from pipeline.config.stages import Slam
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.jit import compiled
+from pipeline.types.records import PoseMeasurement
 
 
 @compiled

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry import Float, wrap_angle
-from pipeline.records import Int
+from pipeline.geometry.poses import Float, wrap_angle
+from pipeline.types.records import Int
 
 
 def composed(a: Float, b: Float) -> Float:

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cells import Cells
-from pipeline.compiled import compiled_within
-from pipeline.geometry import Float
-from pipeline.records import Int, Int32
-from pipeline.slam.gaussian import Pose, corrected, expected_spread, keep_pose, pose_of, turned
-from pipeline.slam.joint_choice import choose_jointly
-from pipeline.slam.pairs import LIKELY, Room, find_doubts, gather_doubts, likely_pairs
-from pipeline.slam.told import AMBIGUOUS as DOUBTFUL
-from pipeline.slam.told import FOUND, INNOVATION, MOST_HITS, RECOGNISED
+from pipeline.geometry.gaussian import Pose, corrected, expected_spread, keep_pose, pose_of, turned
+from pipeline.geometry.hash_grid import Cells
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled_within
+from pipeline.slam.candidate_pairs import LIKELY, Room, find_doubts, gather_doubts, likely_pairs
+from pipeline.slam.joint_association import choose_jointly
+from pipeline.slam.scan_statistics import AMBIGUOUS as DOUBTFUL
+from pipeline.slam.scan_statistics import FOUND, INNOVATION, MOST_HITS, RECOGNISED
+from pipeline.types.records import Int, Int32
 
 
 @compiled_within

@@ -8,21 +8,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.geometry import Float
-from pipeline.records import Bool, Float32, Int
-from pipeline.slam.draws import draws
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
+from pipeline.slam.best_particle import are_apart, heir, leader
 from pipeline.slam.fastslam import FastSlam, rules_of
-from pipeline.slam.frame import FrameMemory
-from pipeline.slam.leading import are_apart, heir, leader
-from pipeline.slam.maps import Maps, take_ancestors
+from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.measurement_update import against_slip, estimated, use_scan
 from pipeline.slam.motion import UNKNOWN, Noise, Wheels, advanced, noise_of
-from pipeline.slam.recent import Doubted, driven_alone, fading_distrust, fading_familiar, remembered
+from pipeline.slam.particle_maps import Maps, take_ancestors
+from pipeline.slam.particle_update import Rules
+from pipeline.slam.random_draws import draws
 from pipeline.slam.resampling import low_variance_ancestors, normalised
-from pipeline.slam.scan import against_slip, estimated, use_scan
+from pipeline.slam.running_statistics import (
+    Doubted,
+    driven_alone,
+    fading_distrust,
+    fading_familiar,
+    remembered,
+)
+from pipeline.slam.scan_statistics import RECOGNISED, TOLD, disagreement, scan_of
 from pipeline.slam.shared_errors import Measured, nothing_measured
-from pipeline.slam.told import RECOGNISED, TOLD, disagreement, scan_of
-from pipeline.slam.update import Rules
+from pipeline.types.records import Bool, Float32, Int
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.geometry import Float
-from pipeline.records import Int
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
+from pipeline.types.records import Int
 
 
 @compiled

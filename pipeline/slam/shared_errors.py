@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.geometry import Float
-from pipeline.readings import SHARED, SOURCES, PoseMeasurement
-from pipeline.records import Int
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
 from pipeline.slam.motion import compounded, correct_by_pose, inverted
+from pipeline.types.records import Int
+from pipeline.types.sensor_data import SHARED, SOURCES, PoseMeasurement
 
 POSE = 3
 

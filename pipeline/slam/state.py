@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.geometry import Float
-from pipeline.saving.codec import NOT_SAVED
-from pipeline.slam.frame import FrameMemory
-from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
-from pipeline.slam.recent import Recent
+from pipeline.geometry.poses import Float
+from pipeline.io.checkpoints.codec import NOT_SAVED
+from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.particle_ancestry import Genealogy
+from pipeline.slam.particle_maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
 from pipeline.slam.resampling import normalised
+from pipeline.slam.running_statistics import Recent
 from pipeline.slam.shared_errors import SharedErrors
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.association import associate
-from pipeline.compiled import compiled, compiled_borrowing
-from pipeline.geometry import Float
-from pipeline.records import Bool, Int
-from pipeline.tracking.doubt import beyond_doubt
+from pipeline.detection.free_space import is_in_free_view
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing
+from pipeline.slam.association import associate
 from pipeline.tracking.kalman import expected_positions
-from pipeline.tracking.sight import Found, Limits, Sight
-from pipeline.tracking.table import Rows
-from pipeline.visibility import is_in_free_view
+from pipeline.tracking.miss_suppression import beyond_doubt
+from pipeline.tracking.track_table import Rows
+from pipeline.tracking.tracking_inputs import Found, Limits, Sight
+from pipeline.types.records import Bool, Int
 
 
 @compiled

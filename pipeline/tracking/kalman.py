@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.compiled import compiled, compiled_borrowing
-from pipeline.geometry import Float
-from pipeline.records import Int
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing
+from pipeline.types.records import Int
 
 H = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
 

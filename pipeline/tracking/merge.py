@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cells import Cells, cell_of, cells_for, fill, first_of_four, per_metre
-from pipeline.compiled import compiled, compiled_borrowing
-from pipeline.geometry import Float
-from pipeline.records import Bool, Verdict
-from pipeline.tracking.shared import split
-from pipeline.tracking.table import Rows, TrackTable
+from pipeline.geometry.hash_grid import Cells, cell_of, cells_for, fill, first_of_four, per_metre
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing
+from pipeline.tracking.split_covariance_intersection import split
+from pipeline.tracking.track_table import Rows, TrackTable
+from pipeline.types.records import Bool, Verdict
 
 
 @compiled

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled, compiled_borrowing, compiled_within
-from pipeline.geometry import Float
-from pipeline.records import Bool, Int, Verdict
-from pipeline.tracking.table import Rows
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.tracking.track_table import Rows
+from pipeline.types.records import Bool, Int, Verdict
 
 SECTORS = 36  # of 10 degrees around a trunk, kept as bits: which sides were seen
 WIDTH = 2.0 * np.pi / SECTORS  # rad

@@ -7,18 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.compiled import compiled, compiled_borrowing
-from pipeline.geometry import Float
-from pipeline.parameters import Parameters
-from pipeline.records import Bool, Int, Int32, Trees
-from pipeline.tracking.judging import judge, learn_between
+from pipeline.config import Parameters
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing
 from pipeline.tracking.kalman import update_rows
 from pipeline.tracking.observation import WIDTH, Telling, diameter, is_confirmed, sides_of
-from pipeline.tracking.scan import hold, recognise, take
-from pipeline.tracking.sight import Found, Limits, Sight
-from pipeline.tracking.table import Rows, TrackTable
-from pipeline.tracking.telling import SHARED_COVARIANCE, telling_of, trees_of
+from pipeline.tracking.track_classification import judge, learn_between
+from pipeline.tracking.track_table import Rows, TrackTable
+from pipeline.tracking.track_update import hold, recognise, take
 from pipeline.tracking.tracker import limits_of
+from pipeline.tracking.tracking_inputs import Found, Limits, Sight
+from pipeline.tracking.tree_records import SHARED_COVARIANCE, telling_of, trees_of
+from pipeline.types.records import Bool, Int, Int32, Trees
 
 _ROOM = 1024  # rows more than are needed
 

@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.bend import Bend
-from pipeline.geometry import Float, Pose2
-from pipeline.parameters.stages import Gathering, Tracking
-from pipeline.records import Columns, Detections, Int, Landmarks, Trees
-from pipeline.tracking.bending import bent, held
-from pipeline.tracking.judging import SCORE_STANDING, judge, learn_between
+from pipeline.config.stages import Gathering, Tracking
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.loop_closure.map_correction import Bend
 from pipeline.tracking.kalman import ENGINES
-from pipeline.tracking.scan import hold, recognise, take
-from pipeline.tracking.sight import Found, Limits, Sight
-from pipeline.tracking.table import Rows, TrackTable, begin
-from pipeline.tracking.telling import trees_of
+from pipeline.tracking.map_correction import bent, held
+from pipeline.tracking.track_classification import SCORE_STANDING, judge, learn_between
+from pipeline.tracking.track_table import Rows, TrackTable, begin
+from pipeline.tracking.track_update import hold, recognise, take
+from pipeline.tracking.tracking_inputs import Found, Limits, Sight
+from pipeline.tracking.tree_records import trees_of
+from pipeline.types.records import Columns, Detections, Int, Landmarks, Trees
 
 _ROOM = 64  # rows more than are needed, at least
 
@@ -80,7 +80,7 @@ class Tracker:
         self._count, self.next_number = take(rows, self._count, self.next_number, sight, found, of, limits)
 
     def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
-        """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.anchor`)."""
+        """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.landmark_anchoring`)."""
         sight = self._sight._replace(pose=T_map_base.as_array(), view_range=float(reach))
         limits = limits_of(self.parameters)
         self._count = hold(self._rows, self._count, sight, landmarks, covariance, limits)
@@ -111,7 +111,7 @@ class Tracker:
         t.score[rows] = np.minimum(known.hits[left], SCORE_STANDING)
 
     def judge(self, stamp_ns: int, columns: Columns, parameters: Gathering) -> Columns:
-        """Take the verdicts of what was gathered (see `pipeline.tracking.judging`).
+        """Take the verdicts of what was gathered (see `pipeline.tracking.track_classification`).
 
         Args:
             stamp_ns: Of the scan.
@@ -119,7 +119,7 @@ class Tracker:
             parameters: Of the votes, how many a tree needs; and how far away returns were gathered.
 
         Returns:
-            The columns with those as trees too that the tracks back (see `pipeline.tracking.backing`).
+            The columns with those as trees too that the tracks back (see `round_fit_override`).
         """
         verdict = columns.verdict.copy()
         self._make_room(len(verdict))

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import threading
 
-from app.session import Session
-from app.worker import run_as_worker
+from app.worker.process import run_as_worker
+from app.worker.session import Session
+from pipeline.config import Parameters
 from pipeline.errors import SourceError
-from pipeline.parameters import Parameters
-from pipeline.sources.base import Source, SourceOptions
-from pipeline.steps import steps
+from pipeline.io.readers.base import Source, SourceOptions
+from pipeline.odometry.synchroniser import steps
 from tests.app.fakes import FakeMapper, FakeSource
 
 

@@ -10,13 +10,15 @@ from zlib import crc32
 
 import numpy as np
 
-from app.session import Session
-from app.stopwatch import Stopwatch
-from app.worker_messages import Opened, ToWorker
+from app.common.stage_timer import Stopwatch
+from app.worker.internal_protocol import Opened, ToWorker
+from app.worker.session import Session
+from pipeline.config import Parameters
 from pipeline.errors import ParameterError, SourceError
-from pipeline.geometry import Pose2, Pose3
-from pipeline.parameters import Parameters
-from pipeline.records import (
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
+from pipeline.odometry.synchroniser import steps
+from pipeline.types.records import (
     Clusters,
     Detections,
     Frame,
@@ -31,8 +33,6 @@ from pipeline.records import (
     Truth,
     TruthTrees,
 )
-from pipeline.sources.base import Source, SourceDescription, SourceOptions
-from pipeline.steps import steps
 
 PERIOD_NS = 100_000_000
 START_NS = 5_000_000_000

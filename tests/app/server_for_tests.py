@@ -11,13 +11,13 @@ import uvicorn
 from fastapi import FastAPI
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
-from app.dashboard import Dashboard
-from app.messages import Open
-from app.parameter_state import ParameterState
-from app.security import session_value
-from app.server import ROUTERS, build
-from app.serving import bind, uvicorn_config
-from app.settings import Settings
+from app.common.settings import Settings
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.parameter_state import ParameterState
+from app.web.app import ROUTERS, build
+from app.web.auth import session_value
+from app.web.serving import bind, uvicorn_config
+from app.worker.protocol import Open
 from tests.app.fakes import FakeScene, FakeWorker
 
 PORT = 8765

@@ -6,9 +6,9 @@ from collections import Counter
 
 import numpy as np
 
+from pipeline.config.stages import Evaluation
 from pipeline.evaluation.matching import match
-from pipeline.parameters.stages import Evaluation
-from pipeline.records import Bool, Float, Int, Trees, TruthTrees
+from pipeline.types.records import Bool, Float, Int, Trees, TruthTrees
 from tests.benchmarks.table import Cell, Table
 
 NOTHING = "nothing"

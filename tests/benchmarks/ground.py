@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 
 from app.training.scenes import labelled_points, trunks
-from pipeline.acquisition import acquire
-from pipeline.geometry import Pose2
+from pipeline.config import preset
+from pipeline.geometry.poses import Pose2
 from pipeline.ground import find_terrain, height_above
-from pipeline.parameters import preset
-from pipeline.records import Bool, Float, Float32, Int
-from pipeline.sources import open_source
-from pipeline.sources.simulated import open_simulated
-from pipeline.steps import steps
+from pipeline.io.readers import open_source
+from pipeline.io.readers.simulated import open_simulated
+from pipeline.odometry.synchroniser import steps
+from pipeline.preprocessing.acquisition import acquire
+from pipeline.types.records import Bool, Float, Float32, Int
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 GROUND = (40, 44, 48, 49, 72)

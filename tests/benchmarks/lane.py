@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry import Pose2, Pose3
-from pipeline.records import Scan, Sensor, Step
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.types.records import Scan, Sensor, Step
 
 TRUNKS = 30
 LENGTH = 30.0  # m

@@ -8,12 +8,12 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from app.training.growing import DOUBTFUL, Examples
+from app.training.fit_forest import DOUBTFUL, Examples
 from app.training.scenes import street_examples
 from app.training.validating import Rates, validate
-from pipeline.gathering.forest import ALL_AROUND, CLASSES, FILE, ONE_WAY, read_forests, standard_forest
-from pipeline.parameters import Parameters, preset
-from pipeline.records import Verdict
+from pipeline.classification.forest import ALL_AROUND, CLASSES, FILE, ONE_WAY, read_forests, standard_forest
+from pipeline.config import Parameters, preset
+from pipeline.types.records import Verdict
 
 REACH = 25.0  # m
 APART = 1000.0  # m between two scenes, each of which begins at the origin

@@ -14,14 +14,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from app.live_cursor import LiveCursor
-from app.odometry import with_odometry
 from app.robot.recording import Recording
 from app.robot.source import LiveSource, open_live
-from app.warming import warm_up
+from app.sources.odometry import with_odometry
+from app.worker.live_cursor import LiveCursor
+from app.worker.numba_warmup import warm_up
+from pipeline.config import preset
+from pipeline.io.readers.container import Message
 from pipeline.mapper import Mapper
-from pipeline.parameters import preset
-from pipeline.sources.container import Message
 
 
 class Costs:

@@ -19,8 +19,8 @@ from zenoh import ext
 
 from app.robot.ros_graph import ADMIN, PUBLISHER, data_key
 from app.robot.zenoh_link import configuration
-from pipeline.sources.mcap_file import McapFile
-from pipeline.sources.rostypes import POINT_CLOUD
+from pipeline.io.readers.mcap_file import McapFile
+from pipeline.io.readers.rostypes import POINT_CLOUD
 
 _HASH = "RIHS01_0"
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import SourceError
-from pipeline.records import Scan
-from pipeline.sources import open_source
-from pipeline.sources.clouds import open_cloud
-from pipeline.sources.clouds.e57_pages import PAGE, checksums
+from pipeline.io.readers import open_source
+from pipeline.io.readers.clouds import open_cloud
+from pipeline.io.readers.clouds.e57_pages import PAGE, checksums
+from pipeline.types.records import Scan
 
 
 def mutation(original: bytes, seed: int, number: int) -> bytes:

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from pipeline.geometry import Pose2, Pose3
+from pipeline.config import Parameters
+from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.mapper import Mapper
-from pipeline.parameters import Parameters
-from pipeline.records import Frame, Scan, Sensor, Step
+from pipeline.types.records import Frame, Scan, Sensor, Step
 from tests.benchmarks.recorded import RecordedScan, Recording
 from tests.benchmarks.turns import StageTimes, serve
 

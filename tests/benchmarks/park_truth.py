@@ -14,7 +14,7 @@ import numpy as np
 from sklearn.cluster import DBSCAN
 
 from app.training.scenes import LEAST_RETURNS, labelled_points, trunks
-from pipeline.records import Float
+from pipeline.types.records import Float
 
 REACH = 25.0  # m
 POLE = 80

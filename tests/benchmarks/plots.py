@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.config import preset
 from pipeline.errors import StemmapError, UsageError
 from pipeline.evaluation.trajectory import fit_rigid
+from pipeline.io.readers import Source, SourceOptions, open_source
 from pipeline.mapper import Mapper
-from pipeline.parameters import preset
-from pipeline.records import Float, Int, Trees, TruthPath, TruthTrees
-from pipeline.records import Path as DrivenPath
-from pipeline.sources import Source, SourceOptions, open_source
-from pipeline.steps import steps
+from pipeline.odometry.synchroniser import steps
+from pipeline.types.records import Float, Int, Trees, TruthPath, TruthTrees
+from pipeline.types.records import Path as DrivenPath
 
 INK, PATH, TRUTH, ODOMETRY, TREE = "#222222", "#1f6fb4", "#d1495b", "#b0b0b0", "#3a7d44"
 WIDTH, DPI, COLOURS = 7.0, 110, 64  # inches; so that a picture stays below 150 kB
@@ -65,7 +65,7 @@ def mapped(source: Source, seed: int, title: str, truth_name: str, truth: TruthP
 
 def oxford() -> Drawn:
     """The benchmark's first seed."""
-    from pipeline.exchange import TRAJECTORY, trajectory_text
+    from pipeline.io.tree_manager_writer import TRAJECTORY, trajectory_text
     from tests.benchmarks.cases.oxford import BIAS, DISTANCE, TURN
     from tests.benchmarks.tree_manager_folder import perturbed, read_recorded, write_states
 

@@ -15,17 +15,18 @@ from itertools import pairwise
 import numpy as np
 
 from app.training.streets import simulate_street
-from pipeline import filters, ground
-from pipeline.acquisition import acquire
-from pipeline.clustering import cluster
-from pipeline.detection import detections, judge
-from pipeline.geometry import Pose2, Pose3
-from pipeline.parameters import Parameters, preset
-from pipeline.records import Float, Float32, Sensor, Step
-from pipeline.shape import describe_stems
-from pipeline.sources import open_source
-from pipeline.steps import steps
-from pipeline.terrain import height_above
+from pipeline import ground
+from pipeline.config import Parameters, preset
+from pipeline.detection.clustering import cluster
+from pipeline.detection.stem_fit import describe_stems
+from pipeline.detection.verdicts import detections, judge
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.ground.terrain import height_above
+from pipeline.io.readers import open_source
+from pipeline.odometry.synchroniser import steps
+from pipeline.preprocessing import filters
+from pipeline.preprocessing.acquisition import acquire
+from pipeline.types.records import Float, Float32, Sensor, Step
 
 EDGES = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 NEAR, SEEN, LEAST = 0.4, 0.35, 4

@@ -21,7 +21,7 @@ class RecordedScan:
 
     Attributes:
         points: float32, shape (N, 3) [m], sensor frame; offset_ns: int32, shape (N,), or None.
-        index, stamp_ns, pose, roll, pitch, tilt_known, twist: As in `pipeline.records.Step`; the pose
+        index, stamp_ns, pose, roll, pitch, tilt_known, twist: As in `pipeline.types.records.Step`; the pose
             is x, y [m], yaw [rad].
     """
 
@@ -44,7 +44,7 @@ class Recording:
         folder: Where it lies.
         steps: One dictionary a scan.
         rotation, translation: Of T_base_lidar, shapes (3, 3) and (3,) [m].
-        sensor: Fields of `pipeline.records.Sensor`.
+        sensor: Fields of `pipeline.types.records.Sensor`.
     """
 
     folder: Path
@@ -82,9 +82,9 @@ def write(uri: str, folder: Path, *, stride: int, scans: int) -> None:
     """Write every `stride`-th scan of a source, at most `scans` of them."""
     from dataclasses import asdict
 
-    from pipeline.records import Step
-    from pipeline.sources import open_source
-    from pipeline.steps import steps
+    from pipeline.io.readers import open_source
+    from pipeline.odometry.synchroniser import steps
+    from pipeline.types.records import Step
 
     def chosen() -> Iterable[Step]:
         for step in steps(source.records()):

@@ -12,7 +12,7 @@ from datetime import date
 from pathlib import Path
 
 from pipeline.errors import StemmapError, UsageError
-from pipeline.files import write_beside
+from pipeline.io.atomic_files import write_beside
 from tests.benchmarks import cases
 from tests.benchmarks.machine import description
 from tests.benchmarks.process import tables_of

@@ -9,20 +9,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import filters, ground
-from pipeline.acquisition import acquire
-from pipeline.clustering import cluster
-from pipeline.detection import detections, judge
+from pipeline import ground
+from pipeline.config import Parameters, preset
+from pipeline.detection.clustering import cluster
+from pipeline.detection.free_space import clear_range
+from pipeline.detection.stem_fit import describe_stems
+from pipeline.detection.verdicts import detections, judge
 from pipeline.evaluation import path_error
-from pipeline.geometry import Pose2
-from pipeline.parameters import Parameters, preset
-from pipeline.records import Detections, Float, Path, Trees, Truth
-from pipeline.shape import describe_stems
+from pipeline.geometry.poses import Pose2
+from pipeline.io.readers import open_source
+from pipeline.odometry.synchroniser import steps
+from pipeline.preprocessing import filters
+from pipeline.preprocessing.acquisition import acquire
 from pipeline.slam import BackEnd
-from pipeline.sources import open_source
-from pipeline.steps import steps
 from pipeline.tracking import Tracker
-from pipeline.visibility import clear_range
+from pipeline.types.records import Detections, Float, Path, Trees, Truth
 from tests.benchmarks.table import Cell, Table
 
 DUPLICATE = 1.0  # m; two trees of the map nearer than this in a stand of wider spacing

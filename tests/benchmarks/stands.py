@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import Pose2
-from pipeline.records import Float
+from pipeline.geometry.poses import Pose2
+from pipeline.types.records import Float
 
 APART = 1.5  # m between two trees
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.exchange import state_name, state_text
-from pipeline.geometry import Pose2, Pose3
-from pipeline.records import Int, TruthPath
-from pipeline.records import Path as DrivenPath
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.io.tree_manager_writer import state_name, state_text
+from pipeline.types.records import Int, TruthPath
+from pipeline.types.records import Path as DrivenPath
 
 _KEYS = ("xyz", "axis_z", "dbh", "dbh_approx", "score", "reconstructed", "n_clusters")
 

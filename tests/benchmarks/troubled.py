@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import Pose2, Pose3
-from pipeline.parameters import Parameters, preset
-from pipeline.readings import PoseMeasurement
-from pipeline.records import Float, Odometry, Record, Scan, Sensor, Stems
+from pipeline.config import Parameters, preset
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.types.records import Float, Odometry, Record, Scan, Sensor, Stems
+from pipeline.types.sensor_data import PoseMeasurement
 
 MS = 1_000_000
 KNOWN, AFTER = 40, 55  # scans before the trouble, and since it began

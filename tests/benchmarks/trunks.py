@@ -18,21 +18,21 @@ from pathlib import Path
 
 import numpy as np
 
-from app.stopwatch import Stopwatch
-from app.training.growing import Examples, as_json, can_grow, grow_all
+from app.common.stage_timer import Stopwatch
+from app.training.augmentation import FOLDER, copies, is_of
+from app.training.fit_forest import Examples, as_json, can_grow, grow_all
 from app.training.keeping import read_examples
-from app.training.pasting import FOLDER, copies, is_of
 from app.training.scenes import labelled_points, trunks
+from pipeline.classification.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, package_alone
+from pipeline.config import preset
 from pipeline.evaluation import evaluate
 from pipeline.evaluation.matching import match
-from pipeline.gathering.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, package_alone
+from pipeline.inventory.circle import FIGURES, best_circle, fit_circle, without_scatter
+from pipeline.io.readers import open_source
+from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.mapper import Mapper
-from pipeline.parameters import preset
-from pipeline.plot.circle import FIGURES, best_circle, fit_circle, without_scatter
-from pipeline.records import Float, Frame, Int
-from pipeline.sources import open_source
-from pipeline.sources.simulated import SimulatedSource
-from pipeline.steps import steps
+from pipeline.odometry.synchroniser import steps
+from pipeline.types.records import Float, Frame, Int
 from tests.benchmarks.classes import ByClass
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))

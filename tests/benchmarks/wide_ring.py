@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import Pose2, Pose3
+from pipeline.config import Parameters, preset
+from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.mapper import Mapper
-from pipeline.parameters import Parameters, preset
-from pipeline.records import Float, Frame, Scan, Sensor, Stems, Step
+from pipeline.types.records import Float, Frame, Scan, Sensor, Stems, Step
 
 STRIDE, REACH, SIGMA = 0.4, 15.0, 0.04  # m
 HALF = 14.0  # m to both sides of the way

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Position, expect
 
-from pipeline.sources import open_source
+from pipeline.io.readers import open_source
 from tests.browser.conftest import opened
 from tests.browser.dashboard import COMPILING_S, Dashboard
 from tests.browser.serving import Server

@@ -11,10 +11,10 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from app.cli import main
+from tests.app.robot.conftest import Child, Robot, free_port
 from tests.browser.conftest import PATIENCE_MS
 from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
-from tests.robot.conftest import Child, Robot, free_port
 
 SECONDS = 6
 #: Colours of a picture where a mark has its middle, of trees that stand near enough to be seen for certain.
@@ -43,7 +43,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Robot, int
     words = ["simulate", "stand", "--duration", str(SECONDS), "--camera", "--out", str(run)]
     assert main(words) == 0
     port = free_port()
-    router = Child("-m", "tests.robot.router", str(port))
+    router = Child("-m", "tests.app.robot.router", str(port))
     assert router.hear() == "ready"
     made = Robot(port, run, "red")
     yield made, port

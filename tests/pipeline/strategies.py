@@ -9,9 +9,19 @@ import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from pipeline.geometry import Pose2, Pose3
-from pipeline.records import Clusters, Detections, Labels, Scan, Sensor, Step, Trees, TruthTrees, Verdict
-from pipeline.visibility import BINS
+from pipeline.detection.free_space import BINS
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.types.records import (
+    Clusters,
+    Detections,
+    Labels,
+    Scan,
+    Sensor,
+    Step,
+    Trees,
+    TruthTrees,
+    Verdict,
+)
 
 # Compiled kernels are slow at their first call, so no example has a deadline.
 LAW = settings(max_examples=50, deadline=None)
@@ -126,7 +136,7 @@ def truth_trees(position, kinds=None, *, dbh=0.3):
 
 def simulated_cloud(duration=1, scan_index=3):
     """Points of one scan of the paper's scenario, level sensor frame, float32, shape (N, 3)."""
-    from pipeline.sources import open_source
+    from pipeline.io.readers import open_source
 
     source = open_source(f"sim:paper?duration={duration}")
     scans = [record for record in source.records() if isinstance(record, Scan)]

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.geometry import Pose2, Pose3
+from pipeline.config import PRESETS, preset
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.io.readers import open_source
 from pipeline.mapper import Mapper
-from pipeline.parameters import PRESETS, preset
-from pipeline.records import Frame, Scan, Sensor, Step, Verdict
-from pipeline.sources import open_source
-from pipeline.steps import steps
+from pipeline.odometry.synchroniser import steps
+from pipeline.types.records import Frame, Scan, Sensor, Step, Verdict
 from tests.pipeline.strategies import SENSOR, arc, scan
 
 URI = "sim:paper?duration=3"

@@ -12,22 +12,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.bend import Bend
-from pipeline.geometry import Float, Pose2
-from pipeline.health import Health
-from pipeline.parameters.stages import Slam
-from pipeline.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
-from pipeline.slam import slip
-from pipeline.slam.gaussian import rows_of
-from pipeline.slam.health import is_astray, judged
-from pipeline.slam.loop import Loop
+from pipeline.config.stages import Slam
+from pipeline.geometry.gaussian import rows_of
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.loop_closure.map_correction import Bend
+from pipeline.slam import slip_detection
+from pipeline.slam.loop_correction import Loop
 from pipeline.slam.motion import Motion, accumulated, compound, moved_pose, noise_of
 from pipeline.slam.pose_graph.keyframe import observe, placed
 from pipeline.slam.pose_graph.smoother import Additions
 from pipeline.slam.pose_graph.state import NOTHING, GraphState
-from pipeline.slam.recent import Doubted, Recent, remembered
+from pipeline.slam.pose_quality import is_astray, judged
+from pipeline.slam.running_statistics import Doubted, Recent, remembered
+from pipeline.slam.scan_statistics import ScanTold, disagreement
 from pipeline.slam.state import SlamState
-from pipeline.slam.told import ScanTold, disagreement
+from pipeline.types.pose_health import Health
+from pipeline.types.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
 
 KEYFRAME = 0.25  # m; views from nearer places share their errors and cost as much
 
@@ -51,7 +51,7 @@ class GraphSlam:
         by_trees = self._by_trees(detections)
         slipped = by_trees.slipped or state.recent.slipped
         doubted = Doubted(bool(doubt), slipped)
-        doubt = doubt or slip.why(state.motion, slipped, by_trees.unsure)
+        doubt = doubt or slip_detection.why(state.motion, slipped, by_trees.unsure)
         if by_trees.slipped or (due and (len(detections.cluster) or motion.measured is not None)):
             driven = state.since_update if np.isfinite(state.since_update) else 0.0
             away = disagreement(by_trees.motion, state.motion, state.motion_covariance)
@@ -165,13 +165,13 @@ class GraphSlam:
             s.since_update += moved[2]
             s.driven += moved[2]
 
-    def _by_trees(self, detections: Detections) -> slip.ByTrees:
+    def _by_trees(self, detections: Detections) -> slip_detection.ByTrees:
         """What the scan tells of the motion."""
         s, p = self.state, self.parameters
         known, pose = s.landmarks, moved_pose(s.pose, s.motion)
         away = known.mean - pose[:2]
-        near = np.hypot(away[:, 0], away[:, 1]) < p.view_range + slip.SEARCH
-        return slip.motion_by_trees(
+        near = np.hypot(away[:, 0], away[:, 1]) < p.view_range + slip_detection.SEARCH
+        return slip_detection.motion_by_trees(
             s.pose, s.motion, s.motion_covariance, s.since_update, s.recent.wheels(noise_of(p)),
             detections.centre, rows_of(detections.covariance), known.mean[near],
             rows_of(known.covariance[near]), known.hits[near], p.hits_to_weigh, p.gate,

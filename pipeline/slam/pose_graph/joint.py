@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compiled import compiled
-from pipeline.geometry import Float
-from pipeline.records import Int, Int32
-from pipeline.slam.pairs import LIKELY
-from pipeline.slam.told import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
+from pipeline.slam.candidate_pairs import LIKELY
+from pipeline.slam.scan_statistics import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
+from pipeline.types.records import Int, Int32
 
 
 def moved_joint(m: Float, Sigma: Float, motion: Float, Q: Float) -> None:

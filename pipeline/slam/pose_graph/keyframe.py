@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.geometry import Float, Pose2, wrap_angle
-from pipeline.parameters.stages import Slam
-from pipeline.records import Bool, Detections, Int
+from pipeline.config.stages import Slam
+from pipeline.detection.free_space import in_free_view
+from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.motion import Motion
+from pipeline.slam.particle_update import SCORE_MAX
 from pipeline.slam.pose_graph.joint import correct_by_pose, moved_joint, recognise_jointly
 from pipeline.slam.pose_graph.landmarks import Landmarks, Sightings, sharpened, turned
 from pipeline.slam.pose_graph.smoother import Additions
 from pipeline.slam.pose_graph.state import GraphState
-from pipeline.slam.told import MISSED, MOST_HITS, SHIFT, TOLD, ScanTold, scan_told
-from pipeline.slam.update import SCORE_MAX
-from pipeline.visibility import in_free_view
+from pipeline.slam.scan_statistics import MISSED, MOST_HITS, SHIFT, TOLD, ScanTold, scan_told
+from pipeline.types.records import Bool, Detections, Int
 
 
 def observe(s: GraphState, p: Slam, motion: Motion, detections: Detections, clear_range: Float) -> ScanTold:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from pipeline.geometry import Float
-from pipeline.records import Bool, Int, Int32
+from pipeline.geometry.poses import Float
+from pipeline.types.records import Bool, Int, Int32
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry import Float
-from pipeline.records import Int
+from pipeline.geometry.poses import Float
+from pipeline.types.records import Int
 
 HUBER = 1.345  # sigma; 95 % efficient where errors are normal
 RELINEARISE = 0.02  # m and rad; a variable that moved farther is linearised anew

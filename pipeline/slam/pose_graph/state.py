@@ -6,14 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.geometry import Float, wrap_angle
-from pipeline.slam.genealogy import Genealogy
-from pipeline.slam.maps import MapColumns
+from pipeline.geometry.poses import Float, wrap_angle
+from pipeline.slam.particle_ancestry import Genealogy
+from pipeline.slam.particle_maps import MapColumns
 from pipeline.slam.pose_graph.landmarks import Landmarks, Sightings, no_sightings
 from pipeline.slam.pose_graph.smoother import Additions, Smoother
 from pipeline.slam.poses import interpolated
-from pipeline.slam.recent import Recent
 from pipeline.slam.resampling import normalised
+from pipeline.slam.running_statistics import Recent
 from pipeline.slam.state import SlamState
 
 NOTHING = np.full(3, np.nan)  # the odometry to a keyframe that it does not lead to

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from tests.benchmarks.table import Cell, Table
 
 if TYPE_CHECKING:
-    from pipeline.geometry import Float, Pose2
-    from pipeline.records import Detections
+    from pipeline.geometry.poses import Float, Pose2
+    from pipeline.types.records import Detections
     from tests.benchmarks.stands import Stand
 
 NAME = "consistency"
@@ -97,12 +97,12 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
     """Drive once (the ring) among trees, with errors and with a filter of this seed."""
     import numpy as np
 
-    from pipeline.geometry import Pose2, wrap_angle
-    from pipeline.parameters import Parameters
+    from pipeline.config import Parameters
+    from pipeline.detection.free_space import BINS
+    from pipeline.geometry.poses import Pose2, wrap_angle
     from pipeline.slam import FastSlam
     from pipeline.slam.motion import noise_of, step_variances
     from pipeline.tracking import Tracker
-    from pipeline.visibility import BINS
     from tests.benchmarks.stands import RING
 
     parameters = Parameters().replace({"slam.particles": particles, "gathering.method": "none"})

@@ -10,8 +10,8 @@ from tests.benchmarks.table import Cell, Table, ratio
 from tests.benchmarks.timing import in_turns, middle
 
 if TYPE_CHECKING:
-    from pipeline.clustering.engines import Dbscan
-    from pipeline.records import Float32
+    from pipeline.detection.clustering.engines import Dbscan
+    from pipeline.types.records import Float32
 
 NAME = "dbscan"
 LINE = "DBSCAN by our grid, scikit-learn and Open3D on the same points"
@@ -46,7 +46,7 @@ def row(size: int, rounds: int, dimensions: int, eps: float, min_points: int) ->
     """Medians at one size."""
     import numpy as np
 
-    from pipeline.clustering import ENGINES
+    from pipeline.detection.clustering import ENGINES
 
     points = np.ascontiguousarray(scene(size)[:, :dimensions])
     sides: dict[str, Callable[[], Dbscan]] = {

@@ -14,7 +14,7 @@ from tests.benchmarks.table import Cell, Table, verdict
 from tests.benchmarks.timing import middle, quantile
 
 if TYPE_CHECKING:
-    from pipeline.records import Sensor, Step
+    from pipeline.types.records import Sensor, Step
 
 NAME = "detection"
 LINE = "From the ground to the verdict, one scan of a VLP-16 and of 64 rings"
@@ -78,8 +78,8 @@ def _steps(uri: str, until: int, every: int) -> tuple[Sensor, list[Step]]:
     """The sensor, and every so many-th step of a run up to a scan."""
     from contextlib import closing
 
-    from pipeline.sources import open_source
-    from pipeline.steps import steps
+    from pipeline.io.readers import open_source
+    from pipeline.odometry.synchroniser import steps
 
     with closing(open_source(uri)) as source:
         about = source.description
@@ -94,9 +94,9 @@ def _steps(uri: str, until: int, every: int) -> tuple[Sensor, list[Step]]:
 
 def _measured(sensor: Sensor, run: Sequence[Step]) -> tuple[StageClock, tuple[int, int]]:
     """Times of the scans, gone through again and again, and their median returns and clusters."""
-    from pipeline.geometry import Pose3
-    from pipeline.parameters import preset
-    from pipeline.perception import perceive
+    from pipeline.config import preset
+    from pipeline.front_end import perceive
+    from pipeline.geometry.poses import Pose3
 
     parameters = preset("forest")
     clock, returns, clusters = StageClock(), [], []

@@ -13,8 +13,8 @@ from tests.benchmarks.table import Cell, Table
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.parameters import Parameters
-    from pipeline.records import Truth
+    from pipeline.config import Parameters
+    from pipeline.types.records import Truth
     from tests.benchmarks.slam_runs import Seen
 
 NAME = "graph"

@@ -38,12 +38,12 @@ def run() -> list[Table]:
 
 def record_drive(place: Path) -> int:
     """Write the drive that each robot sends; the median number of points a scan."""
-    from pipeline.recording import write_recording
-    from pipeline.records import Scan
+    from pipeline.io.readers.simulated import SimulatedSource
+    from pipeline.io.recording import write_recording
     from pipeline.simulation.lidar import SpinningLidar
     from pipeline.simulation.run import open_run
     from pipeline.simulation.uri import parse_uri
-    from pipeline.sources.simulated import SimulatedSource
+    from pipeline.types.records import Scan
 
     uri = f"sim:stand?duration={SECONDS:g}"
     made = replace(open_run(parse_uri(uri)), lidar=SpinningLidar(columns=COLUMNS))
@@ -61,7 +61,7 @@ def record_drive(place: Path) -> int:
 
 def fly(drive: Path, count: int, recording: Path | None = None) -> list[dict[str, Any]]:
     """Let robots send and mappers map; what each mapper tells, with what its robot sent."""
-    from tests.robot.conftest import Child, free_port
+    from tests.app.robot.conftest import Child, free_port
 
     port = free_port()
     words = [str(recording)] if recording is not None else []
@@ -73,7 +73,7 @@ def fly(drive: Path, count: int, recording: Path | None = None) -> list[dict[str
             child.hear()
             return child
 
-        started("-m", "tests.robot.router", str(port))
+        started("-m", "tests.app.robot.router", str(port))
         names = [f"robot{k + 1}" for k in range(count)]
         mappers = [started("-m", "tests.benchmarks.live_mapper", str(port), name, *words) for name in names]
         robots = [started("-m", "tests.benchmarks.live_robot", str(port), str(drive), name) for name in names]

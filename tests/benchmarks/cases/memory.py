@@ -10,7 +10,7 @@ from tests.benchmarks.machine import peak_mib, resident_mib
 from tests.benchmarks.table import Cell, Table, verdict
 
 if TYPE_CHECKING:
-    from pipeline.gathering.memory import Memory
+    from pipeline.classification.voxel_map import Memory
     from pipeline.mapper import Mapper
 
 NAME = "memory"
@@ -47,10 +47,10 @@ def run() -> list[Table]:
 
 def follow(uri: str, every: int) -> list[tuple[int, float, float, int]]:
     """Map a source; scans, resident memory, memory of path and map [MiB], landmarks at each reading."""
+    from pipeline.config import preset
+    from pipeline.io.readers import open_source
     from pipeline.mapper import Mapper
-    from pipeline.parameters import preset
-    from pipeline.sources import open_source
-    from pipeline.steps import steps
+    from pipeline.odometry.synchroniser import steps
 
     source = open_source(uri)
     described = source.description

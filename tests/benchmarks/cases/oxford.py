@@ -74,12 +74,12 @@ def mapped_folder(
 
     import numpy as np
 
+    from pipeline.config import preset
     from pipeline.evaluation import path_error
-    from pipeline.exchange import TRAJECTORY, trajectory_text
+    from pipeline.io.readers import open_source
+    from pipeline.io.tree_manager_writer import TRAJECTORY, trajectory_text
     from pipeline.mapper import Mapper
-    from pipeline.parameters import preset
-    from pipeline.sources import open_source
-    from pipeline.steps import steps
+    from pipeline.odometry.synchroniser import steps
     from tests.benchmarks.tree_manager_folder import perturbed
 
     told = perturbed(

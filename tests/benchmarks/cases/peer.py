@@ -71,7 +71,7 @@ def run() -> list[Table]:
 
 def compare(comparison: Comparison, budget_s: float) -> list[Table]:
     """Map the same scans with both sides in turns."""
-    from pipeline.parameters import preset
+    from pipeline.config import preset
 
     parameters = preset(comparison.preset).replace(comparison.changes)
     with tempfile.TemporaryDirectory() as name:
@@ -157,8 +157,8 @@ def _judged(uri: str, parameters: Any, result: dict[str, Any]) -> Evaluation:
     import numpy as np
 
     from pipeline.evaluation import evaluate
-    from pipeline.records import Trees
-    from pipeline.sources import open_source
+    from pipeline.io.readers import open_source
+    from pipeline.types.records import Trees
 
     truth = open_source(uri).truth()
     if truth is None or truth.trees is None:

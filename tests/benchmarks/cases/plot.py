@@ -35,9 +35,9 @@ def run() -> list[Table]:
 def _whole(folder: Path) -> Table:
     import time
 
-    from pipeline.parameters import preset
-    from pipeline.plot import map_plot
-    from pipeline.sources.clouds import open_cloud
+    from pipeline.config import preset
+    from pipeline.inventory import map_plot
+    from pipeline.io.readers.clouds import open_cloud
 
     rows = []
     for name in ("pine_plot", "MLS_Clip"):
@@ -156,11 +156,11 @@ def _driven(folder: Path) -> Table:
 
     import numpy as np
 
+    from pipeline.config import preset
     from pipeline.evaluation.matching import match
+    from pipeline.io.readers import open_source
     from pipeline.mapper import Mapper
-    from pipeline.parameters import preset
-    from pipeline.sources import open_source
-    from pipeline.steps import steps
+    from pipeline.odometry.synchroniser import steps
 
     table = folder / "pine_plot_stems.csv"
     with table.open(newline="") as file:

@@ -17,7 +17,7 @@ SECONDS, REPEATS, ASKED = 20, 5, 20.0
 
 def run() -> list[Table]:
     """Write a simulated run of standard messages and read it again."""
-    from pipeline.sources import open_source
+    from pipeline.io.readers import open_source
 
     rows: list[tuple[Cell, ...]] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -50,8 +50,8 @@ def run() -> list[Table]:
 
 
 def _read(source: object) -> tuple[int, int]:
-    from pipeline.records import Scan
-    from pipeline.sources import Source
+    from pipeline.io.readers import Source
+    from pipeline.types.records import Scan
 
     records: Source = source  # type: ignore[assignment]
     sizes = [len(record.points) for record in records.records() if isinstance(record, Scan)]

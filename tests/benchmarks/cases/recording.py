@@ -50,15 +50,15 @@ def run() -> list[Table]:
 
 def full_disk(folder: Path) -> dict[str, Any]:
     """What a live run tells whose recording has no more room."""
-    from pipeline.geometry import Pose3
-    from pipeline.recording import write_recording
-    from pipeline.records import Sensor
-    from tests.robot.conftest import Child, clouds
+    from pipeline.geometry.poses import Pose3
+    from pipeline.io.recording import write_recording
+    from pipeline.types.records import Sensor
+    from tests.app.robot.conftest import Child, clouds
 
     drive = folder / "clouds.mcap"
     mounted = Pose3.from_euler([0.2, 0.0, 0.9], 0.0, 0.0, 0.0)
     write_recording(drive, clouds(SCANS), sensor=Sensor("VLP-16", 16), T_base_lidar=mounted)
-    child = Child("-m", "tests.robot.full_disk", str(drive), str(folder / "live.mcap"), str(FULL_BYTES))
+    child = Child("-m", "tests.app.robot.full_disk", str(drive), str(folder / "live.mcap"), str(FULL_BYTES))
     told: dict[str, Any] = json.loads(child.hear())
     child.kill()
     return told
@@ -66,17 +66,17 @@ def full_disk(folder: Path) -> dict[str, Any]:
 
 def kill_once(folder: Path, k: int) -> tuple[int, int, float]:
     """Messages taken, messages that the mended file has, and how much time is missing at its end [s]."""
-    from pipeline.recording import write_recording
-    from pipeline.recording.mending import mend
-    from pipeline.sources import open_source
-    from tests.robot.conftest import Child
+    from pipeline.io.readers import open_source
+    from pipeline.io.recording import write_recording
+    from pipeline.io.recording.recovery import mend
+    from tests.app.robot.conftest import Child
 
     drive, out, mended = folder / "drive.mcap", folder / f"killed{k}.mcap", folder / f"mended{k}.mcap"
     if not drive.exists():
         with closing(open_source("sim:stand?duration=3")) as source:
             known = source.description
             write_recording(drive, source.records(), sensor=known.sensor, T_base_lidar=known.T_base_lidar)
-    child = Child("-m", "tests.robot.recorder", str(drive), str(out))
+    child = Child("-m", "tests.app.robot.recorder", str(drive), str(out))
     told = [child.hear().split() for _ in range(60 + 13 * k)]
     child.kill()
     times = [float(at) for _, at in told]

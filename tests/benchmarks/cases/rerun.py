@@ -13,11 +13,11 @@ import numpy as np
 from tests.benchmarks.table import Cell, Table, verdict
 
 if TYPE_CHECKING:
+    from pipeline.config import Parameters
+    from pipeline.io.readers.base import Source
     from pipeline.mapper import Mapper
-    from pipeline.parameters import Parameters
-    from pipeline.records import Step
-    from pipeline.rerun import Basis, KeptScans, Sample
-    from pipeline.sources.base import Source
+    from pipeline.remapping import Basis, KeptScans, Sample
+    from pipeline.types.records import Step
 
 NAME = "rerun"
 LINE = "The whole run mapped again after a change, from what its scans showed"
@@ -84,9 +84,9 @@ class Times(NamedTuple):
 
 def run() -> list[Table]:
     """Preset forest."""
-    from pipeline.parameters import preset
-    from pipeline.rerun import KeptScans
-    from pipeline.sources import open_source
+    from pipeline.config import preset
+    from pipeline.io.readers import open_source
+    from pipeline.remapping import KeptScans
 
     base = preset("forest")
     source = open_source(URI)
@@ -168,8 +168,8 @@ def _rough(
     bandwidth: float,
 ) -> tuple[Cell, ...]:
     """The rough answer; once before for the kernels."""
-    from app.ahead import looked_at_once
-    from pipeline.rerun import rough_trees
+    from app.worker.parallel import looked_at_once
+    from pipeline.remapping import rough_trees
 
     trees, spent, read = None, 0.0, kept.clusters.nbytes
     for _ in range(2):
@@ -200,8 +200,8 @@ def _first_time(
 ) -> tuple[list[Step], Sample, Times, Basis]:
     """Map the run, keep what it shows and what came of it, and hold its first scans and a sample of all; with
     what the mapping alone takes."""
-    from pipeline.rerun import Basis, Journal, Sample, look_key
-    from pipeline.steps import steps
+    from pipeline.odometry.synchroniser import steps
+    from pipeline.remapping import Basis, Journal, Sample, look_key
 
     mapper, key = _fresh(source, parameters), look_key(parameters)
     held: list[Step] = []
@@ -239,9 +239,9 @@ def _again(
     basis: Basis | None = None,
 ) -> float:
     """Seconds that a rerun takes; once before for the kernels, over a few scans."""
-    from app.abreast import abreast
-    from app.ahead import looked_ahead
-    from pipeline.rerun import Rerun
+    from app.worker.abreast import abreast
+    from app.worker.parallel import looked_ahead
+    from pipeline.remapping import Rerun
 
     spent, reread = 0.0, None if held is None else lambda: iter(held)
     for most in (min(scans, 50), scans):

@@ -20,7 +20,7 @@ def run() -> list[Table]:
     """Twenty rings."""
     import numpy as np
 
-    from pipeline.parameters import preset
+    from pipeline.config import preset
     from tests.benchmarks.wide_ring import WideRing, mapped
 
     rows: list[tuple[Cell, ...]] = []

@@ -13,7 +13,7 @@ from tests.benchmarks.timing import middle, quantile
 
 if TYPE_CHECKING:
     from pipeline.mapper import Mapper
-    from pipeline.records import Frame, Step
+    from pipeline.types.records import Frame, Step
 
 NAME = "scan"
 LINE = "The mapper's time for one VLP-16 scan, stage by stage"
@@ -44,11 +44,11 @@ class Measured:
 
 def run() -> list[Table]:
     """The simulated stand and the constructed lane, preset forest."""
-    from app.stopwatch import Stopwatch
+    from app.common.stage_timer import Stopwatch
+    from pipeline.config import preset
+    from pipeline.io.readers import open_source
     from pipeline.mapper import Mapper
-    from pipeline.parameters import preset
-    from pipeline.sources import open_source
-    from pipeline.steps import steps
+    from pipeline.odometry.synchroniser import steps
     from tests.benchmarks import lane
 
     parameters = preset("forest")

@@ -10,9 +10,9 @@ from tests.benchmarks.table import Cell, Table, ratio, verdict
 from tests.benchmarks.timing import in_turns, middle, quantile
 
 if TYPE_CHECKING:
-    from pipeline.records import Detections, Float
     from pipeline.slam import FastSlam
     from pipeline.slam.recorded import Recorded
+    from pipeline.types.records import Detections, Float
 
 NAME = "slam"
 LINE = "One step of FastSLAM with ten observations, at three numbers of particles and landmarks"
@@ -83,7 +83,7 @@ def loop(steps: int = LOOP_STEPS, rounds: int = LOOP_ROUNDS) -> Table:
 
         outcome["one loop"] = drive(_filter(particles), 0, recorded).pose.tobytes()
 
-    from pipeline.geometry import Pose2
+    from pipeline.geometry.poses import Pose2
 
     single = [(Pose2(motion, 0.0, 0.0), detections_of(seen, SIGMA)) for motion, seen in told[:steps]]
     sides: dict[str, Callable[[], object]] = {"one by one": one_by_one, "one loop": at_once}
@@ -180,10 +180,10 @@ def _ours(particles: int, landmarks: int) -> Feed:
     of the lattice off, and the map would have many of them twice."""
     import numpy as np
 
-    from pipeline.geometry import Pose2
-    from pipeline.slam.maps import MapColumns
+    from pipeline.detection.free_space import BINS
+    from pipeline.geometry.poses import Pose2
+    from pipeline.slam.particle_maps import MapColumns
     from pipeline.slam.state import SlamState
-    from pipeline.visibility import BINS
 
     slam = _filter(particles)
     known = MapColumns(
@@ -203,7 +203,7 @@ def _ours(particles: int, landmarks: int) -> Feed:
 
 
 def _filter(particles: int) -> FastSlam:
-    from pipeline.parameters import Parameters
+    from pipeline.config import Parameters
     from pipeline.slam import FastSlam
 
     return FastSlam(Parameters().replace({"slam.particles": particles}).slam, 0)
@@ -212,8 +212,8 @@ def _filter(particles: int) -> FastSlam:
 def _recorded(told: Sequence[tuple[float, Float]]) -> Recorded:
     import numpy as np
 
+    from pipeline.detection.free_space import BINS
     from pipeline.slam.recorded import Recorded
-    from pipeline.visibility import BINS
 
     centre = np.concatenate([seen for _, seen in told])
     return Recorded(
@@ -229,7 +229,7 @@ def detections_of(seen: Float, sigma: float) -> Detections:
     """Detections at places in the base frame, shape (D, 2) [m], with an error of this sigma [m]."""
     import numpy as np
 
-    from pipeline.records import Detections
+    from pipeline.types.records import Detections
 
     unknown = np.full(len(seen), np.nan)
     covariance = np.tile(sigma**2 * np.eye(2), (len(seen), 1, 1))
@@ -239,7 +239,7 @@ def detections_of(seen: Float, sigma: float) -> Detections:
 def _peer(particles: int) -> Feed:
     import numpy as np
 
-    from pipeline.parameters import Parameters
+    from pipeline.config import Parameters
     from tests.benchmarks.peer.fastslam import FastSlam
     from tests.benchmarks.peer.stages import Detection
 

@@ -72,9 +72,9 @@ WORDS = ("good", "weak", "lost")
 
 def outcome(place: Place, seed: int, trouble: Trouble) -> Outcome:
     """Drive once."""
-    from pipeline.geometry import Pose3
+    from pipeline.geometry.poses import Pose3
     from pipeline.mapper import Mapper
-    from pipeline.steps import steps
+    from pipeline.odometry.synchroniser import steps
     from tests.benchmarks.troubled import KNOWN, SENSOR, drive, parameters
 
     driven = drive(place, seed, trouble)

@@ -13,12 +13,12 @@ DURATION_S = 26
 
 def write(path: Path) -> float:
     """Write the recording; the mean number of returns of its scans."""
-    from pipeline.recording import write_recording
-    from pipeline.records import Scan
+    from pipeline.io.readers.simulated import SimulatedSource
+    from pipeline.io.recording import write_recording
     from pipeline.simulation.lidar import SpinningLidar
     from pipeline.simulation.run import open_run
     from pipeline.simulation.uri import parse_uri
-    from pipeline.sources.simulated import SimulatedSource
+    from pipeline.types.records import Scan
 
     uri = f"sim:stand?duration={DURATION_S}"
     lidar = SpinningLidar(rings=RINGS, ring_step=float(np.radians(1.0)))

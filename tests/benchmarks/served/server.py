@@ -15,16 +15,16 @@ from typing import Any
 
 import uvicorn
 
-from app.dashboard import Dashboard
-from app.messages import Open
-from app.parameter_state import ParameterState
+from app.common.settings import Settings
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.parameter_state import ParameterState
 from app.scene.scene import RENEW_AFTER, Scene
-from app.security import new_token
-from app.server import build
-from app.serving import bind, uvicorn_config
-from app.settings import Settings
-from app.worker_messages import FromWorker, Shown
-from app.worker_process import WorkerProcess
+from app.web.app import build
+from app.web.auth import new_token
+from app.web.serving import bind, uvicorn_config
+from app.worker.internal_protocol import FromWorker, Shown
+from app.worker.protocol import Open
+from app.worker.supervisor import WorkerProcess
 from tests.benchmarks.child import answers
 
 # Of the messages that are still missing so many are sent before others get a turn.

@@ -1,0 +1,127 @@
+"""Two finished maps side by side: one is laid upon the other, and each tree finds its partner."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import Any
+
+import numpy as np
+
+from app.sources import sandbox
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Float, Pose2
+
+# Farther apart than MATCH two trees are two; farther than MOVED one tree stands elsewhere [m].
+MATCH, MOVED = 0.5, 0.1
+_LEAST_SIGMA = 0.02
+
+Run = dict[str, Any]
+
+
+async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
+    """Run b against run a, both with their `map`.
+
+    Two runs of one recording begin at the same place, so their maps share a frame. Others are laid upon
+    one another by the distances between their stems, or compared as they stand where those do not agree.
+
+    Returns:
+        The tables as the page shows them; what is of b stands in the frame of a.
+    """
+    known, how = (Pose2(), "same recording") if same_source else await laid(a, b)
+    pose, how = (Pose2(), f"as they stand: {how}") if known is None else (known, how)
+    place_a, place_b = _places(a), pose.apply(_places(b))
+    pairs, only_a, only_b = await asyncio.to_thread(
+        _paired, a["map"]["trees"], b["map"]["trees"], place_a, place_b
+    )
+    shifts = np.array([pair["shift_m"] for pair in pairs])
+    return {
+        "how": how,
+        "pose": [pose.x, pose.y, pose.yaw],
+        "b_trees": [
+            {**tree, "x": round(x, 4), "y": round(y, 4)}
+            for tree, (x, y) in zip(b["map"]["trees"], place_b.tolist(), strict=True)
+        ],
+        "b_path": np.round(pose.apply(_rows(b["map"]["path"])), 3).tolist(),
+        "pairs": pairs,
+        "only_a": only_a,
+        "only_b": only_b,
+        "moved": int(np.count_nonzero(shifts > MOVED)),
+        "shift_rms_m": float(np.sqrt(np.mean(shifts**2))) if len(shifts) else None,
+        "match_m": MATCH,
+        "moved_m": MOVED,
+        "parameters": _differences(a["parameters"], b["parameters"]),
+    }
+
+
+async def laid(a: Run, b: Run) -> tuple[Pose2 | None, str]:
+    """The pose of b in a, both with their `map`, and how it is known, in words; None and why, where it is
+    not."""
+    try:
+        found = await sandbox.ask({"ask": "laid", "local": _stems(b), "reference": _stems(a)})
+    except StemmapError as error:
+        return None, error.what
+    if found["pose"] is None:
+        return None, f"their stems do not agree with certainty ({found['reason']})"
+    return Pose2(*found["pose"]), f"laid upon one another by {found['stems']} stems"
+
+
+def _stems(run: Run) -> list[list[float | None]]:
+    rows = []
+    for tree in run["map"]["trees"]:
+        known = tree["dbh_cm"] is not None and tree["sigma_dbh_cm"] is not None
+        dbh = [tree["dbh_cm"] / 100.0, tree["sigma_dbh_cm"] / 100.0] if known else [None, None]
+        rows.append([tree["x"], tree["y"], max(tree["ellipse"][0], _LEAST_SIGMA), *dbh])
+    return rows
+
+
+def _places(run: Run) -> Float:
+    return _rows([[tree["x"], tree["y"]] for tree in run["map"]["trees"]])
+
+
+def _rows(points: list[list[float]]) -> Float:
+    return np.array(points, np.float64).reshape(-1, 2)
+
+
+def _paired(
+    a: list[dict[str, Any]], b: list[dict[str, Any]], place_a: Float, place_b: Float
+) -> tuple[list[dict[str, Any]], list[int], list[int]]:
+    """The trees in both, the farthest apart first, and the numbers of those in one alone."""
+    from pipeline.evaluation import match
+
+    a_of = match(place_b, place_a, MATCH)
+    shift = np.hypot(*(place_b - place_a[a_of]).T) if len(place_a) else np.zeros(len(b))
+    pairs = [
+        {
+            "a": a[row]["number"],
+            "b": tree["number"],
+            "shift_m": round(float(shift[k]), 4),
+            "dbh_cm": _change(a[row]["dbh_cm"], tree["dbh_cm"]),
+            "moved": bool(shift[k] > MOVED),
+        }
+        for k, (row, tree) in enumerate(zip(a_of.tolist(), b, strict=True))
+        if row >= 0
+    ]
+    pairs.sort(key=lambda pair: -pair["shift_m"])
+    taken = set(a_of.tolist())
+    only_a = [tree["number"] for k, tree in enumerate(a) if k not in taken]
+    only_b = [tree["number"] for tree, row in zip(b, a_of.tolist(), strict=True) if row < 0]
+    return pairs, only_a, only_b
+
+
+def _change(before: float | None, after: float | None) -> float | None:
+    return None if before is None or after is None else round(after - before, 2)
+
+
+def _differences(a: dict[str, Any], b: dict[str, Any]) -> list[dict[str, Any]]:
+    """The parameters that differ, by dotted name."""
+    names = dict.fromkeys([*a, *b])
+    return [
+        {"name": name, "a": _plain(a.get(name)), "b": _plain(b.get(name))}
+        for name in names
+        if a.get(name) != b.get(name)
+    ]
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - whatever a parameter is
+    return None if isinstance(value, float) and not math.isfinite(value) else value

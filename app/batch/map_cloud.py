@@ -1,0 +1,229 @@
+"""A whole cloud of a plot mapped into a folder, with the same files as a run.
+
+Positions are in the cloud's own coordinates. `path.csv` has a header and no row, because nobody drove, and
+there is no `state.zip`, with which a drive goes on; `slices.csv` stands beside the files of a run and tells
+every circle of every tree, and `terrain.csv` the ground where the cloud shows it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from app.batch.run_folder import as_written
+from app.batch.summary import evaluation_lines
+from app.common.preset_text import changed_values, preset_words
+from app.common.text import count
+from app.common.version import version
+from app.training.learned_forests import kept_forests
+from pipeline.config import Parameters
+from pipeline.evaluation import Evaluation, evaluate
+from pipeline.geometry.poses import Float
+from pipeline.inventory import PlotMap, map_plot
+from pipeline.inventory.cloud import Cloud
+from pipeline.inventory.terrain_raster import HeightMap
+from pipeline.io.result_files import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson
+from pipeline.types.records import Path, Trees, TruthTrees, Verdict
+
+SLICE_COLUMNS = (
+    "tree",
+    "height_m",
+    "x_m",
+    "y_m",
+    "radius_m",
+    "sigma_radius_m",
+    "radial_std_m",
+    "coverage_deg",
+    "points",
+)
+
+
+@dataclass(slots=True, eq=False)
+class PlotOutcome:
+    """What came of a plot, for people: lines to print, warnings, and what was left out by reason."""
+
+    summary: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    losses: dict[str, int] = field(default_factory=dict)
+
+
+def map_plot_run(
+    cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, folder: FilePath
+) -> PlotOutcome:
+    """Map a whole cloud and write its files.
+
+    Raises:
+        SourceError: Nothing could be read.
+        OSError: The folder could not be written; nothing new stands in it then.
+    """
+    files = RunFiles(folder)
+    try:
+        return _map(cloud, preset, parameters, truth, files)
+    except BaseException:
+        files.abandon()
+        raise
+
+
+def _map(
+    cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, files: RunFiles
+) -> PlotOutcome:
+    about = cloud.description
+    plot = map_plot(cloud, parameters, kept_forests())
+    trees = replace(plot.trees, position=plot.trees.position + about.offset[:2])
+    evaluation = None
+    if truth is not None:
+        evaluation = evaluate(as_written(trees, _NO_PATH, 0)[0], truth, parameters.evaluation)
+    losses = {reason: n for reason, n in cloud.losses.items() if n}
+    if plot.counts["apart from the plot"]:
+        losses["points far from the plot"] = plot.counts["apart from the plot"]
+    warnings = list(plot.warnings)
+    lon_lat = _lon_lat(trees.position, about.crs, warnings)
+    frame = {"type": "the cloud's own", "unit": "m", "crs": about.crs} if about.crs else _OWN_FRAME
+    files.add_rows(_detection_rows(plot, about.offset))
+    run = _run_record(cloud, plot, preset, parameters, evaluation, warnings, losses)
+    files.finish(
+        trees,
+        _NO_PATH,
+        0,
+        run,
+        None,
+        further={
+            "trees.geojson": geojson(trees, 0, frame=frame, lon_lat=lon_lat),
+            "slices.csv": csv_text(SLICE_COLUMNS, _slice_rows(plot, about.offset)),
+            "terrain.csv": csv_text(TERRAIN_COLUMNS, _terrain_rows(plot.ground, about.offset)),
+        },
+    )
+    summary = [*_summary(about.uri, plot, trees, evaluation), preset_words(preset, parameters)]
+    return PlotOutcome(summary, warnings, losses)
+
+
+_OWN_FRAME = {**ROBOTS_FRAME, "origin": "that of the cloud"}
+_NOTHING = np.zeros(0)
+_NO_PATH = Path(_NOTHING.astype(np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
+
+
+def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
+    """Longitude and latitude (WGS84) of places, None where their reference system is not known."""
+    if not crs:
+        return None
+    import pyproj
+
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+        to_wgs84 = pyproj.Transformer.from_crs(system, 4326, always_xy=True)
+        lon_lat = np.stack(to_wgs84.transform(position[:, 0], position[:, 1]), axis=1)
+    except pyproj.exceptions.ProjError:
+        lon_lat = np.full((1, 2), np.inf)
+    if not np.isfinite(lon_lat).all():
+        warnings.append("the cloud's coordinate reference system is not understood: no WGS84 coordinates")
+        return None
+    return lon_lat
+
+
+def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
+    c = plot.candidates
+    for k in range(len(c.verdict)):
+        x, y = c.place[k] + offset[:2]
+        yield [
+            "0",
+            "",
+            _text(x, 3),
+            _text(y, 3),
+            Verdict(int(c.verdict[k])).label,
+            "",
+            _text(c.radius[k], 3),
+            _text(c.radial_std[k], 4),
+            _text(math.degrees(c.arc[k]), 0),
+            str(int(c.points[k])) if np.isfinite(c.points[k]) else "",
+            _text(2.0 * c.radius[k], 3),
+            _text(c.height[k], 3),
+        ]
+
+
+def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
+    for number, slices in zip(plot.trees.number, plot.slices, strict=True):
+        for height, s in zip(plot.slice_height, slices, strict=True):
+            if np.isfinite(s[2]):
+                yield [
+                    str(number),
+                    _text(height, 2),
+                    _text(s[0] + offset[0], 3),
+                    _text(s[1] + offset[1], 3),
+                    _text(s[2], 4),
+                    _text(math.sqrt(s[6]), 4),
+                    _text(s[7], 4),
+                    _text(math.degrees(s[8]), 0),
+                    str(int(s[9])),
+                ]
+
+
+def _terrain_rows(ground: HeightMap, offset: Float) -> Iterator[list[str]]:
+    """The middles of the cells in which returns of the ground lay, from west to east; what was filled in
+    between is not told. A cloud has no views to be counted, and how far the heights err is not known."""
+    columns, rows = np.nonzero(ground.seen)
+    place = ground.low + (np.stack([columns, rows], axis=1) + 0.5) * ground.cell + offset[:2]
+    height = ground.height[columns, rows] + offset[2]
+    for (x, y), z in zip(place, height, strict=True):
+        yield [_text(x, 3), _text(y, 3), _text(z, 3), "", ""]
+
+
+def _text(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+
+
+def _run_record(
+    cloud: Cloud,
+    plot: PlotMap,
+    preset: str,
+    parameters: Parameters,
+    evaluation: Evaluation | None,
+    warnings: list[str],
+    losses: dict[str, int],
+) -> dict[str, Any]:
+    about = cloud.description
+    verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict)
+    return {
+        "stemmap": version(),
+        "source": {
+            "uri": about.uri,
+            "kind": about.kind,
+            "sha256": about.digest,
+            "offset_m": about.offset.tolist(),
+            "crs": about.crs or None,
+        },
+        "seed": 0,
+        "preset": preset,
+        "changed": changed_values(preset, parameters),
+        "parameters": parameters.model_dump(),
+        "scans": 0,
+        "trees": len(plot.trees.number),
+        "points": plot.counts,
+        "voxel_size_m": round(plot.voxel_size, 6),
+        "ground_m": [round(float(v) + about.offset[2], 3) for v in _range(plot.ground.height)],
+        "verdicts": dict(sorted(verdicts.items())),
+        "evaluation": None if evaluation is None else asdict(evaluation),
+        "warnings": warnings,
+        "losses": losses,
+    }
+
+
+def _range(values: Float) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
+
+
+def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: Evaluation | None) -> list[str]:
+    dbh = 100.0 * trees.dbh[np.isfinite(trees.dbh)]
+    wide = f", DBH {dbh.min():.1f} to {dbh.max():.1f} cm ({len(dbh)} told)" if len(dbh) else ", no DBH"
+    verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict if v != Verdict.TREE)
+    refused = ", ".join(f"{n} {label}" for label, n in sorted(verdicts.items()))
+    lines = [
+        f"{uri}: {count(plot.counts['read'], 'point')}, {count(len(trees.number), 'tree')}{wide}",
+        f"refused: {refused or 'nothing'}",
+    ]
+    return lines + (evaluation_lines(evaluation, whole=True) if evaluation is not None else [])

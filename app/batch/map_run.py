@@ -1,0 +1,319 @@
+"""A run mapped from its first to its last scan, in this process, into a folder."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
+from pathlib import Path as FilePath
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from app.batch.continue_map import Beginning, Continued, at_origin, go_on
+from app.batch.driven_distance import breaks_of, driven
+from app.batch.run_folder import as_written
+from app.batch.saved_run import FORMAT, SavedRun
+from app.batch.summary import start_lines, summary_lines
+from app.batch.tree_pictures import FOLDER as PICTURES
+from app.batch.tree_pictures import keep_pictures
+from app.common.preset_text import changed_values, preset_words
+from app.common.stage_timer import Stopwatch
+from app.common.text import count
+from app.common.version import version
+from app.sources.odometry import Chosen, with_odometry
+from app.training.learned_forests import kept_forests
+from pipeline.config import Parameters
+from pipeline.errors import SourceError, StemmapError
+from pipeline.evaluation import Evaluation, PathError, evaluate, path_error
+from pipeline.io.checkpoints.saved_map import SavedMap
+from pipeline.io.readers.base import Source
+from pipeline.io.result_files import RunFiles, terrain_text
+from pipeline.jit import on_compiling
+from pipeline.mapper import Mapper
+from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
+
+MEASURED_SCANS = 100_000  # of which times are kept for the medians
+
+
+class Progress(Protocol):
+    """What shows how far it is; tqdm is one."""
+
+    def update(self, n: int = 1, /) -> object:
+        """So many scans more."""
+
+    def close(self) -> None:
+        """No more will come."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OfflineRun:
+    """What to map, and how.
+
+    Attributes:
+        odometry: Where the motion comes from, as asked, see `app.sources.odometry`.
+        stop_after: So many scans.
+        revisions: Other parameters, each from a scan on, in their order.
+        on_frame: Told of each scan's results.
+        chosen: Topics and mounting that were asked for, see `app.sources.source_options`.
+    """
+
+    source: Source
+    preset: str
+    parameters: Parameters
+    seed: int
+    odometry: str
+    truth_trees: TruthTrees | None = None
+    continued: Continued | None = None
+    stop_after: int | None = None
+    revisions: tuple[tuple[int, Parameters], ...] = ()
+    on_frame: Callable[[Frame, Mapper], None] | None = None
+    chosen: dict[str, Any] | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Outcome:
+    """What came of it, for people.
+
+    Attributes:
+        summary: Lines to print.
+        warnings: Each once, with how often it came.
+        losses: What was left out, by reason.
+        scan_ms, stage_ms: Median time of a scan and of each stage [ms]; what waited for a kernel to be
+            compiled does not count.
+    """
+
+    summary: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    losses: dict[str, int] = field(default_factory=dict)
+    scan_ms: float = 0.0
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+
+def map_run(
+    plan: OfflineRun, folder: FilePath, progress: Progress, earlier: FilePath | None = None
+) -> Outcome:
+    """Map a run and write its files.
+
+    Args:
+        plan: What to map.
+        folder: For the files.
+        progress: Told of each scan.
+        earlier: Folder of the run that is continued.
+
+    Raises:
+        SourceError: Nothing could be read.
+        OSError: The folder could not be written; nothing new stands in it then.
+    """
+    files = RunFiles(folder, earlier)
+    stopwatch = Stopwatch(scans=MEASURED_SCANS)
+    try:
+        with on_compiling(stopwatch.disturb):
+            outcome, mapped = _map(plan, files, progress, stopwatch)
+    except BaseException:
+        files.abandon()
+        raise
+    finally:
+        progress.close()
+    if plan.continued is None:  # the path of an earlier drive has no pictures here
+        _keep_pictures(mapped, folder, outcome)
+    return outcome
+
+
+class _Mapped(NamedTuple):
+    """What pictures of trees are made of, once the map is written."""
+
+    source: Source
+    trees: Trees
+    path: Path
+
+
+def _map(
+    plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopwatch
+) -> tuple[Outcome, _Mapped]:
+    moving, chosen = with_odometry(plan.source, plan.odometry)
+    plan = replace(plan, source=moving)
+    description = plan.source.description
+    mapper = Mapper(
+        plan.parameters,
+        sensor=description.sensor,
+        T_base_lidar=description.T_base_lidar,
+        seed=plan.seed,
+        watch=stopwatch,
+        forests=kept_forests(),
+    )
+    begun = _beginning(plan, mapper, chosen)
+    left_out = Counter[str]()
+    to_map = begun.steps(plan.source, chosen.steps, left_out)
+    frame, start_ns = _map_scans(
+        plan, mapper, begun, islice(to_map, plan.stop_after), files, progress, stopwatch
+    )
+    tally = begun.tally
+    path, truth = mapper.path, _truth(plan, begun)
+    evaluation = _evaluate(*as_written(frame.trees, path, start_ns), truth, plan.parameters)
+    error = path_error(path, truth.path) if truth.path else None
+    counted = begun.losses + left_out + Counter(plan.source.losses)
+    losses = {reason: n for reason, n in counted.items() if n}
+    state = _saved(plan, begun, mapper, start_ns, losses).as_bytes()
+    tally.tell_of_far_truth(evaluation)
+    if plan.parameters.gathering.method == "none":  # else a track is judged by more than its hits
+        tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
+    seconds, metres = driven(path, breaks_of(begun.sources))
+    record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
+    record["odometry_used"] = chosen.words
+    outcome = Outcome(
+        summary=[
+            *summary_lines(description.uri, frame, (seconds, metres), evaluation, error),
+            f"odometry: {chosen.words}",
+            preset_words(plan.preset, plan.parameters),
+            *start_lines(begun.sources[-1]),
+            *tally.health.summary(),
+        ],
+        warnings=tally.warnings(),
+        losses=losses,
+        scan_ms=stopwatch.scan_ms,
+        stage_ms=stopwatch.stage_ms,
+    )
+    further = {"terrain.csv": terrain_text(mapper.height_map)}
+    files.finish(frame.trees, path, start_ns, record, state, further)
+    return outcome, _Mapped(plan.source, frame.trees, path)
+
+
+def _map_scans(
+    plan: OfflineRun,
+    mapper: Mapper,
+    begun: Beginning,
+    to_map: Iterable[Step],
+    files: RunFiles,
+    progress: Progress,
+    stopwatch: Stopwatch,
+) -> tuple[Frame, int]:
+    """Map scan by scan; the last frame, and the stamp [ns] that times are told from."""
+    start_ns, frame = begun.start_ns, None
+    for step in to_map:
+        _use_revisions(plan, mapper, step.index)
+        # The first scan loads the kernels, which takes many times longer than to map it.
+        with stopwatch.aside() if frame is None else stopwatch.whole_scan():
+            frame = mapper.process(step)
+        if plan.on_frame is not None:
+            plan.on_frame(frame, mapper)
+        start_ns = frame.stamp_ns if start_ns is None else start_ns
+        files.add(frame, start_ns)
+        begun.tally.add(frame)
+        progress.update(1)
+    if frame is None or start_ns is None:
+        mapped = " that was not mapped yet" if begun.scans else ""
+        raise SourceError(f"there is no scan in it{mapped}", where=plan.source.description.uri)
+    return frame, start_ns
+
+
+def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: Outcome) -> None:
+    """The map stands whole: whatever happens here takes nothing away from it."""
+    try:
+        kept, told = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
+    except (StemmapError, OSError) as error:
+        kept, told = 0, f"not all pictures of trees were made: {error}"
+    except KeyboardInterrupt:
+        kept, told = 0, "not all pictures of trees were made: it was stopped; the map is whole"
+    if kept:
+        outcome.summary.append(f"{count(kept, 'picture')} of trees in {folder / PICTURES}")
+    if told:
+        outcome.warnings.append(told)
+
+
+def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
+    in_force = [parameters for first, parameters in plan.revisions if first <= scan]
+    if in_force and in_force[-1] is not mapper.parameters:
+        mapper.parameters = in_force[-1]
+
+
+def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
+    """The revisions for run.json: what each changed."""
+    told: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
+    before = plan.parameters.flat()
+    for first, parameters in plan.revisions:
+        after = parameters.flat()
+        changes = {name: value for name, value in after.items() if value != before[name]}
+        if changes:
+            told.append({"revision": len(told), "from_scan": first, "changes": changes})
+        before = after
+    return told
+
+
+def _beginning(plan: OfflineRun, mapper: Mapper, chosen: Chosen) -> Beginning:
+    told = (chosen.warning,) if chosen.warning else ()
+    warnings = [*told, *plan.source.description.warnings]
+    if plan.continued is None:
+        return at_origin(plan.source, warnings)
+    return go_on(plan.continued, plan.source, mapper, chosen.steps, plan.seed, warnings)
+
+
+def _saved(
+    plan: OfflineRun, begun: Beginning, mapper: Mapper, start_ns: int, losses: dict[str, int]
+) -> SavedRun:
+    return SavedRun(
+        FORMAT,
+        begun.sources,
+        plan.preset,
+        plan.parameters.model_dump_json(),
+        plan.seed,
+        start_ns,
+        begun.tally,
+        losses,
+        SavedMap.of(mapper),
+    )
+
+
+def _truth(plan: OfflineRun, begun: Beginning) -> Truth:
+    known = begun.truth or plan.source.truth() or Truth()
+    return Truth(plan.truth_trees or known.trees, known.path)
+
+
+def _evaluate(trees: Trees, path: Path, truth: Truth, parameters: Parameters) -> Evaluation | None:
+    if truth.trees is None:
+        return None
+    return evaluate(trees, truth.trees, parameters.evaluation, np.stack([path.x, path.y], axis=1))
+
+
+def _run_record(
+    plan: OfflineRun,
+    begun: Beginning,
+    frame: Frame,
+    driven_s_m: tuple[float, float],
+    start_ns: int,
+    evaluation: Evaluation | None,
+    error: PathError | None,
+    losses: dict[str, int],
+) -> dict[str, Any]:
+    """run.json: no time of day and no time taken, so that the same run gives the same bytes."""
+    description, tally = plan.source.description, begun.tally
+    first, *others = begun.sources
+    return {
+        "stemmap": version(),
+        "source": {
+            "uri": first.uri if others else description.uri,
+            "kind": description.kind,
+            "sha256": first.digest if others else description.digest,
+            "sensor": asdict(description.sensor),
+        },
+        **({"continued": [asdict(other) for other in others]} if others else {}),
+        "seed": plan.seed,
+        "odometry": plan.odometry,
+        **({} if plan.chosen is None else {"chosen": plan.chosen}),
+        "preset": plan.preset,
+        "changed": changed_values(plan.preset, plan.parameters),
+        "parameters": plan.parameters.model_dump(),
+        "revisions": _changes(plan),
+        "scans": frame.index + 1,
+        "duration_s": round(driven_s_m[0], 6),
+        "distance_m": round(driven_s_m[1], 3),
+        "trees": int(np.count_nonzero(frame.trees.confirmed)),
+        "points": dict(tally.points),
+        "health": tally.health.record(start_ns),
+        "verdicts": dict(sorted(tally.verdicts.items())),
+        "evaluation": None if evaluation is None else asdict(evaluation),
+        "path_error": None if error is None else asdict(error),
+        "warnings": tally.warnings(),
+        "losses": losses,
+    }

@@ -1,0 +1,208 @@
+"""Two finished runs of one stand made one: its files, and which tree is which."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections import Counter
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from app.batch.continue_map import PAUSE_NS
+from app.batch.driven_distance import breaks_of, driven
+from app.batch.output_folder import check_folder
+from app.batch.run_folder import read_run_record
+from app.batch.run_totals import Tally
+from app.batch.saved_run import SavedRun, read_saved_run
+from app.common.preset_text import changed_values
+from app.common.version import version
+from app.worker.run_health import RunHealth
+from pipeline.config import Parameters
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Pose2
+from pipeline.io.checkpoints.merged_map import MergedMap, merge_maps
+from pipeline.io.checkpoints.saved_map import SavedMap
+from pipeline.io.result_files import DETECTION_COLUMNS, RunFiles, csv_text
+from pipeline.loop_closure.stem_matching import Match, Stems, find_constellation
+from pipeline.types.records import Path, Trees
+
+CORRESPONDENCE_COLUMNS = ("tree", "tree_a", "tree_b", "distance_m")
+HYPOTHESES = 3_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Merging:
+    """What came of it, for people: trees of a, of b, and in both; the match of the two maps."""
+
+    a: int
+    b: int
+    both: int
+    match: Match
+
+
+def merge_runs(
+    folder_a: FilePath,
+    folder_b: FilePath,
+    out: FilePath,
+    parameters: Parameters | None,
+    *,
+    force: bool = False,
+) -> Merging:
+    """Merge run b into run a and write the files of a run, with correspondence.csv beside them.
+
+    Args:
+        folder_a, folder_b: Of finished runs.
+        out: For the files.
+        parameters: None takes those of run a.
+        force: Write over the map of another source.
+
+    Raises:
+        StemmapError: A run cannot be read, or the two maps do not fit with confidence.
+        OSError: The folder cannot be written; nothing new stands in it then.
+    """
+    a, b = read_saved_run(folder_a), read_saved_run(folder_b)
+    chosen = a.chosen_parameters() if parameters is None else parameters
+    record = read_run_record(folder_a)
+    check_folder(out, a.sources[0].digest, force=force)
+    trees_a, trees_b = a.map.trees(chosen), b.map.trees(b.chosen_parameters())
+    match = find_constellation(
+        Stems.of_trees(trees_b), Stems.of_trees(trees_a), chosen.relocalisation, hypotheses=HYPOTHESES
+    )
+    if match.pose is None:
+        raise StemmapError(
+            f"the two maps do not fit with confidence: {match.reason} "
+            f"({len(match.local)} stems agree, {match.second} in another pose)",
+            where=str(folder_b),
+            remedy="Merge runs that share more trees, or map the second one with --continue and --start",
+        )
+    shift = 0 if b.start_ns > a.map.stamp_ns[-1] else int(a.map.stamp_ns[-1]) + PAUSE_NS - b.start_ns
+    merged = merge_maps(a.map, b.map, match.pose, match.covariance, shift, chosen)
+    saved = _joined(a, b, merged, match, shift, chosen)
+    files = RunFiles(out, folder_a)
+    try:
+        files.add_rows(_moved_rows(folder_b / "detections.csv", match.pose, len(a.map.stamp_ns), shift, a, b))
+        trees = merged.map.trees(chosen)
+        path = _path(merged)
+        _update(record, saved, path, int(np.count_nonzero(trees.confirmed)), match)
+        table = _correspondence(merged, b.map, _shown(trees), _shown(trees_a), _shown(trees_b))
+        more = {"correspondence.csv": csv_text(CORRESPONDENCE_COLUMNS, table)}
+        files.finish(trees, path, a.start_ns, record, saved.as_bytes(), more)
+    except BaseException:
+        files.abandon()
+        raise
+    both = sum(1 for row in table if row[1] and row[2])
+    return Merging(sum(1 for row in table if row[1]), sum(1 for row in table if row[2]), both, match)
+
+
+def _joined(
+    a: SavedRun, b: SavedRun, merged: MergedMap, match: Match, shift: int, parameters: Parameters
+) -> SavedRun:
+    scans, pose = len(a.map.stamp_ns), match.pose or Pose2()
+    moved = []
+    for source in b.sources:
+        at = pose @ Pose2(*source.pose)
+        moved.append(
+            replace(
+                source,
+                from_scan=source.from_scan + scans,
+                start="merged" if source.start == "origin" else source.start,
+                pose=(at.x, at.y, at.yaw),
+                stems=source.stems or len(match.local),
+                stamp_shift_ns=source.stamp_shift_ns + shift,
+            )
+        )
+    tally = Tally(
+        a.tally.warned + b.tally.warned,
+        a.tally.points + b.tally.points,
+        a.tally.verdicts + b.tally.verdicts,
+        RunHealth.of_both(a.tally.health, b.tally.health, scans, shift),
+    )
+    return replace(
+        a,
+        sources=(*a.sources, *moved),
+        parameters=parameters.model_dump_json(),
+        tally=tally,
+        losses=dict(Counter(a.losses) + Counter(b.losses)),
+        map=merged.map,
+    )
+
+
+def _path(merged: MergedMap) -> Path:
+    m = merged.map
+    poses = m.slam.genealogy.path(m.slam.best)
+    return Path(m.stamp_ns, poses[:, 0], poses[:, 1], poses[:, 2], m.sigma_xy)
+
+
+def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, match: Match) -> None:
+    """Make the record of run a that of both."""
+    first, *others = saved.sources
+    seconds, metres = driven(path, breaks_of(saved.sources))
+    record["source"].update(uri=first.uri, sha256=first.digest)
+    record.update(
+        stemmap=version(),
+        parameters=json.loads(saved.parameters),
+        changed=changed_values(saved.preset, saved.chosen_parameters()),
+        scans=len(path.stamp_ns),
+        duration_s=round(seconds, 6),
+        distance_m=round(metres, 3),
+        trees=trees,
+        points=dict(saved.tally.points),
+        health=saved.tally.health.record(saved.start_ns),
+        verdicts=dict(sorted(saved.tally.verdicts.items())),
+        evaluation=None,
+        path_error=None,
+        warnings=saved.tally.warnings(),
+        losses=saved.losses,
+        continued=[asdict(other) for other in others],
+        merged={
+            "stems": len(match.local),
+            "second": match.second,
+            "log10_false_alarms": round(match.false_alarms, 2),
+            "sigma_m_m_rad": [round(float(s), 5) for s in np.sqrt(np.diag(match.covariance))],
+        },
+    )
+
+
+def _shown(trees: Trees) -> set[int]:
+    """Numbers of the trees that a map shows and writes."""
+    return set(trees.number[trees.confirmed].tolist())
+
+
+def _correspondence(
+    merged: MergedMap, b: SavedMap, shown: set[int], of_a: set[int], of_b: set[int]
+) -> list[list[str]]:
+    """Rows of CORRESPONDENCE_COLUMNS of the trees that the merged map shows, by number; a run that did not
+    show the tree has no number of it.
+    """
+    rows = {n: [str(n), str(n) if n in of_a else "", "", ""] for n in sorted(shown)}
+    told = zip(b.tracks.number.tolist(), merged.number_of.tolist(), merged.distance.tolist(), strict=True)
+    for old, new, distance in told:
+        if new in rows and old in of_b:
+            rows[new][2] = str(old)
+            rows[new][3] = "" if math.isnan(distance) or not rows[new][1] else f"{distance:.3f}"
+    return list(rows.values())
+
+
+def _moved_rows(
+    file: FilePath, T: Pose2, scans: int, shift: int, a: SavedRun, b: SavedRun
+) -> list[list[str]]:
+    """The detections of run b in the frame, the numbers and the times of run a."""
+    seconds = (b.start_ns + shift - a.start_ns) * 1e-9
+    try:
+        with file.open(encoding="utf-8", newline="") as text:
+            header, *rows = csv.reader(text)
+        if tuple(header) != DETECTION_COLUMNS:
+            raise ValueError
+        at = T.apply(np.array([[float(row[2]), float(row[3])] for row in rows]).reshape(len(rows), 2))
+        return [
+            [str(int(row[0]) + scans), f"{float(row[1]) + seconds:.3f}", f"{x:.3f}", f"{y:.3f}", *row[4:]]
+            for row, (x, y) in zip(rows, at.tolist(), strict=True)
+        ]
+    except (OSError, ValueError, IndexError):
+        raise StemmapError(
+            "its detections cannot be read", where=str(file), remedy="Map the run again"
+        ) from None

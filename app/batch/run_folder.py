@@ -1,0 +1,161 @@
+"""A finished run, read back from its folder."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from pipeline.config import Parameters
+from pipeline.config.model import validated
+from pipeline.errors import ParameterError, SourceError
+from pipeline.geometry.poses import Float
+from pipeline.io.result_files import PATH_COLUMNS, TREE_COLUMNS, path_rows, tree_rows
+from pipeline.types.records import Int, Path, Trees
+
+LARGEST_FILE = 256 << 20
+_NEVER_EMPTY = frozenset({"t_s", "x_m", "y_m", "tree", "observations", "sigma_x_m", "sigma_y_m"})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedRun:
+    """What `stemmap map` wrote: the source's URI, the seed, the parameters, path and trees.
+
+    Of a whole cloud (`of_cloud`) there is no path.
+    """
+
+    uri: str
+    seed: int
+    parameters: Parameters
+    path: Path
+    trees: Trees
+    of_cloud: bool
+
+
+def read_run(folder: FilePath) -> FinishedRun:
+    """Read a run's folder.
+
+    Raises:
+        SourceError: A file is missing or is not what `stemmap map` writes.
+    """
+    try:
+        record = json.loads(_text(folder / "run.json"))
+        parameters = validated(dict(record["parameters"]))
+        uri, seed = str(record["source"]["uri"]), int(record["seed"])
+    except (ValueError, KeyError, TypeError, RecursionError, ParameterError):
+        raise SourceError("run.json is damaged", where=str(folder), remedy="Map the run again") from None
+    return FinishedRun(
+        uri,
+        seed,
+        parameters,
+        _path(_columns(folder / "path.csv", PATH_COLUMNS)),
+        _trees(_columns(folder / "trees.csv", TREE_COLUMNS)),
+        is_of_cloud(record),
+    )
+
+
+def is_of_cloud(record: dict[str, Any]) -> bool:
+    """Whether run.json tells of a whole cloud, which nobody drove through."""
+    return isinstance(record.get("source"), dict) and "offset_m" in record["source"]
+
+
+def read_run_record(folder: FilePath) -> dict[str, Any]:
+    """run.json of a run's folder.
+
+    Raises:
+        SourceError: It is missing or is not what `stemmap map` writes.
+    """
+    try:
+        record = json.loads(_text(folder / "run.json"))
+        if isinstance(record["source"], dict) and isinstance(record["parameters"], dict):
+            return dict(record)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        pass
+    raise SourceError("run.json is damaged", where=str(folder), remedy="Map the run again")
+
+
+def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
+    """The confirmed trees and the path as `read_run` gives them once they are in their files, so that figures
+    which are told when a run is mapped are those which are told of it later."""
+    columns = (
+        _table(path_rows(path, start_ns), PATH_COLUMNS),
+        _table(tree_rows(trees, start_ns), TREE_COLUMNS),
+    )
+    return _trees(columns[1]), _path(columns[0])
+
+
+def _text(file: FilePath) -> str:
+    try:
+        if file.stat().st_size > LARGEST_FILE:
+            raise SourceError("the file is larger than 256 MB", where=str(file))
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SourceError(
+            f"cannot read it: {error.strerror}",
+            where=str(file),
+            remedy="Name a folder that `stemmap map` wrote",
+        ) from None
+    except UnicodeDecodeError:
+        raise SourceError("it is not text", where=str(file)) from None
+
+
+def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
+    rows = list(csv.reader(_text(file).splitlines()))
+    if not rows or tuple(rows[0]) != names:
+        raise SourceError(f"its columns are not {', '.join(names)}", where=str(file))
+    try:
+        columns = _table(rows[1:], names)
+    except ValueError:
+        raise SourceError("a row is damaged", where=str(file), remedy="Map the run again") from None
+    for name in _NEVER_EMPTY.intersection(names):
+        if not np.all(np.isfinite(columns[name])):
+            raise SourceError(f"a cell of {name} is empty", where=str(file), remedy="Map the run again")
+    return columns
+
+
+def _table(rows: list[list[str]], names: tuple[str, ...]) -> dict[str, Float]:
+    """Columns by name; an empty cell is NaN.
+
+    Raises:
+        ValueError: A row has no such cells.
+    """
+    table = np.array([[float(cell) if cell else math.nan for cell in row] for row in rows], np.float64)
+    return dict(zip(names, table.reshape(len(rows), len(names)).T, strict=True))
+
+
+def _path(c: dict[str, Float]) -> Path:
+    stamp = np.round(c["t_s"] * 1e9).astype(np.int64)
+    return Path(stamp, c["x_m"], c["y_m"], c["yaw_rad"], c["sigma_xy_m"])
+
+
+def _trees(c: dict[str, Float]) -> Trees:
+    n = len(c["tree"])
+    covariance = np.zeros((n, 2, 2))
+    covariance[:, 0, 0], covariance[:, 1, 1] = c["sigma_x_m"] ** 2, c["sigma_y_m"] ** 2
+    return Trees(
+        number=c["tree"].astype(np.int64),
+        position=np.stack([c["x_m"], c["y_m"]], axis=1),
+        covariance=covariance,
+        velocity=np.zeros((n, 2)),
+        dbh=c["dbh_cm"] / 100.0,
+        dbh_sigma=c["sigma_dbh_cm"] / 100.0,
+        eccentricity=c["eccentricity"],
+        observations=c["observations"].astype(np.int64),
+        coverage=np.radians(c["coverage_deg"]),
+        first_seen_ns=_stamps(c["first_seen_s"]),
+        last_seen_ns=_stamps(c["last_seen_s"]),
+        confirmed=np.ones(n, np.bool_),
+    )
+
+
+def _stamps(seconds: Float) -> Int:
+    """Nanoseconds; -1 where no time is known, as in the map of a whole cloud."""
+    stamps: Int = np.where(np.isfinite(seconds), np.round(np.nan_to_num(seconds) * 1e9), -1.0).astype(
+        np.int64
+    )
+    return stamps

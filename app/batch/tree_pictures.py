@@ -1,0 +1,116 @@
+"""A picture of each tree, where a camera drove along: chosen after the run, kept in its folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from app.common.draw_picture import drawn
+from pipeline.io.atomic_files import write_beside
+from pipeline.io.readers.base import Source
+from pipeline.io.readers.camera import Camera, nearest
+from pipeline.io.readers.odometry_override import WithMotion
+from pipeline.io.readers.pictures import WithPictures
+from pipeline.types.records import Bool, Int, Path, Trees
+
+FOLDER = "pictures"
+MOST = 300  # pictures
+NEAREST, FARTHEST, BEST = 1.5, 15.0, 4.0  # m ahead of the camera
+FROM_Z, TO_Z, THIN = 0.0, 2.0, 0.2  # m above the base; the width of a stem whose diameter is not known
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """From where a tree is seen best.
+
+    Attributes:
+        tree: Its number.
+        stamp_ns: Of the picture.
+        box: left, top, right, bottom [pixels].
+    """
+
+    tree: int
+    stamp_ns: int
+    box: tuple[float, float, float, float]
+
+
+def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[View]:
+    """The best view of each confirmed tree that was in view, in the order of time, MOST at most.
+
+    Args:
+        stamps: When pictures were taken, ascending [ns].
+    """
+    views: list[View] = []
+    if not len(stamps):
+        return views
+    taken, there = nearest(stamps, path.stamp_ns)
+    for row in np.flatnonzero(trees.confirmed)[:MOST]:
+        found = _best_view(camera, trees, int(row), path, taken, there)
+        if found is not None:
+            views.append(found)
+    return sorted(views, key=lambda view: (view.stamp_ns, view.tree))
+
+
+def _best_view(camera: Camera, trees: Trees, row: int, path: Path, taken: Int, there: Bool) -> View | None:
+    dx, dy = trees.position[row, 0] - path.x, trees.position[row, 1] - path.y
+    c, s = np.cos(path.yaw), np.sin(path.yaw)
+    ahead, left = c * dx + s * dy, c * dy - s * dx
+    half = 0.5 * (float(trees.dbh[row]) if np.isfinite(trees.dbh[row]) else THIN)
+    at = np.stack([ahead, left, np.full(len(ahead), 0.5 * (FROM_Z + TO_Z))], axis=1)
+    pixels, depth = camera.project(at)
+    inside = (
+        there & (depth > NEAREST) & (depth < FARTHEST) & (pixels[:, 0] > 0) & (pixels[:, 0] < camera.width)
+    )
+    inside &= (pixels[:, 1] > 0) & (pixels[:, 1] < camera.height)
+    if not inside.any():
+        return None
+    off_centre = np.abs(pixels[:, 0] - 0.5 * camera.width) / camera.width
+    cost = np.where(inside, np.abs(np.log(np.maximum(depth, 1e-3) / BEST)) + 2.0 * off_centre, np.inf)
+    k = int(np.argmin(cost))
+    reach = float(np.hypot(ahead[k], left[k]))
+    across = np.array([-left[k], ahead[k], 0.0]) / reach * half
+    corners = np.array([[*at[k, :2], z] + side * across for z in (FROM_Z, TO_Z) for side in (-1.0, 1.0)])
+    seen, _ = camera.project(corners)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return View(int(trees.number[row]), int(taken[k]), box)
+
+
+def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) -> tuple[int, str]:
+    """Write a picture of each tree into `folder`/pictures, in place of those of an earlier run.
+
+    Returns:
+        How many there are, and what a person should know, "" for nothing.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    _clear(folder / FOLDER)
+    origin: object = source.source if isinstance(source, WithMotion) else source
+    if not isinstance(origin, WithPictures):
+        return 0, ""
+    camera, why = origin.camera()
+    if camera is None:
+        return 0, f"no pictures of trees: {why}" if why else ""
+    views = best_views(camera, trees, path, np.array(origin.picture_stamps(), np.int64))
+    kept = refused = 0
+    for picture in origin.pictures({view.stamp_ns for view in views}):
+        for view in (each for each in views if each.stamp_ns == picture.stamp_ns):
+            told = {"encoding": picture.encoding, "width": picture.width, "height": picture.height,
+                    "step": picture.step, "box": view.box, "text": f"tree {view.tree}"}  # fmt: skip
+            content = drawn(told, picture.data)
+            if content is None:
+                refused += 1
+                continue
+            (folder / FOLDER).mkdir(exist_ok=True)
+            with write_beside(folder / FOLDER / f"tree_{view.tree:04d}.jpg") as partial:
+                partial.write_bytes(content)
+            kept += 1
+    return kept, f"{refused} pictures could not be decoded" if refused else ""
+
+
+def _clear(folder: FilePath) -> None:
+    for old in folder.glob("tree_*.jpg") if folder.is_dir() else ():
+        old.unlink()

@@ -1,0 +1,175 @@
+"""The annotations of the run that is open: a store that never blocks the event loop, and the truth that
+comes of it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from app.dashboard.ground_truth import SAME_THING, Against, contradicting, counted, truth_of
+from app.store.async_store import Keeper
+from app.store.records import Annotation, StaleError
+from pipeline.errors import StemmapError
+from pipeline.types.records import TruthTrees
+
+if TYPE_CHECKING:
+    from app.store.store import Store
+
+T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
+
+
+class Annotating:
+    """What people say of the trees of the run that is open.
+
+    Args:
+        keeper: Of the store.
+
+    Attributes:
+        run: Number of the run in the store, None while none is open.
+        rows: The annotations of the run.
+        truth: What the map is scored against.
+        against: Which of the source's truth and the annotations that is, see `truth_of`.
+        problem: Why nothing can be annotated, empty when all is well.
+        changed: Called when something else stands.
+        edited: Called with who edited and how many annotations, after an edit.
+        serial: Grows with each edit, so that a page knows when it has seen what it did.
+    """
+
+    def __init__(self, keeper: Keeper) -> None:
+        self.run: int | None = None
+        self.rows: list[Annotation] = []
+        self.truth: TruthTrees | None = None
+        self.against: Against = "both"
+        self.problem = ""
+        self.serial = 0
+        self.changed: Callable[[], None] = lambda: None
+        self.edited: Callable[[str, int], None] = lambda _who, _number: None
+        self._own: TruthTrees | None = None
+        self._keeper = keeper
+
+    async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
+        """A run was opened.
+
+        Args:
+            source: Digest of what was recorded, else the URI.
+            uri: As it was opened.
+            own: The truth that the source brings, if any.
+        """
+        self.leave()
+
+        def work(store: Store) -> tuple[int, list[Annotation], TruthTrees | None]:
+            run = store.open_run(source, uri, Path(uri).name[:200] or uri[:200])
+            rows = store.annotations(run)
+            return run, rows, truth_of(own, rows, "both")
+
+        self._own = self.truth = own
+        try:
+            self.run, self.rows, truth = await self._keeper.ask(work)
+            # Somebody may have chosen meanwhile.
+            self.truth = truth if self.against == "both" else truth_of(own, self.rows, self.against)
+            self.problem = ""
+        except StemmapError as error:
+            if str(error) != self.problem:
+                _log.warning("%s", error)
+            self.problem = str(error)
+
+    def leave(self) -> None:
+        """No run is open."""
+        self.run, self.rows, self.truth, self._own, self.against = None, [], None, None, "both"
+
+    def score_against(self, against: Against) -> None:
+        """Choose what the map is scored against; neither the source's truth nor an annotation is changed."""
+        self.against = against
+        self.truth = truth_of(self._own, self.rows, against)
+        self.changed()
+
+    async def edit(self, run: int, function: Callable[[Store], T]) -> T:
+        """Let something be done to the store, and tell what stands afterwards.
+
+        Args:
+            run: That the edit is meant for.
+            function: What is to be done, in the thread of the store.
+
+        Raises:
+            StaleError: Another run was opened since, or somebody else has changed the same.
+            StemmapError: Nothing can be annotated.
+        """
+        if self.problem:
+            raise StemmapError(self.problem)
+        if run != self.run:
+            raise StaleError(
+                "another run was opened", remedy="Your edit was not made; look at what stands now"
+            )
+        own, against = self._own, self.against
+
+        def work(store: Store) -> tuple[T | StaleError, list[Annotation], TruthTrees | None]:
+            done: T | StaleError
+            try:
+                done = function(store)
+            except StaleError as error:  # then what stands is news
+                done = error
+            rows = store.annotations(run)
+            return done, rows, truth_of(own, rows, against)
+
+        done, rows, truth = await self._keeper.ask(work)
+        if run == self.run:
+            who, number = _edits(self.rows, rows)
+            self.rows = rows
+            self.truth = truth if against == self.against else truth_of(own, rows, self.against)
+            self.serial += 1
+            self.changed()
+            if number:
+                self.edited(who, number)
+        if isinstance(done, StaleError):
+            raise done
+        return done
+
+    async def read(self, function: Callable[[Store, int], T]) -> T | None:
+        """Ask the store about the run; None where there is none."""
+        run = self.run
+        if run is None or self.problem:
+            return None
+        return await self._keeper.ask(lambda store: function(store, run))
+
+    def as_plain(self) -> dict[str, Any]:
+        """For the browsers."""
+        return {
+            "run": self.run,
+            "serial": self.serial,
+            "problem": self.problem,
+            "used": counted(self._own, self.rows, self.against),
+            "against": self.against,
+            "own": None if self._own is None else len(self._own.x),
+            "contradicting": contradicting(self._own, self.rows),
+            "same_thing_m": SAME_THING,
+            "trees": [row_payload(row) for row in self.rows],
+        }
+
+
+def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:
+    """Who made the last edit that is still to be seen, and how many annotations differ."""
+    old = {row.id: row.version for row in before}
+    new = {row.id: row.version for row in after}
+    edited = [row for row in after if old.get(row.id) != row.version]
+    who = max(edited, key=lambda row: row.at_ns).who if edited else ""
+    return who, len(edited) + len(old.keys() - new.keys())
+
+
+def row_payload(row: Annotation) -> dict[str, Any]:
+    """One annotation, with the units in the names."""
+    content = row.content
+    return {
+        "id": row.id,
+        "x": round(content.x, 4),
+        "y": round(content.y, 4),
+        "kind": content.kind,
+        "dbh_cm": None if content.dbh is None else round(100.0 * content.dbh, 2),
+        "who": row.who,
+        "at_s": row.at_ns // 1_000_000_000,
+        "version": row.version,
+    }

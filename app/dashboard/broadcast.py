@@ -1,0 +1,126 @@
+"""What the browsers are told. Everything told is a state, so only the newest of each kind counts: a
+slow browser skips what it was too slow for, and costs the others nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from app.dashboard.payload import first_difference, path_points
+
+_encode = msgspec.json.encode
+
+# A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
+MAP_PAUSE_S = 0.09
+_EMPTY_MAP: dict[str, Any] = {"type": "map", "index": -1, "trees": []}
+
+
+class Live:
+    """The newest message of each kind, and who listens."""
+
+    def __init__(self) -> None:
+        self._messages: dict[str, tuple[int, bytes]] = {}
+        self._map: tuple[int, dict[str, Any], NDArray[np.float64]] | None = None
+        self._count = 0
+        self._listeners: set[Listener] = set()
+
+    @property
+    def listeners(self) -> int:
+        """How many browsers listen."""
+        return len(self._listeners)
+
+    def tell(self, kind: str, content: object) -> None:
+        """Replace the message of a kind; the content is a dict, a record or None."""
+        plain = msgspec.to_builtins(content) if content is not None else None
+        # A message without content says so; the page shows the empty state.
+        message = {"type": kind, **plain} if isinstance(plain, dict) else {"type": kind, "value": plain}
+        encoded = _encode(message)
+        if kind in self._messages and self._messages[kind][1] == encoded:
+            return
+        self._messages[kind] = (self._next(), encoded)
+        self._wake()
+
+    def show(self, payload: dict[str, Any], path_xy: NDArray[np.float64]) -> None:
+        """Replace the map; `path_xy` of shape (N, 2) is never changed afterwards."""
+        self._map = (self._next(), payload, path_xy)
+        self._wake()
+
+    def forget_map(self) -> None:
+        """There is no map any more: another run begins. Browsers are told an empty one."""
+        if self._map is not None:
+            self.show(_EMPTY_MAP, np.zeros((0, 2)))
+
+    @contextmanager
+    def listener(self) -> Iterator[Listener]:
+        """Listen; what is known already comes first."""
+        listener = Listener(self)
+        self._listeners.add(listener)
+        try:
+            yield listener
+        finally:
+            self._listeners.discard(listener)
+
+    def messages_after(self, count: int) -> list[tuple[int, bytes]]:
+        """The messages told after a count, in their order."""
+        return sorted(m for m in self._messages.values() if m[0] > count)
+
+    def map_after(self, count: int) -> tuple[int, dict[str, Any], NDArray[np.float64]] | None:
+        """The map if it was shown after a count."""
+        return self._map if self._map is not None and self._map[0] > count else None
+
+    def _next(self) -> int:
+        self._count += 1
+        return self._count
+
+    def _wake(self) -> None:
+        for listener in self._listeners:
+            listener.news.set()
+
+
+class Listener:
+    """One browser's place in what is told."""
+
+    def __init__(self, live: Live) -> None:
+        self.news = asyncio.Event()
+        self.news.set()
+        self._live = live
+        self._seen = 0
+        self._map_seen = 0
+        self._map_at = -MAP_PAUSE_S
+        self._path: NDArray[np.float64] | None = None
+
+    async def messages(self) -> AsyncIterator[bytes]:
+        """JSON texts for ever, each as soon as it is told, maps at most ten a second."""
+        while True:
+            await self._wait()
+            self.news.clear()
+            for count, message in self._live.messages_after(self._seen):
+                self._seen = max(self._seen, count)
+                yield message
+            shown = self._live.map_after(self._map_seen)
+            if shown is not None and self._map_wait() <= 0.0:
+                yield self._map_message(*shown)
+
+    async def _wait(self) -> None:
+        waiting = self._live.map_after(self._map_seen) is not None
+        timeout = max(0.0, self._map_wait()) if waiting else None
+        try:
+            await asyncio.wait_for(self.news.wait(), timeout)
+        except TimeoutError:
+            return
+
+    def _map_wait(self) -> float:
+        return self._map_at + MAP_PAUSE_S - time.monotonic()
+
+    def _map_message(self, count: int, payload: dict[str, Any], path_xy: NDArray[np.float64]) -> bytes:
+        start = first_difference(self._path, path_xy)
+        self._map_seen, self._map_at, self._path = count, time.monotonic(), path_xy
+        return _encode({**payload, "path": path_points(path_xy, start)})

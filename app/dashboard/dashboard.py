@@ -1,0 +1,394 @@
+"""The dashboard's state: what the worker said last, and what people asked for.
+
+Joins the worker, the parameters, the 3D scene and the browsers. Everything runs on the event loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from app.common.throttle import Throttle
+from app.dashboard.annotations import Annotating
+from app.dashboard.broadcast import Live
+from app.dashboard.camera_view import CameraDesk
+from app.dashboard.events import Events
+from app.dashboard.interfaces import SceneLike, WorkerLike
+from app.dashboard.map_changes import MapChanges
+from app.dashboard.parameter_sets import ParameterSets
+from app.dashboard.parameter_state import ParameterState
+from app.dashboard.payload import map_payload, truth_payload
+from app.dashboard.run_recorder import Glance, Logbook
+from app.dashboard.scores import Scores, score_payload
+from app.dashboard.selecting import Selecting
+from app.dashboard.verdict_counts import BeforeAfter, counts_of
+from app.explain.client import Asking
+from app.store.async_store import Keeper
+from app.tuning.job import TuneSearch
+from app.tuning.sweep.asking_page import question_of
+from app.tuning.sweep.sensitivity import Sensitivity
+from app.web.connection_limits import Places, Turns
+from app.web.user import SOMEBODY, hand
+from app.worker.internal_protocol import (
+    Answer,
+    Begin,
+    FromWorker,
+    Opened,
+    Remapped,
+    Report,
+    Rough,
+    Shown,
+    ToWorker,
+)
+from app.worker.loop_playback import Loop
+from app.worker.outbox import joined
+from app.worker.protocol import Open, Play, SetParameters, Status
+from pipeline.config.model import Value
+from pipeline.types.records import Path, Trees, TruthTrees
+
+# A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
+_SCENE_PAUSE_S = 0.09
+
+
+class Dashboard:
+    """What is shown, and what can be done to it. `worker` and `scene` are set before `start`.
+
+    Args:
+        parameters: In force at the beginning.
+        live: Where the browsers listen.
+        keeper: Of the store; None keeps all in memory.
+    """
+
+    worker: WorkerLike
+    scene: SceneLike
+
+    def __init__(self, parameters: ParameterState, live: Live, keeper: Keeper | None = None) -> None:
+        self.parameters = parameters
+        self.keeper = keeper or Keeper(None)
+        self.logbook = Logbook(self.keeper)
+        self.annotating = Annotating(self.keeper)
+        self.annotating.changed, self.annotating.edited = self._use_truth, self._mark_edits
+        self.live = live
+        self.scores = Scores(self._tell_score)
+        self.sensitivity = Sensitivity(lambda told: live.tell("sensitivity", told))
+        self.status = Status(state="starting", detail="Starting")
+        self.shown: Shown | None = None
+        self.path: Path | None = None
+        self.path_xy = np.zeros((0, 2))
+        self.truth: TruthTrees | None = None
+        self.sets = ParameterSets(self.keeper, self._show_parameters)
+        self._before_after = BeforeAfter()
+        self.asking = Asking(lambda question: self.worker.send(question), lambda: self._run)
+        self.camera = CameraDesk(self.asking)
+        self.selecting = Selecting(
+            self.asking,
+            live,
+            lambda tree, ring: self.scene.select(tree, ring),
+            run=lambda: self._run,
+            newest=lambda: None if self.shown is None else self.shown.frame.index,
+        )
+        self.pages, self.scenes = Places(), Places()
+        self.viewers_turns = Turns()
+        self.scene_hand = SOMEBODY  # who moved something in the scene last
+        self.source = Open("")
+        self.digest = ""  # of what is mapped, "" before it is open
+        self.events = Events()
+        self.search = TuneSearch(lambda told: live.tell("search", told))
+        self.loop = Loop(live, lambda command: self.worker.send(command))
+        self._run: int | None = None
+        self._notice = ""
+        self._restarts = 0
+        self._go = False
+        self._show_scene = Throttle(lambda f, xy: self.scene.show(f, xy), pause_s=_SCENE_PAUSE_S)
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the run's first scan, 0 before one is shown."""
+        return 0 if self.shown is None else self.shown.frame.stamp_ns - round(self.shown.time_s * 1e9)
+
+    async def start(self, source: Open) -> None:
+        """Start the worker with a source; it plays as soon as it is open."""
+        await self.sets.load()
+        self.live.tell("view", self.scene.view)
+        await self.worker.start()
+        await self._send_parameters()
+        await self.open(source)
+
+    async def close(self) -> None:
+        """End the worker and the scene."""
+        self.scores.close()
+        await self.sensitivity.leave()
+        self.selecting.leave()
+        self._show_scene.cancel()
+        await self.search.leave()
+        await self.logbook.close()
+        await self.worker.close()
+        await self.keeper.close()
+        self.scene.close()
+
+    # --- what people do --------------------------------------------------------------------------
+
+    async def command(self, command: ToWorker) -> None:
+        """Hand a command to the worker."""
+        self._notice = ""
+        # A worker that is down comes back with the source closed; then this is still to be done.
+        self._go = isinstance(command, Play | Open) and self.worker.pid is None
+        await self.worker.send(command)
+
+    async def choose_view(self, name: str, value: str | bool) -> None:
+        """Show or hide a layer of the scene, or colour, label or follow otherwise.
+
+        Raises:
+            ParameterError: There is no such choice.
+        """
+        self.scene.choose(name, value)
+        self.live.tell("view", self.scene.view)
+
+    async def open(self, source: Open) -> None:
+        """Leave the run and open another source."""
+        self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
+        self._run, self.source, self.digest = None, source, ""
+        self.camera.forget()
+        self.logbook.leave()
+        self.annotating.leave()
+        await self.sensitivity.leave()
+        await self.search.leave()
+        await self._forget()
+        await self.command(source)
+
+    async def replay(self, source: Open, preset_name: str, values: dict[str, Value]) -> None:
+        """Open a source once more with the parameters of an earlier run of it.
+
+        Raises:
+            ParameterError: They are not those of this version; nothing is changed.
+        """
+        self.parameters.take(preset_name, values)
+        self._show_parameters()  # the worker gets them when the source is open
+        await self.open(source)
+
+    async def change_parameters(self, changes: dict[str, Value], gesture: str = "") -> None:
+        """Change values by their dotted names, as part of a gesture (see `ParameterState.change`).
+
+        Raises:
+            ParameterError: A value does not fit; nothing is changed.
+        """
+        await self.tune(lambda state: state.change(changes, gesture))
+
+    async def use_preset(self, name: str) -> None:
+        """Take all values of a preset.
+
+        Raises:
+            ParameterError: There is none of this name.
+        """
+        await self.tune(lambda state: state.use_preset(name))
+
+    async def reset_parameters(self, names: list[str]) -> None:
+        """Give parameters (none named: all) the preset's values again.
+
+        Raises:
+            ParameterError: A name is unknown.
+        """
+        await self.tune(lambda state: state.reset(names))
+
+    async def tune(self, change: Callable[[ParameterState], None]) -> None:
+        """Let parameters be changed, and tell everybody.
+
+        Raises:
+            StemmapError: The change is refused; nothing is changed.
+        """
+        before, step = self.parameters.parameters, self.parameters.step
+        change(self.parameters)
+        if self.parameters.step != step:
+            self._before_after.step()
+        await self._send_parameters()  # first of all: the scan is mapped again while all others are told
+        self._show_parameters()
+        if self.shown is not None:
+            self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
+            self._tell_events()
+        state = self.parameters
+        who = hand.get() or self.scene_hand
+        self.logbook.changed(before.flat(), state.parameters.flat(), state.preset, state.revision, who)
+        self._score()
+
+    async def reach(self, *, whole: bool) -> None:
+        """Let changes of parameters act on the whole run, which is mapped again at once, or from the standing
+        scan on."""
+        self.parameters.whole = whole
+        self._show_parameters()
+        await self._send_parameters()
+
+    def how_much_matters(self, name: str, values: list[Value]) -> None:
+        """Have the whole run scored over values of a parameter.
+
+        Raises:
+            StemmapError: It cannot be, and why.
+        """
+        state = self.parameters.parameters
+        self.sensitivity.ask(
+            question_of(self.source, self.digest, self.status, self.truth, state, name, values)
+        )
+
+    async def select_tree(self, number: int | None) -> None:
+        """Select a tree everywhere; None selects nothing."""
+        self.selecting.tree(number)
+
+    async def select_cluster(self, scan: int, cluster: int) -> None:
+        """Select a cluster everywhere, as it stands in a scan that was shown lately, with its tree.
+
+        Raises:
+            NoStoryError: It is not known any more.
+        """
+        await self.selecting.cluster(scan, cluster)
+
+    def _show_parameters(self) -> None:
+        state = self.parameters
+        name = self.sets.name_of(state.preset, state.parameters)
+        self.live.tell("sets", self.sets.as_plain())
+        self.live.tell("parameters", {**state.as_plain(), "set": name})
+        self.scene.show_parameters(state.parameters, state.preset)
+
+    def _tell_events(self) -> None:
+        self.live.tell("events", self.events.as_plain())
+
+    async def _send_parameters(self) -> None:
+        state = self.parameters
+        values = state.parameters.model_dump()
+        await self.worker.send(SetParameters(values, state.revision, state.whole, state.step))
+
+    # --- what the worker says --------------------------------------------------------------------
+
+    async def receive(self, message: FromWorker) -> None:
+        """Take a message of the worker."""
+        match message:
+            case Report(status=status):
+                self._set_status(status)
+            case Opened() if message.asked in ("", self.source.uri):  # else it was left before it was open
+                await self._begin(message)
+            case Shown():
+                self._show(message)
+                if message.run == self._run:
+                    await self.loop.shown(message.time_s, self.status)
+            case Answer():
+                self.asking.take(message)
+            case Remapped(run=run, changes=changes) if run == self._run:
+                self._remapped(changes)
+            case Rough(run=run, revision=revision, trees=trees) if run == self._run:
+                await self._tell_rough(run, revision, trees)
+
+    async def _tell_rough(self, run: int, revision: int, trees: Trees) -> None:
+        """The run is being mapped again: what will come of it, roughly, with its score."""
+        score = None
+        if self.truth is not None:
+            evaluation = self.parameters.parameters.evaluation
+            score = await asyncio.to_thread(score_payload, trees, self.truth, evaluation, self.path_xy)
+            if run != self._run:  # another one was opened meanwhile
+                return
+        places = np.round(trees.position, 3).tolist()
+        self.live.tell("rough", {"revision": revision, "places": places, "score": score})
+
+    def _remapped(self, changes: MapChanges) -> None:
+        """The run was mapped again: the map has other trees, and other numbers."""
+        self.live.tell("remapped", msgspec.to_builtins(changes))
+        self.events.remapped(changes.confirmed, changes.time_s)
+        self._tell_events()
+        self.selecting.renamed(dict(changes.followed))
+
+    async def _begin(self, opened: Opened) -> None:
+        """A source is open and waits: parameters that suit it first, then it plays."""
+        self._run, self.digest = opened.run, opened.digest or opened.uri
+        await self.annotating.begin(opened.digest or opened.uri, opened.uri, opened.truth)
+        if self._run != opened.run:  # it was left meanwhile
+            return
+        await self._forget()
+        if self.parameters.suit(opened.preset):
+            self._show_parameters()
+        restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
+        self.logbook.begin(self.annotating.run, self.source, opened, again=restarted)
+        play = self._go or not restarted
+        if not play:
+            self._notice = "The mapping process ended and was started again. Press play to begin anew"
+        self._go = False
+        state = self.parameters
+        # Always with the parameters: those sent for a run that was left since did not reach the worker.
+        await self.worker.send(Begin(opened.run, state.parameters.model_dump(), state.revision, play))
+
+    async def _forget(self) -> None:
+        """Show an empty map, with the truth of the run that comes."""
+        self.shown = self.path = None
+        self.path_xy = np.zeros((0, 2))
+        self.live.forget_map()
+        self.scores.forget()
+        self._before_after.forget()
+        self.events.forget()
+        self._tell_events()
+        self.loop.choose(None)
+        self.live.tell("remapped", {})
+        self.live.tell("rough", {})
+        self._show_scene.cancel()
+        self.scene.clear()
+        self._use_truth()
+        self.selecting.tree(None)
+
+    def _use_truth(self) -> None:
+        """Show the truth, score against it, and tell what was annotated."""
+        self.truth = self.annotating.truth
+        self.scene.show_truth(self.truth)
+        self.live.tell("truth", truth_payload(self.truth))
+        self.live.tell("annotations", self.annotating.as_plain())
+        if self.truth is None:
+            self.scores.forget()
+        self._score()
+
+    def _mark_edits(self, who: str, number: int) -> None:
+        if self.shown is not None:
+            self.events.annotated(who, number, self.shown.time_s)
+            self._tell_events()
+
+    def _show(self, shown: Shown) -> None:
+        if shown.run != self._run:  # of a run that was left
+            return
+        self.path = joined(self.path, shown.path_start, shown.path)
+        if shown.frame.ground is None and self.shown is not None:
+            # An earlier picture brought it, which the scene may not have drawn, or before it was built anew.
+            frame = replace(shown.frame, ground=self.shown.frame.ground)
+            shown = msgspec.structs.replace(shown, frame=frame)
+        self.shown = shown
+        self.path_xy = np.column_stack([self.path.x, self.path.y])
+        distance = self.parameters.parameters.evaluation.match_distance
+        counts = self._before_after.shown(counts_of(shown.frame, self.truth, distance))
+        payload = map_payload(shown)
+        payload["layers"] |= self.scene.counts
+        self.live.show({**payload, **counts}, self.path_xy)
+        if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
+            self._tell_events()
+        self.logbook.shown(self._glance(shown))
+        self._score()
+        self._show_scene(shown.frame, self.path_xy)
+
+    def _glance(self, shown: Shown) -> Glance:
+        state = self.parameters
+        return Glance(
+            shown, self.path_xy, state.preset, state.parameters.flat(), self.truth, self.scores.latest
+        )
+
+    def _tell_score(self, score: dict[str, Any] | None) -> None:
+        self.live.tell("evaluation", score)
+        self.logbook.scored(score)
+
+    def _score(self) -> None:
+        if self.shown is not None and self.truth is not None:
+            evaluation = self.parameters.parameters.evaluation
+            self.scores.ask(self.shown.frame.trees, self.truth, evaluation, self.path_xy)
+
+    def _set_status(self, status: Status) -> None:
+        if self._notice and status.state == "paused":
+            status = replace(status, detail=self._notice)
+        self.status = status
+        self.live.tell("status", status)
+        if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
+            self._tell_events()

@@ -1,0 +1,46 @@
+"""What the dashboard needs of the scene and of the worker, whatever stands behind them."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.worker.internal_protocol import ToWorker
+from pipeline.config import Parameters
+from pipeline.types.records import Frame, TruthTrees
+
+
+class SceneLike(Protocol):
+    """What the dashboard needs of `app.scene.Scene`."""
+
+    @property
+    def port(self) -> int: ...
+
+    secret: str
+
+    def show(self, frame: Frame, path: NDArray[np.float64], /) -> None: ...
+    def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None: ...
+    def show_truth(self, trees: TruthTrees | None, /) -> None: ...
+    def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None: ...
+    def choose(self, name: str, value: str | bool, /) -> None: ...
+    @property
+    def view(self) -> dict[str, Any]: ...
+    @property
+    def counts(self) -> dict[str, int]: ...
+    def clear(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class WorkerLike(Protocol):
+    """What the dashboard needs of `app.worker.supervisor.WorkerProcess`."""
+
+    restarts: int
+
+    @property
+    def pid(self) -> int | None: ...
+
+    async def start(self) -> None: ...
+    async def send(self, command: ToWorker, /) -> None: ...
+    async def close(self) -> None: ...

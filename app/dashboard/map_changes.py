@@ -1,0 +1,176 @@
+"""What became of the trees of a map when the run was mapped again: which stayed, came, went or moved, and
+why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from pipeline.evaluation import match
+from pipeline.types.records import Columns, Float, Frame, Trees, Verdict
+
+SAME = 0.5  # m; a tree that is found so near is the same one
+MOVED = 0.05  # m; less is not worth telling
+
+
+class TreeChange(msgspec.Struct, frozen=True):
+    """One tree that is not as it was.
+
+    Attributes:
+        kind: What became of it.
+        number: In the map where it is: the new one, or of a tree that is gone the old one.
+        x, y: There [m], in the frame of the map.
+        why: In words.
+    """
+
+    kind: Literal["appeared", "vanished", "moved"]
+    number: int
+    x: float
+    y: float
+    why: str
+
+
+class MapChanges(msgspec.Struct, frozen=True):
+    """A map beside the one before.
+
+    Attributes:
+        revision: Of the parameters.
+        scans: Scans that were mapped again.
+        time_s: Of the last of them, since the run's first one.
+        before, after: Number of trees.
+        ghost: x, y [m] and DBH [m] (None where it is not known) of every tree before.
+        renamed: Old and new number of each tree that stayed.
+        followed: The same of the trees that were shown last, where that is another map than the one before.
+        changes: The others, and those that moved.
+        confirmed: New number of each tree that ever was confirmed, also of one that went again later, and
+            when that was [s since the run's first scan]: what a run marks that was mapped so from its start.
+    """
+
+    revision: int
+    scans: int
+    time_s: float
+    before: int
+    after: int
+    ghost: list[tuple[float, float, float | None]]
+    renamed: list[tuple[int, int]]
+    followed: list[tuple[int, int]]
+    changes: list[TreeChange]
+    confirmed: list[tuple[int, float]]
+
+
+def changes_between(
+    before: Frame,
+    shown: Frame,
+    after: Frame,
+    revision: int,
+    time_s: float,
+    confirmed_s: Mapping[int, float],
+) -> MapChanges:
+    """Compare two maps of the same scans.
+
+    Args:
+        before, after: The last scan of each.
+        shown: The same of the map that was shown last.
+        revision: Of the parameters of `after`.
+        time_s: Of both frames, since the run's first scan.
+        confirmed_s: When each tree on the way to `after` was confirmed.
+    """
+    old, new = np.flatnonzero(before.trees.confirmed), np.flatnonzero(after.trees.confirmed)
+    old_at, new_at = before.trees.position[old], after.trees.position[new]
+    old_of = match(new_at, old_at, SAME)
+    stayed = [(k, int(row)) for k, row in enumerate(old_of.tolist()) if row >= 0]
+    renamed = _renamed(before.trees, after.trees)
+    gone = sorted(set(range(len(old))) - {row for _, row in stayed})
+    changes = [
+        *(_came(before, after.trees, int(new[k])) for k, row in enumerate(old_of.tolist()) if row < 0),
+        *(_went(before.trees, int(old[row]), after) for row in gone),
+        *(
+            _moved(after.trees, int(new[k]), float(np.hypot(*(new_at[k] - old_at[row]))))
+            for k, row in stayed
+            if np.hypot(*(new_at[k] - old_at[row])) > MOVED
+        ),
+    ]
+    dbh = before.trees.dbh[old]
+    return MapChanges(
+        revision=revision,
+        scans=after.index + 1,
+        time_s=time_s,
+        before=len(old),
+        after=len(new),
+        ghost=[
+            (round(float(x), 3), round(float(y), 3), round(float(d), 3) if np.isfinite(d) else None)
+            for (x, y), d in zip(old_at, dbh, strict=True)
+        ],
+        renamed=renamed,
+        followed=renamed if shown is before else _renamed(shown.trees, after.trees),
+        changes=changes,
+        confirmed=sorted(confirmed_s.items(), key=lambda item: (item[1], item[0])),
+    )
+
+
+def _renamed(before: Trees, after: Trees) -> list[tuple[int, int]]:
+    """Old and new number of each tree of a map that is in another one too."""
+    old, new = np.flatnonzero(before.confirmed), np.flatnonzero(after.confirmed)
+    old_of = match(after.position[new], before.position[old], SAME)
+    return [
+        (int(before.number[old[row]]), int(after.number[new[k]]))
+        for k, row in enumerate(old_of.tolist())
+        if row >= 0
+    ]
+
+
+def _came(before: Frame, trees: Trees, row: int) -> TreeChange:
+    place = trees.position[row]
+    return _change("appeared", trees, row, f"before: {_why_not(before, place)}")
+
+
+def _went(trees: Trees, row: int, after: Frame) -> TreeChange:
+    return _change("vanished", trees, row, f"now: {_why_not(after, trees.position[row])}")
+
+
+def _moved(trees: Trees, row: int, distance: float) -> TreeChange:
+    return _change("moved", trees, row, f"by {100 * distance:.0f} cm")
+
+
+def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: int, why: str) -> TreeChange:
+    x, y = trees.position[row]
+    return TreeChange(kind, int(trees.number[row]), round(float(x), 3), round(float(y), 3), why)
+
+
+def _why_not(frame: Frame, place: Float) -> str:
+    """Why no tree stands at a place of a map."""
+    if frame.columns is not None:
+        near = _nearest(frame.columns.axis[:, :2], place)
+        if near >= 0:
+            told = _column(frame.columns, near)
+            if told:
+                return told
+    near = _nearest(frame.trees.position, place)
+    if near < 0:
+        return "nothing was taken for a tree there"
+    seen = int(frame.trees.observations[near])
+    return f"seen {seen} time{'s' * (seen != 1)}, which does not confirm it"
+
+
+def _column(columns: Columns, row: int) -> str:
+    """What was gathered there, unless it was a tree."""
+    verdict = Verdict(int(columns.verdict[row]))
+    if verdict is Verdict.TREE:
+        return ""
+    if verdict in (Verdict.TOO_FEW_POINTS, Verdict.MOVING):
+        return f"what stands there is judged {verdict.label!r}"
+    share = 100 * float(columns.share[row, 0])
+    return f"what stands there is judged {verdict.label!r} ({share:.0f} % of the votes for a tree)"
+
+
+def _nearest(places: Float, place: Float) -> int:
+    """The row of the nearest place within reach, -1 where there is none."""
+    if not len(places):
+        return -1
+    distance = np.hypot(*(places - place).T)
+    row = int(np.argmin(distance))
+    return row if distance[row] <= SAME else -1

@@ -1,0 +1,232 @@
+"""Keeps the record of the run that is open: figures, map, parameters and who changed them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from dataclasses import dataclass, field, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.dashboard.payload import trees_payload, truth_payload
+from app.sources.source_options import plain_of
+from app.store.async_store import Keeper
+from app.store.book import Beginning, Change, Standing
+from app.store.store import Store
+from app.worker.internal_protocol import Opened, Shown
+from app.worker.protocol import Open
+from pipeline.config.model import Value
+from pipeline.errors import StemmapError
+from pipeline.types.records import TruthTrees
+
+Float = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
+
+# A record is a picture of the run for later: it need not be newer than this while the run plays.
+_PAUSE_S = 5.0
+MOST_PATH_POINTS = 3000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Glance:
+    """What the dashboard holds of a run at a moment; nothing of it is changed afterwards.
+
+    Attributes:
+        shown: The picture; path_xy: shape (N, 2) [m].
+        preset, parameters: In force.
+        truth, scores: Known then.
+    """
+
+    shown: Shown
+    path_xy: Float
+    preset: str
+    parameters: dict[str, Value]
+    truth: TruthTrees | None
+    scores: dict[str, Any] | None
+
+
+@dataclass(slots=True, eq=False)
+class _Page:
+    """Of one run: `best` is the glance of the last scan that was ever reached."""
+
+    beginning: Beginning
+    all_scans: int | None
+    record: int | None = None
+    best: Glance | None = None
+    newest: Glance | None = None
+    dirty: bool = False
+    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+
+class Logbook:
+    """Writes down what becomes of the runs, some seconds after it happens and at their end.
+
+    Args:
+        keeper: Of the store.
+    """
+
+    def __init__(self, keeper: Keeper) -> None:
+        self._keeper = keeper
+        self._page: _Page | None = None
+        self._writer: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._problem = ""
+
+    @property
+    def record(self) -> int | None:
+        """Number of the open run's record; None before something of it was written."""
+        return self._page.record if self._page else None
+
+    def begin(self, run: int | None, source: Open, opened: Opened, *, again: bool) -> None:
+        """A run was opened.
+
+        Args:
+            run: Number of its source in the store; None where the store cannot be used.
+            source, opened: What was asked for, and what came of it.
+            again: The worker died and opened the same run once more: its record goes on.
+        """
+        if again and self._page is not None and self._page.beginning.uri == opened.uri:
+            return
+        self.leave()
+        if run is None:
+            return
+        name = FilePath(opened.uri.rstrip("/")).name or opened.uri
+        chosen = plain_of(source)
+        beginning = Beginning(run, name, opened.uri, opened.kind, source.odometry, source.seed, chosen)
+        self._page = _Page(beginning, opened.scans)
+
+    def leave(self) -> None:
+        """The run is left: what is not written yet is written now."""
+        page, self._page = self._page, None
+        if self._writer is not None:
+            self._writer.cancel()
+            self._writer = None
+        if page is not None and page.dirty:
+            self._start(self._write(page))
+
+    def shown(self, glance: Glance) -> None:
+        """A scan was shown. The farthest one counts: who goes back does not take the map away."""
+        page = self._page
+        if page is None:
+            return
+        page.newest = glance
+        if page.best is None or glance.shown.frame.index >= page.best.shown.frame.index:
+            page.best, page.dirty = glance, True
+            self._soon(page)
+
+    def scored(self, scores: dict[str, Any] | None) -> None:
+        """The scan that was shown last has this score."""
+        page = self._page
+        if page is None or page.best is None or page.best is not page.newest or scores is None:
+            return
+        page.best = page.newest = replace(page.best, scores=scores)
+        page.dirty = True
+        self._soon(page)
+
+    def changed(
+        self, before: dict[str, Value], after: dict[str, Value], preset: str, revision: int, who: str
+    ) -> None:
+        """Parameters were changed: all values by dotted name, before and after."""
+        changes = {name: [before[name], value] for name, value in after.items() if before[name] != value}
+        page = self._page
+        if page is None or page.newest is None or not changes:
+            return
+        time_s = page.newest.shown.time_s
+        self._start(self._revise(page, Change(revision, time_s, who, preset, changes)))
+
+    async def close(self) -> None:
+        """Write what is left to be written."""
+        self.leave()
+        while self._tasks:
+            await asyncio.gather(*self._tasks)
+
+    def _soon(self, page: _Page) -> None:
+        if self._writer is None or self._writer.done():
+            self._writer = asyncio.create_task(self._write_on(page), name="logbook")
+
+    async def _write_on(self, page: _Page) -> None:
+        while page.dirty:
+            await asyncio.shield(self._start(self._write(page)))
+            await asyncio.sleep(_PAUSE_S)
+
+    async def _revise(self, page: _Page, change: Change) -> None:
+        if page.record is None:
+            await self._write(page)
+        record = page.record
+        if record is not None:
+            await self._ask(lambda store: store.book.revise(record, change))
+
+    async def _write(self, page: _Page) -> None:
+        async with page.lock:
+            glance, page.dirty = page.best, False
+            if glance is None:
+                return
+
+            def work(store: Store) -> int:
+                standing = _standing(glance, page.all_scans)
+                if page.record is None:
+                    return store.book.begin(page.beginning, standing)
+                store.book.update(page.record, standing)
+                return page.record
+
+            try:
+                page.record = await self._ask(work)
+            except StemmapError:  # it was logged; what was not written is still to be written
+                page.dirty = True
+
+    async def _ask(self, work: Any) -> Any:  # noqa: ANN401 - as the keeper's
+        try:
+            done = await self._keeper.ask(work)
+        except StemmapError as error:
+            if str(error) != self._problem:  # once, not every five seconds
+                _log.warning("the run is not recorded: %s", error)
+            self._problem = str(error)
+            raise
+        self._problem = ""
+        return done
+
+    def _start(self, work: Any) -> asyncio.Task[None]:  # noqa: ANN401 - any coroutine
+        task: asyncio.Task[None] = asyncio.create_task(_quietly(work), name="logbook entry")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+
+async def _quietly(work: Any) -> None:  # noqa: ANN401 - any coroutine
+    with contextlib.suppress(StemmapError):  # it was logged
+        await work
+
+
+def _standing(glance: Glance, all_scans: int | None) -> Standing:
+    shown = glance.shown
+    frame = shown.frame
+    trees = trees_payload(frame, start_ns=frame.stamp_ns - round(shown.time_s * 1e9))
+    truth = truth_payload(glance.truth)
+    return Standing(
+        scans=frame.index + 1,
+        all_scans=all_scans,
+        time_s=round(shown.time_s, 3),
+        distance_m=round(float(np.hypot(*np.diff(glance.path_xy, axis=0).T).sum()), 3),
+        trees=len(trees),
+        preset=glance.preset,
+        parameters=glance.parameters,
+        scores=glance.scores,
+        map={
+            "trees": trees,
+            "path": thinned(glance.path_xy),
+            "truth": None if truth is None else truth["trees"],
+        },
+    )
+
+
+def thinned(path_xy: Float) -> list[list[float]]:
+    """A path (N, 2) [m] with at most MOST_PATH_POINTS rows, its ends among them."""
+    n = len(path_xy)
+    rows = np.unique(np.linspace(0, n - 1, min(n, MOST_PATH_POINTS)).round().astype(np.int64))
+    points: list[list[float]] = np.round(path_xy[rows], 3).tolist()
+    return points

@@ -1,0 +1,124 @@
+"""The score against the ground truth, kept up with the map.
+
+It is computed in the web process, in a thread: it needs nothing but the tree table, which is here
+already, takes about a millisecond, and the worker's time belongs to the mapping. Three times a
+second at most.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.batch.summary import truth_in_doubt
+from pipeline.config.stages import Evaluation
+from pipeline.types.records import Trees, TruthTrees
+
+Float = NDArray[np.float64]
+
+_log = logging.getLogger(__name__)
+
+_PAUSE_S = 0.3
+MOST_PAIRED = 300
+
+
+class Scores:
+    """Computes the newest score that was asked for.
+
+    Args:
+        tell: Called on the event loop with a score, or None when there is none any more.
+    """
+
+    def __init__(self, tell: Callable[[dict[str, Any] | None], None]) -> None:
+        self.latest: dict[str, Any] | None = None
+        self._tell = tell
+        self._asked: tuple[Trees, TruthTrees, Evaluation, Float] | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._runs = 0
+
+    def ask(self, trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> None:
+        """Have the map scored soon, against the truth near the path (N, 2)."""
+        self._asked = (trees, truth, parameters, path_xy)
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._work(), name="scores")
+
+    def forget(self) -> None:
+        """There is no map any more."""
+        self._asked = self.latest = None
+        self._runs += 1
+        self._tell(None)
+
+    def close(self) -> None:
+        """Stop computing."""
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _work(self) -> None:
+        while self._asked is not None:
+            asked, self._asked = self._asked, None
+            run = self._runs
+            try:
+                score = await asyncio.to_thread(score_payload, *asked)
+            except Exception:  # a score that fails must not end those that follow
+                _log.exception("the map could not be scored")
+            else:
+                if run == self._runs:  # else the map has gone meanwhile
+                    self.latest = score
+                    self._tell(score)
+            await asyncio.sleep(_PAUSE_S)
+
+
+def score_payload(trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> dict[str, Any]:
+    """The score with the units in the names; what nothing was matched for is None."""
+    from pipeline.evaluation import evaluate
+
+    score = evaluate(trees, truth, parameters, path_xy)
+    rates = {"TA": score.TA, "TR": score.TR, "FA": score.FA, "FR": score.FR}
+    return {
+        **{name: {"count": r.count, "of": r.of, "rate": r.rate} for name, r in rates.items()},
+        "spurious": score.spurious,
+        "completeness": score.completeness,
+        "correctness": score.correctness,
+        "f1": score.f1,
+        "position_rmse_m": score.position_rmse,
+        "position_bias_m": score.position_bias,
+        "dbh_rmse_cm": None if score.dbh_rmse is None else 100.0 * score.dbh_rmse,
+        "dbh_bias_cm": None if score.dbh_bias is None else 100.0 * score.dbh_bias,
+        "dbh_count": score.dbh_count,
+        "mean_pair_error_percent": score.mean_pair_error_percent,
+        "largest_pair_error_percent": score.largest_pair_error_percent,
+        "reach_m": score.reach,
+        "warning": truth_in_doubt(score),
+    }
+
+
+def pairs_payload(trees: Trees, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
+    """Distances between the confirmed trees [m], and their errors [%] where both trees were matched.
+
+    A matrix of more than MOST_PAIRED trees is no picture any more: the first of them are taken.
+    """
+    from pipeline.evaluation import match, pair_distances, pair_errors
+
+    rows = np.flatnonzero(trees.confirmed)
+    kept = rows[:MOST_PAIRED]
+    position = trees.position[kept]
+    payload: dict[str, Any] = {
+        "numbers": trees.number[kept].tolist(),
+        "distance_m": np.round(pair_distances(position), 3).tolist(),
+        "error_percent": None,
+        "left_out": len(rows) - len(kept),
+    }
+    if truth is None:
+        return payload
+    true_position = np.stack([truth.x, truth.y], axis=1)
+    truth_of = match(position, true_position, match_distance)
+    matched = np.flatnonzero([row >= 0 and truth.kind[row] == "tree" for row in truth_of])
+    errors = np.full((len(kept), len(kept)), np.nan)
+    found = pair_errors(position[matched], true_position[truth_of[matched]])
+    errors[np.ix_(matched, matched)] = np.round(found.percent, 2)
+    return {**payload, "error_percent": errors.tolist()}

@@ -1,0 +1,128 @@
+"""How the estimate of each tree came to where it is: a bounded memory of what each scan made of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.explain.records import History
+from pipeline.remapping import Recalled
+from pipeline.types.records import Frame
+
+_WIDTH = 11  # scan, number, observations, time, x, y, var x, cov xy, var y, DBH, its sigma
+_SCAN, _NUMBER, _OBSERVATIONS, _TIME = range(4)
+_MOST_ROWS = 200_000
+_ALL_OF_FIRST = 10  # observations; there the ellipse shrinks fastest
+_MOST_TOLD = 200
+_NS = 1_000_000_000
+
+
+class TreeHistory:
+    """What each scan made of the trees that it saw.
+
+    The first ten estimates of each tree are kept, and the later ones of every scan; when all together are
+    more than 200,000, the later ones of every second scan are forgotten, again and again.
+    """
+
+    def __init__(self) -> None:
+        self._rows = np.zeros((1024, _WIDTH))
+        self._count = 0
+        self._spacing = 1
+
+    def __len__(self) -> int:
+        return self._count
+
+    def before(self, scan: int) -> TreeHistory:
+        """A memory of its own, of what the scans before one made of the trees."""
+        known = TreeHistory()
+        count = int(np.searchsorted(self._rows[: self._count, _SCAN], scan))
+        known._rows, known._count = self._rows[: max(count, 1024)].copy(), count
+        known._spacing = self._spacing
+        return known
+
+    def record(self, frame: Frame | Recalled, start_ns: int) -> None:
+        """Take a scan, or several. What was known of these and later scans is forgotten: the run went back.
+
+        Args:
+            frame: The results.
+            start_ns: Time of the run's first scan.
+        """
+        rows = _rows_of(frame, start_ns)
+        first = frame.first if isinstance(frame, Recalled) else frame.index
+        self._count = int(np.searchsorted(self._rows[: self._count, _SCAN], first))
+        if self._spacing > 1:
+            rows = rows[(rows[:, _SCAN] % self._spacing == 0) | (rows[:, _OBSERVATIONS] <= _ALL_OF_FIRST)]
+        self._append(rows)
+
+    def of(self, number: int) -> History:
+        """The story of one tree: at most 200 rows, the first and the last among them."""
+        known = self._rows[: self._count]
+        mine = known[known[:, _NUMBER] == number]
+        if len(mine) > _MOST_TOLD:  # closer together where it is young
+            place = np.unique(np.geomspace(1, len(mine), _MOST_TOLD).astype(np.int64) - 1)
+            mine = mine[place]
+        ellipse = half_axes(_matrices(mine[:, 6:9]))
+        return History(
+            time_s=mine[:, _TIME].tolist(),
+            x=mine[:, 4].tolist(),
+            y=mine[:, 5].tolist(),
+            major=ellipse[:, 0].tolist(),
+            minor=ellipse[:, 1].tolist(),
+            angle=ellipse[:, 2].tolist(),
+            dbh=mine[:, 9].tolist(),
+            dbh_sigma=mine[:, 10].tolist(),
+        )
+
+    def _append(self, rows: NDArray[np.float64]) -> None:
+        while self._count + len(rows) > len(self._rows):
+            grown = np.empty((2 * len(self._rows), _WIDTH))
+            grown[: self._count] = self._rows[: self._count]
+            self._rows = grown
+        self._rows[self._count : self._count + len(rows)] = rows
+        self._count += len(rows)
+        while self._count > _MOST_ROWS and self._spacing < _MOST_ROWS:
+            self._spacing *= 2
+            known = self._rows[: self._count]
+            keep = (known[:, _OBSERVATIONS] <= _ALL_OF_FIRST) | (known[:, _SCAN] % self._spacing == 0)
+            self._count = int(keep.sum())
+            self._rows[: self._count] = known[keep]
+
+
+def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Half axes [m] and direction of the longer one [rad] of the 1-sigma ellipses of (T, 2, 2): (T, 3)."""
+    values, vectors = np.linalg.eigh(covariance)
+    minor, major = np.sqrt(np.maximum(values, 0.0)).T
+    return np.stack([major, minor, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])], axis=1)
+
+
+def _matrices(xx_xy_yy: NDArray[np.float64]) -> NDArray[np.float64]:
+    return xx_xy_yy[:, [[0, 1], [1, 2]]]
+
+
+def _rows_of(frame: Frame | Recalled, start_ns: int) -> NDArray[np.float64]:
+    """What scans made of the trees that they detected, shape (R, _WIDTH)."""
+    if isinstance(frame, Recalled):
+        seen = frame.seen
+        place, covariance, dbh, dbh_sigma = seen.position, seen.covariance, seen.dbh, seen.dbh_sigma
+        scan, number, observations = seen.scan, seen.number, seen.observations
+        stamp_ns = frame.stamps_ns[scan - frame.first]
+    else:
+        trees = frame.trees
+        # A tree that its column began has a place before any scan detected it.
+        there = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
+        place, covariance = trees.position[there], trees.covariance[there]
+        dbh, dbh_sigma = trees.dbh[there], trees.dbh_sigma[there]
+        scan, number = np.full(len(there), frame.index), trees.number[there]
+        observations, stamp_ns = trees.observations[there], np.full(len(there), frame.stamp_ns)
+    return np.column_stack(
+        [
+            scan,
+            number,
+            observations,
+            (stamp_ns - start_ns) / _NS,
+            place,
+            covariance[:, [0, 0, 1], [0, 1, 1]],
+            dbh,
+            dbh_sigma,
+        ]
+    )

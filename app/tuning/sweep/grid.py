@@ -1,0 +1,204 @@
+"""Which sets of parameters are compared: every combination of the values that were asked for.
+
+On the command line `NAME=VALUES`, with values as `--set` takes them: a list `0.1,0.15,0.2`, a span with a
+number of values `0.1..0.4/7` (ends included), `0.01..1/5log` with equal ratios, or both in one list. In a
+TOML file one table a stage, with lists or the same texts.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs
+from pipeline.config.model import Value
+from pipeline.config.text import parsed
+from pipeline.errors import ParameterError
+
+PRESET = "preset"  # an axis of its own: what all else is laid over
+MOST_SETS = 20_000
+MOST_VALUES = 1_000
+_LARGEST_FILE = 1 << 20
+_COUNT = re.compile(r"(\d{1,6})(log)?")
+_EXAMPLE = "E.g. --param-grid clustering.eps=0.1,0.15,0.2 or clustering.eps=0.1..0.4/7"
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """A parameter, by its dotted name or PRESET, and the values that it takes."""
+
+    name: str
+    values: tuple[Value, ...]
+
+
+def read_axes(words: Iterable[str]) -> tuple[Axis, ...]:
+    """The axes of the words after `--param-grid`: `NAME=VALUES`, or the name of a TOML file.
+
+    Raises:
+        ParameterError: A name, a value or a file does not fit, or there are too many sets.
+    """
+    axes: dict[str, Axis] = {}
+    for word in words:
+        name, equals, text = (part.strip() for part in word.partition("="))
+        found = [_axis(name, [text])] if equals else _axes_of(Path(word))
+        for axis in found:
+            if axis.name in axes:
+                raise ParameterError(f"{axis.name} is asked for twice", remedy="Put its values into one list")
+            axes[axis.name] = axis
+    sets = math.prod(len(axis.values) for axis in axes.values())
+    if sets > MOST_SETS:
+        raise ParameterError(
+            f"{' x '.join(str(len(axis.values)) for axis in axes.values())} values are {sets:,} sets, "
+            f"more than {MOST_SETS:,}",
+            remedy="Ask for fewer values, or search with `stemmap tune`",
+        )
+    return tuple(axes.values())
+
+
+def combinations(axes: Sequence[Axis]) -> list[dict[str, Value]]:
+    """Every combination of the values, the last axis changing fastest."""
+    return [
+        dict(zip((axis.name for axis in axes), values, strict=True))
+        for values in itertools.product(*(axis.values for axis in axes))
+    ]
+
+
+def laid_over(base: Parameters, changes: Mapping[str, Value]) -> Parameters:
+    """Parameters with the values of a combination; its PRESET was laid below `base` already.
+
+    Raises:
+        ParameterError: Two values contradict one another.
+    """
+    return base.replace({name: value for name, value in changes.items() if name != PRESET})
+
+
+def words_of(changes: Mapping[str, Value]) -> str:
+    """A combination for people, as `--set` would take it."""
+    return " ".join(f"{name}={shown(value)}" for name, value in changes.items()) or "as it is"
+
+
+def shown(value: Value) -> str:
+    """A value as `--set` takes it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _axes_of(file: Path) -> list[Axis]:
+    try:
+        if file.stat().st_size > _LARGEST_FILE:
+            raise ParameterError("the file is larger than 1 MB", where=str(file))
+        given = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise ParameterError(f"cannot read the grid: {reason}", where=str(file), remedy=_EXAMPLE) from None
+    except (ValueError, RecursionError) as error:
+        raise ParameterError(f"not a TOML file: {error}", where=str(file)) from None
+    axes = []
+    for stage, entry in given.items():
+        if stage == PRESET:
+            axes.append(_axis(PRESET, entry if isinstance(entry, list) else [entry]))
+        elif isinstance(entry, dict):
+            axes += [
+                _axis(f"{stage}.{name}", values if isinstance(values, list) else [values])
+                for name, values in entry.items()
+            ]
+        else:
+            raise ParameterError(
+                f"{stage} stands outside of a stage", where=str(file), remedy="Write it below a line [stage]"
+            )
+    return axes
+
+
+def _axis(name: str, entries: Sequence[Any]) -> Axis:
+    if name == PRESET:
+        values: list[Value] = [word for entry in entries for word in _parts(str(entry))]
+        unknown = [value for value in values if value not in PRESETS]
+        if unknown:
+            raise ParameterError(
+                f"there is no preset {unknown[0]!r}", remedy=f"Presets: {', '.join(PRESETS)}"
+            )
+        return Axis(PRESET, tuple(dict.fromkeys(values)))
+    spec = next((spec for spec in field_specs() if spec.name == name), None)
+    if spec is None:
+        Parameters().replace({name: None})  # says which name is near
+        raise ParameterError(f"there is no parameter {name!r}")
+    values = [value for entry in entries for part in _parts(_text(entry)) for value in _values(spec, part)]
+    if not values or len(values) > MOST_VALUES:
+        raise ParameterError(f"{name} has {len(values):,} values, not 1 to {MOST_VALUES:,}", remedy=_EXAMPLE)
+    for value in values:
+        _check(spec, value)
+    return Axis(name, tuple(dict.fromkeys(values)))
+
+
+def _text(entry: object) -> str:
+    """An entry of TOML as it would stand on the command line."""
+    return str(entry).lower() if isinstance(entry, bool) else str(entry)
+
+
+def _parts(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _values(spec: FieldSpec, text: str) -> list[Value]:
+    start, dots, rest = text.partition("..")
+    if not dots:
+        return [_value(spec, text)]
+    end, _, how_many = rest.rpartition("/")  # of the last: units have slashes too
+    counted = _COUNT.fullmatch(how_many.strip())
+    if spec.kind not in ("int", "float") or counted is None:
+        raise ParameterError(
+            f"{spec.name} = {text!r} is no span of numbers with how many values it has", remedy=_EXAMPLE
+        )
+    low, high = float(_value(spec, start)), float(_value(spec, end))
+    count, ratio = int(counted[1]), counted[2] is not None
+    if not 2 <= count <= MOST_VALUES or not (math.isfinite(low) and math.isfinite(high)):
+        raise ParameterError(
+            f"{spec.name} = {text!r}: a span has 2 to {MOST_VALUES:,} values between two numbers",
+            remedy=_EXAMPLE,
+        )
+    if ratio and min(low, high) <= 0.0:
+        raise ParameterError(f"{spec.name} = {text!r}: equal ratios need numbers above 0", remedy=_EXAMPLE)
+    return [_rounded(spec, value) for value in spread(low, high, count, ratio=ratio)]
+
+
+def spread(low: float, high: float, count: int, *, ratio: bool) -> list[float]:
+    """So many values from one to the other, ends included, with equal steps or equal ratios."""
+    shares = [k / (count - 1) for k in range(count)]
+    if ratio:
+        between = [low * (high / low) ** share for share in shares]
+    else:
+        between = [low + (high - low) * share for share in shares]
+    return [low, *between[1:-1], high]
+
+
+def _rounded(spec: FieldSpec, value: float) -> Value:
+    # Twelve digits: 0.1..0.3/3 has the value 0.2 and not 0.2 and a last bit.
+    return round(value) if spec.kind == "int" else float(f"{value:.12g}")
+
+
+def _value(spec: FieldSpec, text: str) -> Value:
+    """A value; its unit may stand behind it."""
+    bare = text.strip()
+    if spec.kind in ("int", "float") and spec.unit:
+        bare = bare.removesuffix(spec.unit).strip()
+    return parsed(spec, bare)
+
+
+def _check(spec: FieldSpec, value: Value) -> None:
+    """Of a value alone; whether two contradict one another hangs on what they are laid over."""
+    if spec.kind in ("int", "float") and spec.minimum is not None and spec.maximum is not None:
+        if not spec.minimum <= float(value) <= spec.maximum:
+            raise ParameterError(
+                f"{spec.name} = {shown(value)} is not within {spec.minimum:g} to {spec.maximum:g}"
+            )
+    elif (spec.kind == "choice" and value not in spec.choices) or (
+        spec.kind == "bool" and not isinstance(value, bool)
+    ):
+        raise ParameterError(f"{spec.name} = {value!r} is none of {', '.join(spec.choices) or 'true, false'}")

@@ -1,0 +1,231 @@
+"""The web application: one port for the page, the API, the live messages and the 3D scene."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from fastapi import FastAPI, Request
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from app.common.settings import Settings
+from app.dashboard.broadcast import Live
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.interfaces import SceneLike, WorkerLike
+from app.dashboard.learning import Learning
+from app.dashboard.parameter_state import ParameterState
+from app.store.async_store import Keeper
+from app.store.records import UnknownError
+from app.training.learned_forests import Forests
+from app.web.auth import BodyTooLargeError, Guard, viewer_token
+from app.web.responses import BadRequestError, error_reply, failure_reply
+from app.web.routes import annotations as annotation_routes
+from app.web.routes import (
+    camera,
+    page,
+    parameter_sets,
+    parameters,
+    pictures,
+    results,
+    run,
+    runs,
+    sensitivity,
+    sockets,
+    story,
+    tuning,
+)
+from app.web.routes import learning as learning_routes
+from app.web.routes import uploads as upload_routes
+from app.web.uploads import Uploads
+from app.worker.protocol import Open
+from pipeline.errors import ParameterError, StemmapError
+
+_log = logging.getLogger(__name__)
+
+ROUTERS = tuple(
+    module.router
+    for module in (
+        camera,
+        page,
+        run,
+        runs,
+        sensitivity,
+        parameters,
+        parameter_sets,
+        pictures,
+        results,
+        annotation_routes,
+        learning_routes,
+        upload_routes,
+        story,
+        tuning,
+        sockets,
+    )
+)
+
+MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
+MakeWorker = Callable[[Dashboard], WorkerLike]
+
+
+@dataclass(frozen=True, slots=True)
+class OfFleet:
+    """What a dashboard knows of the fleet that it belongs to.
+
+    Attributes:
+        port: Of the page of all robots.
+        open_records: Tells the records of the runs that are open in any of its dashboards.
+    """
+
+    port: int
+    open_records: Callable[[], set[int | None]]
+
+
+Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
+
+_HEADERS = (
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"x-frame-options", b"SAMEORIGIN"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+)
+_POLICY = (b"content-security-policy", b"default-src 'none'; frame-ancestors 'self'")
+
+
+def build(
+    settings: Settings,
+    *,
+    port: int,
+    token: str,
+    source: Open,
+    parameter_state: ParameterState,
+    make_scene: MakeScene | None = None,
+    make_worker: MakeWorker | None = None,
+    fleet: OfFleet | None = None,
+) -> FastAPI:
+    """The application.
+
+    Args:
+        settings: Of the deployment.
+        port: On which it is served, for Host and Origin.
+        token: That browsers must show.
+        source: Opened at the start.
+        parameter_state: The parameters at the start.
+        make_scene, make_worker: Stand in for viser and for the worker's process in tests.
+        fleet: That it belongs to; None when it is alone.
+    """
+    parameter_state.check = Forests(settings.folder).check
+    dashboard = Dashboard(parameter_state, Live(), Keeper(settings.folder, settings.database))
+
+    learning = Learning(dashboard.keeper, settings.folder, lambda told: dashboard.live.tell("learning", told))
+    uploads = Uploads(settings.uploads, settings.upload_limit, dashboard.keeper)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        await asyncio.to_thread(uploads.clear)
+        dashboard.worker = (make_worker or partial(_worker, settings.folder))(dashboard)
+        dashboard.scene = (make_scene or _scene)(dashboard, asyncio.get_running_loop())
+        await dashboard.start(source)
+        try:
+            yield
+        finally:
+            await learning.close()
+            await dashboard.close()
+
+    app = guarded(settings, port=port, token=token, lifespan=lifespan)
+    app.state.dashboard, app.state.settings = dashboard, settings
+    app.state.fleet_port = None if fleet is None else fleet.port
+    app.state.open_records = fleet.open_records if fleet else lambda: {dashboard.logbook.record}
+    app.state.uploads, app.state.learning = uploads, learning
+    for router in ROUTERS:
+        app.include_router(router)
+    return app
+
+
+def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) -> FastAPI:
+    """An application without a route that lets through only who may, and answers errors for people."""
+    guard = Middleware(
+        Guard,
+        token=token,
+        host=settings.host,
+        port=port,
+        further_hosts=settings.hosts,
+        body_limit=settings.body_limit,
+        upload_limit=settings.upload_limit,
+    )
+    app = FastAPI(
+        title="stemmap",
+        lifespan=lifespan,
+        middleware=[Middleware(SafeHeaders), guard],
+        docs_url=None,  # its page loads scripts from another server
+        redoc_url=None,
+        openapi_url=None,
+        redirect_slashes=False,
+    )
+    app.state.token, app.state.viewer_token = token, viewer_token(token)
+    _answer_errors(app)
+    return app
+
+
+class SafeHeaders:
+    """ASGI middleware: every answer, the refusals too, carries the headers that keep browsers careful."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Add the headers to the answer."""
+
+        async def careful(message: Message) -> None:
+            if message["type"] in ("http.response.start", "websocket.http.response.start"):
+                given = list(message.get("headers", ()))
+                names = {name.lower() for name, _ in given}
+                message["headers"] = given + [h for h in (*_HEADERS, _POLICY) if h[0] not in names]
+            await send(message)
+
+        await self._app(scope, receive, careful)
+
+
+def _answer_errors(app: FastAPI) -> None:
+    statuses = {
+        BadRequestError: 422,
+        ParameterError: 422,
+        BodyTooLargeError: 413,
+        UnknownError: 404,
+        StemmapError: 409,
+    }
+
+    @app.exception_handler(StemmapError)
+    async def for_people(_: Request, error: Exception) -> Response:
+        assert isinstance(error, StemmapError)  # noqa: S101 - the handler is registered for it
+        return failure_reply(next(statuses[t] for t in type(error).__mro__ if t in statuses), error)
+
+    @app.exception_handler(HTTPException)
+    async def of_the_framework(_: Request, error: Exception) -> Response:
+        assert isinstance(error, HTTPException)  # noqa: S101 - the handler is registered for it
+        return error_reply(error.status_code, str(error.detail).lower())
+
+    @app.exception_handler(Exception)
+    async def unexpected(_: Request, error: Exception) -> Response:
+        _log.error("a request failed", exc_info=error)
+        return error_reply(500, "this is a fault in stemmap", remedy="The terminal shows where it happened")
+
+
+def _worker(folder: Path | None, dashboard: Dashboard) -> WorkerLike:
+    from app.worker.supervisor import WORKER, WorkerProcess
+
+    kept = () if folder is None else (str(folder / "kept"),)
+    return WorkerProcess(dashboard.receive, (*WORKER, *kept))
+
+
+def _scene(dashboard: Dashboard, loop: asyncio.AbstractEventLoop) -> SceneLike:
+    from app.scene import Scene
+
+    return Scene(dashboard, loop)

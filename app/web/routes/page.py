@@ -1,0 +1,126 @@
+"""The page, its files, and viser's page."""
+
+from __future__ import annotations
+
+import mimetypes
+from pathlib import Path, PurePosixPath
+from urllib.parse import urlsplit
+
+from fastapi import APIRouter, Request
+from starlette.responses import FileResponse, RedirectResponse, Response
+
+from app.web.auth import role_of
+from app.web.responses import error_reply, json_reply
+from app.web.static_files import page_folder, plotly_script
+from app.web.viser_proxy import client_page
+
+router = APIRouter()
+
+# Where the machine's own table knows it wrong or not at all, a browser refuses a module script.
+mimetypes.add_type("text/javascript", ".js")
+mimetypes.add_type("text/javascript", ".mjs")
+
+_CHECK_EACH_TIME = {"Cache-Control": "no-cache"}
+
+# Plotly writes style attributes and takes pictures through blob: and data: addresses.
+_PAGE_POLICY = (
+    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "font-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'self'"
+)
+# viser's page is one file that unpacks itself: its scripts stand in it and are evaluated.
+_VISER_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:; "
+    "style-src 'unsafe-inline' blob:; img-src 'self' data: blob:; font-src data: blob:; "
+    "connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
+
+
+@router.get("/")
+def page(request: Request) -> Response:
+    """The dashboard."""
+    return _file(request, page_folder() / "index.html", _PAGE_POLICY)
+
+
+@router.get("/runs")
+def runs_page(request: Request) -> Response:
+    """The page of all runs."""
+    return _file(request, page_folder() / "runs.html", _PAGE_POLICY)
+
+
+@router.get("/robots")
+def all_robots(request: Request) -> Response:
+    """Lead back to the page of the fleet that this dashboard belongs to."""
+    port = request.app.state.fleet_port
+    if port is None:
+        return error_reply(404, "this dashboard stands alone", remedy="Open / in its place")
+    return lead_on(request, port)
+
+
+@router.get("/api/access")
+def access(request: Request) -> Response:
+    """What the link allows, for who may change things the link for those who may look, and whether there are
+    other robots."""
+    role = role_of(request.scope)
+    link = f"/?token={request.app.state.viewer_token}" if role == "owner" else None
+    robots = None if request.app.state.fleet_port is None else "/robots"
+    return json_reply({"role": role, "viewer_link": link, "robots": robots})
+
+
+@router.get("/static/plotly.min.js")
+def plotly(request: Request) -> Response:
+    """The plots' library, of the installed package."""
+    return _file(request, plotly_script(), _PAGE_POLICY)
+
+
+@router.get("/static/{path:path}")
+def page_file(request: Request, path: str) -> Response:
+    """A file of the page."""
+    found = _page_path(path)
+    if found is None:
+        return error_reply(404, "there is no such file", where=f"/static/{path[:200]}")
+    return _file(request, found, _PAGE_POLICY)
+
+
+@router.get("/viser/")
+def viser_page(request: Request) -> Response:
+    """The 3D scene's page, of the installed viser."""
+    return _file(request, client_page(), _VISER_POLICY)
+
+
+def lead_on(request: Request, port: int) -> Response:
+    """On to another port of this host, with the token that who asks may use there."""
+    owner = role_of(request.scope) == "owner"
+    token = request.app.state.token if owner else request.app.state.viewer_token
+    asked = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
+    host = f"[{asked}]" if ":" in asked else asked
+    answer = RedirectResponse(f"http://{host}:{port}/?token={token}", 303)
+    answer.headers["Cache-Control"] = "no-store"
+    return answer
+
+
+def page_answer(request: Request, path: Path) -> Response:
+    """A page of ours, with the policy of a page."""
+    return _file(request, path, _PAGE_POLICY)
+
+
+def _file(request: Request, path: Path, policy: str) -> Response:
+    """The file, or word that the browser has it already."""
+    headers = {**_CHECK_EACH_TIME, "Content-Security-Policy": policy}
+    answer = FileResponse(path, headers=headers, stat_result=path.stat())
+    known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
+    if answer.headers["etag"] in known:
+        return Response(status_code=304, headers={**headers, "ETag": answer.headers["etag"]})
+    return answer
+
+
+def _page_path(path: str) -> Path | None:
+    """The file of a path below /static/, None if there is none or it is hidden or outside."""
+    wanted = PurePosixPath(path)
+    if "\0" in path or any(part.startswith(".") for part in wanted.parts):
+        return None
+    folder = page_folder().resolve()
+    try:
+        found = (folder / wanted).resolve()
+        return found if found.is_relative_to(folder) and found.is_file() else None
+    except OSError:  # a name that no disk takes
+        return None

@@ -1,0 +1,182 @@
+"""Runs the web server in this process: the socket, the printed link, the browser, the signals."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+
+import uvicorn
+from starlette.types import ASGIApp
+
+from app.common.settings import DEFAULT_PORT, Settings
+from app.dashboard.parameter_state import ParameterState
+from app.web.app import build
+from app.web.auth import new_token, viewer_token
+from app.web.browser_launch import page_that_leads_to, show_in_browser
+from app.worker.protocol import Open
+from pipeline.errors import StemmapError
+
+_PORTS_TRIED = 10
+# Less waits in the kernel for a browser behind a slow radio link; what waits is old when it arrives.
+_SEND_BUFFER = 128 * 1024
+_GRACE_S = 1
+_OF_THE_PORT = (errno.EADDRINUSE, errno.EACCES)
+_OTHER_HOST = "Give an address of this machine with --host, or leave it away"
+
+
+def serve(
+    settings: Settings,
+    *,
+    source: Open,
+    parameter_state: ParameterState,
+    open_browser: bool,
+    viewer: bool = False,
+) -> int:
+    """Serve the dashboard until SIGINT or SIGTERM; with `viewer` print the link for looking only too.
+
+    Raises:
+        StemmapError: The port is in use, or the address is not one of this machine.
+    """
+    listening = bind(settings)
+    port = listening.getsockname()[1]
+    token = settings.token or new_token()
+    app = build(settings, port=port, token=token, source=source, parameter_state=parameter_state)
+    link = link_of(settings, port, token)
+    if viewer:
+        print(f"for looking only: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
+    server = LinkedServer(uvicorn_config(app, settings), settings, link, open_browser=open_browser)
+    with contextlib.closing(listening):
+        asyncio.run(server.serve(sockets=[listening]))
+    return 0 if server.started else 1
+
+
+def link_of(settings: Settings, port: int, token: str) -> str:
+    """The link that opens the page."""
+    return f"http://{_name(settings.host)}:{port}/?token={token}"
+
+
+def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
+    """How the application is served."""
+    return uvicorn.Config(
+        app,
+        ws="websockets-sansio",
+        ws_max_size=settings.message_limit,
+        ws_per_message_deflate=False,  # points do not get smaller, and it costs a core
+        timeout_graceful_shutdown=_GRACE_S,
+        server_header=False,
+        log_level="warning",
+        access_log=False,  # the token is in the first address
+        lifespan="on",
+    )
+
+
+def bind(settings: Settings) -> socket.socket:
+    """A listening socket on the port asked for, or where none was, on the first free one.
+
+    Raises:
+        StemmapError: There is none.
+    """
+    first = DEFAULT_PORT if settings.port is None else settings.port
+    ports = [first] if settings.port is not None else range(first, first + _PORTS_TRIED)
+    reason = OSError("no port was tried")
+    for port in ports:
+        try:
+            listening = bound(settings.host, port)
+        except socket.gaierror as error:
+            raise StemmapError(
+                f"no address is known by this name: {error.strerror}",
+                where=settings.host,
+                remedy=_OTHER_HOST,
+            ) from None
+        except OSError as error:
+            reason = error
+            continue
+        if port != first:
+            print(f"Port {first} is in use; {port} is taken instead.", flush=True)  # noqa: T201
+        return listening
+    other_port = "Give another port with --port, or 0 for any free one"
+    raise StemmapError(
+        f"cannot listen: {(reason.strerror or str(reason)).lower()}",
+        where=f"{settings.host}:{first}",
+        remedy=other_port if reason.errno in _OF_THE_PORT else _OTHER_HOST,
+    )
+
+
+def bound(host: str, port: int) -> socket.socket:
+    """A listening socket on a port.
+
+    Raises:
+        OSError: It is not free, or not of this machine.
+    """
+    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    listening = socket.socket(family, kind, protocol)
+    try:
+        if os.name == "posix":  # elsewhere it would let two servers have one port
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        listening.bind(address)
+        listening.listen(128)
+    except OSError:
+        listening.close()
+        raise
+    return listening
+
+
+class LinkedServer(uvicorn.Server):
+    """Says where it is once it is ready, and ends without a traceback."""
+
+    def __init__(self, config: uvicorn.Config, settings: Settings, link: str, *, open_browser: bool) -> None:
+        super().__init__(config)
+        self._settings = settings
+        self._link = link
+        self._open_browser = open_browser
+        self._until_the_end = contextlib.ExitStack()
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, then print the link."""
+        await super().startup(sockets)
+        if not self._settings.loopback:
+            print(  # noqa: T201
+                f"Warning: {self._settings.host} can be reached from the network, and what is sent is not "
+                "encrypted. Whoever has the link can use this dashboard.",
+                file=sys.stderr,
+            )
+        print(f"stemmap is ready: {self._link}", flush=True)  # noqa: T201
+        if self._open_browser and _has_display():
+            page = self._until_the_end.enter_context(page_that_leads_to(self._link))
+            threading.Thread(target=show_in_browser, args=(page,), daemon=True).start()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End, and leave no file behind."""
+        self._until_the_end.close()
+        await super().shutdown(sockets)
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """End on a signal; unlike uvicorn's, do not raise it again afterwards."""
+        before = {s: signal.signal(s, self.handle_exit) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _has_display() -> bool:
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _name(host: str) -> str:
+    """The host as it stands in a link."""
+    if host in ("0.0.0.0", "::"):  # noqa: S104 - compared with, not bound to
+        return socket.gethostname()
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,198 @@
+"""Recordings that come from a browser: streamed into the data folder, and kept only when they can be read."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import secrets
+import shutil
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+from app.sources import sandbox
+from app.store.async_store import Keeper
+from pipeline.errors import StemmapError
+
+# What a disk keeps free for the system and for the annotations.
+SPARE_BYTES = 1 << 30
+MOST_AT_ONCE = 2
+_CHUNK = 4 << 20
+_STALLED_S = 60.0
+# A part that nobody has written to for so long is of a server that ended.
+_ABANDONED_S = 3600.0
+_PART = ".upload-"
+_SUFFIX = re.compile(r"\.[a-z0-9]{1,8}\Z")
+
+
+class UploadError(StemmapError):
+    """An upload that is refused; nothing of it stays. `status` is that of the answer."""
+
+    def __init__(self, status: int, what: str, *, where: str = "", remedy: str = "") -> None:
+        super().__init__(what, where=where, remedy=remedy)
+        self.status = status
+
+
+class Uploads:
+    """Takes uploads into a folder.
+
+    Args:
+        folder: Made when it is first needed; None where nothing is kept.
+        limit: Largest file [bytes].
+        keeper: Of the store, which remembers how a file was called.
+    """
+
+    def __init__(self, folder: Path | None, limit: int, keeper: Keeper) -> None:
+        self._folder, self.limit, self._keeper = folder, limit, keeper
+        self._under_way = 0
+        self._awaited = 0  # bytes that uploads under way have not written yet
+
+    def room(self) -> int:
+        """Bytes that an upload may have now.
+
+        Raises:
+            UploadError: There is no folder for uploads.
+        """
+        return max(0, min(self.limit, self._free() - self._awaited))
+
+    async def take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
+        """Take a file of so many bytes; returns where it lies and what it is.
+
+        Raises:
+            UploadError: It is too large, does not come whole, or cannot be read.
+        """
+        if self._under_way >= MOST_AT_ONCE:
+            raise UploadError(409, f"{MOST_AT_ONCE} uploads are under way", remedy="Wait until one is done")
+        self._under_way += 1
+        try:
+            return await self._take(name, size, stream)
+        finally:
+            self._under_way -= 1
+
+    async def _take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
+        free = await asyncio.to_thread(self._free)
+        room = max(
+            0, min(self.limit, free - self._awaited)
+        )  # what others were promised while this waited too
+        if size > room:
+            why = "the limit" if size > self.limit else "what the disk has free"
+            raise UploadError(
+                413, f"the file has {_gigabytes(size)}, more than {why}: {_gigabytes(room)}", where=name
+            )
+        if size <= 0:
+            raise UploadError(422, "the file is empty", where=name)
+        # The reader looks at the contents first, but a file of bare floats has nothing but its name.
+        suffix = Path(name).suffix.lower()
+        suffix = suffix if _SUFFIX.match(suffix) else ""
+        part = self._place() / f"{_PART}{secrets.token_hex(8)}{suffix}"
+        try:
+            await self._write(part, size, stream)
+            kind = await _look_at(part, name)
+            made_up = f"upload-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}{suffix}"
+            place = part.with_name(made_up)
+            part.rename(place)
+        except OSError as error:
+            raise UploadError(507, f"the file cannot be kept: {error.strerror}", where=name) from None
+        finally:
+            part.unlink(missing_ok=True)
+        with contextlib.suppress(StemmapError):  # then it is listed under its made-up name
+            await self._keeper.ask(lambda store: store.book.add_upload(made_up, _shown(name), kind, size))
+        return {"uri": str(place), "name": _shown(name), "kind": kind, "bytes": size}
+
+    def _free(self) -> int:
+        return shutil.disk_usage(self._place()).free - SPARE_BYTES
+
+    async def _write(self, part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
+        awaited = size
+
+        def wrote(length: int) -> None:
+            nonlocal awaited
+            awaited -= length
+            self._awaited -= length
+
+        self._awaited += size
+        try:
+            await _write(part, size, stream, wrote)
+        finally:
+            self._awaited -= awaited
+
+    def clear(self) -> None:
+        """Remove what servers left that were ended in the middle of an upload."""
+        if self._folder is None or not self._folder.is_dir():
+            return
+        for part in self._folder.glob(f"{_PART}*"):
+            with contextlib.suppress(OSError):
+                if part.stat().st_mtime < time.time() - _ABANDONED_S:
+                    part.unlink()
+
+    def _place(self) -> Path:
+        if self._folder is None:
+            raise UploadError(409, "there is no folder for uploads", remedy="Name one with STEMMAP_FOLDER")
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise UploadError(
+                507, f"the folder for uploads cannot be made: {error.strerror}", where=str(self._folder)
+            ) from None
+        return self._folder
+
+
+async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Callable[[int], None]) -> None:
+    """Write the file in large pieces, each in a thread; `wrote` is told the length of each.
+
+    Raises:
+        UploadError: The browser left, sends nothing any more, or sends another length than it said.
+    """
+    written, waiting = 0, bytearray()
+    # Not in a thread: who is cancelled meanwhile would not know of the file that comes after all.
+    file = part.open("xb")
+    try:
+        async for piece in _in_time(stream):
+            waiting += piece
+            if len(waiting) >= _CHUNK:
+                written += len(waiting)
+                await asyncio.to_thread(file.write, bytes(waiting))
+                wrote(len(waiting))
+                waiting.clear()
+        written += len(waiting)
+        await asyncio.to_thread(file.write, bytes(waiting))
+    finally:
+        file.close()
+    if written != size:
+        raise UploadError(422, f"{written} of {size} bytes came", remedy="Upload the file again")
+
+
+async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    pieces = aiter(stream)
+    while True:
+        try:
+            yield await asyncio.wait_for(anext(pieces), _STALLED_S)
+        except StopAsyncIteration:
+            return
+        except TimeoutError:
+            raise UploadError(408, f"nothing came for {_STALLED_S:.0f} s", remedy="Upload it again") from None
+
+
+async def _look_at(part: Path, name: str) -> str:
+    """What the file is, in words, found out by a process of its own."""
+    try:
+        told = await sandbox.ask({"ask": "recording", "path": str(part)})
+    except sandbox.TookTooLongError:
+        return "not looked through yet"  # a very large one; opening it will tell
+    except StemmapError as error:
+        # The path is of the part; the person knows the file by its name.
+        what, remedy = (text.replace(str(part), name) for text in (error.what, error.remedy))
+        raise UploadError(422, what, where=_shown(name), remedy=remedy) from None
+    return str(told["kind"])
+
+
+def _shown(name: str) -> str:
+    """The name without folders and without what would steer a terminal."""
+    last = name.replace("\\", "/").rpartition("/")[2]
+    return "".join(letter for letter in last if letter.isprintable())[:200] or "recording"
+
+
+def _gigabytes(size: int) -> str:
+    return f"{size / 1e9:.1f} GB" if size >= 1e8 else f"{size / 1e6:.1f} MB"

@@ -1,0 +1,29 @@
+"""What browsers are told over a websocket, as long as they listen."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from app.dashboard.broadcast import Listener, Live
+
+
+@contextlib.asynccontextmanager
+async def telling(browser: WebSocket, live: Live) -> AsyncIterator[None]:
+    """Inside, a browser is told all that changes."""
+    with live.listener() as listener:
+        sending = asyncio.create_task(_send(browser, listener))
+        try:
+            yield
+        finally:
+            sending.cancel()
+            with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
+                await sending
+
+
+async def _send(browser: WebSocket, listener: Listener) -> None:
+    async for message in listener.messages():
+        await browser.send_text(message.decode())

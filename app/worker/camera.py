@@ -1,0 +1,53 @@
+"""What the run's camera saw at the time of a scan; found by the mapping process, decoded elsewhere."""
+
+from __future__ import annotations
+
+import msgspec
+
+from app.robot.source import LiveSource
+from pipeline.errors import StemmapError
+from pipeline.io.readers.base import Source, SourceDescription
+from pipeline.io.readers.camera import SHOWN_NS, Camera, Picture
+from pipeline.io.readers.odometry_override import WithMotion
+from pipeline.io.readers.pictures import WithPictures
+from pipeline.io.readers.rostypes import COMPRESSED_IMAGE, IMAGE
+
+
+class CameraPicture(msgspec.Struct, frozen=True):
+    """A picture as it was recorded, and how the camera stands.
+
+    Attributes:
+        picture: Not decoded.
+        camera: None where nobody tells where things stand in it.
+        why: There is none.
+        told: How many pictures came of a live run, in words; "" of a recording.
+    """
+
+    picture: Picture
+    camera: Camera | None
+    why: str
+    told: str = ""
+
+
+def has_camera(description: SourceDescription) -> bool:
+    """Whether a source has pictures."""
+    return any(t.read_as == "camera" and t.type in (IMAGE, COMPRESSED_IMAGE) for t in description.topics)
+
+
+def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
+    """The picture nearest to a time.
+
+    Raises:
+        StemmapError: There is none, and why.
+    """
+    origin: object = source.source if isinstance(source, WithMotion) else source
+    if source is None or not has_camera(source.description) or not isinstance(origin, WithPictures):
+        raise StemmapError("this run has no camera", remedy="Record a camera's topic beside the LiDAR")
+    picture = origin.picture_near(stamp_ns, SHOWN_NS)
+    if picture is None:
+        raise StemmapError(
+            f"no picture was taken within {SHOWN_NS / 1e9:g} s of this scan",
+            remedy="Play on, or go to another scan",
+        )
+    told = origin.pictures_told if isinstance(origin, LiveSource) else ""
+    return CameraPicture(picture, *origin.camera(), told)

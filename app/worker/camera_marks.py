@@ -1,0 +1,84 @@
+"""Where the trees of the map and a scan's clusters stand in a picture, as parts of its width and height."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from app.dashboard.payload import clusters_payload
+from pipeline.geometry.poses import Pose2
+from pipeline.io.readers.camera import Camera
+from pipeline.types.records import Float, Frame
+
+#: Trees farther away are a few pixels; so much of a stem is marked [m]; its width where no diameter is known.
+FARTHEST, NEAREST, FROM_Z, TO_Z, THIN = 25.0, 0.5, 0.0, 2.0, 0.2
+MOST = 150
+
+
+def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
+    """Boxes of clusters and of trees that are in view, the farthest of each first; the MOST nearest at most.
+
+    The robot's tilt is not known here, so on a slope the boxes of trees stand a little high or low.
+
+    Args:
+        frame: Of the scan.
+        camera: Of the picture.
+        moved: T_scan_picture of the base, where the picture was taken at another time.
+    """
+    found = [*_trees(frame, camera, moved), *_clusters(frame, camera, moved)]
+    nearest = sorted(found, key=lambda mark: float(mark["distance_m"]))[:MOST]
+    # What comes later lies on top and takes the click.
+    return sorted(nearest, key=lambda mark: (mark["kind"] == "tree", -float(mark["distance_m"])))
+
+
+def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
+    trees = frame.trees
+    marks = []
+    places = (frame.estimate.T_map_base @ moved).inverse().apply(trees.position)
+    for row in np.flatnonzero(trees.confirmed):
+        x, y = places[row]
+        reach = float(np.hypot(x, y))
+        if not NEAREST < reach < FARTHEST:
+            continue
+        half = 0.5 * (float(trees.dbh[row]) if np.isfinite(trees.dbh[row]) else THIN)
+        across = np.array([-y, x, 0.0]) * half / reach
+        corners = np.array([[x, y, z] + side * across for z in (FROM_Z, TO_Z) for side in (-1.0, 1.0)])
+        box = _box(camera, corners)
+        if box is not None:
+            number = int(trees.number[row])
+            marks.append({"kind": "tree", "number": number, "verdict": "tree", "distance_m": reach, **box})
+    return marks
+
+
+def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
+    verdicts = clusters_payload(frame)["verdict"]
+    points = frame.filtered.astype(np.float64) + frame.sensor_offset
+    points[:, :2] = moved.inverse().apply(points[:, :2])
+    order = np.argsort(frame.labels, kind="stable")
+    labels = frame.labels[order]
+    marks = []
+    for number, verdict in enumerate(verdicts):
+        first, last = np.searchsorted(labels, [number, number + 1])
+        members = points[order[first:last]]
+        box = _box(camera, members) if len(members) else None
+        if box is not None:
+            reach = float(np.hypot(*members[:, :2].mean(axis=0)))
+            marks.append(
+                {"kind": "cluster", "number": number, "verdict": verdict, "distance_m": reach, **box}
+            )
+    return marks
+
+
+def _box(camera: Camera, points: Float) -> dict[str, float] | None:
+    """The box around points of the base frame, None where it is not in view."""
+    pixels, depth = camera.project(points)
+    if not (depth > NEAREST).all():
+        return None
+    size = np.array([camera.width, camera.height])
+    low, high = pixels.min(axis=0) / size, pixels.max(axis=0) / size
+    if (high <= 0.0).any() or (low >= 1.0).any():
+        return None
+    low, high = np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
+    left, top, width, height = (round(float(v), 4) for v in (*low, *(high - low)))
+    return {"left": left, "top": top, "width": width, "height": height}

@@ -1,0 +1,146 @@
+"""Messages between the two processes: four bytes of length, then msgpack.
+
+Arrays travel as their dtype, shape and bytes. Both sides know the types that they expect: a message
+of another type, an array of another dtype or of a size that contradicts its bytes is refused. Nothing
+is ever run or imported because of what a message says, as pickle would.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, BinaryIO, Generic, TypeVar, get_args
+
+import msgspec
+import numpy as np
+
+from app.worker.internal_protocol import FromWorker, ToWorker
+
+M = TypeVar("M")
+
+LENGTH_BYTES = 4
+# A scan of 4 million points with all its layers; far above any sensor, far below the machine's memory.
+LARGEST_MESSAGE = 128 * 1024 * 1024
+_DTYPES = frozenset({"<f4", "<f8", "<i4", "<i8", "|b1"})
+_MOST_DIMENSIONS = 3
+
+
+class WireError(Exception):
+    """A message that is too large, cut, or not of the types agreed upon."""
+
+
+class _Array(msgspec.Struct, frozen=True, array_like=True):
+    """An array as it travels."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    content: bytes
+
+
+class Channel(Generic[M]):
+    """Encodes and decodes the messages of one direction.
+
+    Args:
+        message_type: A union of msgspec Structs with tags; fields may be dataclasses with arrays.
+    """
+
+    def __init__(self, message_type: Any) -> None:  # noqa: ANN401 - a union is no `type`
+        self._encoder = msgspec.msgpack.Encoder(enc_hook=_to_plain)
+        self._decoder: msgspec.msgpack.Decoder[M] = msgspec.msgpack.Decoder(
+            message_type, dec_hook=_from_plain
+        )
+
+    def encode(self, message: M) -> bytes:
+        """The message with its length before it.
+
+        Raises:
+            WireError: It is larger than LARGEST_MESSAGE.
+        """
+        packed = bytearray(LENGTH_BYTES)
+        self._encoder.encode_into(message, packed, LENGTH_BYTES)
+        size = len(packed) - LENGTH_BYTES
+        check_size(size)
+        packed[:LENGTH_BYTES] = size.to_bytes(LENGTH_BYTES, "little")
+        return bytes(packed)
+
+    def decode(self, body: bytes) -> M:
+        """A message from its bytes, without the length before it.
+
+        Raises:
+            WireError: It is not one of the agreed types.
+        """
+        try:
+            return self._decoder.decode(body)
+        except (msgspec.MsgspecError, ValueError, OverflowError) as error:
+            raise WireError(f"a message of {len(body)} bytes cannot be read: {error}") from None
+
+    def read(self, stream: BinaryIO) -> M | None:
+        """The next message of a blocking stream; None at its end.
+
+        Raises:
+            WireError: The stream ends within a message, or the message is not as agreed.
+        """
+        head = _read_exactly(stream, LENGTH_BYTES)
+        if not head:
+            return None
+        size = int.from_bytes(head, "little")
+        check_size(size)
+        body = _read_exactly(stream, size)
+        if len(head) < LENGTH_BYTES or len(body) < size:
+            raise WireError("the stream ends within a message")
+        return self.decode(body)
+
+
+def check_size(size: int) -> None:
+    """Refuse a length before memory is taken for it.
+
+    Raises:
+        WireError: It is larger than LARGEST_MESSAGE.
+    """
+    if size > LARGEST_MESSAGE:
+        raise WireError(f"a message of {size} bytes is larger than {LARGEST_MESSAGE}")
+
+
+def to_worker() -> Channel[ToWorker]:
+    """The direction from the web process to the worker."""
+    return Channel(ToWorker)
+
+
+def from_worker() -> Channel[FromWorker]:
+    """The direction from the worker to the web process."""
+    return Channel(FromWorker)
+
+
+def _read_exactly(stream: BinaryIO, size: int) -> bytes:
+    """Up to `size` bytes: fewer only at the end of the stream (a pipe gives what it has)."""
+    parts: list[bytes] = []
+    while size > 0 and (part := stream.read(size)):
+        parts.append(part)
+        size -= len(part)
+    return b"".join(parts)
+
+
+def _to_plain(value: object) -> object:
+    if isinstance(value, np.ndarray):
+        if value.dtype.str not in _DTYPES or value.ndim > _MOST_DIMENSIONS:
+            raise WireError(f"an array of {value.dtype} and {value.ndim} dimensions cannot be sent")
+        content = np.ascontiguousarray(value)
+        return (value.dtype.str, value.shape, content.data.cast("B") if content.size else b"")
+    if isinstance(value, np.generic):
+        return value.item()
+    raise NotImplementedError(f"{type(value).__name__} cannot be sent")
+
+
+def _from_plain(expected: Any, plain: object) -> object:  # noqa: ANN401 - the hook's own signature
+    if getattr(expected, "__origin__", None) is not np.ndarray:
+        raise NotImplementedError(f"{expected} cannot be received")
+    array = msgspec.convert(plain, _Array)
+    want = np.dtype(get_args(get_args(expected)[1])[0])
+    if array.dtype not in _DTYPES or np.dtype(array.dtype) != want:
+        raise ValueError(f"an array of {array.dtype} where {want.str} was agreed")
+    # Python integers: a product of hostile sizes cannot overflow.
+    if len(array.shape) > _MOST_DIMENSIONS or min(array.shape, default=0) < 0:
+        raise ValueError(f"an array of the shape {array.shape[:4]}")
+    if math.prod(array.shape) * want.itemsize != len(array.content):
+        raise ValueError(f"{len(array.content)} bytes are no array of {array.dtype} {array.shape}")
+    # A copy, for memory that is aligned and does not hold on to the whole message.
+    return np.frombuffer(array.content, dtype=want).reshape(array.shape).copy()

@@ -1,0 +1,366 @@
+"""The worker's loop: takes commands between two scans, keeps the time of the replay, tells the web
+process what came of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import queue
+import sys
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
+
+import msgspec
+
+from app.common.text import COMPILING
+from app.explain.recent_scans import Recent
+from app.sources.opening import options_of
+from app.worker.internal_protocol import (
+    Begin,
+    FromWorker,
+    Opened,
+    Question,
+    Remapped,
+    Report,
+    Rough,
+    Shown,
+    ToWorker,
+)
+from app.worker.protocol import Advance, Command, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
+from app.worker.queries import Answering
+from app.worker.replay_clock import Pacer
+from app.worker.session import Session
+from pipeline.config.model import validated
+from pipeline.errors import StemmapError
+from pipeline.types.records import Frame
+
+Put = Callable[[FromWorker], None]
+T = TypeVar("T")
+
+# How often figures are told while a run plays, and how often a picture is shown on the way to a scan
+# that is sought: rarely enough that a short way shows no flicker.
+_REPORT_S = 0.25
+_GLIMPSE_S = 0.5
+_COMPILING = COMPILING.capitalize()
+_COMPILES_ON_S = 60.0  # a kernel compiled so soon after another is of the same wait
+# How often a robot is asked for what came: a little of a scan's time, and less than 1 % of a core.
+_LISTEN_S = 0.005
+# About how long scans are mapped again between two looks at the commands, and how many scans of a run that
+# plays are mapped before it is done once, however late the run is.
+_REMAP_S = 0.02
+_SCANS_A_REMAP = 4
+# Scans mapped again in one go: two halves of the work begin and end apart. Fewer where looking takes long.
+_AT_ONCE = 8
+
+
+class Driver:
+    """Drives a session until the commands end.
+
+    Args:
+        session: Where the run is.
+        commands: Filled by another thread; None ends the loop.
+        put: Sends a message to the web process without waiting.
+        clock: Seconds from any start.
+        recent: The pictures that were sent, of which people may ask.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        commands: queue.Queue[ToWorker | None],
+        put: Put,
+        clock: Callable[[], float] = time.monotonic,
+        recent: Recent | None = None,
+    ) -> None:
+        self._session = session
+        session.on_rough = lambda revision, trees: put(Rough(self._run, revision, trees))
+        self._commands = commands
+        self._put = put
+        self._clock = clock
+        self._recent = recent or Recent()
+        self._answering = Answering(session, self._recent)
+        self._taken: deque[ToWorker | None] = deque()
+        self._pacer = Pacer()
+        self._run, self._asked = 0, ""
+        self._held = False
+        self._prepared = False
+        self._reported: tuple[Status, float] | None = None
+        self._glimpse_at = 0.0
+        self._long_way_at = 0.0
+        self._compiling_since_s, self._compiled_at = 0.0, -math.inf
+        self._mapped = 0  # scans since a scan was mapped again
+        self._at_once = 1
+
+    def run(self) -> None:
+        """Work until None comes as a command."""
+        self._report()
+        while True:
+            try:
+                command = self._next_command()
+            except queue.Empty:
+                self._guarded(self._map)
+                continue
+            if command is None:
+                self._session.close()
+                return
+            if isinstance(command, Question):
+                self._put(self._answering.answer(command, self._run))
+                if self._says_compiling:  # an answer may need other code than the run
+                    self._report()
+            else:
+                self._obey(command)
+
+    def _next_command(self) -> ToWorker | None:
+        """The next command; of parameters that follow one another (a slider that moves) the last."""
+        if not self._taken:
+            self._taken.append(self._commands.get(timeout=self._patience()))
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._taken.append(self._commands.get_nowait())
+        command = self._taken.popleft()
+        while (
+            isinstance(command, SetParameters) and self._taken and isinstance(self._taken[0], SetParameters)
+        ):
+            command = self._taken.popleft()
+        return command
+
+    def _patience(self) -> float | None:
+        """Seconds until the next scan is to be mapped; None when only a command can start work."""
+        pace = self._session.pace
+        if self._session.is_remapping:
+            return 0.0
+        if pace == "idle":
+            return None
+        if pace == "live":
+            return _LISTEN_S if self._guarded(self._session.next_ns) is None else 0.0
+        if pace == "hurry" or not self._prepared:
+            return 0.0
+        stamp_ns = self._guarded(self._session.next_ns)
+        return 0.0 if stamp_ns is None else self._pacer.delay(stamp_ns, self._clock())
+
+    def _map(self) -> None:
+        if self._session.is_remapping:
+            if self._mapped >= _SCANS_A_REMAP or not self._is_due():
+                self._mapped = 0
+                self._remap()
+                return
+            self._mapped += 1
+        if self._session.pace == "live" and self._session.next_ns() is None:
+            self._listen()
+            return
+        if not self._prepared:
+            self._prepare()
+            return
+        hurried = self._session.pace == "hurry"
+        frame = self._session.work()
+        now = self._clock()
+        if frame is not None:
+            self._pacer.mapped(frame.stamp_ns, now)
+        if hurried and self._session.pace != "hurry":  # arrived: time counts from here
+            self._pacer.release()
+        if hurried and self._session.pace == "hurry" and now < self._glimpse_at:
+            return
+        self._glimpse_at = now + _GLIMPSE_S
+        self._show(self._session.frame)
+        standing = self._session.pace == "idle"
+        if standing:
+            self._report()
+        else:
+            self._report_when_due(now)
+
+    def _is_due(self) -> bool:
+        """Whether a scan is to be mapped now."""
+        pace = self._session.pace
+        if pace == "idle":
+            return False
+        stamp_ns = self._session.next_ns()
+        if pace == "live":
+            return stamp_ns is not None
+        return not self._prepared or stamp_ns is None or self._pacer.delay(stamp_ns, self._clock()) <= 0.0
+
+    def _remap(self) -> None:
+        """Use the time between two scans, or while the run stands, to map it again."""
+        begun = self._clock()
+        while True:
+            asked = self._clock()
+            done = self._session.remap(self._at_once)
+            now = self._clock()
+            if now > asked + 2.0 * _REMAP_S:
+                self._at_once = max(1, self._at_once // 2)
+            elif now < asked + _REMAP_S:
+                self._at_once = min(_AT_ONCE, 2 * self._at_once)
+            if done is not None or not self._session.is_remapping or now >= begun + _REMAP_S:
+                break
+        if done is None:
+            self._report_when_due(self._clock())
+            return
+        frame, changes = done
+        self._recent.forget()  # they were judged with other parameters
+        self._put(Remapped(self._run, changes))
+        self._show(frame)
+        self._report()
+
+    def _report_when_due(self, now: float) -> None:
+        if self._reported is None or now >= self._reported[1] + _REPORT_S:
+            self._report()
+
+    def _listen(self) -> None:
+        """Nothing is to be mapped of a robot: look what is heard of it."""
+        opened = self._session.listen()
+        if opened is not None:
+            self._tell_opened(opened)
+        self._report_when_due(self._clock())
+
+    def _obey(self, command: Command | Begin) -> None:
+        self._pacer.release()
+        self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
+        self._guarded(lambda: self._carry_out(command))
+        self._report()
+
+    def _carry_out(self, command: Command | Begin) -> None:
+        session = self._session
+        match command:
+            case Play():
+                self._play()
+            case Pause():
+                self._held = True
+                session.pause()
+            case Advance(scans=scans):
+                self._held = True
+                session.advance(scans)
+            case Seek(time_s=time_s):
+                session.seek(time_s)
+            case SetSpeed(factor=factor):
+                self._pacer.speed = factor
+            case SetParameters(values=values, revision=revision, whole=whole, step=step):
+                self._show(session.set_parameters(validated(values), revision, whole=whole, step=step))
+            case Open():
+                self._open(command)
+            case Begin():
+                self._begin(command)
+
+    def _open(self, command: Open) -> None:
+        self._run, self._asked = self._run + 1, command.uri
+        opening = f"Opening {command.uri}"
+        self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
+        opened = self._session.open(
+            command.uri,
+            command.odometry,
+            command.seed,
+            command.record,
+            publish=command.publish,
+            options=options_of(command),
+        )
+        if opened is not None:
+            self._tell_opened(opened)
+
+    def _play(self) -> None:
+        self._held = False
+        opened_again = self._session.play()
+        if opened_again is not None:
+            self._run += 1
+            self._tell_opened(opened_again)
+
+    def _tell_opened(self, opened: Opened) -> None:
+        self._prepared = self._held = False
+        self._put(msgspec.structs.replace(opened, run=self._run, asked=self._asked))
+
+    def _begin(self, command: Begin) -> None:
+        if command.run != self._run:  # another was opened since
+            return
+        self._show(self._session.set_parameters(validated(command.values), command.revision))
+        if self._held:  # a person, or a failure, was faster than this answer
+            return
+        if command.play:
+            self._session.play()
+        else:
+            self._session.advance(1)
+
+    def _prepare(self) -> None:
+        """Before the first scan, and not when opening: only now are the parameters those of the run."""
+        self._tell(self._preparing(), self._clock())
+        self._prepared = True
+        self._session.prepare()
+        self._pacer.release()
+        self._report()
+
+    def _preparing(self) -> Status:
+        return replace(self._session.status(), state="starting", detail="Preparing the mapper")
+
+    def compiling(self) -> None:
+        """Say that work waits for a kernel that is being compiled; called while it works."""
+        self._session.disturb()
+        now = self._clock()
+        if now > self._compiled_at + _COMPILES_ON_S:
+            self._compiling_since_s = time.time()
+        self._compiled_at = now
+        if self._reported is None or self._says_compiling:
+            return
+        # What was told last, because the session is in the middle of its work.
+        status = replace(self._reported[0], detail=_COMPILING, compiling_since_s=self._compiling_since_s)
+        if status.state == "playing":
+            status = replace(status, state="waiting")
+        self._reported = (status, -math.inf)  # so that what comes of it is told at once
+        self._put(Report(status))
+
+    @property
+    def _says_compiling(self) -> bool:
+        return self._reported is not None and self._reported[0].detail == _COMPILING
+
+    def _show(self, frame: Frame | None) -> None:
+        run, path = self._session.run, self._session.path
+        if frame is not None and run is not None and path is not None:
+            confirmed_s = run.confirmed_s(frame.trees)
+            self._put(Shown(self._run, self._session.time_s, frame, 0, path, confirmed_s))
+
+    def _report(self) -> None:
+        now = self._clock()
+        if self._session.pace not in ("idle", "live") and not self._prepared:
+            # Nothing plays yet: the first scan is read, and on a new machine all is compiled, before.
+            self._tell(self._preparing(), now)
+            return
+        playing = self._session.pace in ("replay", "live")
+        status = self._session.status()
+        if status.going_to and now >= self._long_way_at:  # a short way would only flicker
+            status = replace(status, detail=f"Going to {status.going_to} …", going_far=True)
+        status = replace(
+            status,
+            speed=self._pacer.speed,
+            scan_rate_hz=round(self._pacer.rate_hz, 2) if playing and status.state != "waiting" else 0.0,
+            scans_behind=self._behind(status, now) if playing else 0,
+        )
+        self._tell(status, now)
+
+    def _tell(self, status: Status, now: float) -> None:
+        self._reported = (status, now)
+        self._put(Report(status))
+
+    def _behind(self, status: Status, now: float) -> int:
+        if status.live:
+            return status.scans_behind
+        behind = self._pacer.behind(now)
+        return behind if status.scans is None else min(behind, status.scans - 1 - status.scan_index)
+
+    def _guarded(self, work: Callable[[], T]) -> T | None:
+        """Do some work; what goes wrong becomes the state "failed", and the worker lives on."""
+        try:
+            return work()
+        except StemmapError as error:
+            self._fail(str(error))
+        except Exception as error:
+            traceback.print_exc(file=sys.stderr)
+            self._fail(
+                f"The run stopped: {type(error).__name__}: {error}. This is a fault in stemmap; "
+                "the terminal shows where. Play starts the run again"
+            )
+        self._report()
+        return None
+
+    def _fail(self, detail: str) -> None:
+        self._held = True
+        self._session.fail(detail)

@@ -1,0 +1,158 @@
+"""From the worker's loop to the pipe: the newest picture wins, everything else is kept."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import replace
+from typing import BinaryIO
+
+import numpy as np
+from msgspec import structs
+
+from app.explain.recent_scans import Recent
+from app.worker.codec import WireError, from_worker
+from app.worker.internal_protocol import FromWorker, Opened, Report, Shown
+from app.worker.thin_frame import picture_of
+from pipeline.types.records import HeightMap, Path
+
+# Faster pictures nobody sees; they would only fill the pipe and the browsers' sockets.
+_SHORTEST_PAUSE_S = 0.05
+
+
+class Mailbox:
+    """Writes messages to a stream in a thread of its own, so that a slow reader never stops the map.
+
+    Pictures wait in one slot: a newer one replaces it. Other messages are sent in order and none is
+    dropped. After `Opened` no picture of an older run is sent. What cannot be sent is left out, and
+    the status says so.
+
+    Args:
+        stream: Where the bytes go; closed by nobody here.
+        recent: Remembers the pictures that are sent.
+    """
+
+    def __init__(self, stream: BinaryIO, recent: Recent | None = None) -> None:
+        self._stream = stream
+        self._recent = recent or Recent()
+        self._channel = from_worker()
+        self._changed = threading.Condition()
+        self._messages: deque[FromWorker] = deque()
+        self._picture: Shown | None = None
+        self._closing = False
+        self._sent_run = -1
+        self._sent_path: Path | None = None
+        self._sent_ground: HeightMap | None = None
+        self._sent_at = -_SHORTEST_PAUSE_S
+        self._report: Report | None = None
+        self._refused = ""
+        self._thread = threading.Thread(target=self._write_all, name="mailbox", daemon=True)
+        self._thread.start()
+
+    def put(self, message: FromWorker) -> None:
+        """Send a message; of pictures the newest one only."""
+        with self._changed:
+            if isinstance(message, Shown):
+                self._picture = message
+            else:
+                if isinstance(message, Opened):
+                    self._picture = None  # of the run before
+                self._messages.append(message)
+            self._changed.notify()
+
+    def close(self, timeout_s: float = 0.3) -> None:
+        """Send what waits, then end the thread."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+
+    def _write_all(self) -> None:
+        try:
+            while (message := self._next()) is not None:
+                for packed in self._packed(message):
+                    self._stream.write(packed)
+                self._stream.flush()
+        except (BrokenPipeError, ValueError, OSError):
+            return  # the web process is gone; the reader of commands ends the worker
+
+    def _packed(self, message: FromWorker) -> list[bytes]:
+        """A message in bytes; instead of one that cannot be sent, a status that says so."""
+        try:
+            return [self._channel.encode(self._made_ready(message))]
+        except WireError as error:
+            if isinstance(message, Shown):
+                self._sent_path = self._sent_ground = None  # what was in it did not arrive
+            self._refused = f"a picture could not be shown: {error}"
+            return [] if self._report is None else [self._channel.encode(self._with_refusal(self._report))]
+
+    def _made_ready(self, message: FromWorker) -> FromWorker:
+        if isinstance(message, Shown):
+            self._sent_at = time.monotonic()
+            self._recent.keep(message.run, message.frame)
+            return self._with_new_path_only(message)
+        if isinstance(message, Opened):
+            self._refused = ""
+        elif isinstance(message, Report):
+            self._report = message
+            return self._with_refusal(message)
+        return message
+
+    def _with_refusal(self, report: Report) -> Report:
+        if not self._refused:
+            return report
+        return Report(replace(report.status, warnings=[*report.status.warnings, self._refused]))
+
+    def _next(self) -> FromWorker | None:
+        with self._changed:
+            while True:
+                if self._messages:
+                    return self._messages.popleft()
+                wait = self._sent_at + _SHORTEST_PAUSE_S - time.monotonic()
+                if self._picture is not None and (wait <= 0 or self._closing):
+                    picture, self._picture = self._picture, None
+                    return picture
+                if self._closing:
+                    return None
+                self._changed.wait(wait if self._picture is not None else None)
+
+    def _with_new_path_only(self, shown: Shown) -> Shown:
+        """The same picture with the path cut to what was not sent before."""
+        old, self._sent_path = self._sent_path, shown.path
+        start = 0 if old is None or shown.run != self._sent_run else rows_in_common(old, shown.path)
+        picture = picture_of(shown.frame)
+        if picture.ground is self._sent_ground and shown.run == self._sent_run:
+            picture = replace(picture, ground=None)
+        else:
+            self._sent_ground = picture.ground
+        self._sent_run = shown.run
+        return structs.replace(shown, frame=picture, path_start=start, path=rows_from(shown.path, start))
+
+
+def rows_in_common(old: Path, new: Path) -> int:
+    """How many rows from the start are equal in two paths."""
+    n = min(old.x.size, new.x.size)
+    differs = np.zeros(n, dtype=np.bool_)
+    for name in ("stamp_ns", "x", "y", "yaw", "sigma_xy"):
+        differs |= getattr(old, name)[:n] != getattr(new, name)[:n]
+    return int(np.argmax(differs)) if differs.any() else n
+
+
+def rows_from(path: Path, start: int) -> Path:
+    """The rows of a path from a row on."""
+    return Path(
+        path.stamp_ns[start:], path.x[start:], path.y[start:], path.yaw[start:], path.sigma_xy[start:]
+    )
+
+
+def joined(old: Path | None, start: int, tail: Path) -> Path:
+    """The path of which `tail` is the new part from row `start` on."""
+    if old is None or start == 0:
+        return tail
+    return Path(
+        *(
+            np.concatenate([getattr(old, name)[:start], getattr(tail, name)])
+            for name in ("stamp_ns", "x", "y", "yaw", "sigma_xy")
+        )
+    )

@@ -1,0 +1,144 @@
+"""The process that owns the source and the mapper: `python -m app.worker.process [FOLDER]`.
+
+The scan cache is kept in the folder.
+
+Commands come on stdin, messages go to stdout; both as app.worker.codec says. It ends when stdin ends, so it
+never outlives the web process.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO
+
+from app.common.stage_timer import Stopwatch
+from app.common.text import COMPILING
+from app.explain.recent_scans import Recent
+from app.worker.codec import WireError, to_worker
+from app.worker.internal_protocol import ToWorker
+from app.worker.loop import Driver
+from app.worker.outbox import Mailbox
+from app.worker.scan_cache import keep_in, keep_without_name
+from app.worker.session import Session
+from pipeline.config import Parameters
+from pipeline.io.readers.base import Source
+from pipeline.jit import on_compiling
+
+# A scan that is being mapped, or a large file that is being opened, may take a moment to notice.
+_GRACE_S = 1.0
+
+
+def new_session(folder: Path | None = None) -> Session:
+    """A session on the real pipeline, for the worker and for commands that map in process.
+
+    Args:
+        folder: Where what scans show is kept for the next opening of a recording; None keeps nothing.
+    """
+    from app.common.compile_ahead import compile_ahead
+    from app.robot.source import LiveSource
+    from app.sources.opening import open_any
+    from app.training.learned_forests import kept_forests
+    from app.worker.numba_warmup import warm_up
+    from pipeline.io.readers import SourceOptions
+    from pipeline.mapper import Mapper
+    from pipeline.odometry.synchroniser import OdometryChoice, steps
+
+    choices: dict[str, OdometryChoice] = {"auto": "auto", "wheels": "wheels", "static": "static"}
+
+    def make_mapper(source: Source, parameters: Parameters, seed: int, watch: Stopwatch) -> Mapper:
+        known = source.description
+        return Mapper(
+            parameters,
+            sensor=known.sensor,
+            T_base_lidar=known.T_base_lidar,
+            seed=seed,
+            watch=watch,
+            forests=kept_forests(),
+        )
+
+    def open_ready(uri: str, options: SourceOptions) -> Source | LiveSource:
+        source = open_any(uri, options)
+        if isinstance(source, LiveSource):  # it is not listened to before this session asks for its scans
+            warm_up()
+        return source
+
+    return Session(
+        open_source=open_ready,
+        make_mapper=make_mapper,
+        make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
+        parameters=Parameters(),
+        keep=keep_without_name if folder is None else keep_in(folder),
+        compile_ahead=compile_ahead,
+    )
+
+
+def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
+    """Drive a session by the commands of a stream until it ends."""
+    commands: queue.Queue[ToWorker | None] = queue.Queue()
+    finished = threading.Event()
+    reader = threading.Thread(target=_read, args=(incoming, commands, finished), daemon=True)
+    reader.start()
+    recent = Recent()
+    mailbox = Mailbox(outgoing, recent)
+    driver = Driver(session, commands, mailbox.put, recent=recent)
+    with on_compiling(_said_once(driver.compiling)):
+        driver.run()
+    mailbox.close()
+    finished.set()
+
+
+def _said_once(told: Callable[[], None]) -> Callable[[], None]:
+    """Hands on each kernel that is being compiled, and says the first one in the terminal."""
+    said = False
+
+    def compiling() -> None:
+        nonlocal said
+        if not said:
+            said = True
+            print(f"stemmap: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
+        told()
+
+    return compiling
+
+
+def _read(incoming: BinaryIO, commands: queue.Queue[ToWorker | None], finished: threading.Event) -> None:
+    channel = to_worker()
+    try:
+        while (command := channel.read(incoming)) is not None:
+            commands.put(command)
+    except WireError as error:
+        print(f"stemmap worker: {error}", file=sys.stderr)  # noqa: T201
+    commands.put(None)
+    if not finished.wait(_GRACE_S):
+        os._exit(0)
+
+
+def _private_streams() -> tuple[BinaryIO, BinaryIO]:
+    """The pipes of this process, moved away from where a library may read or print."""
+    incoming = os.fdopen(os.dup(0), "rb")
+    outgoing = os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nowhere, 0)
+    os.close(nowhere)
+    os.dup2(2, 1)
+    return incoming, outgoing
+
+
+def run_as_worker(session: Session) -> None:
+    """Be the worker of the web process that started this one, until it closes our input."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
+    incoming, outgoing = _private_streams()
+    work(session, incoming, outgoing)
+    sys.stderr.flush()
+    os._exit(0)  # nothing is left to be saved, and waiting for the threads of libraries takes seconds
+
+
+if __name__ == "__main__":
+    run_as_worker(new_session(Path(sys.argv[1]) if len(sys.argv) > 1 else None))

@@ -1,0 +1,63 @@
+"""Answers to what people ask of the run. Nobody who asks changes how the run goes."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+
+from app.explain.recent_scans import Recent
+from app.worker.camera import camera_picture
+from app.worker.internal_protocol import Answer, AskCamera, AskCompare, AskTree, Question
+from app.worker.session import Session
+from app.worker.thin_frame import for_comparison
+from pipeline.config.model import validated
+from pipeline.errors import StemmapError
+
+
+class Answering:
+    """Answers from a session.
+
+    Args:
+        session: Where the run is.
+        recent: The pictures that were sent, of which people may ask.
+    """
+
+    def __init__(self, session: Session, recent: Recent) -> None:
+        self._session = session
+        self._recent = recent
+
+    def answer(self, question: Question, run: int) -> Answer:
+        """The answer, or why there is none.
+
+        Args:
+            question: Of any kind.
+            run: Number of the run that is open.
+        """
+        try:
+            if question.run != run:
+                raise StemmapError("the run was left")
+            return self._answer(question)
+        except StemmapError as error:
+            return Answer(question.ticket, missing=str(error))
+        except Exception as error:  # an answer that fails must not stop the run
+            traceback.print_exc(file=sys.stderr)
+            fault = f"this is a fault in stemmap: {type(error).__name__}: {error}"
+            return Answer(question.ticket, missing=f"{fault}. The terminal shows where")
+
+    def _answer(self, question: Question) -> Answer:
+        ticket = question.ticket
+        if isinstance(question, AskCompare):
+            sets = [validated(values) for values in question.sets]
+            return Answer(ticket, frames=[for_comparison(f) for f in self._session.compare(sets)])
+        if isinstance(question, AskCamera):
+            run = self._session.run
+            source = None if run is None else run.source
+            return Answer(ticket, camera=camera_picture(source, question.stamp_ns))
+        if isinstance(question, AskTree):
+            return Answer(ticket, tree=self._session.tree_story(question.tree))
+        frame = self._recent.find(question.run, question.scan)
+        if frame is None:
+            raise StemmapError(
+                f"scan {question.scan} was shown too long ago", remedy="Click a cluster of the newest one"
+            )
+        return Answer(ticket, cluster=self._session.cluster_story(frame, question.cluster))

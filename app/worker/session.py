@@ -1,0 +1,385 @@
+"""A run as a person drives it: play, pause, step, seek, tune. No thread, no socket and no clock: a
+driver asks for the `pace` and calls `work` as often as it likes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path as FilePath
+from typing import Literal
+
+from app.dashboard.map_changes import MapChanges
+from app.explain import run_queries
+from app.explain.build import make_ready
+from app.explain.records import ClusterStory, TreeStory
+from app.robot.recording import Recording
+from app.robot.source import LiveSource
+from app.worker.internal_protocol import Opened
+from app.worker.protocol import LONGEST_S, State, Status
+from app.worker.run import MakeMapper, Run
+from app.worker.run_factory import Beginning, MakeSynchroniser
+from app.worker.scan_cache import Keep, keep_without_name
+from app.worker.seek import Way
+from app.worker.session_status import Said, describe, opened_of
+from app.worker.whole_run import WholeRun
+from pipeline.config import Parameters
+from pipeline.errors import SourceError, StemmapError
+from pipeline.io.readers.base import Source, SourceOptions
+from pipeline.types.records import Frame, Path, Trees
+
+OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
+Pace = Literal["idle", "replay", "hurry", "live"]
+
+_NS = 1_000_000_000
+_MOST_WARNINGS = 20
+
+
+class Session:
+    """Owns the source and the mapper.
+
+    After `SourceError` or any other exception out of `open` or `work`, call `fail`; another source
+    can be opened, and play begins anew.
+
+    Args:
+        open_source: From a URI, and what is chosen about it.
+        make_mapper: A fresh mapper for a source, from parameters, seed and a stopwatch.
+        make_synchroniser: From the choice of odometry.
+        parameters: In force at the beginning.
+        keep: Where what the scans show is kept.
+        compile_ahead: Compiles what is not compiled on this machine yet, faster than the first scan would.
+
+    Attributes:
+        on_rough: Is told a rough answer (see `Run.rough`) with the revision of the parameters, before any
+            scan is mapped with them.
+    """
+
+    def __init__(
+        self,
+        open_source: OpenSource,
+        make_mapper: MakeMapper,
+        make_synchroniser: MakeSynchroniser,
+        parameters: Parameters,
+        keep: Keep = keep_without_name,
+        compile_ahead: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._open_source = open_source
+        self._compile_ahead = compile_ahead
+        self._begun = Beginning(make_mapper, make_synchroniser, keep)
+        self._parameters = parameters
+        self._revision = 0
+        self._asked: tuple[str, str, int] | None = None
+        self._open_again: Callable[[], Opened | None] = lambda: None
+        self._run: Run | None = None
+        self._robot: LiveSource | None = None
+        self._state: State = "starting"
+        self._detail = ""
+        self._way = Way()
+        self._whole = WholeRun()
+        self._warnings: dict[str, None] = {}
+        self.on_rough: Callable[[int, Trees], None] = lambda _revision, _trees: None
+
+    @property
+    def pace(self) -> Pace:
+        """Whether a scan is to be mapped at once (on the way to a sought scan), in its time, as soon as it
+        comes (of a robot that is heard live), or not."""
+        if self._state == "failed" or (self._run is None and self._robot is None):
+            return "idle"
+        if self._robot is not None:
+            return "live" if self._run is None or self._state == "playing" else "idle"
+        if self._way.sought:
+            return "hurry"
+        return "replay" if self._state == "playing" else "idle"
+
+    @property
+    def frame(self) -> Frame | None:
+        """The picture of the standing scan."""
+        return self._run.frame if self._run else None
+
+    @property
+    def path(self) -> Path | None:
+        """Where the robot was up to the standing scan."""
+        return self._run.path if self._run else None
+
+    @property
+    def time_s(self) -> float:
+        """Of the picture, since the run's first scan."""
+        frame = self.frame
+        return 0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / _NS
+
+    @property
+    def run(self) -> Run | None:
+        """What is mapped, None before it is open."""
+        return self._run
+
+    def next_ns(self) -> int | None:
+        """Time of the next scan; None at the end of the run."""
+        return self._run.peek_ns() if self._run else None
+
+    def open(
+        self,
+        uri: str,
+        odometry: str,
+        seed: int,
+        record: str = "",
+        *,
+        publish: bool = False,
+        options: SourceOptions | None = None,
+    ) -> Opened | None:
+        """Leave the present run and stand, paused, before the first scan of another source, with the topics
+        and mounting of `options`. A robot is recorded to the file `record`, unless that is empty, and told of
+        its map if `publish` says so.
+
+        Returns:
+            What was opened; None of a robot that is still to be heard, see `listen`.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        self._leave()
+        self._asked = uri, odometry, seed
+        self._open_again = lambda: self.open(uri, odometry, seed, record, publish=publish, options=options)
+        source = self._open_source(uri, replace(options or SourceOptions(), seed=seed))
+        if isinstance(source, LiveSource):
+            try:
+                source.use(Recording(FilePath(record)) if record else None, publish=publish)
+            except SourceError:
+                source.close()
+                raise
+            self._robot, self._state, self._detail = source, "waiting", ""
+            return None
+        return self._begin(source, odometry, seed)
+
+    def listen(self) -> Opened | None:
+        """Of a robot: what was opened, once it is heard; None before and after.
+
+        Raises:
+            SourceError: What it sends cannot be read.
+        """
+        if self._robot is None or self._asked is None:
+            return None
+        self._warn(self._robot.notices())
+        if self._run is not None or not self._robot.listen():
+            return None
+        return self._begin(self._robot, *self._asked[1:])
+
+    def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
+        self._run, warnings = self._begun(source, odometry, seed, self._parameters)
+        self._state, self._detail = "paused", ""
+        self._warn(warnings)
+        return opened_of(self._run)
+
+    def prepare(self) -> None:
+        """Have all ready for the first scan, which can take a minute the first time on a machine.
+
+        Raises:
+            SourceError: There is no scan.
+        """
+        if self._run is not None:
+            self._compile_ahead()
+            self._run.prepare()
+            make_ready(self._run.source.description.sensor)
+
+    def disturb(self) -> None:
+        """What is being mapped waits for something that is no part of the mapping: its times do not count."""
+        if self._run is not None:
+            self._run.stopwatch.disturb()
+
+    def work(self) -> Frame | None:
+        """Map one scan if one is wanted. None when there was none: the run is at its end, or the
+        sought scan was already reached."""
+        run = self._run
+        if run is None or self.pace == "idle":
+            return None
+        self._way.set_out(run)
+        if self._way.is_at_end(run):
+            return self._arrive(run)
+        frame = run.map_next(hurried=self._way.sought)
+        if frame is None:
+            self._state = "finished" if self._robot is None else self._state
+        else:
+            self._warn(frame.warnings)
+            if self._robot is not None:
+                self._robot.mapped(frame, run.path)
+        if self._way.is_at_end(run) or (frame is None and self._way.sought):
+            return self._arrive(run)
+        return frame
+
+    def play(self) -> Opened | None:
+        """Go on; from the start when the run is at its end. A run that has failed is opened again.
+
+        Returns:
+            What was opened again, if so.
+
+        Raises:
+            SourceError: It cannot be read.
+        """
+        opened = None
+        if self._run is None and self._robot is not None and self._state != "failed":
+            return None  # it plays when it is heard
+        if self._run is None or self._state == "failed":
+            opened = self._open_again()
+        elif self._state == "finished":
+            self._way.to_scan(0)
+        if self._run is not None:
+            self._state, self._detail = "playing", ""
+        return opened
+
+    def pause(self) -> None:
+        """Stand still; on the way to a sought scan, once it is reached."""
+        if self._state == "playing":
+            self._state = "paused"
+
+    def advance(self, scans: int) -> None:
+        """Pause, and stand so many scans further or back."""
+        if self._run is None or self._is_live():
+            return
+        here = self._run.standing if self._way.index is None else self._way.index
+        self._settle()
+        self._way.to_scan(max(0, here + scans))
+
+    def seek(self, time_s: float) -> None:
+        """Stand at the last scan not later than a time; the run then goes on as it did before."""
+        if self._run is None or not math.isfinite(time_s) or self._is_live():
+            return
+        if self._state != "playing":
+            self._settle()
+        seconds = min(max(time_s, 0.0), LONGEST_S)
+        self._way.to_time(self._run, self._run.start_ns + round(seconds * _NS))
+
+    def set_parameters(
+        self, parameters: Parameters, revision: int, *, whole: bool = False, step: int | None = None
+    ) -> Frame | None:
+        """Use other parameters: from the next scan on, or from the sought or the standing scan on; and if
+        `whole` says so, begin to map the run again with them from its first scan (see `remap`). What that
+        changes is told of all with the same `step` together.
+
+        Returns:
+            The standing scan, mapped again, when the run stands still; else None.
+        """
+        self._parameters, self._revision = parameters, revision
+        self._whole.begin(step)
+        run = self._run
+        if run is None:
+            return None
+        run.stay()
+        if self._way.sought:  # see `_arrive`
+            self._whole.wanted_there = whole
+            return None
+        stands = self._state != "playing" and run.standing >= 0
+        from_scan = run.standing + (0 if stands else 1)
+        run.use(parameters, from_scan)
+        if self._robot is not None:
+            self._robot.use_parameters(revision, from_scan, parameters)
+        if whole and run.standing >= 0:
+            run.remap(parameters)
+            self._tell_rough(run)
+        return run.map_again() if stands and self._state != "failed" else None
+
+    @property
+    def is_remapping(self) -> bool:
+        """Whether `remap` has work that can be done now."""
+        return self._run is not None and self._run.remapped is not None and not self._way.sought
+
+    def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
+        """Map so many scans of the run again. Once all are, the map is another one: gives the standing scan
+        with it, and what it changes."""
+        if self._run is None:
+            return None
+        try:
+            done = self._whole.work(self._run, scans, self._revision, self.time_s)
+        except StemmapError as error:
+            self._warn([f"the run was not mapped again, its map is as before: {error}"])
+            return None
+        if done is not None and self._robot is not None:
+            self._robot.use_parameters(self._revision, 0, self._run.parameters_at(0))
+        return done
+
+    def cluster_story(self, frame: Frame, cluster: int) -> ClusterStory:
+        """The story of a cluster of a frame of this run, which may have lost its raw points.
+
+        Raises:
+            StemmapError: There is no such cluster.
+        """
+        return run_queries.cluster_story(self._run, frame, cluster)
+
+    def tree_story(self, number: int) -> TreeStory:
+        """The story of a tree as the standing scan knows it.
+
+        Raises:
+            StemmapError: There is no such tree now.
+        """
+        return run_queries.tree_story(self._run, number)
+
+    def compare(self, sets: Sequence[Parameters]) -> list[Frame]:
+        """The standing scan under each of other parameters; the run stays as it is.
+
+        Raises:
+            StemmapError: There is none, or a set cannot be mapped with.
+        """
+        if self._run is None or self._state == "failed":
+            raise StemmapError("nothing is mapped", remedy="Press play, or open a run")
+        return self._run.map_with(sets)
+
+    def fail(self, detail: str) -> None:
+        """Say that the run cannot go on, and why."""
+        self._state, self._detail = "failed", detail
+        self._way.forget()
+        if self._run is not None:
+            self._run.stay()
+
+    def status(self) -> Status:
+        """How the run goes; what only a clock can tell is left at 0."""
+        said = Said(
+            state=self._state,
+            detail=self._detail,
+            uri=self._asked[0] if self._asked else "",
+            time_s=self.time_s,
+            warnings=tuple(self._warnings),
+            revision=self._revision,
+            going_to=self._way.words(self._run),
+            going_to_s=self._way.time_s(self._run),
+        )
+        return describe(self._run, self._robot, said)
+
+    def close(self) -> None:
+        """Let go of the source."""
+        self._leave()
+
+    def _is_live(self) -> bool:
+        """Whether the run is of a robot, in whose time nobody can go; a person is told so."""
+        if self._robot is not None:
+            self._warn(["a live run goes on as it comes: to step and seek, open its recording"])
+        return self._robot is not None
+
+    def _settle(self) -> None:
+        self._state, self._detail = "paused", ""
+
+    def _arrive(self, run: Run) -> Frame | None:
+        """Stand at the sought scan. The map before it is as it was; the parameters in force now act
+        from this scan on, whenever on the way they came."""
+        self._way.forget()
+        changed = run.use(self._parameters, run.standing)
+        if self._whole.arrived(run, self._parameters):
+            self._tell_rough(run)
+        return run.map_again() if changed or run.is_bare else run.frame
+
+    def _tell_rough(self, run: Run) -> None:
+        if run.rough is not None:
+            self.on_rough(self._revision, run.rough)
+
+    def _leave(self) -> None:
+        owner = self._run or self._robot
+        if owner is not None:
+            owner.close()
+        self._run, self._robot, self._whole = None, None, WholeRun()
+        self._warnings.clear()
+        self._way.forget()
+
+    def _warn(self, warnings: Iterable[str]) -> None:
+        for warning in warnings:
+            self._warnings.pop(warning, None)
+            self._warnings[warning] = None
+        while len(self._warnings) > _MOST_WARNINGS:
+            del self._warnings[next(iter(self._warnings))]

@@ -1,0 +1,271 @@
+"""Columns: upright runs of voxels that may be stems, each with its axis and its profile over height.
+
+Everything of one tile is laid into a dense block of cells first, because a column is asked for its
+neighbourhood again and again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.classification.voxel_map import SIDE, SLICE, SLICES
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
+from pipeline.types.records import Bool, Float32, Int, Int32
+
+BUCKET = 0.9  # m; as far as a column's neighbourhood reaches
+MARGIN = 1.2  # m around a tile; a column looks so far for its neighbours
+LOW, LOW_HIGH, HIGH = 1, 7, 15  # slices: 0.2 to 1.4 m and to 3 m, where a column must show
+LEAST = 3  # of them hold returns
+TWIN = 0.02  # m; two axes nearer than that are one
+APART = 0.3  # m; of two columns nearer than that the weaker one is the same thing
+INSIDE, RING_NEAR, RING_FAR = 0.3, 0.45, 0.9  # m around the axis
+OCTANTS = 8
+ARC = 11  # where the moments of a slice's arc begin, see `profile`
+PROFILE = 20  # figures of a slice, see `profile`
+
+
+@compiled
+def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Float:
+    """Columns whose foot lies in a square tile or near to it.
+
+    They are looked for twice, over all heights and over the low ones, where a trunk shows below a crown
+    that hides it from a count over all.
+
+    Args:
+        mean: Voxels in and around the tile, shape (N, 3): x, y, height [m]; returns: shape (N,).
+        low: Corner of the tile, shape (2,) [m]; side: its length [m].
+
+    Returns:
+        Shape (K, 5): the axis, x, y at 1.3 m above the ground and its shift per metre of height, and
+        the strength.
+    """
+    cells = int(np.ceil((side + 2 * MARGIN) / SIDE))
+    reach, border = int(APART / SIDE), int(MARGIN / SIDE) - 4
+    columns = np.empty((cells * cells // 4, 5))
+    n = 0
+    for high in (HIGH, LOW_HIGH):
+        strength = _strength(mean, returns, low, cells, high)
+        for i in range(border, cells - border):
+            for j in range(border, cells - border):
+                if strength[i, j] > 0.0 and _is_peak(strength, i, j, reach):
+                    columns[n, 0] = low[0] - MARGIN + (i + 0.5) * SIDE
+                    columns[n, 1] = low[1] - MARGIN + (j + 0.5) * SIDE
+                    columns[n, 2], columns[n, 3], columns[n, 4] = 0.0, 0.0, strength[i, j]
+                    n += 1
+    return columns[:n]
+
+
+@compiled
+def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
+    for di in range(-reach, reach + 1):
+        for dj in range(-reach, reach + 1):
+            other = strength[
+                min(max(i + di, 0), strength.shape[0] - 1), min(max(j + dj, 0), strength.shape[1] - 1)
+            ]
+            later = di > 0 or (di == 0 and dj > 0)
+            if other > strength[i, j] or (other == strength[i, j] and not later and (di != 0 or dj != 0)):
+                return False
+    return True
+
+
+@compiled
+def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) -> Float:
+    """Sum over the slices of the logarithm of the returns in the cell and its eight neighbours; 0 where
+    fewer than `LEAST` slices hold any."""
+    block = np.zeros((cells, cells, high - LOW), np.float32)
+    for i in range(mean.shape[0]):
+        a = int(np.floor((mean[i, 0] - low[0] + MARGIN) / SIDE))
+        b = int(np.floor((mean[i, 1] - low[1] + MARGIN) / SIDE))
+        h = int(mean[i, 2] / SLICE)
+        if 0 <= a < cells and 0 <= b < cells and LOW <= h < high:
+            block[a, b, h - LOW] += returns[i]
+    along = np.zeros_like(block)  # sums of three cells along y, then of three such along x
+    for a in range(cells):
+        for b in range(1, cells - 1):
+            for h in range(high - LOW):
+                along[a, b, h] = block[a, b - 1, h] + block[a, b, h] + block[a, b + 1, h]
+    strength = np.zeros((cells, cells))
+    for a in range(1, cells - 1):
+        for b in range(1, cells - 1):
+            total, filled = 0.0, 0
+            for h in range(high - LOW):
+                n = along[a - 1, b, h] + along[a, b, h] + along[a + 1, b, h]
+                if n > 0.0:
+                    filled += 1
+                    total += np.log(1.0 + n)
+            if filled >= LEAST:
+                strength[a, b] = total
+    return strength
+
+
+@compiled
+def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
+    """The voxels bucket by bucket of `BUCKET` seen from above: order (N,) and bounds (buckets + 1,)."""
+    across = int(np.ceil((side + 2 * MARGIN) / BUCKET))
+    bucket = np.empty(mean.shape[0], np.int64)
+    bounds = np.zeros(across * across + 1, np.int64)
+    for i in range(mean.shape[0]):
+        a = min(max(int((mean[i, 0] - low[0] + MARGIN) / BUCKET), 0), across - 1)
+        b = min(max(int((mean[i, 1] - low[1] + MARGIN) / BUCKET), 0), across - 1)
+        bucket[i] = a * across + b
+        bounds[bucket[i] + 1] += 1
+    bounds = np.cumsum(bounds)
+    place, order = bounds[:-1].copy(), np.empty(mean.shape[0], np.int64)
+    for i in range(mean.shape[0]):
+        order[place[bucket[i]]] = i
+        place[bucket[i]] += 1
+    return order, bounds
+
+
+@compiled
+def near_rows(x: float, y: float, low: Float, bounds: Int) -> Int:
+    """Runs of rows (first, one past the last) of the buckets around a place, shape (3, 2)."""
+    across = int(np.sqrt(bounds.shape[0] - 1) + 0.5)
+    a = min(max(int((x - low[0] + MARGIN) / BUCKET), 0), across - 1)
+    b = min(max(int((y - low[1] + MARGIN) / BUCKET), 0), across - 1)
+    runs = np.zeros((3, 2), np.int64)
+    for k in range(3):
+        if 0 <= a + k - 1 < across:
+            runs[k, 0] = bounds[(a + k - 1) * across + max(b - 1, 0)]
+            runs[k, 1] = bounds[(a + k - 1) * across + min(b + 1, across - 1) + 1]
+    return runs
+
+
+@compiled
+def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Float, Float]:
+    """The columns of a tile and what stands around each.
+
+    Args:
+        mean, returns, low, side: See `find_columns`.
+
+    Returns:
+        The columns, shape (K, 5), those whose foot lies in the tile; their profiles, shape
+        (K, SLICES, PROFILE).
+    """
+    found = find_columns(mean, returns, low, side)
+    order, bounds = in_buckets(mean, low, side)
+    sorted_mean, sorted_returns = mean[order], returns[order]
+    profiles = np.zeros((found.shape[0], SLICES, PROFILE))
+    kept = 0
+    for c in range(found.shape[0]):
+        axis = found[c]
+        for turn in range(4):
+            runs = near_rows(axis[0], axis[1], low, bounds)
+            _fit_line(axis, sorted_mean, sorted_returns, runs, 0.35 if turn < 2 else 0.25)
+        here = low[0] <= axis[0] < low[0] + side and low[1] <= axis[1] < low[1] + side
+        if here and not _is_known(axis, found, kept):
+            found[kept] = axis
+            profile(
+                axis, sorted_mean, sorted_returns, near_rows(axis[0], axis[1], low, bounds), profiles[kept]
+            )
+            kept += 1
+    return found[:kept].copy(), profiles[:kept].copy()
+
+
+@compiled
+def _is_known(axis: Float, found: Float, kept: int) -> bool:
+    """Whether the search over other heights has led to the same axis before."""
+    known = False
+    for k in range(kept):
+        known |= abs(axis[0] - found[k, 0]) < TWIN and abs(axis[1] - found[k, 1]) < TWIN
+    return known
+
+
+@compiled
+def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: float) -> None:
+    """One round; a slice weighs by how much of what is around the axis lies at it, however many returns
+    it has, so that foliage does not draw the axis away. A weak prior keeps it upright."""
+    w, x, y, around = np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES)
+    for run in range(runs.shape[0]):
+        for i in range(runs[run, 0], runs[run, 1]):
+            h = mean[i, 2]
+            s = int(h / SLICE)
+            if s < LOW or s >= HIGH:
+                continue
+            dx = mean[i, 0] - axis[0] - axis[2] * (h - 1.3)
+            dy = mean[i, 1] - axis[1] - axis[3] * (h - 1.3)
+            r2 = dx * dx + dy * dy
+            if r2 < reach * reach:
+                w[s] += returns[i]
+                x[s] += returns[i] * mean[i, 0]
+                y[s] += returns[i] * mean[i, 1]
+            elif r2 < RING_FAR * RING_FAR:
+                around[s] += returns[i]
+    n, sh, shh, sx, sy, shx, shy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for s in range(SLICES):
+        if w[s] > 0.0:
+            h = (s + 0.5) * SLICE - 1.3
+            clean = w[s] / (w[s] + around[s])
+            v = w[s] / (w[s] + 2.0) * clean * clean
+            n += v
+            sh += v * h
+            shh += v * h * h
+            sx += v * x[s] / w[s]
+            sy += v * y[s] / w[s]
+            shx += v * h * x[s] / w[s]
+            shy += v * h * y[s] / w[s]
+    if n < 1e-3:
+        return
+    det = n * (shh + 0.5) - sh * sh
+    axis[2] = min(max((n * shx - sh * sx) / det, -0.5), 0.5)
+    axis[3] = min(max((n * shy - sh * sy) / det, -0.5), 0.5)
+    axis[0] = (sx - axis[2] * sh) / n
+    axis[1] = (sy - axis[3] * sh) / n
+
+
+@compiled
+def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) -> None:
+    """What stands around an axis, slice by slice, into `rows` of zeros, shape (SLICES, PROFILE).
+
+    Columns: returns inside, returns between, returns in the ring, voxels inside, filled octants of the
+    ring, middle of the inside (x, y from the axis) [m], rms distance of the inside from the axis [m],
+    and the second moments xx, xy, yy of the inside about its middle [m^2]. From ARC on, of what lies
+    nearer than RING_NEAR, sums from which a circle is fitted (Kasa 1976), with z = x^2 + y^2 from the
+    axis: 1, x, y, xx, xy, yy, xz, yz, zz.
+
+    Args:
+        axis: See `find_columns`; mean, returns: voxels, bucket by bucket; runs: see `near_rows`.
+        rows: Is filled.
+    """
+    octants = np.zeros((SLICES, OCTANTS), np.bool_)
+    for run in range(runs.shape[0]):
+        for i in range(runs[run, 0], runs[run, 1]):
+            h = mean[i, 2]
+            s = int(h / SLICE)
+            if s < 0 or s >= SLICES:
+                continue
+            dx = mean[i, 0] - axis[0] - axis[2] * (h - 1.3)
+            dy = mean[i, 1] - axis[1] - axis[3] * (h - 1.3)
+            _count(dx, dy, float(returns[i]), rows[s], octants[s])
+    for s in range(SLICES):
+        rows[s, 4] = octants[s].sum()
+        if rows[s, 0] > 0.0:
+            for a in range(5, ARC):
+                rows[s, a] /= rows[s, 0]
+            rows[s, 7] = np.sqrt(rows[s, 7])
+            rows[s, 8] -= rows[s, 5] * rows[s, 5]
+            rows[s, 9] -= rows[s, 5] * rows[s, 6]
+            rows[s, 10] -= rows[s, 6] * rows[s, 6]
+
+
+@compiled
+def _count(dx: float, dy: float, n: float, row: Float, octant: Bool) -> None:
+    r2 = dx * dx + dy * dy
+    if r2 < RING_NEAR * RING_NEAR:
+        for a, v in enumerate((1.0, dx, dy, dx * dx, dx * dy, dy * dy, dx * r2, dy * r2, r2 * r2)):
+            row[ARC + a] += n * v
+    if r2 < INSIDE * INSIDE:
+        row[0] += n
+        row[3] += 1.0
+        row[5] += n * dx
+        row[6] += n * dy
+        row[7] += n * r2
+        row[8] += n * dx * dx
+        row[9] += n * dx * dy
+        row[10] += n * dy * dy
+    elif r2 < RING_NEAR * RING_NEAR:
+        row[1] += n
+    elif r2 < RING_FAR * RING_FAR:
+        row[2] += n
+        octant[(dx > 0.0) * 4 + (dy > 0.0) * 2 + (abs(dx) > abs(dy))] = True

@@ -1,0 +1,288 @@
+"""Features: the figures of a column by which it is judged, none of them in the sensor's own units."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.classification.column_extraction import ARC, HIGH
+from pipeline.classification.voxel_map import SLICE, SLICES
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
+from pipeline.types.records import Int32
+
+# Bands of height above the ground, as slices: first, one past the last.
+BANDS = np.array([[1, 4], [4, 7], [7, 11], [11, 16], [16, 30]])
+CLEAN, CLEAN_NEAR = 0.5, 0.7  # of the returns around a clean slice lie at the axis, see `_stem`
+GAP = 2  # slices that a stem may be hidden over
+
+_BAND_WORDS = ("0.2-0.8", "0.8-1.4", "1.4-2.2", "2.2-3.2", "3.2-6")
+NAMES = tuple(
+    [f"{figure} {band} m" for band in _BAND_WORDS for figure in ("filled", "alone", "ring open")]
+    + [
+        "lowest return",
+        "clean from",
+        "clean to",
+        "clean slices",
+        "highest return",
+        "headroom",
+        "looked at up to",
+        "tilt",
+        "wobble",
+        "spread",
+        "voxels a slice",
+        "returns a voxel",
+        "returns around",
+        "crown",
+        "gone",
+        "returns a slice",
+        "thick",
+        "wide",
+        "uneven",
+        "part of the view filled",
+        "radius",
+        "residual",
+        "residual of the radius",
+        "thick above",
+        "wide above",
+        "voxels to 3 m",
+    ]
+    + [f"alone beyond 0.45 m {band} m" for band in _BAND_WORDS[:4]]
+    + [f"alone within 0.45 m {band} m" for band in _BAND_WORDS[:4]]
+    + [f"opaque {band} m" for band in _BAND_WORDS]
+    + [
+        "free above what is clean",
+        "free above the highest return",
+        "rays up to",
+        "nothing above what is clean",
+    ]
+)
+COUNT = len(NAMES)
+# The figures from RAYS on are what rays tell.
+LAST, RAYS = NAMES.index("clean to"), NAMES.index("opaque 0.2-0.8 m")
+UNSEEN = -1.0  # of a figure of a band that no return tells anything of
+
+
+@compiled
+def features(
+    axis: Float,
+    profiles: Float,
+    viewed: Float,
+    present: Float,
+    absent: Float,
+    met: Int32,
+    passed: Int32,
+    figures: Float,
+) -> None:
+    """The features of columns, into `figures`, shape (K, COUNT), in the order of NAMES.
+
+    Args:
+        axis: shape (K, 5), see `find_columns`.
+        profiles: shape (K, SLICES, PROFILE).
+        viewed: How high above the ground any scan looked there, shape (K,) [m].
+        present, absent: In how many scans something, or nothing, stood there in free view, shape (K,).
+        met, passed: Rays that ended at it or passed its axis, shape (K, SLICES).
+        figures: Is filled.
+    """
+    for c in range(axis.shape[0]):
+        _features(axis[c], profiles[c], viewed[c], present[c], absent[c], figures[c])
+        _rays(profiles[c], met[c], passed[c], int(figures[c, LAST] / SLICE + 0.5), figures[c, RAYS:])
+
+
+@compiled
+def _features(axis: Float, rows: Float, viewed: float, present: float, absent: float, out: Float) -> None:
+    for b in range(BANDS.shape[0]):
+        _band(rows, BANDS[b, 0], BANDS[b, 1], out[3 * b : 3 * b + 3])
+    k = 3 * BANDS.shape[0]
+    bottom, first, last, clean, top = _stem(rows)
+    out[k] = bottom * SLICE
+    out[k + 1] = first * SLICE
+    out[k + 2] = last * SLICE
+    out[k + 3] = clean
+    out[k + 4] = top * SLICE
+    out[k + 5] = max(viewed, top * SLICE) - top * SLICE
+    out[k + 6] = max(viewed, top * SLICE)
+    out[k + 7] = np.hypot(axis[2], axis[3])
+    inside, cells, filled, wobble, spread, ring = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for s in range(1, min(last + 1, SLICES)):
+        if rows[s, 0] > 0.0:
+            filled += 1.0
+            inside += rows[s, 0]
+            cells += rows[s, 3]
+            wobble += rows[s, 5] ** 2 + rows[s, 6] ** 2
+            spread += rows[s, 7]
+            ring += rows[s, 1] + rows[s, 2]
+    some = max(filled, 1.0)
+    out[k + 8] = np.sqrt(wobble / some)
+    out[k + 9] = spread / some
+    out[k + 10] = cells / some
+    out[k + 11] = np.log(1.0 + inside / max(cells, 1.0))
+    out[k + 12] = ring / max(inside + ring, 1.0)
+    above = 0.0
+    for s in range(last + 1, SLICES):
+        above += rows[s, 0] + rows[s, 1] + rows[s, 2]
+    out[k + 13] = above / max(above + inside, 1.0)
+    out[k + 14] = absent / max(present + absent, 1.0)
+    out[k + 15] = np.log(1.0 + inside / some)
+    _shape(rows, last, out[k + 16 : k + 19])
+    out[k + 19] = last * SLICE / max(out[k + 6], SLICE)
+    _circle(rows, last, out[k + 20 : k + 23])
+    _above(rows, last, out[k + 23 : k + 25])
+    out[k + 25] = rows[1:HIGH, 3].sum()
+    for b in range(4):
+        _nearer(rows, BANDS[b, 0], BANDS[b, 1], out[k + 26 + b : k + 31 + b : 4])
+
+
+@compiled
+def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None:
+    """Of each band the part of the rays that ended at the column; then how much was seen to be free above
+    the clean slices before the next return, and above the highest return; up to where rays tell something;
+    and how far above the clean slices the next return lies, as far as that. All in metres."""
+    n = BANDS.shape[0]
+    for b in range(n):
+        ended, went = 0.0, 0.0
+        for s in range(BANDS[b, 0], BANDS[b, 1]):
+            ended += met[s]
+            went += passed[s]
+        out[b] = ended / (ended + went) if ended + went > 0.0 else UNSEEN
+    free, above, told, top = 0, 0, 0, 0
+    gap = -1
+    for s in range(1, SLICES):
+        if rows[s, 0] > 0.0:
+            top, above = s, 0
+            if s > last and gap < 0:
+                gap = s - last - 1
+        elif passed[s] > 0:
+            above += 1
+            free += s > last and gap < 0
+        if met[s] + passed[s] > 0:
+            told = s
+    out[n] = free * SLICE
+    out[n + 1] = above * SLICE
+    out[n + 2] = told * SLICE
+    out[n + 3] = (gap if gap >= 0 else max(told - top, 0)) * SLICE
+
+
+@compiled
+def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
+    """Of what lies nearer than 0.9 m, the part nearer than 0.45 m, and of that the part at the axis."""
+    inside, near, ring = 0.0, 0.0, 0.0
+    for s in range(first, end):
+        inside += rows[s, 0]
+        near += rows[s, 0] + rows[s, 1]
+        ring += rows[s, 2]
+    out[0] = near / (near + ring) if near > 0.0 else UNSEEN
+    out[1] = inside / near if inside > 0.0 else UNSEEN
+
+
+@compiled
+def _shape(rows: Float, last: int, out: Float) -> None:
+    """Of the slices up to `last`: standard deviation of the inside across its long side and along it,
+    averaged [m], and how unevenly wide the slices are."""
+    xx, xy, yy, n, total, squares = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for s in range(1, min(last + 1, SLICES)):
+        if rows[s, 3] >= 2.0:
+            n += 1.0
+            xx += rows[s, 8]
+            xy += rows[s, 9]
+            yy += rows[s, 10]
+            wide = np.sqrt(max(rows[s, 8] + rows[s, 10], 0.0))
+            total += wide
+            squares += wide * wide
+    some = max(n, 1.0)
+    middle, half = 0.5 * (xx + yy) / some, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy) / some
+    out[0] = np.sqrt(max(middle - half, 0.0)) if n > 0.0 else UNSEEN
+    out[1] = np.sqrt(max(middle + half, 0.0)) if n > 0.0 else UNSEEN
+    out[2] = np.sqrt(max(squares / some - (total / some) ** 2, 0.0)) / max(total / some, 0.01)
+
+
+@compiled
+def _circle(rows: Float, last: int, out: Float) -> None:
+    """Radius of the circle through the clean slices laid upon one another, rms distance from it [m], and
+    their ratio; UNSEEN where the returns do not tell (Kasa 1976: z + B x + C y + D = 0 by least squares)."""
+    m = np.zeros(9)
+    for s in range(1, min(last + 1, SLICES)):
+        if rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2]):
+            m += rows[s, ARC : ARC + 9]
+    out[:] = UNSEEN
+    if m[0] < 6.0:
+        return
+    m /= m[0]
+    x, y, z = m[1], m[2], m[3] + m[5]
+    xx, xy, yy = m[3] - x * x, m[4] - x * y, m[5] - y * y
+    xz, yz, zz = m[6] - x * z, m[7] - y * z, m[8] - z * z
+    det = xx * yy - xy * xy
+    if det < 1e-12:
+        return
+    B, C = -(yy * xz - xy * yz) / det, -(xx * yz - xy * xz) / det
+    D = -(z + B * x + C * y)
+    square = 0.25 * (B * B + C * C) - D
+    if square <= 1e-6:
+        return
+    radius = np.sqrt(square)
+    misfit = zz + 2.0 * (B * xz + C * yz) + B * B * xx + 2.0 * B * C * xy + C * C * yy
+    out[0] = min(radius, 1.0)
+    out[1] = np.sqrt(max(misfit, 0.0)) / (2.0 * radius)
+    out[2] = out[1] / out[0]
+
+
+@compiled
+def _above(rows: Float, last: int, out: Float) -> None:
+    """Standard deviations of what lies above the clean slices, across its long side and along it [m]:
+    the plate of a sign is flat, foliage is not."""
+    n, xx, xy, yy = 0.0, 0.0, 0.0, 0.0
+    for s in range(last + 1, SLICES):
+        if rows[s, 3] >= 2.0:
+            n += 1.0
+            xx += rows[s, 8]
+            xy += rows[s, 9]
+            yy += rows[s, 10]
+    some = max(n, 1.0)
+    middle, half = 0.5 * (xx + yy) / some, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy) / some
+    out[0] = np.sqrt(max(middle - half, 0.0)) if n > 0.0 else UNSEEN
+    out[1] = np.sqrt(max(middle + half, 0.0)) if n > 0.0 else UNSEEN
+
+
+@compiled
+def _band(rows: Float, first: int, end: int, out: Float) -> None:
+    """Filled part of the slices, part of the returns that lies at the axis, open part of the ring."""
+    inside, around, filled, octants = 0.0, 0.0, 0.0, 0.0
+    for s in range(first, end):
+        inside += rows[s, 0]
+        around += rows[s, 1] + rows[s, 2]
+        filled += rows[s, 0] > 0.0
+        octants += rows[s, 4]
+    out[0] = filled / (end - first)
+    out[1] = inside / (inside + around) if inside > 0.0 else UNSEEN
+    out[2] = 1.0 - octants / (8.0 * (end - first))
+
+
+@compiled
+def _stem(rows: Float) -> tuple[int, int, int, int, int]:
+    """Slices: lowest with a return, first and last clean one of the run, their number, highest return.
+
+    A thick neighbour returns more than a thin stem does and leaves it no clean slice; there a slice is
+    clean by what lies nearer than the neighbour.
+    """
+    bottom, top = SLICES, 0
+    for s in range(1, SLICES):
+        if rows[s, 0] > 0.0:
+            bottom = min(bottom, s)
+            top = s
+    first, last, clean = _run(rows, CLEAN, 1.0)
+    if clean == 0:
+        first, last, clean = _run(rows, CLEAN_NEAR, 0.0)
+    return bottom, first, last, clean, top
+
+
+@compiled
+def _run(rows: Float, part: float, ring: float) -> tuple[int, int, int]:
+    """First and last clean slice of the run, and their number: slices in which such a part of the returns
+    lies at the axis; those of the ring count so much."""
+    first, last, clean = SLICES, 0, 0
+    for s in range(1, SLICES):
+        at_axis = rows[s, 0] >= part * (rows[s, 0] + rows[s, 1] + ring * rows[s, 2])
+        if rows[s, 0] > 0.0 and at_axis and (clean == 0 or s - last <= GAP + 1):
+            first = min(first, s)
+            last = s
+            clean += 1
+    return first, last, clean

@@ -1,0 +1,182 @@
+"""Obstacles: what stands in the way that the robot drives, from one scan.
+
+The way is the arc that the present velocities lead along. With v the forward velocity and omega the turn,
+its centre is (0, R) in the base frame, R = v / omega; a point (x, y) lies at the angle
+theta = atan2(x, sign(R) (R - y)) on it, s = |R| theta along it, and |R| - |(x, y - R)| beside it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pipeline.config.stages import Obstacles
+from pipeline.ground.terrain import Terrain, ground_at
+from pipeline.jit import compiled
+from pipeline.types.clearance import Clearance, Zone
+from pipeline.types.records import Float, Float32
+
+#: Slower than this the robot stands [m/s]: it is asked what lies straight before it.
+STANDING = 0.05
+#: The tightest way, 1 / curvature [m]: velocities of a robot that turns on the spot tell of none.
+TIGHTEST = 0.5
+#: Returns that stand within such a depth of one another are one obstacle [m].
+DEPTH = 0.5
+#: What stands farther beside the robot than this is not asked for [m].
+BESIDE = 3.0
+#: The sensor looks along the way when returns lie within 30 degrees of its beginning.
+_LOOKING = math.tan(math.radians(30.0))
+STRAIGHT = 1e-6  # 1/m; a way that bends less does not bend
+_NO_GROUND = np.zeros((0, 0))
+
+
+def find_clearance(
+    points: Float32,
+    near: Float32,
+    terrain: Terrain | None,
+    sensor_offset: Float,
+    twist: tuple[float, float, float],
+    parameters: Obstacles,
+) -> Clearance | None:
+    """The clearance of the way that the robot drives; None where it is not asked for. What stands beside the
+    robot, within the width of the way, is nearer than anything. Where there is no terrain and the sensor
+    stands lower than the lowest obstacle (as where nobody told how it is mounted), what stands below it would
+    be left out, so that such a way is never free.
+
+    Args:
+        points: float32, shape (N, 3) [m], level sensor frame, the whole scan from `acquisition.range_min` on.
+        near: float32, shape (M, 3) [m], likewise, what is nearer; of these, what lies within the robot is it.
+        terrain: Of the scan; without one, heights are those above the base.
+        sensor_offset: shape (3,) [m], of the sensor in the level base frame.
+        twist: Velocity of the base: forward, left [m/s], turn [rad/s].
+        parameters: Of this stage.
+    """
+    if parameters.method == "none":
+        return None
+    backward = twist[0] < -STANDING
+    reach = _reach(sensor_offset, backward, parameters)
+    beyond = _beyond_the_robot(near, sensor_offset, parameters)
+    curvature = way_of(twist)
+    zone, ahead, beside, x, y = _along(
+        np.vstack([points, beyond]) if len(beyond) else points,
+        _NO_GROUND if terrain is None else terrain.height,
+        sensor_offset,
+        curvature,
+        backward,
+        np.array([parameters.height_min, parameters.height_max]),
+        np.array([*reach, 0.5 * parameters.width]),
+        np.array([parameters.stop_distance, parameters.slow_distance]),
+        parameters.min_points,
+    )
+    if terrain is None and sensor_offset[2] < parameters.height_min and zone != Zone.STOP:
+        zone = Zone.UNKNOWN
+    return Clearance(
+        Zone(zone), ahead, beside, x, y, curvature, backward, parameters.slow_distance, begins=reach[0]
+    )
+
+
+def _reach(sensor_offset: Float, backward: bool, parameters: Obstacles) -> tuple[float, float]:
+    """How far the robot reaches along its way and against it, to its sensor at least [m]."""
+    along = -float(sensor_offset[0]) if backward else float(sensor_offset[0])
+    return max(parameters.reach, along), max(parameters.reach, -along)
+
+
+def _beyond_the_robot(near: Float32, sensor_offset: Float, parameters: Obstacles) -> Float32:
+    """The points that do not lie within the box of the robot, which holds its base and its sensor."""
+    half = np.array([parameters.reach, 0.5 * parameters.width])
+    place = near[:, :2] + sensor_offset[:2]
+    own = (np.minimum(-half, sensor_offset[:2]) <= place) & (place <= np.maximum(half, sensor_offset[:2]))
+    beyond: Float32 = near[~own.all(axis=1)]
+    return beyond
+
+
+def way_of(twist: tuple[float, float, float]) -> float:
+    """Curvature of the way that velocities lead along [1/m], no tighter than `TIGHTEST`."""
+    forward, _, turn = twist
+    if abs(forward) < STANDING or not math.isfinite(turn / forward):
+        return 0.0
+    return min(max(turn / forward, -1.0 / TIGHTEST), 1.0 / TIGHTEST)
+
+
+@compiled
+def _along(
+    points: Float32,
+    ground: Float,
+    sensor: Float,
+    curvature: float,
+    backward: bool,
+    band: Float,
+    robot: Float,
+    zones: Float,
+    least: int,
+) -> tuple[int, float, float, float, float]:
+    reach, behind, half = robot[0], robot[1], robot[2]
+    stop, slow = zones[0], zones[1]
+    most = reach + slow
+    farthest = (most + half + BESIDE) ** 2
+    way = -1.0 if backward else 1.0
+    s, place, aside = np.empty(points.shape[0]), np.empty((points.shape[0], 2)), np.empty(points.shape[0])
+    n = near = looks = 0
+    for i in range(points.shape[0]):
+        x, y = points[i, 0] + sensor[0], points[i, 1] + sensor[1]
+        looks += abs(y) < way * x * _LOOKING
+        if not x * x + y * y < farthest:  # neither what is no number
+            continue
+        off = _beside_the_way(way * x, y, curvature)
+        if off > half + BESIDE:  # asked first: most of the ground around the robot fails it
+            continue
+        along = _on_the_way(way * x, y, curvature)
+        if along <= -behind or along > most:
+            continue
+        height = points[i, 2] + sensor[2]
+        if ground.shape[0] > 0:
+            height = points[i, 2] - ground_at(ground, points[i, 0], points[i, 1])
+        if not band[0] <= height <= band[1]:
+            continue
+        aside[near] = max(off - half, 0.0)
+        near += 1
+        if off <= half:
+            s[n], place[n, 0], place[n, 1] = max(along - reach, 0.0), x, y
+            n += 1
+    beside = _nearest(aside[:near], least)
+    ahead = _nearest(s[:n], least)
+    at_x = at_y = np.nan
+    for i in range(n):
+        if s[i] == ahead:
+            at_x, at_y = place[i, 0], place[i, 1]
+    zone = 2 if ahead < stop else (1 if ahead < slow else 0)
+    if zone == 0 and looks < least:
+        zone = 3
+    return zone, ahead, beside, at_x, at_y
+
+
+@compiled
+def _beside_the_way(x: float, y: float, curvature: float) -> float:
+    """How far beside an arc from the origin a place lies [m]."""
+    if abs(curvature) < STRAIGHT:
+        return abs(y)
+    radius = 1.0 / abs(curvature)
+    to_centre = radius - (y if curvature > 0.0 else -y)
+    return float(abs(radius - np.sqrt(x * x + to_centre * to_centre)))
+
+
+@compiled
+def _on_the_way(x: float, y: float, curvature: float) -> float:
+    """How far along an arc from the origin a place lies [m]; half a turn at most lies before the robot, all
+    else behind it."""
+    if abs(curvature) < STRAIGHT:
+        return x
+    radius = 1.0 / abs(curvature)
+    return float(radius * np.arctan2(x, radius - (y if curvature > 0.0 else -y)))
+
+
+@compiled
+def _nearest(values: Float, least: int) -> float:
+    """Where the first `least` values begin that lie within DEPTH; infinite where there are none. A few single
+    returns (rain, an insect) are no obstacle."""
+    ordered = np.sort(values)
+    for i in range(ordered.shape[0] - least + 1):
+        if ordered[i + least - 1] - ordered[i] <= DEPTH:
+            return float(ordered[i])
+    return np.inf

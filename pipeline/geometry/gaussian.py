@@ -1,0 +1,132 @@
+"""Gaussians of a pose and of places in the plane, written out: rows are scalars, which stay in registers,
+and the library's products of such small matrices cost more than all else here."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing, compiled_within
+
+SMALL_TURN = 0.02  # rad; below it the series of sine and cosine is exact to 1e-10
+
+
+class Pose(NamedTuple):
+    """x, y [m], yaw [rad] and the upper half of their covariance."""
+
+    x: float
+    y: float
+    yaw: float
+    xx: float
+    xy: float
+    xt: float
+    yy: float
+    yt: float
+    tt: float
+
+
+@compiled_borrowing
+def pose_of(mu: Float, P: Float) -> Pose:
+    """A pose from its mean, shape (3,), and covariance, shape (3, 3)."""
+    return Pose(mu[0], mu[1], mu[2], P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
+
+
+@compiled_borrowing
+def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
+    """The inverse of `pose_of`, into arrays."""
+    mu[0], mu[1], mu[2] = pose.x, pose.y, pose.yaw
+    P[0, 0], P[1, 1], P[2, 2] = pose.xx, pose.yy, pose.tt
+    P[0, 1] = P[1, 0] = pose.xy
+    P[0, 2] = P[2, 0] = pose.xt
+    P[1, 2] = P[2, 1] = pose.yt
+
+
+@compiled
+def rows_of(covariance: Float) -> Float:
+    """xx, xy, yy, shape (D, 3), of covariances of shape (D, 2, 2)."""
+    rows = np.empty((covariance.shape[0], 3))
+    for d in range(covariance.shape[0]):
+        rows[d, 0], rows[d, 1], rows[d, 2] = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
+    return rows
+
+
+@compiled_within
+def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
+    """The covariance R[d] (xx, xy, yy) turned by the angle of cosine c and sine s."""
+    xx, xy, yy = R[d, 0], R[d, 1], R[d, 2]
+    return (
+        c * c * xx - 2.0 * c * s * xy + s * s * yy,
+        c * s * (xx - yy) + (c * c - s * s) * xy,
+        s * s * xx + 2.0 * c * s * xy + c * c * yy,
+    )
+
+
+@compiled_within
+def expected_spread(
+    pose: Pose, c: float, s: float, ax: float, ay: float, R: Float, d: int
+) -> tuple[float, float, float]:
+    """C R C^T + J P J^T of detection d, xx, xy, yy: how far it may lie by the pose and by its own error.
+
+    Args:
+        pose: With its covariance P; c, s: cosine and sine of its yaw.
+        ax, ay: From the robot to the detection, frame of the map: J = [I, (-ay, ax)^T].
+        R: xx, xy, yy in the base frame, shape (D, 3) [m^2].
+    """
+    xx, xy, yy = rotated(R, d, c, s)
+    return (
+        xx + pose.xx - 2.0 * ay * pose.xt + ay * ay * pose.tt,
+        xy + pose.xy + ax * pose.xt - ay * pose.yt - ax * ay * pose.tt,
+        yy + pose.yy + 2.0 * ax * pose.yt + ax * ax * pose.tt,
+    )
+
+
+@compiled_within
+def corrected(
+    pose: Pose, ax: float, ay: float, S0: float, S1: float, S2: float, y0: float, y1: float
+) -> Pose:
+    """Kalman update of a pose by one landmark; S: xx, xy, yy of its innovation y, J as in
+    `expected_spread`."""
+    scale = 1.0 / (S0 * S2 - S1 * S1)
+    a0, a1, a2 = pose.xx - ay * pose.xt, pose.xy - ay * pose.yt, pose.xt - ay * pose.tt
+    b0, b1, b2 = pose.xy + ax * pose.xt, pose.yy + ax * pose.yt, pose.yt + ax * pose.tt
+    k00, k01 = (a0 * S2 - b0 * S1) * scale, (b0 * S0 - a0 * S1) * scale
+    k10, k11 = (a1 * S2 - b1 * S1) * scale, (b1 * S0 - a1 * S1) * scale
+    k20, k21 = (a2 * S2 - b2 * S1) * scale, (b2 * S0 - a2 * S1) * scale
+    return Pose(
+        pose.x + (k00 * y0 + k01 * y1),
+        pose.y + (k10 * y0 + k11 * y1),
+        pose.yaw + (k20 * y0 + k21 * y1),
+        pose.xx - (k00 * a0 + k01 * b0),
+        pose.xy - (k00 * a1 + k01 * b1),
+        pose.xt - (k00 * a2 + k01 * b2),
+        pose.yy - (k10 * a1 + k11 * b1),
+        pose.yt - (k10 * a2 + k11 * b2),
+        pose.tt - (k20 * a2 + k21 * b2),
+    )
+
+
+@compiled_within
+def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
+    """Cosine and sine of a yaw from those before it turned by a little."""
+    if abs(by) > SMALL_TURN:
+        return np.cos(yaw), np.sin(yaw)
+    b2 = by * by
+    cos, sin = 1.0 - b2 * (0.5 - b2 / 24.0), by * (1.0 - b2 / 6.0)
+    return c * cos - s * sin, s * cos + c * sin
+
+
+@compiled_within
+def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
+    """out[p] = mu + L noise[p] with L L^T = P (Cholesky); a direction without variance gets no noise."""
+    l00 = np.sqrt(max(P[0, 0], 0.0))
+    l10 = P[1, 0] / l00 if l00 > 1e-12 else 0.0
+    l20 = P[2, 0] / l00 if l00 > 1e-12 else 0.0
+    l11 = np.sqrt(max(P[1, 1] - l10 * l10, 0.0))
+    l21 = (P[2, 1] - l20 * l10) / l11 if l11 > 1e-12 else 0.0
+    l22 = np.sqrt(max(P[2, 2] - l20 * l20 - l21 * l21, 0.0))
+    n0, n1, n2 = noise[p, 0], noise[p, 1], noise[p, 2]
+    out[p, 0] = mu[0] + l00 * n0
+    out[p, 1] = mu[1] + l10 * n0 + l11 * n1
+    out[p, 2] = (mu[2] + l20 * n0 + l21 * n1 + l22 * n2 + np.pi) % (2.0 * np.pi) - np.pi

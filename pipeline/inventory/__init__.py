@@ -1,0 +1,261 @@
+"""A whole cloud of a plot, as a terrestrial or mobile scanner gives it, mapped at once.
+
+`map_plot` reads from top to bottom: extent, ground, thinned points above it, slices, circles, stems. The
+cloud is read three times part by part, so that its size decides the time and not the memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.classification import ForestOf, package_alone
+from pipeline.config import Parameters
+from pipeline.errors import SourceError
+from pipeline.geometry.poses import Float
+from pipeline.inventory.cloud import Cloud
+from pipeline.inventory.column_candidates import CLASSES, find_upright
+from pipeline.inventory.cross_sections import HIGHEST, LOWEST, Slices, cut, find_circles
+from pipeline.inventory.extent import find_extent
+from pipeline.inventory.stem_model import (
+    COVERAGE,
+    FIRST,
+    LAST,
+    LEAN_X,
+    LEAN_Y,
+    POINTS,
+    RADIUS,
+    SCATTER,
+    SLICES,
+    TAPER,
+    VAR_X,
+    VAR_Y,
+    X,
+    Y,
+    describe_stems,
+    diameters,
+    judge,
+    middles,
+    same,
+)
+from pipeline.inventory.stem_tracing import chain, follow
+from pipeline.inventory.terrain_raster import HeightMap, LowestReturns, heights_above
+from pipeline.inventory.thinning import Thinned
+from pipeline.types.records import Float32, Int32, Trees, Verdict
+
+MOST_RASTER = 96 << 20  # bytes
+COARSE = 0.04  # m; above this the thinning tells on diameters
+SURE = 0.5  # of the votes for pole, person or wall against a stem
+BESIDE = 0.4  # m; a column so near to a stem is the stem
+NEVER = -1  # a time that nobody knows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """All that was asked whether it is a tree, in the frame of the cloud less its offset; columns of
+    length K.
+
+    Attributes:
+        place: shape (K, 2) [m]; radius, radial_std [m]; arc [rad]; points: on the
+            circle of a usual slice.
+        verdict: int32, see Verdict.
+        height: Between the lowest and the highest slice [m].
+    """
+
+    place: Float
+    radius: Float
+    radial_std: Float
+    arc: Float
+    points: Float
+    height: Float
+    verdict: Int32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlotMap:
+    """The map of a plot, in the frame of the cloud less its offset.
+
+    Attributes:
+        trees: All confirmed; observations are slices.
+        slices: Circles of the trees, shape (T, S, FIGURES), see `fit_circle`; slice_height: shape (S,) [m].
+        candidates: With their verdicts.
+        ground: Height map; points: thinned, between LOWEST and HIGHEST above it, shape (N, 4).
+        counts: Of points, by name; voxel_size: to which they were thinned [m].
+        lean: Shift of the axis per metre of height of each tree, shape (T, 2); taper: of the radius (T,).
+        warnings: For people.
+    """
+
+    trees: Trees
+    slices: Float
+    slice_height: Float
+    candidates: Candidates
+    ground: HeightMap
+    points: Float32
+    counts: dict[str, int]
+    voxel_size: float
+    lean: Float
+    taper: Float
+    warnings: tuple[str, ...]
+
+
+def map_plot(cloud: Cloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
+    """Map a whole cloud.
+
+    Raises:
+        SourceError: It cannot be read, has no points, or is wider than a plot.
+    """
+    r_min, r_max = parameters.detection.radius_min, parameters.detection.radius_max
+    ground, near, counts = find_ground(cloud, parameters.ground.slope_max)
+    slices = cut(near.points)
+    circles = find_circles(slices, max(r_min, 0.02), r_max)
+    number, stems = chain(circles)
+    fits = follow(slices, circles, number, stems, max(r_min, 0.02), r_max)
+    height = middles(slices)
+    figures = describe_stems(fits, height)
+    verdict = judge(figures, r_min, r_max)
+    kept = ~same(figures, verdict)
+    fits, figures, verdict = fits[kept], figures[kept], verdict[kept]
+    places, share = find_upright(near.points, forests(parameters.gathering.forest, True))
+    _refuse_what_is_known(figures, verdict, places, share)
+    tree = verdict == Verdict.TREE
+    # From west to east, so that numbers can be found again.
+    order = np.flatnonzero(tree)[np.lexsort((figures[tree, Y], figures[tree, X]))]
+    return PlotMap(
+        trees=_trees(figures[order], np.radians(parameters.tracking.dbh_arc_min)),
+        slices=fits[order],
+        slice_height=height,
+        candidates=_candidates(figures, verdict, places, share),
+        ground=ground,
+        points=near.points,
+        counts={**counts, "thinned": len(near.points), "in slices": len(slices.points)},
+        voxel_size=near.side,
+        lean=figures[order][:, [LEAN_X, LEAN_Y]],
+        taper=figures[order, TAPER],
+        warnings=_warnings(cloud, near, slices, ground),
+    )
+
+
+def find_ground(
+    cloud: Cloud, slope_max: float, *, band: tuple[float, float] = (LOWEST, HIGHEST), most: int = 1 << 21
+) -> tuple[HeightMap, Thinned, dict[str, int]]:
+    """The ground under a cloud, and its thinned points (x, y, z, height above the ground) in a band.
+
+    Args:
+        cloud: Is read three times.
+        slope_max: Of the terrain against the plane of the plot [degrees].
+        band: Lowest and highest point kept, above the ground [m].
+        most: Points that are kept after thinning, a power of two.
+
+    Raises:
+        SourceError: It cannot be read, has no points, or is wider than a plot.
+    """
+    extent = find_extent(cloud.parts(), cloud.description.uri)
+    room = LowestReturns.room(extent.low, extent.high)
+    if room > MOST_RASTER:
+        wide, long = (extent.high - extent.low).tolist()
+        raise SourceError(
+            f"the cloud is too large for one plot: {wide:.0f} x {long:.0f} m",
+            where=cloud.description.uri,
+            remedy="Cut it into plots of at most 400 x 400 m",
+        )
+    lowest = LowestReturns(extent.low, extent.high)
+    for part in cloud.parts():
+        lowest.add(part)
+    ground = lowest.ground(float(np.radians(slope_max)))
+    del lowest
+    near, below = Thinned(most), 0
+    for part in cloud.parts():
+        inside = ((part[:, :2] >= extent.low) & (part[:, :2] <= extent.high)).all(axis=1)
+        part = part[inside]
+        above = heights_above(part, ground)
+        below += int(np.count_nonzero(above < -0.3))
+        chosen = (above > band[0]) & (above < band[1])
+        near.add(np.column_stack([part[chosen], above[chosen]]))
+    counts = {"read": extent.points, "apart from the plot": extent.apart, "below the ground": below}
+    return ground, near, counts
+
+
+def _refuse_what_is_known(figures: Float, verdict: Int32, places: Float, share: Float) -> None:
+    """Stems that the votes say are poles, persons or walls are none, in place."""
+    from scipy.spatial import cKDTree
+
+    tree = np.flatnonzero(verdict == Verdict.TREE)
+    if len(tree) == 0 or len(places) == 0:
+        return
+    away, nearest = cKDTree(places).query(figures[tree][:, [X, Y]])
+    votes = share[nearest]
+    strongest = votes[:, 1:5].argmax(axis=1) + 1
+    others = (Verdict.POLE, Verdict.PERSON, Verdict.WALL)
+    kind = np.array(CLASSES, np.int32)[strongest]
+    known = (away < BESIDE) & (votes[np.arange(len(votes)), strongest] > SURE) & np.isin(kind, others)
+    verdict[tree[known]] = kind[known]
+
+
+def _trees(stems: Float, arc_min: float) -> Trees:
+    n = len(stems)
+    dbh, sigma = diameters(stems, arc_min)
+    covariance = np.zeros((n, 2, 2))
+    covariance[:, 0, 0], covariance[:, 1, 1] = stems[:, VAR_X], stems[:, VAR_Y]
+    return Trees(
+        number=np.arange(1, n + 1),
+        position=stems[:, [X, Y]],
+        covariance=covariance,
+        velocity=np.zeros((n, 2)),
+        dbh=dbh,
+        dbh_sigma=sigma,
+        eccentricity=np.full(n, np.nan),
+        observations=stems[:, SLICES].astype(np.int64),
+        coverage=stems[:, COVERAGE],
+        first_seen_ns=np.full(n, NEVER),
+        last_seen_ns=np.full(n, NEVER),
+        confirmed=np.ones(n, np.bool_),
+    )
+
+
+def _candidates(figures: Float, verdict: Int32, places: Float, share: Float) -> Candidates:
+    """Stems, and the upright columns that are none of them."""
+    alone = _away_from(places, figures[:, [X, Y]]) > BESIDE
+    places, share = places[alone], share[alone]
+    kind = np.array(CLASSES, np.int32)[share.argmax(axis=1)] if len(share) else np.zeros(0, np.int32)
+    kind[kind == Verdict.TREE] = Verdict.NO_ARC  # it stands like a stem, and no circle carries it
+    nothing = np.full(len(places), np.nan)
+    span = figures[:, LAST] - figures[:, FIRST]
+    columns = (RADIUS, SCATTER, COVERAGE, POINTS)
+    radius, scatter, arc, points = (np.append(figures[:, c], nothing) for c in columns)
+    return Candidates(
+        place=np.vstack([figures[:, [X, Y]], places]),
+        radius=radius,
+        radial_std=scatter,
+        arc=arc,
+        points=points,
+        height=np.append(span, nothing),
+        verdict=np.append(verdict, kind.astype(np.int32)),
+    )
+
+
+def _away_from(places: Float, others: Float) -> Float:
+    from scipy.spatial import cKDTree
+
+    others = others[np.isfinite(others).all(axis=1)]
+    if len(others) == 0 or len(places) == 0:
+        return np.full(len(places), np.inf)
+    away: Float = cKDTree(others).query(places)[0]
+    return away
+
+
+def _warnings(cloud: Cloud, near: Thinned, slices: Slices, ground: HeightMap) -> tuple[str, ...]:
+    told = list(cloud.description.warnings)
+    if near.side > COARSE:
+        told.append(
+            f"the cloud was thinned to {100.0 * near.side:.0f} cm, which makes diameters less sharp: "
+            "cut it into smaller plots"
+        )
+    if len(slices.points) == 0:
+        told.append("nothing stands higher than 0.2 m above the lowest returns")
+    if ground.seen.mean() < 0.1:
+        told.append("less than a tenth of the plot shows its ground: heights are uncertain")
+    return tuple(told)
+
+
+__all__ = ["Candidates", "PlotMap", "find_ground", "map_plot"]

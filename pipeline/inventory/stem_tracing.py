@@ -1,0 +1,229 @@
+"""Stems: circles of several slices that stand above one another, followed up and down."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.geometry.poses import Float
+from pipeline.inventory.circle import FIGURES, fit_circle, share_inside
+from pipeline.inventory.cross_sections import ARC, HOLLOW, INSIDE, LEAST, SLAB, STEP, THICK, Slices
+from pipeline.jit import compiled
+from pipeline.types.records import Int
+
+BREAST = 1.3  # m above the ground
+LINK_STEPS = 3  # slices that may lie between two circles of one stem
+LINK, LINK_LEAN = 0.06, 0.25  # m, and metres per metre of height
+ALIKE = 0.4  # part by which the radii of neighbours may differ
+LEAST_SLICES = 4
+REACH = 0.25  # m around the circle of the slice before that is looked at
+WANDER, WANDER_OF_RADIUS = 0.06, 0.25  # m, and part of the radius, by which the next circle may be off
+LOST = 5  # slices without a circle that end a stem
+BUCKET = 0.5  # m
+TUKEY = 4.7
+FOOT = 9  # x, y at breast height, their shift per metre of height, radius there, its change per metre, ...
+
+
+def chain(circles: Float) -> tuple[Int, int]:
+    """Which circles stand above one another: number of the stem of each, -1 for none, and how many stems.
+
+    Args:
+        circles: As `find_circles` gives them, slice after slice.
+    """
+    if len(circles) == 0:
+        return np.zeros(0, np.int64), 0
+    slabs = circles[:, SLAB].astype(np.int64)
+    bounds = np.searchsorted(slabs, np.arange(int(slabs.max()) + 2))
+    root = _link(circles, bounds)
+    size = np.bincount(root, minlength=len(root))
+    levels = np.bincount(np.unique(root * 1000 + slabs) // 1000, minlength=len(root))
+    # Best first, so that of two chains of one stem the better one begins it.
+    worth = np.bincount(root, weights=circles[:, 8], minlength=len(root))
+    keep = np.flatnonzero((size > 0) & (levels >= LEAST_SLICES))
+    keep = keep[np.argsort(-worth[keep], kind="stable")]
+    number = np.full(len(root), -1, np.int64)
+    number[keep] = np.arange(len(keep))
+    return number[root], len(keep)
+
+
+@compiled
+def _link(circles: Float, bounds: Int) -> Int:
+    n = circles.shape[0]
+    parent = np.arange(n)
+    for i in range(n):
+        k = int(circles[i, SLAB])
+        for j in range(i + 1, bounds[min(k + LINK_STEPS + 1, bounds.shape[0] - 1)]):
+            rise = STEP * (circles[j, SLAB] - circles[i, SLAB])
+            dx, dy = circles[j, 0] - circles[i, 0], circles[j, 1] - circles[i, 1]
+            near = LINK + LINK_LEAN * rise
+            if dx * dx + dy * dy < near * near:
+                r, s = circles[i, 2], circles[j, 2]
+                if abs(r - s) < ALIKE * max(r, s) + 0.01:
+                    a, b = _root(parent, i), _root(parent, j)
+                    parent[max(a, b)] = min(a, b)
+    for i in range(n):
+        parent[i] = _root(parent, i)
+    return parent
+
+
+@compiled
+def _root(parent: Int, c: int) -> int:
+    while parent[c] != c:
+        parent[c] = parent[parent[c]]
+        c = parent[c]
+    return c
+
+
+def follow(slices: Slices, circles: Float, number: Int, stems: int, r_min: float, r_max: float) -> Float:
+    """Each stem in all slices: from its best circle up and down, with what lies around the next circle.
+
+    Returns:
+        Shape (stems, slices, FIGURES): the figures of `fit_circle`, radius NaN where there is none.
+    """
+    buckets = _Buckets(slices)
+    return _follow(
+        buckets.xy,
+        buckets.start,
+        buckets.low,
+        buckets.across,
+        slices.count,
+        circles,
+        number,
+        stems,
+        r_min,
+        r_max,
+    )
+
+
+class _Buckets:
+    """The points of each step of height in square buckets seen from above."""
+
+    def __init__(self, slices: Slices) -> None:
+        xy = slices.points[:, :2]
+        steps = len(slices.bounds) - 1
+        self.low = xy.min(axis=0) if len(xy) else np.zeros(2)
+        high = xy.max(axis=0) if len(xy) else np.zeros(2)
+        self.across = np.floor((high - self.low) / BUCKET).astype(np.int64) + 1
+        cell = np.floor((xy - self.low) / BUCKET).astype(np.int64)
+        step = np.repeat(np.arange(steps), np.diff(slices.bounds))
+        each = int(self.across[0] * self.across[1])
+        key = step * each + cell[:, 0] * self.across[1] + cell[:, 1]
+        order = np.argsort(key, kind="stable")
+        self.xy = np.ascontiguousarray(xy[order])
+        self.start = np.searchsorted(key[order], np.arange(steps * each + 1))
+
+
+@compiled
+def _around(
+    xy: Float, start: Int, low: Float, across: Int, k: int, x: float, y: float, reach: float
+) -> Float:
+    """The points of slice k within `reach` of a place, shape (M, 2)."""
+    a0, a1 = int((x - reach - low[0]) / BUCKET), int((x + reach - low[0]) / BUCKET)
+    b0, b1 = int((y - reach - low[1]) / BUCKET), int((y + reach - low[1]) / BUCKET)
+    a0, a1, b0, b1 = max(a0, 0), min(a1, across[0] - 1), max(b0, 0), min(b1, across[1] - 1)
+    near = np.empty((64, 2))
+    n = 0
+    for step in range(k, k + THICK):
+        for a in range(a0, a1 + 1):
+            at = (step * across[0] + a) * across[1]
+            for i in range(start[at + b0], start[at + b1 + 1] if b1 >= b0 else start[at + b0]):
+                if (xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2 < reach * reach:
+                    if n == near.shape[0]:
+                        near = np.concatenate((near, np.empty_like(near)))
+                    near[n] = xy[i]
+                    n += 1
+    return near[:n]
+
+
+@compiled
+def _follow(
+    xy: Float,
+    start: Int,
+    low: Float,
+    across: Int,
+    slabs: int,
+    circles: Float,
+    number: Int,
+    stems: int,
+    r_min: float,
+    r_max: float,
+) -> Float:
+    out = np.full((stems, slabs, FIGURES), np.nan)
+    best = np.full(stems, -1, np.int64)
+    for i in range(circles.shape[0]):
+        s = number[i]
+        if s >= 0 and (best[s] < 0 or _worth(circles[i]) > _worth(circles[best[s]])):
+            best[s] = i
+    row = np.empty(FIGURES)
+    for s in range(stems):
+        seed = circles[best[s]]
+        k0 = int(seed[SLAB])
+        for way in (1, -1):
+            x, y, r = seed[0], seed[1], seed[2]
+            lean_x, lean_y, missed = 0.0, 0.0, 0
+            k = k0 if way == 1 else k0 - 1
+            while 0 <= k < slabs and missed <= LOST:
+                x, y = x + lean_x, y + lean_y
+                near = _around(xy, start, low, across, k, x, y, r + REACH)
+                row[0], row[1], row[2] = x, y, r
+                if _fits(near, row, r_min, r_max, missed):
+                    out[s, k] = row
+                    # The way on follows what was found, a little at a time.
+                    lean_x += 0.2 * (row[0] - x)
+                    lean_y += 0.2 * (row[1] - y)
+                    x, y, r = x + 0.7 * (row[0] - x), y + 0.7 * (row[1] - y), r + 0.5 * (row[2] - r)
+                    missed = 0
+                else:
+                    missed += 1
+                k += way
+    return out
+
+
+@compiled
+def _worth(circle: Float) -> float:
+    return float(circle[8] * (1.0 - circle[INSIDE]) * min(circle[9], 60.0) / (0.01 + circle[7]))
+
+
+@compiled
+def _fits(near: Float, row: Float, r_min: float, r_max: float, missed: int) -> bool:
+    """Fit a circle from where the stem should go on, and tell whether it is it."""
+    x, y, r = row[0], row[1], row[2]
+    if near.shape[0] < LEAST or not fit_circle(near, max(0.04, 0.4 * r), r_min, r_max, row):
+        return False
+    off = np.sqrt((row[0] - x) ** 2 + (row[1] - y) ** 2)
+    may = (WANDER + WANDER_OF_RADIUS * r) * (1.0 + 0.3 * missed)
+    alike = abs(row[2] - r) < 0.3 * r + 0.01
+    return bool(
+        off < may
+        and alike
+        and row[9] >= LEAST
+        and row[8] >= ARC
+        and row[7] < max(0.3 * r, 0.012)
+        and share_inside(near, row[0], row[1], row[2]) <= HOLLOW
+    )
+
+
+@compiled
+def lines(height: Float, value: Float, weight: Float) -> tuple[float, float, float, float]:
+    """A line through values over height by weights that forget what lies off it: value at breast
+    height, its change per metre, their standard deviations. A weak prior holds the slope near 0."""
+    n = height.shape[0]
+    a, b, scale = np.median(value), 0.0, 1.0
+    saa, sab, sbb = 1.0, 0.0, 1.0
+    for turn in range(12):
+        off = np.abs(value - a - b * (height - BREAST))
+        scale = max(np.median(off) / 0.6745, 0.001)
+        saa, sab, sbb, ta, tb = 0.0, 0.0, (scale / 0.1) ** 2, 0.0, 0.0
+        for i in range(n):
+            u2 = (off[i] / (TUKEY * scale)) ** 2 if turn > 0 else 0.0
+            if u2 >= 1.0:
+                continue
+            w, t = weight[i] * (1.0 - u2) ** 2, height[i] - BREAST
+            saa += w
+            sab += w * t
+            sbb += w * t * t
+            ta += w * value[i]
+            tb += w * t * value[i]
+        D = saa * sbb - sab * sab
+        a, b = (sbb * ta - sab * tb) / D, (saa * tb - sab * ta) / D
+    D = saa * sbb - sab * sab
+    return a, b, scale * np.sqrt(sbb / D), scale * np.sqrt(saa / D)

@@ -1,0 +1,317 @@
+"""The height of the ground over a plot: a raster under a whole cloud, found in one pass over its points.
+
+Of each cell the lowest returns are kept. One that lies alone below the others is noise; a cell that lies
+alone below its neighbours is noise too; a cell that rises steeper than the terrain can, seen from any
+lower one, is a stem, a bush or a crown. What is left carries planes, and holes are filled between them.
+All of this is done relative to the plane that the whole plot lies on, so that a steep hillside is as
+easy as flat land.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
+from pipeline.types.records import Bool, Float32, Int32
+
+CELL = 0.5  # m
+KEPT = 8  # lowest returns of a cell
+TOGETHER = 0.3  # m; a ground return has two more so little above it
+PIT = 0.5  # m; a cell that lies so far below its neighbours is noise
+TOLERANCE = 0.15  # m; grass and noise over the steepest slope
+WINDOW = 2  # cells to each side that carry a plane
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightMap:
+    """Heights of the ground at the corners and centres of a raster.
+
+    Attributes:
+        low: shape (2,) [m]: corner of the raster.
+        cell: Side of a cell [m].
+        height: shape (columns, rows) [m], at the centres of the cells.
+        seen: shape (columns, rows): whether returns of the ground lay in the cell.
+    """
+
+    low: Float
+    cell: float
+    height: Float
+    seen: Bool
+
+    def at(self, x: Float, y: Float) -> Float:
+        """Heights [m] at places of shape (N,) [m], between the cells bilinear."""
+        return self.evaluate(x, y)[:, 0]
+
+    def evaluate(self, x: Float, y: Float) -> Float:
+        """Height, dz/dx and dz/dy at places of shape (N,) [m]; shape (N, 3)."""
+        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+        return _evaluate(self.height, self.low, self.cell, np.ascontiguousarray(x), np.ascontiguousarray(y))
+
+
+class LowestReturns:
+    """The lowest returns of each cell, gathered part by part.
+
+    Args:
+        low, high: Corners of the raster, shape (2,) [m]; what lies outside is not taken.
+    """
+
+    def __init__(self, low: Float, high: Float) -> None:
+        shape = np.maximum(np.ceil((high - low) / CELL).astype(np.int64), 1)
+        self._low = low.astype(np.float64)
+        self._lowest = np.full((shape[0], shape[1], KEPT, 3), np.inf, np.float32)
+        self._count = np.zeros((shape[0], shape[1]), np.int32)
+
+    @staticmethod
+    def room(low: Float, high: Float) -> int:
+        """Bytes that a raster between two corners takes."""
+        columns, rows = (max(int(np.ceil(v / CELL)), 1) for v in (high - low).tolist())
+        return columns * rows * (12 * KEPT + 4)
+
+    def add(self, points: Float32) -> None:
+        """Take points of shape (N, 3) [m]."""
+        _keep_lowest(points, self._low, self._lowest, self._count)
+
+    def ground(self, slope_max: float) -> HeightMap:
+        """The ground under all points so far.
+
+        Args:
+            slope_max: The terrain never rises steeper than this against the plane of the plot [rad].
+        """
+        ground = _supported(self._lowest, self._count)
+        trend = _trend(ground)
+        ground[:, :, 2] -= ground[:, :, 0] * trend[0] + ground[:, :, 1] * trend[1] + trend[2]
+        for _ in range(2):
+            _forget_pits(ground)
+        _forget_what_overhangs(ground, float(np.tan(slope_max)))
+        height, seen = _planes(ground, self._low)
+        _fill(height)
+        x = self._low[0] + (np.arange(height.shape[0]) + 0.5) * CELL
+        y = self._low[1] + (np.arange(height.shape[1]) + 0.5) * CELL
+        height += x[:, None] * trend[0] + y[None, :] * trend[1] + trend[2]
+        return HeightMap(self._low, CELL, height, seen)
+
+
+def heights_above(points: Float32, ground: HeightMap) -> Float32:
+    """Height of each point (N, 3) above the ground, float32, shape (N,) [m]."""
+    return _heights_above(points, ground.height, ground.low, ground.cell)
+
+
+@compiled
+def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32) -> None:
+    columns, rows = count.shape
+    for i in range(points.shape[0]):
+        a = int(np.floor((points[i, 0] - low[0]) / CELL))
+        b = int(np.floor((points[i, 1] - low[1]) / CELL))
+        if not (0 <= a < columns and 0 <= b < rows):
+            continue
+        cell = lowest[a, b]
+        count[a, b] += 1
+        z = points[i, 2]
+        if z >= cell[KEPT - 1, 2]:
+            continue
+        k = KEPT - 1
+        while k > 0 and cell[k - 1, 2] > z:
+            for c in range(3):
+                cell[k, c] = cell[k - 1, c]
+            k -= 1
+        for c in range(3):
+            cell[k, c] = points[i, c]
+
+
+@compiled
+def _supported(lowest: Float32, count: Int32) -> Float:
+    """Of each cell the lowest return that has two more close above it; where there are fewer than three
+    returns, the lowest. Shape (columns, rows, 3), z inf where nothing was seen."""
+    columns, rows = count.shape
+    ground = np.full((columns, rows, 3), np.inf)
+    for a in range(columns):
+        for b in range(rows):
+            kept = min(count[a, b], KEPT)
+            if kept == 0:
+                continue
+            chosen = 0 if kept < 3 else kept - 1
+            for k in range(kept - 2):
+                if lowest[a, b, k + 2, 2] - lowest[a, b, k, 2] < TOGETHER:
+                    chosen = k
+                    break
+            for c in range(3):
+                ground[a, b, c] = lowest[a, b, chosen, c]
+    for a in range(columns):
+        for b in range(rows):
+            if ground[a, b, 2] == np.inf:
+                ground[a, b, 0] = ground[a, b, 1] = 0.0
+    return ground
+
+
+def _trend(ground: Float) -> Float:
+    """The plane z = a x + b y + c that the lowest cells of squares of 4 m lie on, by weights that forget
+    what lies off it; shape (3,)."""
+    squares = 8
+    columns, rows = (-(-n // squares) * squares for n in ground.shape[:2])
+    padded = np.full((columns, rows, 3), np.inf)
+    padded[: ground.shape[0], : ground.shape[1]] = ground
+    blocks = padded.reshape(columns // squares, squares, rows // squares, squares, 3).swapaxes(1, 2)
+    blocks = blocks.reshape(-1, squares * squares, 3)
+    place = blocks[np.arange(len(blocks)), blocks[:, :, 2].argmin(axis=1)]
+    place = place[np.isfinite(place[:, 2])]
+    middle = np.median(place[:, 2]) if len(place) else 0.0
+    if len(place) < 6:
+        return np.array([0.0, 0.0, middle])
+    A = np.column_stack([place[:, :2], np.ones(len(place))])
+    weight = np.ones(len(place))
+    plane = np.array([0.0, 0.0, middle])
+    for _ in range(10):
+        root = np.sqrt(weight)[:, None]
+        # A little towards level: few squares in a row say nothing of the slope across them.
+        G = np.vstack([A * root, np.diag([0.3, 0.3, 0.0])])
+        plane = np.linalg.lstsq(G, np.append(place[:, 2] * root[:, 0], np.zeros(3)), rcond=None)[0]
+        off = np.abs(place[:, 2] - A @ plane)
+        scale = max(float(np.median(off)), 0.1)
+        weight = 1.0 / (1.0 + (off / scale) ** 2)
+    return np.asarray(plane)
+
+
+@compiled
+def _forget_pits(ground: Float) -> None:
+    """Take away cells that lie far below nearly all of their neighbours: noise below the ground."""
+    columns, rows = ground.shape[0], ground.shape[1]
+    before = ground[:, :, 2].copy()
+    around = np.empty(25)
+    for a in range(columns):
+        for b in range(rows):
+            if before[a, b] == np.inf:
+                continue
+            n = 0
+            for i in range(max(a - 2, 0), min(a + 3, columns)):
+                for j in range(max(b - 2, 0), min(b + 3, rows)):
+                    if before[i, j] < np.inf and (i != a or j != b):
+                        around[n] = before[i, j]
+                        n += 1
+            # The lower quartile: among crowns few cells are ground, and these are no pits.
+            if n >= 4 and before[a, b] < np.sort(around[:n])[n // 4] - PIT:
+                ground[a, b, 2] = np.inf
+
+
+@compiled
+def _forget_what_overhangs(ground: Float, slope: float) -> None:
+    """Take away cells that rise steeper than `slope` above a lower cell: the cone of each cell is carried
+    over the raster by two sweeps there and back (a chamfer distance)."""
+    columns, rows = ground.shape[0], ground.shape[1]
+    cone = ground[:, :, 2].copy()
+    straight, across = slope * CELL, slope * CELL * np.sqrt(2.0)
+    for _ in range(2):
+        for turn in (1, -1):
+            for p in range(columns):
+                a = p if turn == 1 else columns - 1 - p
+                for q in range(rows):
+                    b = q if turn == 1 else rows - 1 - q
+                    best = cone[a, b]
+                    before, beside = a - turn, b - turn
+                    if 0 <= before < columns:
+                        best = min(best, cone[before, b] + straight)
+                        if b - 1 >= 0:
+                            best = min(best, cone[before, b - 1] + across)
+                        if b + 1 < rows:
+                            best = min(best, cone[before, b + 1] + across)
+                    if 0 <= beside < rows:
+                        best = min(best, cone[a, beside] + straight)
+                    cone[a, b] = best
+    for a in range(columns):
+        for b in range(rows):
+            if ground[a, b, 2] > cone[a, b] + TOLERANCE + straight:
+                ground[a, b, 2] = np.inf
+
+
+@compiled
+def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
+    """Height at the centre of each cell with ground, by a plane through the lowest returns around it,
+    which lie anywhere in their cells; NaN elsewhere. And which cells were seen."""
+    columns, rows = ground.shape[0], ground.shape[1]
+    height = np.full((columns, rows), np.nan)
+    seen = np.zeros((columns, rows), np.bool_)
+    H, g = np.empty((3, 3)), np.empty(3)
+    for a in range(columns):
+        for b in range(rows):
+            if ground[a, b, 2] == np.inf:
+                continue
+            seen[a, b] = True
+            x, y = low[0] + (a + 0.5) * CELL, low[1] + (b + 0.5) * CELL
+            H[:] = 0.0
+            g[:] = 0.0
+            H[0, 0] = H[1, 1] = 0.02  # towards level, where too few say it
+            n = 0
+            for i in range(max(a - WINDOW, 0), min(a + WINDOW + 1, columns)):
+                for j in range(max(b - WINDOW, 0), min(b + WINDOW + 1, rows)):
+                    z = ground[i, j, 2]
+                    if z < np.inf:
+                        dx, dy = ground[i, j, 0] - x, ground[i, j, 1] - y
+                        w = 1.0 / (1.0 + 8.0 * (dx * dx + dy * dy))
+                        _add_row(H, g, dx, dy, z, w)
+                        n += 1
+            height[a, b] = np.linalg.solve(H, g)[2] if n >= 3 else ground[a, b, 2]
+    return height, seen
+
+
+@compiled
+def _add_row(H: Float, g: Float, dx: float, dy: float, z: float, w: float) -> None:
+    row = (dx, dy, 1.0)
+    for k in range(3):
+        g[k] += w * row[k] * z
+        for m in range(3):
+            H[k, m] += w * row[k] * row[m]
+
+
+def _fill(height: Float) -> None:
+    """Fill what is NaN from ever coarser means around it (a pyramid there and back), in place."""
+    if not np.isfinite(height).any():
+        height[:] = 0.0
+        return
+    unknown = np.isnan(height)
+    if not unknown.any():
+        return
+    columns, rows = (-(-n // 2) * 2 for n in height.shape)
+    padded = np.full((columns, rows), np.nan)
+    padded[: height.shape[0], : height.shape[1]] = height
+    blocks = padded.reshape(columns // 2, 2, rows // 2, 2).swapaxes(1, 2).reshape(columns // 2, rows // 2, 4)
+    known = np.isfinite(blocks)
+    count = known.sum(axis=2)
+    coarse = np.where(count > 0, np.where(known, blocks, 0.0).sum(axis=2) / np.maximum(count, 1), np.nan)
+    _fill(coarse)
+    at = np.indices(height.shape).reshape(2, -1) + 0.5
+    ahead = _evaluate(coarse, np.zeros(2), 2.0, at[0], at[1])[:, 0].reshape(height.shape)
+    height[unknown] = ahead[unknown]
+
+
+@compiled
+def _evaluate(height: Float, low: Float, cell: float, x: Float, y: Float) -> Float:
+    out = np.empty((x.shape[0], 3))
+    for i in range(x.shape[0]):
+        out[i, 0], out[i, 1], out[i, 2] = ground_at(height, low, cell, x[i], y[i])
+    return out
+
+
+@compiled
+def ground_at(height: Float, low: Float, cell: float, x: float, y: float) -> tuple[float, float, float]:
+    """Height [m] of the raster at a place and its slope along x and y; beyond the border as at it."""
+    columns, rows = height.shape
+    u = min(max((x - low[0]) / cell - 0.5, 0.0), columns - 1.0)
+    v = min(max((y - low[1]) / cell - 0.5, 0.0), rows - 1.0)
+    a, b = min(int(u), max(columns - 2, 0)), min(int(v), max(rows - 2, 0))
+    f, g = u - a, v - b
+    a2, b2 = min(a + 1, columns - 1), min(b + 1, rows - 1)
+    h00, h10, h01, h11 = height[a, b], height[a2, b], height[a, b2], height[a2, b2]
+    z = (1 - f) * (1 - g) * h00 + f * (1 - g) * h10 + (1 - f) * g * h01 + f * g * h11
+    gx = ((1 - g) * (h10 - h00) + g * (h11 - h01)) / cell
+    gy = ((1 - f) * (h01 - h00) + f * (h11 - h10)) / cell
+    return z, gx, gy
+
+
+@compiled
+def _heights_above(points: Float32, height: Float, low: Float, cell: float) -> Float32:
+    above = np.empty(points.shape[0], np.float32)
+    for i in range(points.shape[0]):
+        above[i] = points[i, 2] - ground_at(height, low, cell, points[i, 0], points[i, 1])[0]
+    return above

@@ -1,0 +1,210 @@
+"""Two maps of one stand made one: the first keeps its frame and its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from pipeline.classification import PackedMemory
+from pipeline.classification.voxel_map import TILE
+from pipeline.config import Parameters
+from pipeline.geometry.poses import Float, Pose2, wrap_angle
+from pipeline.io.checkpoints.saved_map import SavedMap
+from pipeline.slam import SlamState
+from pipeline.slam.association import associate
+from pipeline.slam.frame_uncertainty import FrameMemory, carried
+from pipeline.slam.particle_ancestry import Genealogy
+from pipeline.slam.particle_maps import MapColumns, shared_map
+from pipeline.tracking.merge import join
+from pipeline.tracking.observation import SECTORS
+from pipeline.tracking.track_table import TrackTable
+from pipeline.types.records import Bool, Columns, Int, Verdict
+
+GATE = 5.0  # sigma; beyond it two trees are two
+SAME_COLUMN = 0.35  # m
+MOST_RETURNS = 20  # of a voxel of the second map; more say nothing new
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedMap:
+    """What came of a merging.
+
+    Attributes:
+        map: The trees, landmarks and paths of both.
+        number_of: The number of each tree of the second map in the merged one, int64, shape (T,).
+        distance: How far apart the two trees stood that became one, NaN for a tree of its own, (T,) [m].
+    """
+
+    map: SavedMap
+    number_of: Int
+    distance: Float
+
+
+def merge_maps(
+    a: SavedMap, b: SavedMap, T_a_b: Pose2, covariance: Float, stamp_shift_ns: int, parameters: Parameters
+) -> MergedMap:
+    """Bring map b into map a.
+
+    Args:
+        a, b: The maps.
+        T_a_b: Where the frame of b stands in that of a; covariance: of it, shape (3, 3).
+        stamp_shift_ns: Added to the times of b, which must then come after those of a.
+        parameters: Of all stages.
+    """
+    moved = _moved_tracks(b.tracks, T_a_b, covariance, stamp_shift_ns)
+    slack = parameters.relocalisation.slack**2
+    row_of, _ = associate(
+        moved.x[:, :2], _flat(moved.P) + np.array([slack, 0.0, slack]), a.tracks.x[:, :2], _flat(a.tracks.P),
+        GATE, parameters.tracking.distance_max,
+    )  # fmt: skip
+    fresh = row_of < 0
+    number_of = np.zeros(len(moved), np.int64)
+    distance = np.full(len(moved), np.nan)
+    number_of[fresh] = a.next_number + np.arange(np.count_nonzero(fresh))
+    number_of[~fresh] = a.tracks.number[row_of[~fresh]]
+    gap = moved.x[~fresh, :2] - a.tracks.x[row_of[~fresh], :2]
+    distance[~fresh] = np.hypot(gap[:, 0], gap[:, 1])
+    both = a.tracks.extended(moved)
+    for k in np.flatnonzero(~fresh):
+        join(both, int(row_of[k]), len(a.tracks) + int(k))
+    matched = row_of[~fresh]
+    shown = (moved.verdict[~fresh] < 0) & (moved.hits[~fresh] >= parameters.tracking.hits_to_confirm)
+    hidden = ((a.tracks.verdict[matched] < 0) | shown) & (both.verdict[matched] != Verdict.TREE)
+    both.verdict[matched[hidden]] = -1  # a tree that one of the runs shows by its hits stays shown
+    both.number[len(a.tracks) :] = number_of
+    tracks = both.take(np.concatenate([np.ones(len(a.tracks), np.bool_), fresh]))
+    path = np.concatenate([a.slam.genealogy.path(a.slam.best), _moved_path(b, T_a_b)])
+    merged = replace(
+        a,
+        slam=_slam(a.slam, b.slam, T_a_b, covariance, path, parameters.tracking.distance_max),
+        memory=_memory(a.memory, b.memory, T_a_b, len(path), 1 << parameters.gathering.voxels_log2),
+        columns=_columns(a.columns, b.columns, T_a_b),
+        tracks=tracks,
+        next_number=a.next_number + int(np.count_nonzero(fresh)),
+        odometry=None,
+        search=None,  # a robot that was lost at the end of a stands at the end of b now
+        stamp_ns=np.concatenate([a.stamp_ns, b.stamp_ns + stamp_shift_ns]),
+        sigma_xy=np.concatenate(
+            [a.sigma_xy, np.hypot(b.sigma_xy, np.sqrt(np.trace(covariance[:2, :2]) / 2))]
+        ),
+        motion=np.concatenate([a.motion, b.motion]),
+        placed=len(a.stamp_ns) + b.placed,
+        closed=len(a.stamp_ns) + b.closed,
+    )
+    return MergedMap(merged, number_of, distance)
+
+
+def _flat(P: Float) -> Float:
+    flat: Float = P[:, [0, 0, 1], [0, 1, 1]]
+    return flat
+
+
+def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int) -> TrackTable:
+    moved = tracks.copy()
+    C = np.kron(np.eye(2), T.rotation())
+    moved.x[:] = tracks.x @ C.T
+    moved.x[:, :2] += [T.x, T.y]
+    moved.P[:] = C @ tracks.P @ C.T
+    of_the_frame = _of_the_frame(moved.x[:, :2], T, covariance)
+    moved.P[:, :2, :2] += of_the_frame
+    moved.shared[:] = C[:2, :2] @ tracks.shared @ C[:2, :2].T + of_the_frame
+    moved.stamp_ns[:] += shift_ns
+    moved.first_ns[:] += shift_ns
+    turn = round(T.yaw / (2.0 * np.pi / SECTORS)) % SECTORS
+    all_sides = (1 << SECTORS) - 1
+    moved.sides[:] = ((tracks.sides << turn) | (tracks.sides >> (SECTORS - turn))) & all_sides
+    return moved
+
+
+def _of_the_frame(place: Float, T: Pose2, covariance: Float) -> Float:
+    """What the error of a frame's pose, covariance of shape (3, 3), adds to places in it, shape (N, 2) and
+    already moved: J S J^T with J = d place / d (x, y, yaw), shape (N, 2, 2)."""
+    J = np.zeros((len(place), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = T.y - place[:, 1], place[:, 0] - T.x
+    spread: Float = J @ covariance @ J.transpose(0, 2, 1)
+    return spread
+
+
+def _moved_path(b: SavedMap, T: Pose2) -> Float:
+    poses = b.slam.genealogy.path(b.slam.best)
+    return np.column_stack([T.apply(poses[:, :2]), wrap_angle(poses[:, 2] + T.yaw)])
+
+
+def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, reach: float) -> SlamState:
+    """The best map of each in every particle, which stand where the second run ended."""
+    P = len(a.pose)
+    known, other = a.map_of(a.best), b.map_of(b.best)
+    C = T.rotation()
+    full = other.covariance[:, [[0, 1], [1, 2]]]
+    mean = T.apply(other.mean)
+    R = _flat(C @ full @ C.T + _of_the_frame(mean, T, covariance))
+    row_of, _ = associate(mean, R, known.mean, known.covariance, np.inf, reach)
+    new = row_of < 0
+    moved = MapColumns(mean, R, other.hits, other.score, other.birth + a.detections)
+    landmarks = MapColumns(
+        *(np.concatenate([getattr(known, name), getattr(moved, name)[new]]) for name in MapColumns._fields)
+    )
+    return replace(
+        a.placed(np.tile(path[-1], (P, 1))),
+        frame=_frame(a, b, T, covariance),
+        maps=shared_map(P, landmarks),
+        detections=a.detections + b.detections,
+        genealogy=Genealogy.of_path(path, P),
+    )
+
+
+def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemory:
+    """The marks of both, those of b as well known as its own frame allows and T besides."""
+    own, other = a.frame.forgotten(), b.frame
+    if not len(other.serial):
+        return own
+    pose = np.column_stack([T.apply(other.pose[:, :2]), wrap_angle(other.pose[:, 2] + T.yaw)])
+    C = np.eye(3)
+    C[:2, :2] = T.rotation()
+    moved = C @ other.covariance @ C.T
+    for k, (x, y, _) in enumerate(pose):
+        moved[k] += carried(covariance, x - T.x, y - T.y)
+    return replace(
+        own,
+        serial=np.concatenate([own.serial, other.serial + a.detections]),
+        scan=np.concatenate([own.scan, other.scan + len(a.genealogy)]),
+        pose=np.concatenate([own.pose, pose]),
+        covariance=np.concatenate([own.covariance, moved]),
+        at=pose[-1],
+    )
+
+
+def _memory(a: PackedMemory, b: PackedMemory, T: Pose2, scan: int, most: int) -> PackedMemory:
+    """The voxels of a, and the means of those of b as often as they were seen, up to a bound."""
+    memory = a.unpacked()
+    points = b.mean.copy()
+    points[:, :2] = T.apply(b.mean[:, :2].astype(np.float64))
+    memory.add(np.repeat(points, np.minimum(b.returns, MOST_RETURNS), axis=0), scan, most)
+    memory.added += b.added - 1
+    while len(memory.judge_anew(1.0)):  # the columns of both stand until more is seen
+        pass
+    return PackedMemory.of(memory)
+
+
+def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
+    """The columns of a, and those of b at places where a has none."""
+    axis = b.axis.copy()
+    axis[:, :2] = T.apply(b.axis[:, :2])
+    axis[:, 2:4] = b.axis[:, 2:4] @ T.rotation().T
+    new = _apart(axis[:, :2], a.axis[:, :2])
+    names = [f.name for f in fields(Columns) if f.name not in ("tile", "axis")]
+    joined = {name: np.concatenate([getattr(a, name), getattr(b, name)[new]]) for name in names}
+    tile = np.floor(axis[new, :2] / TILE).astype(np.int64)
+    return Columns(tile=np.concatenate([a.tile, tile]), axis=np.concatenate([a.axis, axis[new]]), **joined)
+
+
+def _apart(place: Float, other: Float) -> Bool:
+    from scipy.spatial import cKDTree
+
+    if not len(place) or not len(other):
+        return np.ones(len(place), np.bool_)
+    distance, _ = cKDTree(other).query(place)
+    apart: Bool = distance > SAME_COLUMN
+    return apart

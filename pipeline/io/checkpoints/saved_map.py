@@ -1,0 +1,179 @@
+"""A map as it is saved: all that the mapper knows, so that it goes on from there to the same bytes.
+
+What is kept to take back wrong scans is left out: a robot that is carried away shortly after a run goes on
+takes back no scan from before. A search that goes on keeps nothing more, and is saved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pipeline.classification import GatheringState, PackedMemory, no_columns
+from pipeline.config import Parameters
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.ground.terrain_map import PackedHeightMap
+from pipeline.loop_closure.kidnapped_robot import RecoveryState
+from pipeline.mapper import Mapper
+from pipeline.mapper_records import MapperState
+from pipeline.slam import GraphState, SlamState
+from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.particle_ancestry import BLOCK
+from pipeline.slam.particle_maps import is_sound
+from pipeline.tracking import Tracker
+from pipeline.tracking.track_table import TrackTable
+from pipeline.types.records import Columns, Int, Trees
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Search:
+    """Of a robot that is lost: see RecoveryState."""
+
+    local: SlamState
+    driven: float
+    since: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedMap:
+    """See MapperState; `stamp_ns`, `sigma_xy` and `motion` are those of the path, one a scan."""
+
+    slam: SlamState
+    memory: PackedMemory
+    columns: Columns
+    ground: PackedHeightMap
+    tracks: TrackTable
+    next_number: int
+    odometry: Pose2 | None
+    stamp_ns: Int
+    sigma_xy: Float
+    motion: Float
+    placed: int
+    closed: int
+    search: Search | None = None
+
+    @classmethod
+    def of(cls, mapper: Mapper) -> SavedMap:
+        """What a mapper knows now; a pose graph is saved as the particles that would go on from it."""
+        state, path = mapper.snapshot(), mapper.path
+        slam, lost = state.slam, state.recovery
+        if isinstance(slam, GraphState):
+            slam = slam.as_particles(mapper.parameters.slam.particles, seed=0)
+        return cls(
+            slam,
+            PackedMemory.of(state.gathering.folded()),
+            state.gathering.columns,
+            PackedHeightMap.of(state.ground),
+            state.tracks,
+            state.next_number,
+            state.odometry,
+            path.stamp_ns,
+            path.sigma_xy,
+            mapper.motion,
+            state.placed,
+            state.closed,
+            None if lost.local is None else Search(lost.local, lost.driven, lost.since),
+        )
+
+    def state(self) -> MapperState:
+        """As the mapper takes it.
+
+        Raises:
+            ValueError: Its parts do not fit one another; they come from a file.
+        """
+        _check_slam(self.slam)
+        n = len(self.slam.genealogy)
+        if not self.stamp_ns.shape == self.sigma_xy.shape == (n,) or np.any(np.diff(self.stamp_ns) <= 0):
+            raise ValueError("the stamps are not those of the path")
+        if (
+            self.motion.shape != (n, 3)
+            or not 0 <= min(self.placed, self.closed) <= max(self.placed, self.closed) <= n
+        ):
+            raise ValueError("the odometry is not that of the path")
+        _check_rows(self.tracks, TrackTable.empty())
+        _check_rows(self.columns, no_columns())
+        _check_finite(self.tracks.x, self.tracks.P, self.tracks.shared, self.columns.axis, self.motion)
+        if (
+            len(self.tracks)
+            and not 0 < self.tracks.number.min() <= self.tracks.number.max() < self.next_number
+        ):
+            raise ValueError("the numbers of the trees are out of order")
+        gathering = GatheringState(self.memory.checked(), (), self.columns)
+        return MapperState(
+            self.slam, gathering, self.ground.unpacked(), self.tracks, self.next_number, self.odometry, n,
+            self.placed, self.closed, self._recovery(n),
+        )  # fmt: skip
+
+    def _recovery(self, scans: int) -> RecoveryState[MapperState]:
+        if self.search is None:
+            return RecoveryState()
+        local, driven, since = self.search.local, self.search.driven, self.search.since
+        _check_slam(local)
+        if not (np.isfinite(driven) and driven >= 0.0 and 0 <= since <= scans):
+            raise ValueError("the search does not fit the path")
+        return RecoveryState(local=local, driven=driven, since=since)
+
+    def trees(self, parameters: Parameters) -> Trees:
+        """The trees of the map, by these parameters."""
+        tracker = Tracker(parameters.tracking)
+        tracker.tracks, tracker.next_number = self.tracks, self.next_number
+        return tracker.trees()
+
+
+def _check_slam(slam: SlamState) -> None:
+    P = len(slam.pose)
+    template = SlamState.at_origin(max(P, 1))
+    for f in fields(SlamState):
+        wanted = getattr(template, f.name)
+        if isinstance(wanted, np.ndarray) and getattr(slam, f.name).shape != wanted.shape:
+            raise ValueError(f"{f.name} of the particles has another shape")
+    if not is_sound(slam.maps, P) or not 0 <= slam.best < P:
+        raise ValueError("the particles' maps do not fit")
+    _check_finite(slam.pose, slam.motion, slam.motion_covariance, slam.maps.mean, slam.maps.covariance)
+    past = slam.genealogy
+    after = P
+    for generation in reversed(past.recent):
+        size, ancestors = len(generation.pose), generation.ancestors
+        fits = size == after if ancestors is None else len(ancestors) == after and _within(ancestors, size)
+        if not fits or generation.pose.shape != (size, 3):
+            raise ValueError("the particles have another past")
+        after = size
+    if any(block.shape != (BLOCK, 3) for block in past.settled):
+        raise ValueError("the path has other columns")
+    if past.founders is not None and any(len(f) != P or not _within(f, 1 << 20) for f in past.founders):
+        raise ValueError("the particles have other founders")
+    _check_frame(slam.frame, len(past))
+
+
+def _check_frame(frame: FrameMemory, scans: int) -> None:
+    marks, template = len(frame.serial), FrameMemory()
+    for f in fields(FrameMemory):
+        column, wanted = getattr(frame, f.name), getattr(template, f.name)
+        if column.shape != ((marks, *wanted.shape[1:]) if len(wanted) == 0 else wanted.shape):
+            raise ValueError(f"{f.name} of the frame has another shape")
+    if np.any(np.diff(frame.serial) < 0) or np.any(np.diff(frame.scan) < 0):
+        raise ValueError("the marks of the frame are out of order")
+    if marks and not 0 <= frame.scan[0] <= frame.scan[-1] < scans:
+        raise ValueError("the marks of the frame are of no scan")
+    _check_finite(frame.pose, frame.covariance, frame.hidden, frame.at)
+
+
+def _check_finite(*columns: Float) -> None:
+    """Compiled code turns places into rows of its tables, and what is no number into any row."""
+    if not all(np.isfinite(column).all() for column in columns):
+        raise ValueError("a place or a covariance is not finite")
+
+
+def _within(rows: Int, size: int) -> bool:
+    return rows.ndim == 1 and bool(np.all((rows >= 0) & (rows < size)))
+
+
+def _check_rows(table: TrackTable | Columns, empty: TrackTable | Columns) -> None:
+    """All columns as long as the first, each row shaped as in an empty table."""
+    n = None
+    for f in fields(table):
+        column, wanted = getattr(table, f.name), getattr(empty, f.name)
+        n = len(column) if n is None and column.ndim else n
+        if column.shape != (n, *wanted.shape[1:]):
+            raise ValueError(f"{f.name} has another shape")

@@ -1,0 +1,168 @@
+"""Ground truth trees from a CSV, with the headers that other tools write."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import SourceError
+from pipeline.geometry.poses import Float
+from pipeline.types.records import TruthTrees
+
+KINDS = ("tree", "pole", "person", "bush", "other")
+LARGEST_FILE = 64 << 20
+_X = ("x_m", "x", "treelocationx", "easting", "easting_m", "east", "utm_x")
+_Y = ("y_m", "y", "treelocationy", "northing", "northing_m", "north", "utm_y")
+_AZIMUTH = ("azimuth_deg", "azimuth")
+_DISTANCE = ("distance_m", "distance", "dist_m")
+_DBH_CM = ("dbh_cm",)
+_DBH_M = ("dbh_m",)
+_DBH_MM = ("dbh_mm",)
+_DBH_OF_UNKNOWN_UNIT = ("dbh", "diameter")
+_KIND = ("class", "kind", "type")
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+
+
+def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
+    """Read a table of trees.
+
+    Positions stand as x and y (or easting and northing) in metres, or as azimuth in degrees from
+    north (y), clockwise, with a distance in metres. A row's class is one of KINDS; without such a
+    column all rows are trees.
+
+    Args:
+        path: A CSV with a header line; commas, semicolons or tabs.
+        dbh_unit: "m", "cm" or "mm" for a column `dbh` that does not say its unit.
+
+    Raises:
+        SourceError: It is no such table; the message names line and column.
+    """
+    return parse_truth_trees(_text_of(path), where=str(path), dbh_unit=dbh_unit)
+
+
+def parse_truth_trees(text: str, *, where: str, dbh_unit: str | None = None) -> TruthTrees:
+    """The same from the text of a table.
+
+    Args:
+        text: Of the whole table.
+        where: What messages call it.
+        dbh_unit: As for `read_truth_trees`.
+
+    Raises:
+        SourceError: It is no such table; the message names line and column.
+    """
+    lines, rows = _rows_of(text, where)
+    header = [name.strip().lower() for name in rows[0]] if rows else []
+    column = {name: k for k, name in reversed(list(enumerate(header)))}
+    table = _Table(where, lines[1:], rows[1:], column)
+    x, y = _positions(table)
+    dbh = _diameters(table, dbh_unit)
+    return TruthTrees(x, y, dbh, _kinds(table))
+
+
+class _Table:
+    def __init__(self, where: str, lines: list[int], rows: list[list[str]], column: dict[str, int]) -> None:
+        self.where, self.lines, self.rows, self.column = where, lines, rows, column
+
+    def find(self, names: Iterable[str]) -> str | None:
+        return next((name for name in names if name in self.column), None)
+
+    def text(self, name: str) -> list[str]:
+        k = self.column[name]
+        return [row[k].strip() if k < len(row) else "" for row in self.rows]
+
+    def numbers(self, name: str, *, required: bool) -> Float:
+        return np.array(
+            [self._number(text, name, k, required) for k, text in enumerate(self.text(name))], np.float64
+        )
+
+    def _number(self, text: str, name: str, row: int, required: bool) -> float:
+        if text == "" and not required:
+            return math.nan
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) and (required or text.lower() not in ("nan", "na")):
+            raise SourceError(f"line {self.lines[row]}: {name} = {text!r} is not a number", where=self.where)
+        return value
+
+
+def _text_of(path: Path) -> str:
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise SourceError("the table of trees is larger than 64 MB", where=str(path))
+        return path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise SourceError(f"cannot read the table of trees: {error.strerror}", where=str(path)) from None
+    except UnicodeDecodeError:
+        raise SourceError("the table of trees is not text", where=str(path)) from None
+
+
+def _rows_of(text: str, where: str) -> tuple[list[int], list[list[str]]]:
+    """The line number and the cells of every row that is not empty."""
+    first = text.partition("\n")[0]
+    delimiter = max(",;\t", key=first.count)
+    try:
+        reader = csv.reader(text.splitlines(), delimiter=delimiter)
+        numbered = [(reader.line_num, row) for row in reader if any(row)]
+    except csv.Error as error:
+        raise SourceError(f"the table of trees is not a CSV: {error}", where=where) from None
+    return [line for line, _ in numbered], [row for _, row in numbered]
+
+
+def _positions(table: _Table) -> tuple[Float, ...]:
+    x, y = table.find(_X), table.find(_Y)
+    if x is not None and y is not None:
+        return table.numbers(x, required=True), table.numbers(y, required=True)
+    azimuth, distance = table.find(_AZIMUTH), table.find(_DISTANCE)
+    if azimuth is None or distance is None:
+        raise SourceError(
+            "the table has no position",
+            where=table.where,
+            remedy=f"Name the columns x_m and y_m, or azimuth_deg and distance_m; it has "
+            f"{', '.join(table.column) or 'no header'}",
+        )
+    angle = np.radians(table.numbers(azimuth, required=True))
+    reach = table.numbers(distance, required=True)
+    return reach * np.sin(angle), reach * np.cos(angle)
+
+
+def _diameters(table: _Table, dbh_unit: str | None) -> Float:
+    for names, unit in ((_DBH_CM, "cm"), (_DBH_M, "m"), (_DBH_MM, "mm")):
+        name = table.find(names)
+        if name is not None:
+            return _measured(table.numbers(name, required=False)) * _UNITS[unit]
+    name = table.find(_DBH_OF_UNKNOWN_UNIT)
+    if name is None:
+        return np.full(len(table.rows), np.nan)
+    if dbh_unit is None:
+        raise SourceError(
+            f"column {name!r} does not say its unit",
+            where=table.where,
+            remedy="Give --dbh-unit m, cm or mm",
+        )
+    return _measured(table.numbers(name, required=False)) * _UNITS[dbh_unit]
+
+
+def _measured(diameter: Float) -> Float:
+    """Other tools write 0 or a negative number for a diameter that was not measured."""
+    return np.where(diameter > 0.0, diameter, np.nan)
+
+
+def _kinds(table: _Table) -> tuple[str, ...]:
+    name = table.find(_KIND)
+    if name is None:
+        return ("tree",) * len(table.rows)
+    kinds = tuple(text.lower() or "tree" for text in table.text(name))
+    for row, kind in enumerate(kinds):
+        if kind not in KINDS:
+            raise SourceError(
+                f"line {table.lines[row]}: class {kind!r} is none of {', '.join(KINDS)}",
+                where=table.where,
+            )
+    return kinds

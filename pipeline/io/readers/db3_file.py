@@ -1,0 +1,135 @@
+"""ROS 2 bags in SQLite (.db3)."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from pipeline.errors import SourceError
+from pipeline.io.readers.container import Channel, Message, count_loss, damaged, ros2_type_name
+from pipeline.types.records import Int
+
+MAGIC = b"SQLite format 3\x00"
+MESSAGE_LIMIT = 256 << 20
+
+
+class Db3File:
+    """One SQLite bag as a container of messages. The file is opened for reading only.
+
+    Raises:
+        SourceError: It is no bag, or its tables cannot be read.
+    """
+
+    kind = "ROS 2 bag (db3)"
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.damage: dict[str, int] = {}
+        # `immutable` keeps SQLite from writing a journal beside a recording on a read-only disk.
+        self._database = sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)
+        try:
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MESSAGE_LIMIT)
+            self._database.execute("PRAGMA trusted_schema = OFF")
+            self._refuse_views()
+            self._row, self._topic, self._stamp = self._read_index()
+            self.channels = self._read_channels()
+        except (sqlite3.Error, OverflowError, UnicodeDecodeError, ValueError, TypeError) as error:
+            self.close()
+            raise damaged(f"the database cannot be read: {error}", path) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def tail_ns(self, numbers: Collection[int]) -> int:
+        """See Container."""
+        found = np.flatnonzero(np.isin(self._topic, list(numbers)))
+        return int(self._stamp[found[-1]]) if len(found) else 0
+
+    def messages(
+        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
+    ) -> Iterator[Message]:
+        """See Container."""
+        first = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
+        chosen = first + np.flatnonzero(np.isin(self._topic[first:], list(numbers)))
+        for index in chosen:
+            payload = self._payload(int(self._row[index]))
+            if payload is None:
+                count_loss(losses, "messages that the database cannot give")
+            else:
+                yield Message(int(self._topic[index]), int(self._stamp[index]), payload)
+
+    def attachment(self, name: str, limit: int) -> bytes | None:
+        """A db3 bag has no attachments."""
+        del name, limit
+        return None
+
+    def close(self) -> None:
+        """Close the database."""
+        self._database.close()
+
+    def _payload(self, row: int) -> bytes | None:
+        try:
+            found = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
+        except (sqlite3.Error, MemoryError):
+            return None
+        return found[0] if found is not None and isinstance(found[0], bytes) else None
+
+    def _refuse_views(self) -> None:
+        """A view or a virtual table could compute for ever; a recorder writes plain tables."""
+        plain = self._database.execute(
+            "SELECT name FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
+            " AND sql NOT LIKE '%VIRTUAL%' AND sql NOT LIKE '%GENERATED%'"
+        ).fetchall()
+        if len(plain) != 2:
+            raise damaged("the database holds no tables of messages and topics", self._path)
+
+    def _read_index(self) -> tuple[Int, Int, Int]:
+        """Row, topic and time of all messages in the order of time; what is damaged is left out."""
+        rows: list[tuple[int, int, int]] = []
+        cursor = self._database.execute("SELECT rowid, topic_id, timestamp FROM messages")
+        try:
+            rows.extend(row for row in cursor if all(isinstance(cell, int) for cell in row))
+        except sqlite3.Error:
+            count_loss(self.damage, "pages of the database that cannot be read")
+        table = np.array(rows, dtype=np.int64).reshape(-1, 3)
+        table = table[np.argsort(table[:, 2], kind="stable")]
+        return table[:, 0], table[:, 1], table[:, 2]
+
+    def _read_channels(self) -> list[Channel]:
+        definitions = self._definitions()
+        channels = []
+        for number, topic, msgtype, encoding in self._database.execute(
+            "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
+        ):
+            kind, text = definitions.get(msgtype, ("", ""))
+            count = int(np.count_nonzero(self._topic == int(number)))
+            channels.append(
+                Channel(
+                    int(number), str(topic), ros2_type_name(str(msgtype)), str(encoding), text, kind, count
+                )
+            )
+        return channels
+
+    def _definitions(self) -> dict[str, tuple[str, str]]:
+        """Message definitions by type, as recorders since ROS 2 Iron store them."""
+        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        try:
+            return {str(name): (str(kind), str(text)) for name, kind, text in self._database.execute(query)}
+        except sqlite3.Error:
+            return {}
+
+
+def open_db3(path: Path) -> Db3File:
+    """Open a SQLite bag.
+
+    Raises:
+        SourceError: It cannot be opened or read.
+    """
+    try:
+        return Db3File(path)
+    except (OSError, sqlite3.Error) as error:
+        raise SourceError(f"cannot open the file: {error}", where=str(path)) from error

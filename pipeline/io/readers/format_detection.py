@@ -1,0 +1,181 @@
+"""The formats that can be read, and how each is recognised: by contents first, by name last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.io.readers.base import Source, SourceOptions
+
+Opener = Callable[[str, Path, SourceOptions], Source]
+
+
+def _mcap(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.live_recording import open_live_recording
+    from pipeline.io.readers.mcap_file import open_mcap
+    from pipeline.io.readers.ros import open_ros
+
+    live = open_live_recording(uri, path, options)
+    return live or open_ros(uri, lambda: open_mcap(path), [path], options)
+
+
+def _db3(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.db3_file import open_db3
+    from pipeline.io.readers.ros import open_ros
+
+    return open_ros(uri, lambda: open_db3(path), [path], options)
+
+
+def _bag(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.bag_file import open_bag
+    from pipeline.io.readers.ros import open_ros
+
+    return open_ros(uri, lambda: open_bag(path), [path], options)
+
+
+def _bag_folder(uri: str, folder: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.bag_folder import BagFolder, bag_files
+    from pipeline.io.readers.ros import open_ros
+
+    files = bag_files(folder)
+    return open_ros(uri, lambda: BagFolder(files), files, options)
+
+
+def _pcap(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.pcap import PcapSource
+
+    return PcapSource(uri, path, options)
+
+
+def _victoria(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.victoria_park import VictoriaParkSource
+
+    return VictoriaParkSource(uri, path, options)
+
+
+def _kitti(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.kitti import open_kitti
+
+    return open_kitti(uri, path, options)
+
+
+def _tree_manager(uri: str, folder: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.tree_manager import TreeManagerSource
+
+    return TreeManagerSource(uri, folder, options)
+
+
+def _pcd(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.pcd import open_pcd
+
+    return open_pcd(uri, path, options)
+
+
+def _scan_tables(uri: str, folder: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.table_scans import open_table_scans
+
+    return open_table_scans(uri, folder, options)
+
+
+def _cloud(uri: str, path: Path, options: SourceOptions) -> Source:
+    from pipeline.io.readers.simulated import drive_through
+
+    return drive_through(uri, path, options)
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A kind of file.
+
+    Attributes:
+        words: For people.
+        magic: What the file may begin with; () when only the name tells.
+        suffixes: Names it usually has, in lower case.
+        open: Makes the source.
+    """
+
+    words: str
+    magic: tuple[bytes, ...]
+    suffixes: tuple[str, ...]
+    open: Opener
+
+
+FILES = (
+    Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _mcap),
+    Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _db3),
+    Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _bag),
+    Format(
+        "Velodyne .pcap",
+        (
+            b"\xd4\xc3\xb2\xa1",
+            b"\xa1\xb2\xc3\xd4",
+            b"\x4d\x3c\xb2\xa1",
+            b"\xa1\xb2\x3c\x4d",
+            b"\x0a\x0d\x0d\x0a",
+        ),
+        (".pcap",),
+        _pcap,
+    ),
+    Format("Victoria Park .zip (LASER.txt, DRS.txt)", (b"PK\x03\x04",), (".zip",), _victoria),
+    Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _pcd),
+    Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud),
+    Format("whole cloud .e57", (b"ASTM-E57",), (".e57",), _cloud),
+    Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), _cloud),
+    Format("whole cloud .npy or .npz", (b"\x93NUMPY",), (".npy", ".npz"), _cloud),
+    Format("KITTI .bin", (), (".bin",), _kitti),
+)
+
+_MOST_NAMED = 5
+READABLE = ", ".join(
+    [kind.words for kind in FILES]
+    + [
+        "a folder of .bin, .pcd, .ply, .npy, .npz, .las or .laz scans",
+        "a rosbag2 folder",
+        "a folder of TreeManagerState_<i>.csv with trajectory.txt",
+        "sim:stand and the other sim: scenarios",
+    ]
+)
+
+
+def file_format(path: Path, head: bytes) -> Format | None:
+    """The format of a file by its first bytes, or by its name where the contents have no mark."""
+    if path.suffix.lower() == ".npz":  # a .zip by its contents
+        return expected_format(path)
+    for kind in FILES:
+        if any(head.startswith(mark) for mark in kind.magic):
+            return kind
+    suffix = path.suffix.lower()
+    return next((kind for kind in FILES if not kind.magic and suffix in kind.suffixes), None)
+
+
+def expected_format(path: Path) -> Format | None:
+    """The format that a file's name promises."""
+    return next((kind for kind in FILES if path.suffix.lower() in kind.suffixes), None)
+
+
+def recordings_in(folder: Path) -> list[str]:
+    """Names of the files in a folder that are runs or clouds by their names, each by itself."""
+    return sorted(path.name for path in folder.iterdir() if path.is_file() and expected_format(path))
+
+
+def named(names: list[str]) -> str:
+    """Some of them, for people."""
+    more = len(names) - _MOST_NAMED
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def folder_opener(folder: Path) -> Opener | None:
+    """How to open a folder, None when nothing in it can be read."""
+    names = {path.name for path in folder.iterdir() if path.is_file()}
+    if any(name.startswith("TreeManagerState_") for name in names):
+        return _tree_manager
+    suffixes = {Path(name).suffix.lower() for name in names}
+    if suffixes & {".mcap", ".db3", ".zstd"}:
+        return _bag_folder
+    inside = folder / "velodyne"
+    if ".bin" in suffixes or (inside.is_dir() and any(inside.glob("*.bin"))):
+        return _kitti
+    if ".pcd" in suffixes:
+        return _pcd
+    return _scan_tables if suffixes & {".ply", ".npy", ".npz", ".las", ".laz"} else None

@@ -1,0 +1,177 @@
+"""Poses and times that stand in text files beside a folder of scans."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.geometry.poses import Pose3
+from pipeline.types.records import Float, Int
+
+TEXT_LIMIT = 64 << 20
+#: The usual turn between a camera's axes (x right, y down, z forward) and a LiDAR's.
+R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+_STILL = 0.05
+TUM_COLUMNS = 8
+
+
+class TextError(Exception):
+    """A text file that does not hold what its name promises; the text says why."""
+
+
+def read_poses(path: Path) -> list[Pose3]:
+    """Poses of the LiDAR, x forward, in the frame of the first LiDAR pose's axes.
+
+    A row has the 12 numbers of a 3 x 4 matrix. KITTI writes the poses of its left camera (x right,
+    y down, z forward); others write those of the LiDAR itself. Where `calib.txt` with a row `Tr:`
+    stands beside it, it is KITTI's. Otherwise the motion tells: a robot goes forward, along z of a
+    camera or along x of a LiDAR. Poses that do not move are the same in both. (The poses of the
+    shared recordings in park_trunks are of that kind: all rows are equal, the sensor stood still.)
+
+    Raises:
+        TextError: It has another form.
+        OSError: It cannot be read.
+    """
+    rows = read_table(path, 12).reshape(-1, 3, 4)
+    R, t = rows[:, :, :3], rows[:, :, 3]
+    if not np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-2):
+        raise TextError("its matrices are no rotations")
+    T_camera_lidar = _calibration(path.with_name("calib.txt"))
+    if T_camera_lidar is None and _moves_along_z(R, t):
+        T_camera_lidar = Pose3(R_LIDAR_CAMERA.T, np.zeros(3))
+    poses = [Pose3(_nearest_rotation(rotation), shift) for rotation, shift in zip(R, t, strict=True)]
+    if T_camera_lidar is None:
+        return poses
+    T_lidar_camera = T_camera_lidar.inverse()
+    return [T_lidar_camera @ pose @ T_camera_lidar for pose in poses]
+
+
+def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
+    """Poses of the LiDAR with their times [ns] (TUM: t x y z qx qy qz qw), or one a scan (KITTI, times None).
+
+    Raises:
+        TextError: It has neither form.
+        OSError: It cannot be read.
+    """
+    if _columns(path) != TUM_COLUMNS:
+        return None, read_poses(path)
+    rows = read_table(path, TUM_COLUMNS)
+    times = exact_ns(path)
+    if np.any(np.diff(times) <= 0):
+        raise TextError("its times do not ascend")
+    try:
+        return times, [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in rows]
+    except ValueError as error:
+        raise TextError("it has a quaternion of no length") from error
+
+
+def exact_ns(path: Path) -> Int:
+    """The first column, seconds in decimals, in whole nanoseconds: a float has not the digits for it."""
+    words = [line.split()[0] for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
+    try:
+        return np.array([seconds_ns(word) for word in words], dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise TextError("its times are no seconds") from error
+
+
+def seconds_ns(text: str) -> int:
+    """Seconds in decimals as nanoseconds, to the last digit.
+
+    Raises:
+        ValueError: It is no number, or beyond what nanoseconds can tell.
+    """
+    whole, dot, fraction = text.partition(".")
+    plain = whole.isascii() and whole.isdigit() and (not dot or (fraction.isascii() and fraction.isdigit()))
+    nanoseconds = (
+        int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0") or "0")
+        if plain and len(whole) < 12
+        else round(float(text) * 1e9)
+    )
+    if abs(nanoseconds) >= 1 << 62:
+        raise ValueError("too far away in time")
+    return nanoseconds
+
+
+def _columns(path: Path) -> int:
+    lines = (line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#"))
+    return len(next(lines, []))
+
+
+def read_times(path: Path) -> Int:
+    """Times [ns] of a file with seconds, or with dates and times of day, one a row.
+
+    Raises:
+        TextError: It has another form, or its times go back.
+        OSError: It cannot be read.
+    """
+    try:
+        times = np.rint(read_table(path, 1) * 1e9).astype(np.int64).ravel()
+    except TextError:
+        times = np.array([_date(line) for line in _text(path).split("\n") if line.strip()], dtype=np.int64)
+    if not len(times) or np.any(np.diff(times) < 0):
+        raise TextError("its times go back")
+    return times
+
+
+def _text(path: Path) -> str:
+    if path.stat().st_size > TEXT_LIMIT:
+        raise TextError(f"it is longer than {TEXT_LIMIT >> 20} MB")
+    try:
+        return path.read_text("utf-8")
+    except UnicodeDecodeError as error:
+        raise TextError("it is no text") from error
+
+
+def read_table(path: Path, columns: int) -> Float:
+    """Rows of finite numbers below 10^10, shape (rows, columns); lines that begin with # are left aside.
+
+    Raises:
+        TextError: It has another form.
+        OSError: It cannot be read.
+    """
+    lines = [line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
+    if not lines or any(len(line) != columns for line in lines):
+        raise TextError(f"its rows do not have {columns} numbers")
+    try:
+        numbers = np.array([float(word) for line in lines for word in line])
+    except ValueError as error:
+        raise TextError("it has words where numbers should be") from error
+    if not np.all(np.abs(numbers) < 1e10):
+        raise TextError("it has numbers that are not finite or too large")
+    return numbers.reshape(-1, columns)
+
+
+def _date(line: str) -> int:
+    """A time like 2011-09-26 13:02:25.964389445 in nanoseconds since 1970 (UTC)."""
+    whole, _, fraction = line.strip().partition(".")
+    try:
+        moment = datetime.fromisoformat(whole + "+00:00")
+        return int(moment.timestamp()) * 1_000_000_000 + int((fraction or "0").ljust(9, "0")[:9])
+    except ValueError as error:
+        raise TextError("its rows are no times") from error
+
+
+def _calibration(path: Path) -> Pose3 | None:
+    """`T_camera_lidar` of KITTI's calib.txt, None when there is none."""
+    try:
+        rows = [line.split() for line in _text(path).split("\n") if line.startswith("Tr:")]
+        matrix = np.array([float(word) for word in rows[0][1:]]).reshape(3, 4)
+    except (OSError, TextError, ValueError, IndexError):
+        return None
+    sound = np.isfinite(matrix).all() and np.allclose(matrix[:, :3] @ matrix[:, :3].T, np.eye(3), atol=1e-2)
+    return Pose3(_nearest_rotation(matrix[:, :3]), matrix[:, 3]) if sound else None
+
+
+def _moves_along_z(R: Float, t: Float) -> bool:
+    """Whether the steps, seen from the poses themselves, go along z more than along x."""
+    steps = np.einsum("nji,nj->ni", R[:-1], np.diff(t, axis=0))
+    x, _, z = np.abs(steps).sum(axis=0)
+    return bool(z > x and z > _STILL)
+
+
+def _nearest_rotation(matrix: Float) -> Float:
+    U, _, Vt = np.linalg.svd(matrix)
+    R: Float = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return R

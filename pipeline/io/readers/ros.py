@@ -1,0 +1,330 @@
+"""ROS recordings (.mcap, .db3, .bag) as a source: clouds or Velodyne packets, odometry, IMU, transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from pipeline.errors import SourceError
+from pipeline.geometry.poses import Pose3
+from pipeline.io.readers import ros_messages
+from pipeline.io.readers.base import SourceDescription, SourceOptions
+from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture, find_camera
+from pipeline.io.readers.container import Channel, Container, Message, count_loss
+from pipeline.io.readers.decompression import plain_message
+from pipeline.io.readers.digest import digest_of
+from pipeline.io.readers.extrinsics import Mounting
+from pipeline.io.readers.measured_poses import MeasuredPoses
+from pipeline.io.readers.message_time import Clock, header_stamp
+from pipeline.io.readers.ordering import WINDOW_NS, Stamped, by_stamp
+from pipeline.io.readers.pictures import RecordedPictures
+from pipeline.io.readers.ros_records import RecordDecoder
+from pipeline.io.readers.rostypes import LASER_SCAN, MessageDecoder
+from pipeline.io.readers.sensor_inference import rings_descend, sensor_of
+from pipeline.io.readers.tf_tree import frame_name
+from pipeline.io.readers.topics import Topic, choose_topics
+from pipeline.io.readers.truth_file import ATTACHMENT, SIZE_LIMIT, read_truth
+from pipeline.io.readers.velodyne import SENSORS
+from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
+
+#: How many scans may be unreadable at the start before the recording is refused.
+_TRIES = 20
+
+
+class RosSource:
+    """A recording of ROS messages.
+
+    Args:
+        uri: As the user wrote it.
+        container: The recording; the source closes it.
+        paths: Its files, for the digest.
+        options: Topics and mounting, where the user knows better.
+        make_clock: From stamp minus time of writing of each topic's first message.
+        live: Whether `records_of` will be given more than the container holds.
+
+    Attributes:
+        notices: What a person should know of the messages of `records_of`; who tells of it empties the list.
+
+    Raises:
+        SourceError: It holds no scans, or none of the first ones can be read.
+    """
+
+    def __init__(
+        self,
+        uri: str,
+        container: Container,
+        paths: list[Path],
+        options: SourceOptions,
+        make_clock: Callable[[list[int | None]], Clock] = Clock,
+        *,
+        live: bool = False,
+    ) -> None:
+        self._uri, self._container = uri, container
+        channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
+        decoder = MessageDecoder(channels.values())
+        self._channels, self._decoder = channels, decoder
+        self._topics = choose_topics(channels.values(), options.topics, uri)
+        self._mounting = Mounting(container, decoder)
+        self._mounting.read(self._topics.fixed, self._topics.moving)
+        self._records = RecordDecoder(channels, decoder, self._mounting.tree)
+        self._losses: dict[str, int] = {}
+        self._camera: tuple[Camera | None, str] | None = None
+        named = [t for t in (self._topics.scan, self._topics.odometry, self._topics.imu) if t is not None]
+        self._clock = make_clock([self._clock_offset(topic) for topic in named])
+        self._moving = self._moving_numbers()
+        self._wanted = self._moving.union(*(topic.numbers for topic in named))
+        self._truth, sensor = self._read_truth()
+        first, frame, product = self._first_scan()
+        sensor = sensor or SENSORS.get(product) or sensor_of(first)
+        self._top_ring = sensor.rings - 1 if rings_descend(first) else None
+        self._description = self._describe(first, frame, sensor, decoder.refused, options)
+        self._description = replace(self._description, digest=digest_of(paths))
+        self._records.poses = frozenset() if self._topics.pose is None else self._topics.pose.numbers
+        odometry = self._moving if self._topics.odometry is None else self._topics.odometry.numbers
+        self._measured = MeasuredPoses(container, self._records, self._topics, odometry, self._times_of)
+        self._description = self._measured.begin(self._description, live=live)
+        self.notices = self._measured.notices
+
+    @property
+    def description(self) -> SourceDescription:
+        """What is known before reading."""
+        return self._description
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was left out when opening and in the latest reading, by reason."""
+        total = dict(self._container.damage)
+        for reason, count in self._losses.items():
+            count_loss(total, reason, count)
+        return total
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """Yield records in the order of time; what lies before `start_ns` is not decoded."""
+        losses: dict[str, int] = {}
+        self._losses = losses
+        for stamped in by_stamp(self._arrivals(start_ns, losses), losses):
+            yield from self._decoded(stamped, losses)
+
+    def records_of(
+        self, message: Message, losses: dict[str, int], from_ns: int | None = None
+    ) -> Iterator[Record]:
+        """The records that one message gives, whenever it came, unless they lie before a time; what cannot be
+        used is counted."""
+        if message.channel in self._wanted or message.channel in self._measured.numbers:
+            for stamped in self._times_of(message, losses):
+                self._measured.add(stamped)
+                if from_ns is None or stamped.stamp_ns >= from_ns:
+                    yield from self._decoded(stamped, losses)
+
+    def use_clock(self, clock: Clock) -> None:
+        """Tell times by another clock from now on."""
+        self._clock = clock
+
+    def truth(self) -> Truth | None:
+        """The truth that a simulated recording carries."""
+        return self._truth
+
+    def camera(self) -> tuple[Camera | None, str]:
+        """The camera beside the LiDAR; None and why where there is none that tells where things stand."""
+        topic = self._topics.camera
+        if topic is None:
+            return None, ""
+        if self._camera is None:  # it is asked for with each picture
+            self._camera = find_camera(
+                self._container, self._decoder, self._mounting.tree, self._records.base, topic.numbers
+            )
+        return self._camera
+
+    def picture_stamps(self) -> list[int]:
+        """When the camera took a picture, ascending [ns]."""
+        return self._pictures().stamps()
+
+    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
+        """The pictures that were taken at some of `picture_stamps`, each once."""
+        return self._pictures().at(wanted_ns)
+
+    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The picture that was taken nearest to a time, None where none is within `within_ns` of it."""
+        return self._pictures().near(stamp_ns, within_ns)
+
+    @property
+    def base(self) -> str:
+        """The name of the base frame, "" where nobody says it."""
+        return self._records.base
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._container.close()
+
+    # --- reading ---------------------------------------------------------------------------------
+
+    def _pictures(self) -> RecordedPictures:
+        numbers = frozenset[int]() if self._topics.camera is None else self._topics.camera.numbers
+        clock = self._clock
+        return RecordedPictures(
+            self._container, self._decoder, self._channels, numbers, clock.time_of, clock.offset_ns
+        )
+
+    def _arrivals(
+        self, start_ns: int | None, losses: dict[str, int]
+    ) -> Iterator[Stamped[Message | Odometry]]:
+        """The messages that are read, with their time, in the order of writing."""
+        log_start = None if start_ns is None else start_ns - self._clock.offset_ns - WINDOW_NS
+        wanted = self._wanted | self._measured.numbers
+        for message in self._container.messages(wanted, log_start, losses):
+            for arrival in self._times_of(message, losses):
+                if start_ns is None or arrival.stamp_ns >= start_ns:
+                    yield arrival
+
+    def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
+        """What a message holds, with its time."""
+        plain = replace(message, payload=plain_message(message.payload))
+        if message.channel in self._moving:
+            return self._transforms(plain, losses)
+        return self._stamped(plain, losses)
+
+    def _decoded(self, stamped: Stamped[Message | Odometry], losses: dict[str, int]) -> Iterator[Record]:
+        if isinstance(stamped.content, Odometry):
+            yield stamped.content
+            return
+        record = self._records.record(stamped.content, stamped.stamp_ns, losses)
+        if isinstance(record, Scan):
+            yield self._upright(record)
+        elif record is not None:
+            yield record
+
+    def _stamped(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
+        time_ns = self._clock.time_of(header_stamp(self._channels[message.channel], message.payload), message)
+        if time_ns is None:
+            count_loss(losses, "messages with an impossible time stamp")
+        else:
+            yield Stamped(time_ns, int(message.channel in self._topics.scan.numbers), message)
+
+    def _transforms(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
+        """Odometry that is only there as a moving transform."""
+        for stamp_ns, parent, child, pose in self._mounting.decode(message):
+            if (parent, child) == self._mounting.odometry_link:
+                time_ns = self._clock.time_of(stamp_ns, message)
+                if time_ns is None:
+                    count_loss(losses, "messages with an impossible time stamp")
+                else:
+                    yield Stamped(time_ns, 0, Odometry(time_ns, pose))
+
+    def _upright(self, scan: Scan) -> Scan:
+        """Number the rings from below, as records say."""
+        if self._top_ring is None or scan.ring is None:
+            return scan
+        return replace(scan, ring=np.maximum(self._top_ring - scan.ring, 0).astype(np.int32))
+
+    # --- opening ---------------------------------------------------------------------------------
+
+    def _moving_numbers(self) -> frozenset[int]:
+        if self._topics.odometry is not None or self._mounting.odometry_link is None:
+            return frozenset()
+        return frozenset[int]().union(*(topic.numbers for topic in self._topics.moving))
+
+    def _clock_offset(self, topic: Topic) -> int | None:
+        """Stamp minus time of writing of a topic's first message [ns], None without a stamp."""
+        for message in islice(self._container.messages(topic.numbers, None, {}), 1):
+            stamp_ns = header_stamp(self._channels[message.channel], plain_message(message.payload))
+            return stamp_ns - message.log_ns if stamp_ns else None
+        return None
+
+    def _first_scan(self) -> tuple[Scan, str, int]:
+        """The first scan that can be read, its frame and the product number of the sensor."""
+        reason = "the topic has no messages that can be read"
+        for arrival in islice(self._scan_arrivals(None), _TRIES):
+            try:
+                with np.errstate(all="ignore"):
+                    found = self._records.scan(arrival.content, arrival.stamp_ns, {})
+            except Exception as error:  # as in RecordDecoder.record
+                reason = f"the first scans cannot be read: {str(error)[:200] or type(error).__name__}"
+                continue
+            if len(found[0].points):
+                return found
+            reason = "the first scans have no points"
+        raise SourceError(
+            reason,
+            where=f"{self._uri}, topic {self._topics.scan.name}",
+            remedy="Name another with --topic scan=NAME.",
+        )
+
+    def _scan_arrivals(self, log_start: int | None) -> Iterator[Stamped[Message]]:
+        for message in self._container.messages(self._topics.scan.numbers, log_start, {}):
+            for arrival in self._stamped(replace(message, payload=plain_message(message.payload)), {}):
+                if isinstance(arrival.content, Message):
+                    yield Stamped(arrival.stamp_ns, arrival.rank, arrival.content)
+
+    def _last_stamp(self) -> int | None:
+        tail_ns = self._container.tail_ns(self._topics.scan.numbers)
+        return max((arrival.stamp_ns for arrival in self._scan_arrivals(tail_ns)), default=None)
+
+    def _read_truth(self) -> tuple[Truth | None, Sensor | None]:
+        content = self._container.attachment(ATTACHMENT, SIZE_LIMIT)
+        return (None, None) if content is None else read_truth(content, self._uri)
+
+    def _said_base(self) -> str:
+        """The base frame as the odometry topic names it, "" when it does not."""
+        topic = self._topics.odometry
+        numbers = frozenset[int]() if topic is None else topic.numbers
+        for message in islice(self._container.messages(numbers, None, {}), 1 if numbers else 0):
+            try:
+                plain = replace(message, payload=plain_message(message.payload))
+                message_of_odometry = cast(ros_messages.Odometry, self._records.message(plain))
+                return frame_name(message_of_odometry.child_frame_id)
+            except Exception:  # as in RecordDecoder.record
+                return ""
+        return ""
+
+    def _describe(
+        self, first: Scan, frame: str, sensor: Sensor, refused: list[str], options: SourceOptions
+    ) -> SourceDescription:
+        self._records.base = base = self._mounting.base_frame(self._said_base())
+        has_odometry = self._topics.odometry is not None or bool(self._moving)
+        linked = options.T_base_lidar or self._mounting.tree.find(base, frame)
+        warnings = [f"the file's definition of {topic} is not used: it is not sound" for topic in refused]
+        if linked is None and has_odometry and base != frame:
+            warnings.append(
+                f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "
+                "the LiDAR is taken to stand at the base"
+            )
+        if not self._clock.by_stamp:
+            warnings.append("the time stamps in the messages do not fit together: times of writing are used")
+        if self._container.damage:
+            warnings.append("the recording is cut or damaged: only what is whole is read")
+        return SourceDescription(
+            uri=self._uri,
+            kind=self._container.kind,
+            sensor=sensor,
+            T_base_lidar=linked or Pose3.identity(),
+            has_odometry=has_odometry,
+            has_imu=self._topics.imu is not None,
+            scans=self._topics.scan.count,
+            start_ns=first.stamp_ns,
+            end_ns=self._last_stamp(),
+            digest="",
+            preset="laser2d" if self._topics.scan.msgtype == LASER_SCAN else "forest",
+            topics=self._topics.recorded(),
+            warnings=tuple(warnings),
+        )
+
+
+def open_ros(
+    uri: str, open_container: Callable[[], Container], paths: list[Path], options: SourceOptions
+) -> RosSource:
+    """Open a recording; its files are closed again when it cannot be read.
+
+    Raises:
+        SourceError: See RosSource.
+    """
+    container = open_container()
+    try:
+        return RosSource(uri, container, paths, options)
+    except BaseException:
+        container.close()
+        raise

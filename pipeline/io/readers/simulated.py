@@ -1,0 +1,126 @@
+"""Simulated runs as a source: `sim:stand`, `sim:paper?seed=3&odometry=poor`, ..."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlencode
+
+from pipeline.errors import SourceError
+from pipeline.io.readers.base import SourceDescription, SourceOptions
+from pipeline.simulation.inertial import IMU_HZ
+from pipeline.simulation.run import START_NS, SimulatedRun, open_run
+from pipeline.simulation.scenarios import scenarios
+from pipeline.simulation.uri import CLOUD, SCHEME, RunRequest, parse_uri
+from pipeline.simulation.wheels import ODOMETRY_HZ
+from pipeline.types.records import Record, Truth
+
+__all__ = ["SimulatedSource", "open_simulated", "scenarios"]
+
+_TICK_NS = 1_000_000_000 // IMU_HZ
+
+
+class SimulatedSource:
+    """A simulated run, read like any recording (see `pipeline.io.readers.base.Source`)."""
+
+    def __init__(
+        self,
+        uri: str,
+        run: SimulatedRun,
+        *,
+        knows_trees: bool = True,
+        kind: str = "simulated run",
+        warnings: tuple[str, ...] = (),
+    ) -> None:
+        self.run = run
+        self._knows_trees = knows_trees
+        last = START_NS + (run.scans - 1) * run.lidar.period_ns
+        self.description = SourceDescription(
+            uri=uri,
+            kind=kind,
+            sensor=run.lidar.sensor,
+            T_base_lidar=run.T_base_lidar,
+            has_odometry=True,
+            has_imu=True,
+            scans=run.scans,
+            start_ns=START_NS,
+            end_ns=last,
+            digest=run.digest(),
+            warnings=warnings,
+        )
+        self.losses: dict[str, int] = {}
+
+    def records(self, start_ns: int | None = None, *, every: int = 1) -> Iterator[Record]:
+        """All records in the order of time; at the same time IMU, odometry, scan. Of so many scans one is
+        made: what is not asked for costs nothing.
+
+        A scan bears the time at which its sweep starts, so readings taken while the sensor turns follow
+        it. They go on to the end of the last sweep, so that every sweep can be undistorted.
+        """
+        period = self.run.lidar.period_ns
+        per_odometry, per_scan = IMU_HZ // ODOMETRY_HZ, period // _TICK_NS
+        first = 0 if start_ns is None else max(0, -((START_NS - start_ns) // _TICK_NS))
+        for tick in range(first, self.run.scans * per_scan + 1):
+            yield self.run.imu_record(tick)
+            if tick % per_odometry == 0:
+                yield self.run.odometry_record(tick // per_odometry)
+            if tick % (per_scan * every) == 0 and tick // per_scan < self.run.scans:
+                yield self.run.sweep(tick // per_scan).scan
+
+    def truth(self) -> Truth:
+        """All trees and what else stands there, and the true path."""
+        trees = self.run.scene.truth if self._knows_trees else None
+        return Truth(trees=trees, path=self.run.true_path())
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedSource:
+    """Open `sim:NAME?seed=&sigma=&odometry=&duration=&trees=`.
+
+    `options.seed` is taken where the URI names no seed; `options.T_base_lidar` mounts the simulated
+    LiDAR elsewhere on the robot.
+
+    `sim:cloud?file=&truth=` drives through the real cloud of a plot instead.
+
+    Raises:
+        SourceError: No such scenario or option, a value out of bounds, or a file that cannot be read.
+    """
+    chosen = SourceOptions() if options is None else options
+    request = parse_uri(uri, chosen.seed)
+    if request.name == CLOUD:
+        return _open_cloud(uri, request, chosen)
+    return SimulatedSource(uri, open_run(request, chosen.T_base_lidar))
+
+
+def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> SimulatedSource:
+    """A run through the real cloud of a plot."""
+    from pipeline.io.ground_truth import read_truth_trees
+    from pipeline.io.readers.clouds import open_cloud
+    from pipeline.simulation.cloud_run import open_cloud_run
+
+    trees = read_truth_trees(Path(request.truth).expanduser()) if request.truth else None
+    run = open_cloud_run(request, open_cloud(request.file), trees, options.T_base_lidar)
+    return SimulatedSource(uri, run, knows_trees=trees is not None, warnings=run.warnings)
+
+
+def drive_through(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
+    """A whole cloud as a run: a simulated robot drives through it (`sim:cloud?file=`).
+
+    Raises:
+        SourceError: It cannot be read, or leaves no way for a robot.
+    """
+    from pipeline.io.readers.clouds import open_cloud
+    from pipeline.simulation.cloud_run import open_cloud_run
+
+    request = parse_uri(f"{SCHEME}{CLOUD}?{urlencode({'file': str(file)})}", options.seed)
+    cloud = open_cloud(str(file))
+    try:
+        run = open_cloud_run(request, cloud, None, options.T_base_lidar)
+    except SourceError as error:
+        raise SourceError(
+            error.what, where=uri, remedy="`stemmap map` maps the cloud as a whole, without a robot"
+        ) from None
+    kind = f"simulated drive through a whole cloud ({cloud.description.kind})"
+    return SimulatedSource(uri, run, knows_trees=False, kind=kind, warnings=run.warnings)

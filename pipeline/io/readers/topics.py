@@ -1,0 +1,203 @@
+"""Which topics of a recording are read: found by their type, the one with the most messages wins."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from pipeline.errors import SourceError
+from pipeline.io.readers.base import RecordedTopic
+from pipeline.io.readers.container import Channel
+from pipeline.io.readers.rostypes import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    IMU,
+    LASER_SCAN,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    POINT_CLOUD,
+    POSE_WITH_COVARIANCE,
+    ROS1_TRANSFORMS,
+    TRANSFORMS,
+    VELODYNE_SCAN,
+)
+
+TYPES_BY_ROLE = {
+    "scan": (POINT_CLOUD, VELODYNE_SCAN, LASER_SCAN),
+    "odometry": (ODOMETRY,),
+    "imu": (IMU,),
+    "gnss": (NAV_SAT_FIX,),
+    "pose": (POSE_WITH_COVARIANCE, ODOMETRY),
+    "camera": (COMPRESSED_IMAGE, IMAGE),
+}
+ROLES = "scan, odometry, imu, gnss, pose or camera"
+_READABLE = ("cdr", "ros1")
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of one type with the channels that carry it.
+
+    Attributes:
+        name, msgtype: Of the topic.
+        numbers: The channels.
+        count: Number of messages of all of them.
+    """
+
+    name: str
+    msgtype: str
+    numbers: frozenset[int]
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """The topics that are read; `fixed` and `moving` carry transforms, `every` is all there is."""
+
+    scan: Topic
+    odometry: Topic | None
+    imu: Topic | None
+    gnss: Topic | None
+    pose: Topic | None
+    camera: Topic | None
+    fixed: tuple[Topic, ...]
+    moving: tuple[Topic, ...]
+    every: tuple[Topic, ...]
+
+    def recorded(self) -> tuple[RecordedTopic, ...]:
+        """All topics for people, each with what it is read as."""
+        reading: dict[Topic, str] = dict.fromkeys((*self.fixed, *self.moving), "transforms")
+        infos = [topic for topic in self.every if topic.msgtype == CAMERA_INFO]
+        reading.update(dict.fromkeys(infos if self.camera else [], "camera"))
+        chosen = {
+            "scan": self.scan,
+            "odometry": self.odometry,
+            "imu": self.imu,
+            "gnss": self.gnss,
+            "pose": self.pose,
+            "camera": self.camera,
+        }
+        reading.update({topic: role for role, topic in chosen.items() if topic is not None})
+        return tuple(
+            RecordedTopic(
+                topic.name,
+                topic.msgtype,
+                topic.count,
+                reading.get(topic, ""),
+                _role_of(topic),
+                "" if topic in reading else _why_not(topic, chosen.get(_role_of(topic))),
+            )
+            for topic in self.every
+        )
+
+
+def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where: str) -> Topics:
+    """Choose the topics by role.
+
+    Args:
+        channels: Of the recording.
+        wanted: Topic by role ("scan", "odometry", "imu", "pose") as the user said; others are found by type.
+        where: The recording, for errors.
+
+    Raises:
+        SourceError: There is no scan, or a topic that the user named is not there or not of a type
+            for its role. The text names the topics that are there.
+    """
+    topics = _group(channels)
+    unknown = sorted(wanted.keys() - TYPES_BY_ROLE.keys())
+    if unknown:
+        raise SourceError(f"there is no role {unknown[0]!r} for a topic", where=where, remedy=f"Use {ROLES}.")
+    chosen = {
+        role: _choose(_free(topics, role, wanted), role, wanted.get(role), where) for role in TYPES_BY_ROLE
+    }
+    scan = chosen["scan"]
+    if scan is None:
+        types = " or ".join(TYPES_BY_ROLE["scan"])
+        raise SourceError(
+            f"the recording has no scans (messages of {types}); {_listing(topics)}",
+            where=where,
+            remedy="Record the topic of the LiDAR.",
+        )
+    transforms = [topic for topic in topics if topic.msgtype in (TRANSFORMS, ROS1_TRANSFORMS)]
+    fixed = tuple(topic for topic in transforms if topic.name.endswith("tf_static"))
+    moving = tuple(topic for topic in transforms if not topic.name.endswith("tf_static"))
+    return Topics(
+        scan,
+        chosen["odometry"],
+        chosen["imu"],
+        chosen["gnss"],
+        chosen["pose"],
+        chosen["camera"],
+        fixed,
+        moving,
+        tuple(topics),
+    )
+
+
+def _role_of(topic: Topic) -> str:
+    return next((role for role, types in TYPES_BY_ROLE.items() if topic.msgtype in types), "")
+
+
+def _free(topics: list[Topic], role: str, wanted: Mapping[str, str]) -> list[Topic]:
+    """The topics that may be given a role: what was named as the pose of another SLAM is no odometry."""
+    taken = wanted.get("pose") if role == "odometry" else None
+    return [topic for topic in topics if topic.name != taken]
+
+
+def _why_not(topic: Topic, chosen: Topic | None) -> str:
+    """Why a topic is not read, for people."""
+    if chosen is None and topic.count and topic.msgtype == POSE_WITH_COVARIANCE:
+        return "it counts when it is named as pose"
+    if chosen is None:
+        return "no message in it" if _role_of(topic) else "nothing is made of this type"
+    if topic.count == 0:
+        return "no message in it"
+    if chosen.msgtype != LASER_SCAN and topic.msgtype == LASER_SCAN:
+        return f"{chosen.name} sees in space"
+    if topic.count == chosen.count:
+        return f"{chosen.name} has as many messages, and is taken"
+    return f"{chosen.name} has more messages" if chosen.count > topic.count else f"{chosen.name} was named"
+
+
+def _group(channels: Iterable[Channel]) -> list[Topic]:
+    groups: dict[tuple[str, str], list[Channel]] = {}
+    for channel in channels:
+        if channel.encoding in _READABLE:
+            groups.setdefault((channel.topic, channel.msgtype), []).append(channel)
+        else:
+            named = f"{channel.msgtype or 'unknown type'} as {channel.encoding[:20] or 'unknown encoding'}"
+            groups.setdefault((channel.topic, named), []).append(channel)
+    return [
+        Topic(name, msgtype, frozenset(c.number for c in members), sum(c.count for c in members))
+        for (name, msgtype), members in sorted(groups.items())
+    ]
+
+
+def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Topic | None:
+    types = TYPES_BY_ROLE[role]
+    fitting = [topic for topic in topics if topic.msgtype in types and (name is None or topic.name == name)]
+    if name is not None and not fitting:
+        there = any(topic.name == name for topic in topics)
+        reason = f"the topic {name} is not of the type {' or '.join(types)}" if there else f"no topic {name}"
+        raise SourceError(
+            f"{reason}; {_listing(topics)}", where=where, remedy=f"Name one with --topic {role}=NAME."
+        )
+    if role == "pose" and name is None:  # whether another program is better than we are, a person knows
+        return None
+    filled = [topic for topic in fitting if topic.count > 0] or (fitting if name is not None else [])
+    # Of equally many messages the decoded cloud is preferred to the raw packets it was made of.
+    # A laser that sees in one plane is the robot's bumper where there is a LiDAR too.
+    return max(
+        filled,
+        key=lambda topic: (topic.msgtype != LASER_SCAN, topic.count, -types.index(topic.msgtype)),
+        default=None,
+    )
+
+
+def _listing(topics: list[Topic]) -> str:
+    if not topics:
+        return "it has no topics"
+    shown = [f"{topic.name[:80]} [{topic.msgtype[:80]}, {topic.count}]" for topic in topics[:30]]
+    more = f" and {len(topics) - 30} more" if len(topics) > 30 else ""
+    return "it has " + ", ".join(shown) + more

@@ -1,0 +1,204 @@
+"""The Victoria Park recording: a zip with LASER.txt, DRS.txt (encoders) and GPS.txt.
+
+The base frame is the laser's: x ahead, y left. Dead reckoning starts at the origin with heading 0;
+GPS (x east, y north) is the truth in a frame of its own.
+"""
+
+from __future__ import annotations
+
+import heapq
+import zipfile
+import zlib
+from collections.abc import Iterator
+from operator import attrgetter
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SourceError
+from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.base import SourceDescription, SourceOptions
+from pipeline.io.readers.cleaning import clean_scan
+from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.digest import digest_of
+from pipeline.io.readers.number_text import parse_numbers
+from pipeline.io.readers.vehicle import Car, dead_reckoning
+from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Truth, TruthPath
+
+BEAMS = 361
+#: 81.91 m is the laser's word for no return.
+RANGE_MAX = 80.0
+MEMBER_LIMIT = 128 << 20
+LASER = Sensor("SICK LMS 221", 1, 0.0, float(np.radians(0.5)), 0.05, RANGE_MAX)
+_STEEPEST, _FASTEST, _LONGEST_S = 1.0, 50.0, 10_000_000.0
+
+
+class VictoriaParkSource:
+    """The zip as a source of planar scans (z = 0) and of odometry.
+
+    Args:
+        uri: As the user wrote it.
+        path: The zip.
+        options: The mounting; dead reckoning gives the laser's own path, so identity suits.
+
+    Raises:
+        SourceError: It is another zip, damaged, or too large when unpacked.
+        OSError: It cannot be read.
+    """
+
+    def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
+        self._damage: dict[str, int] = {}
+        self._losses: dict[str, int] = {}
+        members = _unpack(path, uri)
+        self._scan_ns, self._ranges = self._read_laser(members["laser.txt"], uri)
+        self._odometry_ns, self._poses = self._read_encoders(members["drs.txt"], uri)
+        self._gps = self._read_gps(members.get("gps.txt", b""))
+        bearing = np.radians(0.5) * np.arange(BEAMS) - np.pi / 2
+        self._directions = np.stack([np.cos(bearing), np.sin(bearing), np.zeros(BEAMS)], axis=1)
+        self._description = SourceDescription(
+            uri=uri,
+            kind="Victoria Park zip",
+            sensor=LASER,
+            T_base_lidar=options.T_base_lidar or Pose3.identity(),
+            has_odometry=True,
+            has_imu=False,
+            scans=len(self._scan_ns),
+            start_ns=int(self._scan_ns[0]),
+            end_ns=int(self._scan_ns[-1]),
+            digest=digest_of([path]),
+            preset="laser2d",
+        )
+
+    @property
+    def description(self) -> SourceDescription:
+        """What is known before reading."""
+        return self._description
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was left out when opening and in the latest reading, by reason."""
+        return {**self._damage, **self._losses}
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """Yield odometry and scans in the order of time, from `start_ns` on."""
+        self._losses = losses = dict[str, int]()
+        streams: list[Iterator[Record]] = [self._odometry(start_ns), self._scans(start_ns, losses)]
+        return heapq.merge(*streams, key=attrgetter("stamp_ns"))
+
+    def truth(self) -> Truth | None:
+        """The path by GPS, None when the zip has none."""
+        return None if self._gps is None else Truth(path=self._gps)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _odometry(self, start_ns: int | None) -> Iterator[Record]:
+        begin = 0 if start_ns is None else int(np.searchsorted(self._odometry_ns, start_ns))
+        for index in range(begin, len(self._odometry_ns)):
+            x, y, yaw = self._poses[index].tolist()
+            yield Odometry(int(self._odometry_ns[index]), Pose3.from_euler([x, y, 0.0], 0.0, 0.0, yaw))
+
+    def _scans(self, start_ns: int | None, losses: dict[str, int]) -> Iterator[Record]:
+        begin = 0 if start_ns is None else int(np.searchsorted(self._scan_ns, start_ns))
+        for index in range(begin, len(self._scan_ns)):
+            scan = self._scan(index)
+            if len(scan.points):
+                yield scan
+            else:
+                count_loss(losses, "scans without points")
+
+    def _scan(self, index: int) -> Scan:
+        ranges = self._ranges[index]
+        with np.errstate(invalid="ignore"):
+            seen = (ranges > 0.0) & (ranges < RANGE_MAX)
+        points = ranges[seen, None] * self._directions[seen]
+        return clean_scan(int(self._scan_ns[index]), points, dropped=int(BEAMS - np.count_nonzero(seen)))
+
+    def _read_laser(self, text: bytes, uri: str) -> tuple[Int, NDArray[np.float32]]:
+        table, rest = _table(text, BEAMS + 1)
+        if rest:
+            count_loss(self._damage, "numbers at the end of LASER.txt that are no whole scan", rest)
+        table = self._ascending(table, "laser scans with impossible times")
+        if not len(table):
+            raise SourceError("LASER.txt holds no scan", where=uri, remedy="Get the file again.")
+        return _nanoseconds(table[:, 0]), table[:, 1:].astype(np.float32)
+
+    def _read_encoders(self, text: bytes, uri: str) -> tuple[Int, Float]:
+        """Times and poses; a pose at rest before the first reading reaches back to the first scan."""
+        table, rest = _table(text, 3)
+        if rest:
+            count_loss(self._damage, "numbers at the end of DRS.txt that are no whole row", rest)
+        table = self._ascending(table, "encoder readings with impossible times")
+        sound = (np.abs(table[:, 1]) < _FASTEST) & (np.abs(table[:, 2]) < _STEEPEST)
+        if not sound.all():
+            count_loss(self._damage, "encoder readings out of bounds", int(np.count_nonzero(~sound)))
+        table = table[sound]
+        if not len(table):
+            raise SourceError("DRS.txt holds no reading", where=uri, remedy="Get the file again.")
+        poses = dead_reckoning(table[:, 0], table[:, 1], table[:, 2], Car())
+        stamp_ns = _nanoseconds(table[:, 0])
+        if self._scan_ns[0] < stamp_ns[0]:
+            return np.append(self._scan_ns[:1], stamp_ns), np.concatenate([poses[:1], poses])
+        return stamp_ns, poses
+
+    def _read_gps(self, text: bytes) -> TruthPath | None:
+        table, _ = _table(text, 3)
+        table = self._ascending(table, "GPS rows with impossible times")
+        if not len(table):
+            return None
+        north, east = table[:, 1].copy(), table[:, 2].copy()
+        return TruthPath(
+            _nanoseconds(table[:, 0]), east, north, np.full(len(table), np.nan), same_frame=False
+        )
+
+    def _ascending(self, table: Float, reason: str) -> Float:
+        """Rows whose time is sound and not before the one above."""
+        time = table[:, 0]
+        with np.errstate(invalid="ignore"):
+            sound = (time >= 0.0) & (time < _LONGEST_S) & np.isfinite(table).all(axis=1)
+        sound &= np.where(sound, time, -np.inf) >= np.maximum.accumulate(np.where(sound, time, -np.inf))
+        if not sound.all():
+            count_loss(self._damage, reason, int(np.count_nonzero(~sound)))
+        return table[sound]
+
+
+def _unpack(path: Path, uri: str) -> dict[str, bytes]:
+    """The text files of the zip by name in lower case; sizes are checked before unpacking."""
+    wanted = {"laser.txt", "drs.txt", "gps.txt"}
+    try:
+        # A damaged zip may lead before the start of the file, which is an OSError like any other.
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+            found = {Path(entry.filename).name.lower(): entry for entry in archive.infolist()}
+            if not {"laser.txt", "drs.txt"} <= found.keys():
+                raise SourceError(
+                    "the zip holds no LASER.txt and DRS.txt",
+                    where=uri,
+                    remedy="Of zips only Victoria Park's can be read; unpack others first.",
+                )
+            chosen = {name: entry for name, entry in found.items() if name in wanted}
+            large = [name for name, entry in chosen.items() if entry.file_size > MEMBER_LIMIT]
+            if large:
+                raise SourceError(f"{large[0]} unpacks to more than {MEMBER_LIMIT >> 20} MB", where=uri)
+            return {name: archive.read(entry) for name, entry in chosen.items()}
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        RuntimeError,
+        OSError,
+        ValueError,
+        UnicodeDecodeError,
+    ) as error:
+        raise SourceError(f"the zip is damaged: {error}", where=uri, remedy="Get the file again.") from error
+
+
+def _table(text: bytes, columns: int) -> tuple[Float, int]:
+    """Whole rows of the numbers of a text, and how many numbers are left over at its end."""
+    numbers = parse_numbers(text)
+    whole = len(numbers) // columns * columns
+    return numbers[:whole].reshape(-1, columns), len(numbers) - whole
+
+
+def _nanoseconds(seconds: Float) -> Int:
+    return np.rint(seconds * 1e9).astype(np.int64)

@@ -1,0 +1,278 @@
+"""The files of a mapped run. A value that is not known is empty, never 0."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from pipeline.geometry.poses import Float
+from pipeline.io.atomic_files import UNFINISHED, hold
+from pipeline.types.records import Frame, HeightMap, Path, Trees, Verdict
+
+ROWS = "detections.csv"  # is written as the run goes
+TREE_COLUMNS = (
+    "tree",
+    "x_m",
+    "y_m",
+    "sigma_x_m",
+    "sigma_y_m",
+    "dbh_cm",
+    "sigma_dbh_cm",
+    "eccentricity",
+    "observations",
+    "coverage_deg",
+    "first_seen_s",
+    "last_seen_s",
+)
+PATH_COLUMNS = ("t_s", "x_m", "y_m", "yaw_rad", "sigma_xy_m")
+TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
+DETECTION_COLUMNS = (
+    "scan",
+    "t_s",
+    "x_m",
+    "y_m",
+    "verdict",
+    "eccentricity",
+    "radius_m",
+    "radial_std_m",
+    "arc_deg",
+    "points",
+    "width_m",
+    "height_m",
+)
+
+
+def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
+    """The confirmed trees as rows of TREE_COLUMNS; seconds count from `start_ns`, and a stamp
+    below 0 is unknown."""
+    return [
+        [
+            str(trees.number[k]),
+            _number(trees.position[k, 0], 3),
+            _number(trees.position[k, 1], 3),
+            _number(math.sqrt(trees.covariance[k, 0, 0]), 3),
+            _number(math.sqrt(trees.covariance[k, 1, 1]), 3),
+            _number(100.0 * trees.dbh[k], 1),
+            _number(100.0 * trees.dbh_sigma[k], 1),
+            _number(trees.eccentricity[k], 3),
+            str(trees.observations[k]),
+            _number(math.degrees(trees.coverage[k]), 0) if trees.coverage[k] > 0 else "",
+            _number(_seconds(trees.first_seen_ns[k], start_ns), 3),
+            _number(_seconds(trees.last_seen_ns[k], start_ns), 3),
+        ]
+        for k in np.flatnonzero(trees.confirmed)
+    ]
+
+
+def path_rows(path: Path, start_ns: int) -> list[list[str]]:
+    """The path as rows of PATH_COLUMNS, one a scan."""
+    return [
+        [
+            _number(_seconds(stamp, start_ns), 3),
+            _number(x, 4),
+            _number(y, 4),
+            _number(yaw, 5),
+            _number(sigma, 4),
+        ]
+        for stamp, x, y, yaw, sigma in zip(
+            path.stamp_ns, path.x, path.y, path.yaw, path.sigma_xy, strict=True
+        )
+    ]
+
+
+def terrain_text(ground: HeightMap) -> str:
+    """The file terrain.csv."""
+    return csv_text(TERRAIN_COLUMNS, terrain_rows(ground))
+
+
+def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
+    """The known cells of the height map as rows of TERRAIN_COLUMNS, from west to east; x and y are their
+    middles."""
+    order = np.lexsort((ground.place[:, 1], ground.place[:, 0]))
+    middle = (ground.place[order] + 0.5) * ground.cell
+    columns = (middle, ground.height[order], ground.sigma[order], ground.views[order])
+    for (x, y), z, sigma, views in zip(*columns, strict=True):
+        yield [_number(x, 3), _number(y, 3), _number(z, 3), _number(sigma, 3), str(views)]
+
+
+def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
+    """Every cluster of a scan with its verdict, in the frame of the map, as rows of DETECTION_COLUMNS."""
+    c = frame.clusters
+    centre = frame.estimate.T_map_base.apply(c.centre + frame.sensor_offset[:2])
+    fitted = np.isfinite(c.radius)
+    return [
+        [
+            str(frame.index),
+            _number(_seconds(frame.stamp_ns, start_ns), 3),
+            _number(centre[k, 0], 3),
+            _number(centre[k, 1], 3),
+            Verdict(int(c.verdict[k])).label,
+            _number(c.eccentricity[k], 3),
+            _number(c.radius[k], 3),
+            _number(c.radial_std[k], 4),
+            _number(math.degrees(c.arc[k]), 0) if fitted[k] else "",
+            str(c.size[k]),
+            _number(c.extent[k, 1], 3),
+            _number(c.extent[k, 2], 3),
+        ]
+        for k in range(len(c.size))
+    ]
+
+
+ROBOTS_FRAME = {"type": "local", "unit": "m", "origin": "first pose of the robot, x along its heading"}
+
+
+def geojson(
+    trees: Trees,
+    start_ns: int,
+    *,
+    frame: Mapping[str, str] | None = None,
+    lon_lat: Float | None = None,
+) -> str:
+    """The confirmed trees as a FeatureCollection.
+
+    RFC 7946 wants WGS84; a map without georeference says so by its `coordinateFrame` member.
+
+    Args:
+        trees: The map.
+        start_ns: Seconds count from here.
+        frame: What the coordinates of `trees` are; None means ROBOTS_FRAME.
+        lon_lat: Longitude and latitude of each confirmed tree, shape (T, 2) [degrees], where they are known:
+            they become the geometry, and x and y properties.
+    """
+    features = []
+    for k, row in enumerate(tree_rows(trees, start_ns)):
+        values = dict(zip(TREE_COLUMNS, row, strict=True))
+        if lon_lat is None:
+            x, y = float(values.pop("x_m")), float(values.pop("y_m"))
+        else:
+            x, y = (round(float(v), 8) for v in lon_lat[k])
+        properties: dict[str, Any] = {
+            name: None if text == "" else json.loads(text) for name, text in values.items()
+        }
+        features.append(
+            {
+                "type": "Feature",
+                "id": properties["tree"],
+                "geometry": {"type": "Point", "coordinates": [x, y]},
+                "properties": properties,
+            }
+        )
+    collection: dict[str, Any] = {"type": "FeatureCollection"}
+    if lon_lat is None:
+        collection["coordinateFrame"] = dict(ROBOTS_FRAME if frame is None else frame)
+    collection["features"] = features
+    return json.dumps(collection, indent=1) + "\n"
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Rows below a header, comma-separated, lines ended by a single line feed."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+class RunFiles:
+    """The folder that `stemmap map` fills. Rows of detections are written as they come, everything
+    else at the end; the files appear under their names all together, in `finish`.
+
+    Args:
+        folder: Made when it is not there; files of an earlier run are replaced.
+        earlier: Folder of the run that this one continues; its detections come first.
+
+    Raises:
+        OSError: The folder cannot be made or written.
+    """
+
+    def __init__(self, folder: FilePath, earlier: FilePath | None = None) -> None:
+        self._folder = folder
+        self._made_folder = not folder.exists()
+        folder.mkdir(parents=True, exist_ok=True)
+        # A folder of its own, so that two runs into one place do not mix their halves.
+        self._staging = FilePath(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder))
+        rows = self._staging / ROWS
+        if earlier is not None and (earlier / rows.name).is_file():
+            shutil.copyfile(earlier / rows.name, rows)
+        else:
+            rows.write_text(csv_text(DETECTION_COLUMNS, []), encoding="utf-8", newline="")
+        self._detections = rows.open("a", encoding="utf-8", newline="")
+        with contextlib.suppress(OSError):  # a disk of a network may know no locks
+            hold(self._detections)
+
+    def add(self, frame: Frame, start_ns: int) -> None:
+        """Write the clusters of one scan."""
+        writer = csv.writer(self._detections, lineterminator="\n")
+        writer.writerows(detection_rows(frame, start_ns))
+
+    def add_rows(self, rows: Iterable[Sequence[str]]) -> None:
+        """Write rows of DETECTION_COLUMNS."""
+        csv.writer(self._detections, lineterminator="\n").writerows(rows)
+
+    def finish(
+        self,
+        trees: Trees,
+        path: Path,
+        start_ns: int,
+        run: dict[str, Any],
+        state: bytes | None,
+        further: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write the other files and give all of them their names.
+
+        Args:
+            trees, path, start_ns, run: What was found.
+            state: What the run goes on from; None where nothing goes on.
+            further: Texts of files beside the others, or in their place, by name.
+        """
+        self._detections.close()
+        texts = {
+            "trees.csv": csv_text(TREE_COLUMNS, tree_rows(trees, start_ns)),
+            "path.csv": csv_text(PATH_COLUMNS, path_rows(path, start_ns)),
+            "trees.geojson": geojson(trees, start_ns),
+            **(further or {}),
+            "run.json": json.dumps(run, indent=1, allow_nan=False) + "\n",
+        }
+        for name, text in texts.items():
+            (self._staging / name).write_text(text, encoding="utf-8", newline="")
+        states = [] if state is None else ["state.zip"]
+        if state is None:
+            (self._folder / "state.zip").unlink(missing_ok=True)  # of an earlier run
+        else:
+            (self._staging / "state.zip").write_bytes(state)
+        # run.json last: where it stands, the others do too
+        for name in (ROWS, *states, *texts):
+            (self._staging / name).replace(self._folder / name)
+        self._staging.rmdir()
+
+    def abandon(self) -> None:
+        """Remove what was begun; what an earlier run left stays as it was."""
+        self._detections.close()
+        for file in self._staging.iterdir():
+            file.unlink()
+        self._staging.rmdir()
+        if self._made_folder:
+            self._folder.rmdir()
+
+
+def _seconds(stamp_ns: int, start_ns: int) -> float:
+    return (int(stamp_ns) - start_ns) * 1e-9 if stamp_ns >= 0 else math.nan
+
+
+def _number(value: float, digits: int) -> str:
+    """Decimal text without an exponent; empty where the value is not finite; no minus zero."""
+    if not math.isfinite(value):
+        return ""
+    text = f"{value:.{digits}f}"
+    return text.lstrip("-") if float(text) == 0.0 else text

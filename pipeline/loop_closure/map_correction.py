@@ -1,0 +1,104 @@
+"""A path that was bent after the fact, and what was mapped from it moved along."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.poses import Float, wrap_angle
+from pipeline.types.records import Int
+
+TILE = 4.0  # m; what stands in one tile moves as one piece, so that no trunk is torn
+NEAR = 20.0  # m driven before and after a tree was seen first; what was driven there later may bend otherwise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bend:
+    """Where the scans were taken to be, and where they are now.
+
+    Attributes:
+        before, after: x, y [m], yaw [rad] of every scan, shape (N, 3), in the frame of the map.
+        first: Scan; what was mapped until it stays.
+        last: Scan; what came after it mapped nothing.
+    """
+
+    before: Float
+    after: Float
+    first: int
+    last: int
+
+    def moved(self, place: Float, scan: Int) -> Float:
+        """Where places are now, shape (N, 2) [m].
+
+        Args:
+            place: Where they were, shape (N, 2) [m].
+            scan: int64, shape (N,): the scan that each one was mapped by; it tells whether a place moves, not
+                by how much, for neighbours must move alike.
+        """
+        out = place.copy()
+        moves = np.flatnonzero(scan > self.first)
+        if not len(moves) or self.last <= self.first:
+            return out
+        rows = self._nearest(place[moves])
+        before, after = self.before[rows], self.after[rows]
+        turn = after[:, 2] - before[:, 2]
+        c, s = np.cos(turn), np.sin(turn)
+        dx, dy = (place[moves] - before[:, :2]).T
+        out[moves] = after[:, :2] + np.column_stack([c * dx - s * dy, s * dx + c * dy])
+        return out
+
+    def of_trees(self, place: Float, scan: Int) -> tuple[Float, Float]:
+        """Where trees are now, shape (N, 2) [m], and by how much they are turned, shape (N,) [rad].
+
+        A tree moves with the scan nearest to it of those driven when it was seen first: a path that went
+        astray may have led past it later, as it seemed, and bends otherwise there.
+
+        Args:
+            place: Where they were, shape (N, 2) [m]; scan: int64, shape (N,), that each was seen in first.
+        """
+        out, turn = place.copy(), np.zeros(len(place))
+        moves = np.flatnonzero(scan > self.first)
+        if not len(moves) or self.last <= self.first:
+            return out, turn
+        step = np.hypot(*np.diff(self.before[:, :2], axis=0, prepend=self.before[:1, :2]).T)
+        way = np.cumsum(step)
+        at = way[np.minimum(scan[moves], self.last)]
+        low = np.maximum(np.searchsorted(way, at - NEAR), self.first + 1)
+        high = np.minimum(np.searchsorted(way, at + NEAR, side="right"), self.last + 1)
+        for k, i, j in zip(moves.tolist(), low.tolist(), high.tolist(), strict=True):
+            row = i + int(np.argmin(np.hypot(*(self.before[i:j, :2] - place[k]).T)))
+            was, now = self.before[row], self.after[row]
+            turn[k] = wrap_angle(now[2] - was[2])
+            c, s = np.cos(turn[k]), np.sin(turn[k])
+            dx, dy = place[k] - was[:2]
+            out[k] = now[0] + c * dx - s * dy, now[1] + s * dx + c * dy
+        return out, turn
+
+    def turned(self, place: Float, scan: Int) -> Float:
+        """By how much what stands at places is turned, shape (N,) [rad]; see `moved`."""
+        turn = np.zeros(len(place))
+        moves = np.flatnonzero(scan > self.first)
+        if len(moves) and self.last > self.first:
+            rows = self._nearest(place[moves])
+            turn[moves] = wrap_angle(self.after[rows, 2] - self.before[rows, 2])
+        return turn
+
+    def poses(self, pose: Float, scan: Int) -> Float:
+        """Poses near those of scans, shape (N, 3), moved with them."""
+        before, after = self.before[scan], self.after[scan]
+        turn = after[:, 2] - before[:, 2]
+        c, s = np.cos(turn), np.sin(turn)
+        dx, dy = (pose[:, :2] - before[:, :2]).T
+        return np.column_stack(
+            [after[:, 0] + c * dx - s * dy, after[:, 1] + s * dx + c * dy, wrap_angle(pose[:, 2] + turn)]
+        )
+
+    def _nearest(self, place: Float) -> Int:
+        """The scan that moves that was taken nearest to the tile of each place."""
+        from scipy.spatial import cKDTree
+
+        tiles, of = np.unique(np.floor(place / TILE), axis=0, return_inverse=True)
+        _, row = cKDTree(self.before[self.first + 1 : self.last + 1, :2]).query((tiles + 0.5) * TILE)
+        rows: Int = self.first + 1 + row[of.ravel()]
+        return rows

@@ -1,0 +1,208 @@
+"""Find a constellation of stems in a map: the pose and its covariance, or why there is none.
+
+A wrong loop ruins a map, a missed one costs little. So a pose is told only where (1) enough stems agree,
+(2) so many would not agree by chance, by the number of false alarms of the a contrario method (Desolneux,
+Moisan, Morel 2000), (3) no other pose explains nearly as many, which is what a plantation offers, and
+(4) the stems that agree fix the pose well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pipeline.config.stages import Relocalisation
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.loop_closure.stem_matching.alignment import aligned, alignment_covariance
+from pipeline.loop_closure.stem_matching.hypotheses import cells_of, crowding, pairs_within, partners, search
+from pipeline.loop_closure.stem_matching.stem_constellation import Stems
+from pipeline.types.records import Int, Int32
+
+Refusal = Literal[
+    "too few stems", "no agreement", "could be chance", "ambiguous", "most stems disagree", "weakly fixed"
+]
+SHORTEST, LONGEST = 2.0, 20.0  # m, of pairs; shorter ones leave the heading open, longer ones bend
+MOST_PAIRS = 2_000_000  # of the map
+BASE_PAIRS = 150  # of the constellation
+GOLDEN = 0.6180339887498949  # its multiples, modulo 1, spread evenly however many are taken
+LEAST = 4  # stems in agreement, of a hypothesis that is looked at
+REACH = 1.0  # m, at most, between two stems that agree
+ROUNDS = 8
+WIDE, WIDE_ROUNDS = 3.0, 2  # times the slack in the first rounds, when the pose is that of one pair
+WINDOW = 8.0  # m, in which the density of the map is taken
+FALSE_ALARMS = 1e-4  # expected number of agreements as good by chance
+SECOND_BEST = 0.7  # of the stems that agree in the best pose may agree in the second best, and
+LEAD = 3  # so many fewer at least
+AGREEING = 0.4  # of the local stems that come to lie among the map's
+SIGMA_XY, SIGMA_YAW = 0.5, 0.05  # m, rad
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """What came of a search.
+
+    Attributes:
+        pose: T_reference_local, None where it was refused.
+        covariance: Of x, y [m], yaw [rad], shape (3, 3); zeros where refused.
+        reason: Why there is no pose; None where there is one.
+        local, reference: Rows of the stems that agree in the best pose, int64, shape (K,).
+        second: How many agree in the best other pose.
+        false_alarms: Expected number of agreements as good by chance, as a decimal logarithm.
+    """
+
+    pose: Pose2 | None
+    covariance: Float
+    reason: Refusal | None
+    local: Int
+    reference: Int
+    second: int
+    false_alarms: float
+
+
+def find_constellation(
+    local: Stems, reference: Stems, parameters: Relocalisation, *, hypotheses: int = 300_000
+) -> Match:
+    """Find where local stems stand in a reference map; no guess is needed.
+
+    Args:
+        local: In their own frame, e.g. what was mapped since the robot was lost.
+        reference: In the frame of the map.
+        parameters: Of this stage.
+        hypotheses: About how many are looked at before the search ends.
+    """
+    rows, map_rows = np.flatnonzero(local.usable()), np.flatnonzero(reference.usable())
+    search_ = _Search(local.take(rows), reference.take(map_rows), parameters, hypotheses)
+    best, second = search_.best_two()
+    if best is None:
+        none = np.zeros(0, np.int64)
+        return Match(None, np.zeros((3, 3)), search_.reason, none, none, 0, 0.0)
+    pose, covariance, chance, reason = search_.judged(best, 0 if second is None else second.found)
+    at = np.flatnonzero(best.of >= 0)
+    return Match(
+        pose=pose if reason is None else None,
+        covariance=covariance if reason is None else np.zeros((3, 3)),
+        reason=reason,
+        local=rows[at],
+        reference=map_rows[best.of[at]],
+        second=0 if second is None else second.found,
+        false_alarms=chance,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A refined pose x, y, yaw; the row of the map of each local stem, -1 for none; how many there are."""
+
+    pose: Float
+    of: Int
+    found: int
+
+    def is_same(self, other: _Candidate) -> bool:
+        """Whether it pairs the stems as another one does, by more than half."""
+        return 2 * int(np.count_nonzero((self.of >= 0) & (self.of == other.of))) > self.found
+
+
+class _Search:
+    """One search; local stems are kept about their mean, so that a turn moves them least."""
+
+    def __init__(self, local: Stems, reference: Stems, parameters: Relocalisation, most: int) -> None:
+        self.reason: Refusal = "too few stems"
+        self._p = parameters
+        self._mean: Float = local.position.mean(axis=0) if len(local) else np.zeros(2)
+        self._local = Stems(local.position - self._mean, local.sigma, local.dbh, local.dbh_sigma)
+        self._reference = reference
+        self._most, self._looked = most, 0
+
+    def best_two(self) -> tuple[_Candidate | None, _Candidate | None]:
+        """The pose in which most stems agree, and the best one that pairs them differently."""
+        local, reference, p = self._local, self._reference, self._p
+        if min(len(local), len(reference)) < p.stems_min:
+            return None, None
+        self.reason = "no agreement"
+        base, _ = pairs_within(local.position, SHORTEST, LONGEST, MOST_PAIRS)
+        pair, length = pairs_within(reference.position, SHORTEST - 1.0, LONGEST + 1.0, MOST_PAIRS)
+        if not len(base) or not len(pair):
+            return None, None
+        self._grid = cells_of(reference.position, REACH)
+        rough, _, self._looked = search(
+            *self._columns(local), _evenly(base), *self._columns(reference), pair, length, *self._grid,
+            p.slack, REACH, LEAST, self._most,
+        )  # fmt: skip
+        refined = sorted((self._refined(pose) for pose in rough), key=lambda c: -c.found)
+        if not refined or refined[0].found < LEAST:
+            return None, None
+        best = refined[0]
+        return best, next((c for c in refined[1:] if not c.is_same(best)), None)
+
+    def judged(self, best: _Candidate, second: int) -> tuple[Pose2, Float, float, Refusal | None]:
+        """The pose with covariance, the logarithm of the false alarms, and why it is refused if it is."""
+        local, reference = self._local, self._reference
+        at = np.flatnonzero(best.of >= 0)
+        about_mean = Pose2(*(float(v) for v in best.pose))
+        pose = about_mean @ Pose2(-float(self._mean[0]), -float(self._mean[1]))
+        to = best.of[at]
+        variance = local.sigma[at] ** 2 + reference.sigma[to] ** 2 + self._p.slack**2
+        own = local.position[at] + self._mean
+        covariance = alignment_covariance(pose, own, reference.position[to], variance)
+        density, inside = crowding(best.pose, local.position, reference.position, WINDOW)
+        reach2 = 9.0 * (float(np.mean(local.sigma**2) + np.mean(reference.sigma**2)) + self._p.slack**2)
+        p = float(1.0 - np.exp(-density * np.pi * min(reach2, REACH**2)))
+        chance = _log10_false_alarms(self._looked, len(local) - 2, best.found - 2, p)
+        at_mean = alignment_covariance(about_mean, local.position[at], reference.position[to], variance)
+        return pose, covariance, chance, self._refusal(best.found, second, chance, inside, at_mean)
+
+    def _refusal(
+        self, found: int, second: int, chance: float, inside: int, covariance: Float
+    ) -> Refusal | None:
+        if found < self._p.stems_min:
+            return "too few stems"
+        if chance > np.log10(FALSE_ALARMS):
+            return "could be chance"
+        if second > SECOND_BEST * found or second > found - LEAD:
+            return "ambiguous"
+        if found < AGREEING * inside:
+            return "most stems disagree"
+        sigma = np.sqrt(np.diag(covariance))
+        if max(sigma[:2]) > SIGMA_XY or sigma[2] > SIGMA_YAW:
+            return "weakly fixed"
+        return None
+
+    def _refined(self, pose: Float) -> _Candidate:
+        """Pair and align in turns until the pairs stay."""
+        local, reference = self._local, self._reference
+        pose = pose.copy()
+        of, before = np.full(len(local), -1, np.int64), np.full(len(local), -2, np.int64)
+        found = 0
+        for k in range(ROUNDS):
+            slack = self._p.slack * (WIDE if k < WIDE_ROUNDS else 1.0)
+            found = partners(
+                pose, *self._columns(local), *self._columns(reference), *self._grid, slack, REACH, of
+            )
+            if found < 2 or (k > WIDE_ROUNDS and np.array_equal(of, before)):
+                break
+            at = np.flatnonzero(of >= 0)
+            to = of[at]
+            weight = 1.0 / (local.sigma[at] ** 2 + reference.sigma[to] ** 2 + self._p.slack**2)
+            aligned(local.position[at], reference.position[to], weight, found, pose)
+            before = of.copy()
+        return _Candidate(pose, of, found)
+
+    @staticmethod
+    def _columns(stems: Stems) -> tuple[Float, Float, Float, Float]:
+        return stems.position, stems.sigma, stems.dbh, stems.dbh_sigma
+
+
+def _evenly(base: Int32) -> Int32:
+    """At most BASE_PAIRS of the pairs, in an order of which every beginning is even over their lengths."""
+    rows = np.linspace(0, len(base) - 1, min(len(base), BASE_PAIRS)).astype(np.int64)
+    return base[rows[np.argsort(np.arange(len(rows)) * GOLDEN % 1.0, kind="stable")]]
+
+
+def _log10_false_alarms(tests: int, trials: int, hits: int, p: float) -> float:
+    """log10 of tests * P(Binomial(trials, p) >= hits)."""
+    from scipy.stats import binom
+
+    tail = float(binom.logsf(hits - 1, max(trials, 1), p)) / np.log(10.0)
+    return float(np.log10(max(tests, 1)) + max(tail, -300.0))

@@ -1,0 +1,64 @@
+"""Stems of a map as a constellation sees them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.poses import Float
+from pipeline.types.records import Bool, Int, Trees
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stems:
+    """Columns of N stems in the frame of one map.
+
+    Attributes:
+        position: shape (N, 2) [m].
+        sigma: Standard deviation of a position in its worst direction, shape (N,) [m].
+        dbh: Diameter at breast height, NaN where unknown, shape (N,) [m]; dbh_sigma: of it, shape (N,).
+    """
+
+    position: Float
+    sigma: Float
+    dbh: Float
+    dbh_sigma: Float
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    @classmethod
+    def at(cls, position: Float, sigma: float = 0.05) -> Stems:
+        """Stems of which the place alone is known, positions of shape (N, 2) [m]."""
+        n = len(position)
+        unknown = np.full(n, np.nan)
+        return cls(np.asarray(position, np.float64).reshape(n, 2), np.full(n, sigma), unknown, unknown)
+
+    @classmethod
+    def of_trees(cls, trees: Trees) -> Stems:
+        """The confirmed trees of a map."""
+        kept = trees.confirmed
+        unknown = np.isnan(trees.dbh[kept])
+        return cls(
+            trees.position[kept],
+            worst_sigma(trees.covariance[kept][:, [0, 0, 1], [0, 1, 1]]),
+            trees.dbh[kept],
+            np.where(unknown, np.nan, trees.dbh_sigma[kept]),
+        )
+
+    def usable(self) -> Bool:
+        """Which of them stand at a finite place that is known to some extent, shape (N,)."""
+        finite: Bool = np.isfinite(self.position).all(axis=1) & np.isfinite(self.sigma) & (self.sigma >= 0.0)
+        return finite
+
+    def take(self, rows: Int | Bool) -> Stems:
+        """Some of them."""
+        return Stems(self.position[rows], self.sigma[rows], self.dbh[rows], self.dbh_sigma[rows])
+
+
+def worst_sigma(covariance: Float) -> Float:
+    """Square root of the larger eigenvalue of covariances xx, xy, yy, shape (N, 3) -> (N,) [m]."""
+    xx, xy, yy = covariance[:, 0], covariance[:, 1], covariance[:, 2]
+    largest: Float = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
+    return np.sqrt(np.maximum(largest, 0.0))

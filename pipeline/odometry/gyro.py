@@ -1,0 +1,186 @@
+"""The gyroscope: how far the robot turned between two scans, and what that says of its wheels.
+
+Wheels that slip tell a wrong turn, a gyroscope does not; it has a bias instead, which is seen while the robot
+stands. Turn rates are about the vertical: (w_y sin roll + w_z cos roll) / cos pitch. It may hang upside down
+where nobody said how it is mounted, or tell degrees, so it is not asked before it turned as the wheels did.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from pipeline.geometry.poses import Pose2, wrap_angle
+from pipeline.types.records import Imu, Learnt, Turn
+
+KEEP_NS = 3_000_000_000
+GAP_NS = 60_000_000  # a longer time without a reading is a hole
+AROUND_NS = 50_000_000  # to both sides of a scan's stamp, for the rate at its time
+BLOCK = 50  # readings in a row that are looked at for a bias
+BLOCKS_MOST = 20  # that are averaged: the bias wanders
+STILL_SIGMA, STILL_MOST = 0.03, 0.1  # rad/s; scatter and mean of a block in which the robot stands
+DEAD = 20  # the same reading so many times is no gyroscope
+NOISE = 1e-3  # rad/sqrt(s), of a small MEMS gyroscope on a robot that shakes
+SCALE = 0.01  # of the turn
+BIAS_UNKNOWN, BIAS_KNOWN = 0.01, 5e-4  # rad/s
+WANDERS = 10.0  # s, over which what is left of a bias errs alike: short scans must not take it for noise
+CONTRADICTION, CONTRADICTION_LEAST = 4.0, 0.01  # sigma, rad
+PROOF, ALIKE = 0.1, 3.0  # rad by the wheels; and what a gyroscope that is right may differ by, as a factor
+HALF_TRACK = 0.5  # m; wheels that told a turn wrongly by an angle slipped by so much of it
+SLIPPED = "the wheels and the gyroscope tell different turns: the wheels slip"
+
+
+class Gyro:
+    """Readings of the last seconds, and the bias."""
+
+    def __init__(self) -> None:
+        self._readings: deque[tuple[int, float]] = deque()
+        self._block: list[float] = []
+        self._blocks, self._bias, self._scatter = 0, 0.0, 0.0
+        self._same = 0
+        self._turned = (0.0, 0.0, 0.0)
+        self._proven = False
+
+    def add(self, imu: Imu, tilt: tuple[float, float], *, standing: bool, needed_ns: int) -> None:
+        """One reading more, later than those before it.
+
+        Args:
+            tilt: Roll and pitch [rad].
+            standing: Whether the wheels stand still.
+            needed_ns: Readings from shortly before this time on are kept.
+        """
+        _, wy, wz = (float(w) for w in imu.angular_velocity)
+        roll, pitch = tilt
+        rate = (wy * math.sin(roll) + wz * math.cos(roll)) / max(math.cos(pitch), 0.1)
+        last = self._readings[-1][1] if self._readings else math.nan
+        self._same = self._same + 1 if rate == last else 0
+        self._readings.append((imu.stamp_ns, rate))
+        while self._readings[0][0] < min(needed_ns, imu.stamp_ns) - KEEP_NS:
+            self._readings.popleft()
+        self._learn_bias(rate, standing=standing)
+
+    def forget_since(self, stamp_ns: int) -> None:
+        """Drop the readings of this time and later: they were of no such time."""
+        while self._readings and self._readings[-1][0] >= stamp_ns:
+            self._readings.pop()
+
+    def _learn_bias(self, rate: float, *, standing: bool) -> None:
+        if not standing:
+            self._block.clear()
+            return
+        self._block.append(rate)
+        if len(self._block) < BLOCK:
+            return
+        mean, sigma = float(np.mean(self._block)), float(np.std(self._block))
+        self._block.clear()
+        if sigma < STILL_SIGMA and abs(mean) < STILL_MOST:
+            self._blocks = min(self._blocks + 1, BLOCKS_MOST)
+            self._bias += (mean - self._bias) / self._blocks
+            self._scatter += (sigma - self._scatter) / self._blocks
+
+    def learnt(self, stamp_ns: int) -> Learnt:
+        """What the readings so far have taught, as of a time."""
+        block = tuple(self._block)
+        of_bias = stamp_ns, self._bias, self._scatter, self._blocks, block
+        return Learnt(*of_bias, self._same, self._turned, self._proven)
+
+    def go_on_from(self, learnt: Learnt) -> None:
+        """Know what was learnt before; readings are kept as they are."""
+        self._bias, self._scatter = learnt.bias, learnt.scatter
+        self._blocks, self._block = learnt.blocks, list(learnt.block)
+        self._same, self._turned, self._proven = learnt.same, learnt.turned, learnt.proven
+
+    @property
+    def proven(self) -> bool:
+        """Whether it was seen to turn as the wheels do."""
+        return self._proven
+
+    def compare(self, by_wheels: float, turn: Turn) -> None:
+        """Take both turns of one step [rad]; the slope of a line through all of them proves the gyroscope."""
+        way, square, product = self._turned
+        way, square = way + abs(by_wheels), square + by_wheels**2
+        self._turned = (way, square, product + by_wheels * turn.angle)
+        alike = square < ALIKE * self._turned[2] < ALIKE**2 * square
+        self._proven = self._proven or (way >= PROOF and alike)
+
+    @property
+    def bias(self) -> float:
+        """Of the turn rate [rad/s], 0 before the robot stood."""
+        return self._bias
+
+    def turn(self, from_ns: int, to_ns: int) -> Turn | None:
+        """The turn between two times; None where readings are missing."""
+        angle = self._integral(from_ns, to_ns)
+        if angle is None:
+            return None
+        seconds = (to_ns - from_ns) * 1e-9
+        angle -= self._bias * seconds
+        bias_sigma = BIAS_UNKNOWN
+        if self._blocks:
+            bias_sigma = math.hypot(BIAS_KNOWN, self._scatter / math.sqrt(BLOCK * self._blocks))
+        of_bias = bias_sigma**2 * seconds * max(seconds, WANDERS)
+        variance = NOISE**2 * seconds + of_bias + (SCALE * angle) ** 2
+        return Turn(angle, math.sqrt(variance))
+
+    def rate(self, stamp_ns: int) -> float | None:
+        """The turn rate around a time [rad/s]; None where readings are missing."""
+        near = [rate for _, rate in self._between(stamp_ns - AROUND_NS, stamp_ns + AROUND_NS)]
+        return None if not near or self._is_dead else float(np.mean(near)) - self._bias
+
+    @property
+    def _is_dead(self) -> bool:
+        """Whether it says the same again and again, or has said nothing else yet."""
+        return self._same >= min(DEAD, max(len(self._readings) - 1, 1))
+
+    def _between(self, from_ns: int, to_ns: int) -> list[tuple[int, float]]:
+        found = []
+        for reading in reversed(self._readings):
+            if reading[0] < from_ns:
+                break
+            if reading[0] <= to_ns:
+                found.append(reading)
+        return found[::-1]
+
+    def _integral(self, from_ns: int, to_ns: int) -> float | None:
+        """Of the rate by trapezoids [rad]; the rate stays as it is before the first and after the last."""
+        inside = self._between(from_ns - GAP_NS, to_ns + GAP_NS)
+        if self._is_dead or not inside or to_ns <= from_ns:
+            return None
+        at = np.array([(stamp - from_ns) * 1e-9 for stamp, _ in inside])
+        end, gap = (to_ns - from_ns) * 1e-9, GAP_NS * 1e-9
+        if at[0] > gap or at[-1] < end - gap or np.any(np.diff(at) > gap):
+            return None
+        grid = np.unique(np.concatenate([[0.0, end], at[(at > 0.0) & (at < end)]]))
+        rates = np.interp(grid, at, [rate for _, rate in inside])
+        return float(np.trapezoid(rates, grid))
+
+
+def fused(
+    step: Pose2, sigma: float, slack: tuple[float, float], turn: Turn
+) -> tuple[Pose2, float, tuple[float, float], str]:
+    """A step of the wheels with the turn that the gyroscope tells.
+
+    Both turns are weighed by their variances; where they contradict one another the gyroscope is believed.
+    The way goes along the middle of the turn, so it is turned by half of what the turn is corrected by.
+
+    Args:
+        step: By the wheels; sigma: of its turn [rad]; slack: see `records.Step`.
+
+    Returns:
+        The step, the sigma of its turn [rad], the slack that is left, and why the wheels are doubted, empty
+        where they are not.
+    """
+    of_wheels, of_gyro = sigma**2 + slack[1] ** 2, turn.sigma**2
+    gap = float(wrap_angle(turn.angle - step.yaw))
+    total = of_wheels + of_gyro
+    if abs(gap) > max(CONTRADICTION * math.sqrt(total), CONTRADICTION_LEAST):
+        return _turned(step, gap), turn.sigma, (math.hypot(slack[0], HALF_TRACK * gap), 0.0), SLIPPED
+    share = of_wheels / total if total > 0.0 else 0.0
+    return _turned(step, share * gap), math.sqrt(share * of_gyro), (slack[0], 0.0), ""
+
+
+def _turned(step: Pose2, by: float) -> Pose2:
+    c, s = math.cos(0.5 * by), math.sin(0.5 * by)
+    return Pose2(c * step.x - s * step.y, s * step.x + c * step.y, float(wrap_angle(step.yaw + by)))

@@ -1,0 +1,134 @@
+"""Odometry beside scans: without jumps, where the base was, how fast, and since when it stands."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.geometry.poses import Pose2, Pose3, interpolate, wrap_angle
+from pipeline.types.records import Odometry
+
+KEEP_NS = 2_000_000_000
+JUMP_SPEED, JUMP_TURN = 15.0, 6.0  # m/s, rad/s; nothing that maps trees moves this fast
+STANDS = (0.005, 0.002)  # m, rad; a robot that stands stays within it
+STILL = (0.0, 0.0, 0.0)
+
+Tilt = tuple[float, float]  # roll, pitch [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Odometry as it is used: in the plane, without jumps; tilt None where it knows the plane alone."""
+
+    stamp_ns: int
+    pose: Pose2
+    tilt: Tilt | None
+
+
+class Jump(NamedTuple):
+    """A step that no robot makes: distance [m], turn [rad] (absolute)."""
+
+    distance: float
+    turn: float
+
+
+class Moving(NamedTuple):
+    """The base at a time: T_odom_base, its velocity x, y [m/s], yaw [rad/s] in its own frame, and its tilt
+    where the odometry is of the whole pose."""
+
+    pose: Pose2
+    twist: tuple[float, float, float]
+    tilt: Tilt | None
+
+
+class OdometryInTime:
+    """The newest readings, as if every jump so far had been no motion at all.
+
+    Attributes:
+        stands: Since when [ns] the robot has been standing, and where; of the last reading.
+    """
+
+    def __init__(self) -> None:
+        self._readings: deque[Reading] = deque()
+        self._T_odom_jumped = Pose2()
+        self.stands: tuple[int, Pose2] | None = None
+
+    @property
+    def newest(self) -> Reading | None:
+        """The last reading, None before the first."""
+        return self._readings[-1] if self._readings else None
+
+    def add(self, odometry: Odometry) -> Jump | None:
+        """Keep a reading with finite numbers that is later than the one before; what of it was a jump."""
+        raw, jump = odometry.T_odom_base.planar(), None
+        pose = self._T_odom_jumped @ raw
+        if self._readings:
+            last = self._readings[-1]
+            step = last.pose.inverse() @ pose
+            span = max((odometry.stamp_ns - last.stamp_ns) * 1e-9, 0.1)
+            distance = float(np.hypot(step.x, step.y))
+            if distance > JUMP_SPEED * span or abs(step.yaw) > JUMP_TURN * span:
+                jump = Jump(distance, abs(step.yaw))
+                self._T_odom_jumped = last.pose @ raw.inverse()
+                pose = self._T_odom_jumped @ raw
+        reading = Reading(odometry.stamp_ns, pose, _tilt(odometry.T_odom_base))
+        self._readings.append(reading)
+        self._watch_standing(reading)
+        return jump
+
+    def _watch_standing(self, reading: Reading) -> None:
+        if self.stands is not None:
+            away = self.stands[1].inverse() @ reading.pose
+            if np.hypot(away.x, away.y) < STANDS[0] and abs(away.yaw) < STANDS[1]:
+                return
+        self.stands = (reading.stamp_ns, reading.pose)
+
+    def forget(self, needed_ns: int) -> None:
+        """Drop what no scan from that time on will ask for."""
+        while len(self._readings) > 2 and self._readings[1].stamp_ns < needed_ns - KEEP_NS:
+            self._readings.popleft()
+
+    def pose_at(self, stamp_ns: int) -> Pose2:
+        """T_odom_base at a time, that of the nearest reading where it lies outside; there is a reading."""
+        before, after = self._around(stamp_ns)
+        span = after.stamp_ns - before.stamp_ns
+        fraction = (stamp_ns - before.stamp_ns) / span if span > 0 else 1.0
+        return interpolate(before.pose, after.pose, min(max(fraction, 0.0), 1.0))
+
+    def motion_at(self, stamp_ns: int) -> Moving:
+        """The base at a time; there is a reading."""
+        before, after = self._around(stamp_ns)
+        span = (after.stamp_ns - before.stamp_ns) * 1e-9
+        if span <= 0.0:
+            return Moving(after.pose, STILL, after.tilt)
+        fraction = float(np.clip((stamp_ns - before.stamp_ns) * 1e-9 / span, 0.0, 1.0))
+        step = before.pose.inverse() @ after.pose
+        twist = (step.x / span, step.y / span, step.yaw / span)
+        return Moving(
+            interpolate(before.pose, after.pose, fraction), twist, _tilt_between(before, after, fraction)
+        )
+
+    def _around(self, stamp_ns: int) -> tuple[Reading, Reading]:
+        """The readings before and after a time; the two nearest ones where it lies outside."""
+        readings = self._readings
+        after = next((k for k, r in enumerate(readings) if r.stamp_ns >= stamp_ns), len(readings) - 1)
+        after = max(after, min(1, len(readings) - 1))
+        return readings[max(after - 1, 0)], readings[after]
+
+
+def _tilt_between(before: Reading, after: Reading, fraction: float) -> Tilt | None:
+    """Roll and pitch between two readings; a reading in the plane beside one in space is level by chance."""
+    if before.tilt is None and after.tilt is None:
+        return None
+    (roll, pitch), (roll_after, pitch_after) = before.tilt or (0.0, 0.0), after.tilt or (0.0, 0.0)
+    turn = float(wrap_angle(roll_after - roll))
+    return roll + fraction * turn, pitch + fraction * (pitch_after - pitch)
+
+
+def _tilt(T_odom_base: Pose3) -> Tilt | None:
+    """Roll and pitch of a pose in space; None for wheel odometry, which knows the plane alone."""
+    roll, pitch, _ = T_odom_base.euler()
+    return None if roll == 0.0 and pitch == 0.0 else (roll, pitch)

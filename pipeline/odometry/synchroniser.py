@@ -1,0 +1,312 @@
+"""Steps: each scan joined with the motion and the tilt at its time."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from pipeline.geometry.poses import Pose2, Pose3, wrap_angle
+from pipeline.odometry.gyro import Gyro
+from pipeline.odometry.odometry_buffer import KEEP_NS, STILL, Jump, OdometryInTime, Tilt
+from pipeline.odometry.pose_buffer import MeasuredInTime
+from pipeline.types.records import Imu, Learnt, Notice, Odometry, PoseMeasurement, Record, Scan, Step, Turn
+
+OdometryChoice = Literal["auto", "wheels", "static"]
+WAIT = 5  # scans that wait for the odometry that follows them before they go without
+STALE_NS = 250_000_000  # a reading farther away in time than this says nothing of a scan
+JUMP_SLACK = (0.2, 0.05)  # m, rad; what the robot may have moved while its odometry jumped
+PAUSE_NS = 10_000_000_000  # without a scan; trees that were in view may be out of it
+WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion that no odometry told
+WALK_MOST = (3.0, 0.5)  # m, rad; beyond it the trees around are others
+SETTLES_NS = 300_000_000
+AHEAD_NS = 1_000_000_000
+TILTS_NS = 90_000_000
+NO_ODOMETRY = (
+    "there is no odometry for some scans: the robot stands still in them, unless trees tell its motion"
+)
+FASTEST = 20.0  # rad/s; a robot that maps trees, whatever it shakes like, does not turn this fast
+
+
+def steps(
+    records: Iterable[Record],
+    *,
+    odometry: OdometryChoice = "auto",
+    first_index: int = 0,
+    losses: Counter[str] | None = None,
+    after: Learnt | None = None,
+) -> Iterator[Step]:
+    """Join scans with the pose by odometry, interpolated to their time, and the tilt.
+
+    A scan is held back until the first odometry at or after its stamp has come, or until five
+    scans wait; then the last pose stands for it. A scan that is not later than the one before it
+    is left out, counted in `losses` and said in the warnings of the next step.
+
+    Args:
+        records: In the order in which they came.
+        odometry: "static" leaves poses aside: the robot stands still.
+        first_index: Number of the first step.
+        losses: Counts what was left out, by reason.
+        after: What had been learnt until a step of an earlier reading, where the records begin shortly before
+            that step.
+    """
+    counted = Counter[str]() if losses is None else losses
+    joiner = Joiner(use_odometry=odometry != "static", index=first_index, losses=counted, after=after)
+    for record in records:
+        joiner.add(record)
+        yield from joiner.ready()
+    yield from joiner.ready(end=True)
+
+
+class Joiner:
+    """Takes records one by one, in the order in which they came, and gives the steps that are ready.
+
+    Args:
+        use_odometry: Else poses are left aside and no scan waits for one.
+        index: Number of the first step.
+        losses: Counts what was left out, by reason.
+        after: See `steps`.
+    """
+
+    def __init__(
+        self, *, use_odometry: bool, index: int, losses: Counter[str], after: Learnt | None = None
+    ) -> None:
+        self._losses = losses
+        self._use_odometry = use_odometry
+        self._index = index
+        self._scans: deque[Scan] = deque()
+        self._odometry = OdometryInTime()
+        self._imu: deque[Imu] = deque()
+        self._gyro = Gyro()
+        self._after = after
+        if after is not None:
+            self._gyro.go_on_from(after)
+        self._stepped: Pose2 | None = None  # the odometry of the step before
+        self._turned_ns: int | None = None
+        self._gyro_tilt = (0, 0.0, 0.0)  # when [ns], roll and pitch [rad]
+        self._measured = MeasuredInTime()
+        self._slack = (0.0, 0.0)
+        self._doubt = ""
+        self._stepped_ns: int | None = None
+        self._last_stamp: int | None = None
+        self._warnings: list[str] = []
+
+    def add(self, record: Record) -> None:
+        """Take a record of any kind."""
+        match record:
+            case Scan():
+                self._add_scan(record)
+            case Odometry():
+                self._add_odometry(record)
+            case PoseMeasurement():
+                self._add_pose(record)
+            case Imu():
+                self._add_imu(record)
+            case Notice():
+                self._warn(record.text)
+
+    def _add_scan(self, scan: Scan) -> None:
+        if self._last_stamp is not None and scan.stamp_ns <= self._last_stamp:
+            self._leave_out("scans that were not later than the one before")
+            return
+        self._last_stamp = scan.stamp_ns
+        self._scans.append(scan)
+
+    def _add_odometry(self, odometry: Odometry) -> None:
+        T = odometry.T_odom_base
+        if not (np.all(np.isfinite(T.t)) and np.all(np.isfinite(T.R))):
+            self._leave_out("odometry readings without finite numbers")
+        elif (newest := self._odometry.newest) is not None and odometry.stamp_ns <= newest.stamp_ns:
+            self._leave_out("odometry readings that were not later than the one before")
+        elif self._use_odometry:
+            jump = self._odometry.add(odometry)
+            if jump is not None:
+                self._tell_jump(jump)
+            self._odometry.forget(self._needed_ns(odometry.stamp_ns))
+
+    def _tell_jump(self, jump: Jump) -> None:
+        self._warn(
+            f"the odometry jumped by {jump.distance:.1f} m and {np.degrees(jump.turn):.0f} degrees; "
+            "that is not taken as motion"
+        )
+        self._suspect("the odometry jumped", JUMP_SLACK)
+
+    def _add_pose(self, pose: PoseMeasurement) -> None:
+        if not pose.is_sound():
+            self._leave_out("measured poses without finite numbers or a positive definite covariance")
+        elif not self._measured.add(pose):
+            self._leave_out("measured poses that were not later than the one before")
+
+    def _suspect(self, why: str, slack: tuple[float, float]) -> None:
+        self._doubt = why
+        self._slack = (float(np.hypot(self._slack[0], slack[0])), float(np.hypot(self._slack[1], slack[1])))
+
+    def _add_imu(self, imu: Imu) -> None:
+        if (
+            self._turned_ns is not None
+            and imu.stamp_ns <= self._turned_ns
+            and not self._was_ahead(imu.stamp_ns)
+        ):
+            self._leave_out("IMU readings that were not later than the one before")
+            return
+        self._turned_ns = imu.stamp_ns
+        self._add_turn_rate(imu)
+        if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
+            return
+        if self._imu and imu.stamp_ns <= self._imu[-1].stamp_ns:
+            return
+        self._imu.append(imu)
+        while len(self._imu) > 2 and self._imu[1].stamp_ns < self._needed_ns(imu.stamp_ns) - KEEP_NS:
+            self._imu.popleft()
+
+    def _was_ahead(self, stamp_ns: int) -> bool:
+        """Whether the IMU's reading before was of no such time, so that this one counts in its place: then it
+        lies farther from all else than this one does, by more than the order of messages can be mixed up."""
+        last = self._turned_ns
+        newest = self._odometry.newest
+        others = [s.stamp_ns for s in self._scans] + ([] if newest is None else [newest.stamp_ns])
+        if last is None or last - stamp_ns < AHEAD_NS or not others:
+            return False
+        if abs(stamp_ns - max(others)) >= abs(last - max(others)):
+            return False
+        self._gyro.forget_since(stamp_ns)
+        while self._imu and self._imu[-1].stamp_ns >= stamp_ns:
+            self._imu.pop()
+        self._leave_out("IMU readings that were ahead of their time")
+        return True
+
+    def _add_turn_rate(self, imu: Imu) -> None:
+        if not np.all(np.isfinite(imu.angular_velocity)):
+            return
+        if np.abs(imu.angular_velocity).max() > FASTEST:
+            self._leave_out("readings of the gyroscope that no robot turns as fast as")
+            return
+        stands, newest = self._odometry.stands, self._odometry.newest
+        settled = stands is not None and imu.stamp_ns - stands[0] > SETTLES_NS
+        fresh = newest is not None and imu.stamp_ns - newest.stamp_ns < STALE_NS
+        still = settled and fresh and self._after is None
+        oldest = self._needed_ns(imu.stamp_ns)
+        # A tilt changes the rate by its square alone; counted so that it does not hang on the first reading.
+        if imu.stamp_ns // TILTS_NS != self._gyro_tilt[0] // TILTS_NS:
+            self._gyro_tilt = (imu.stamp_ns, *(_tilt_of(imu) or (0.0, 0.0)))
+        self._gyro.add(imu, self._gyro_tilt[1:], standing=still, needed_ns=oldest)
+
+    def _needed_ns(self, now_ns: int) -> int:
+        """From when on readings may still be asked for: that of the oldest scan that waits."""
+        return self._scans[0].stamp_ns if self._scans else now_ns
+
+    def ready(self, *, end: bool = False) -> Iterator[Step]:
+        """Steps whose odometry has come, in order."""
+        while self._scans and (end or self._is_ready(self._scans[0])):
+            yield self._join(self._scans.popleft())
+
+    def _is_ready(self, scan: Scan) -> bool:
+        if len(self._scans) > WAIT:
+            return True
+        newest = self._odometry.newest
+        return not self._use_odometry if newest is None else newest.stamp_ns >= scan.stamp_ns
+
+    def _join(self, scan: Scan) -> Step:
+        if self._stepped_ns is None and self._after is not None and self._after.stamp_ns < scan.stamp_ns:
+            self._stepped_ns = self._after.stamp_ns
+        self._tell_pause(scan.stamp_ns)
+        pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
+        tilt = self._tilt_at(scan.stamp_ns) or base_tilt
+        turn = self._turn_to(scan.stamp_ns, pose)
+        odometry_at = None if self._odometry.newest is None else self._odometry.pose_at
+        step = Step(
+            index=self._index,
+            scan=scan,
+            T_odom_base=pose,
+            roll=tilt[0] if tilt else 0.0,
+            pitch=tilt[1] if tilt else 0.0,
+            tilt_known=tilt is not None,
+            twist=twist,
+            warnings=tuple(self._warnings),
+            doubt=self._doubt,
+            slack=self._slack,
+            measured=self._measured.at(scan.stamp_ns, pose, odometry_at),
+            turn=turn if self._gyro.proven else None,
+            turn_rate=self._gyro.rate(scan.stamp_ns) if self._gyro.proven or pose is None else None,
+            learnt=replace(
+                self._gyro.learnt(scan.stamp_ns), stands=self._odometry.stands, tilt=self._gyro_tilt
+            ),
+        )
+        if self._after is not None and scan.stamp_ns >= self._after.stamp_ns:
+            step = replace(step, learnt=self._after)
+            self._gyro.go_on_from(self._after)
+            self._odometry.stands, self._gyro_tilt = self._after.stands, self._after.tilt
+            self._after = None
+        self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
+        self._stepped = pose
+        self._index += 1
+        self._warnings.clear()
+        return step
+
+    def _turn_to(self, stamp_ns: int, pose: Pose2 | None) -> Turn | None:
+        """By the gyroscope since the step before, compared with the odometry where that has no doubt."""
+        turn = None if self._stepped_ns is None else self._gyro.turn(self._stepped_ns, stamp_ns)
+        if turn is None or pose is None or self._stepped is None or self._doubt or self._after is not None:
+            return turn
+        self._gyro.compare(float(wrap_angle(pose.yaw - self._stepped.yaw)), turn)
+        return turn
+
+    def _motion_at(self, stamp_ns: int) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None]:
+        """Pose, velocity in the base frame, and tilt where the odometry is of the whole pose."""
+        newest = self._odometry.newest
+        if newest is None:
+            if self._use_odometry:
+                self._bridge(stamp_ns)
+            return None, STILL, None
+        if stamp_ns > newest.stamp_ns + STALE_NS:
+            self._bridge(stamp_ns)
+            return newest.pose, STILL, None
+        return self._odometry.motion_at(stamp_ns)
+
+    def _tell_pause(self, stamp_ns: int) -> None:
+        """Of a long time without a scan the odometry alone tells; the trees after it may contradict that."""
+        seconds = 0.0 if self._stepped_ns is None else (stamp_ns - self._stepped_ns) * 1e-9
+        if seconds * 1e9 > PAUSE_NS:
+            self._warn(f"no scan came for {seconds:.0f} s: where the robot is then, the odometry alone tells")
+            self._suspect(f"no scan came for {seconds:.0f} s", (0.0, 0.0))
+
+    def _bridge(self, stamp_ns: int) -> None:
+        """Nothing told the motion since the scan before: it may have been any walk of a robot."""
+        self._warn(NO_ODOMETRY)
+        since = self._stepped_ns if self._stepped_ns is not None else stamp_ns
+        seconds = (stamp_ns - since) * 1e-9
+        self._suspect(
+            "there is no odometry",
+            (min(WALK_SPEED * seconds, WALK_MOST[0]), min(WALK_TURN * seconds, WALK_MOST[1])),
+        )
+
+    def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
+        if not self._imu:
+            return None
+        nearest = min(self._imu, key=lambda imu: abs(imu.stamp_ns - stamp_ns))
+        if abs(nearest.stamp_ns - stamp_ns) > STALE_NS:
+            self._warn("there is no IMU reading for some scans: they are not levelled by it")
+            return None
+        return _tilt_of(nearest)
+
+    def _leave_out(self, reason: str) -> None:
+        self._losses[reason] += 1
+        self._warn(f"left out: {reason}")
+
+    def _warn(self, text: str) -> None:
+        if text not in self._warnings:
+            self._warnings.append(text)
+
+
+def _tilt_of(imu: Imu) -> tuple[float, float] | None:
+    """Roll and pitch by a reading's orientation, None where it tells none."""
+    if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
+        return None
+    try:
+        roll, pitch, _ = Pose3.from_quaternion(np.zeros(3), imu.orientation).euler()
+    except ValueError:
+        return None
+    return roll, pitch

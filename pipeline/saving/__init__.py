@@ -1,6 +1,0 @@
-"""Saving: records of the pipeline in a file, without a pickle, with every size checked."""
-
-from pipeline.saving.archive import read_archive, write_archive
-from pipeline.saving.codec import decode, encode
-
-__all__ = ["decode", "encode", "read_archive", "write_archive"]

@@ -1,0 +1,128 @@
+"""Which detection is which tree: by likelihood, one to one."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.geometry.hash_grid import Cells, cell_of, cells_for, fill, first_of_four, per_metre
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing
+from pipeline.types.records import Int
+
+
+class _Pairs(NamedTuple):
+    """The squared Mahalanobis distance of each pair and the determinant of its covariance, its landmark and
+    its detection; and how many there are of each detection."""
+
+    squared: Float
+    beside: Float
+    landmark: Int
+    detection: Int
+    of_detection: Int
+
+
+@compiled
+def associate(
+    centre: Float, R: Float, mean: Float, covariance: Float, gate: float, distance_max: float
+) -> tuple[Int, Float]:
+    """The landmark of each detection, -1 for none: pairs by falling likelihood, each used once.
+
+    Args:
+        centre: Detections, shape (D, 2) [m]; R: their covariances xx, xy, yy, shape (D, 3).
+        mean: Landmarks in the same frame, shape (M, 2) [m]; covariance: likewise, shape (M, 3).
+        gate: Largest Mahalanobis distance [sigma].
+        distance_max: Largest distance [m].
+
+    Returns:
+        landmark row and squared Mahalanobis distance of each detection, shape (D,).
+    """
+    detections = centre.shape[0]
+    landmark_of = np.full(detections, -1, np.int64)
+    distance2 = np.zeros(detections)
+    cells, scale = cells_for(detections), per_metre(distance_max)
+    fill(cells, centre, detections, scale)
+    n = _count_pairs(cells, scale, centre, mean, distance_max)
+    pairs = _Pairs(
+        np.empty(n), np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.zeros(detections, np.int64)
+    )
+    n = _add_pairs(pairs, cells, scale, centre, R, mean, covariance, gate, distance_max)
+    clear = _is_one_to_one(pairs, n)
+    if not clear:
+        for k in range(n):
+            pairs.beside[k] = pairs.squared[k] + np.log(pairs.beside[k])
+    taken = np.zeros(mean.shape[0], np.bool_)
+    for k in np.arange(n) if clear else np.argsort(pairs.beside[:n], kind="mergesort"):
+        d, j = pairs.detection[k], pairs.landmark[k]
+        if landmark_of[d] < 0 and not taken[j]:
+            landmark_of[d] = j
+            distance2[d] = pairs.squared[k]
+            taken[j] = True
+    return landmark_of, distance2
+
+
+@compiled_borrowing
+def _count_pairs(cells: Cells, scale: float, centre: Float, mean: Float, distance_max: float) -> int:
+    """How many landmarks and detections lie within reach of one another."""
+    n = 0
+    for j in range(mean.shape[0]):
+        u, v = first_of_four(mean[j, 0], mean[j, 1], scale)
+        for quarter in range(4):
+            d = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+            while d >= 0:
+                y0, y1 = centre[d, 0] - mean[j, 0], centre[d, 1] - mean[j, 1]
+                n += y0 * y0 + y1 * y1 <= distance_max * distance_max
+                d = cells.following[d]
+    return n
+
+
+@compiled_borrowing
+def _add_pairs(
+    pairs: _Pairs,
+    cells: Cells,
+    scale: float,
+    centre: Float,
+    R: Float,
+    mean: Float,
+    covariance: Float,
+    gate: float,
+    distance_max: float,
+) -> int:
+    """Fill in the pairs within the gate, landmark by landmark and in the order of the detections: of pairs
+    that cost the same the first one counts. Returns how many there are."""
+    n = 0
+    for j in range(mean.shape[0]):
+        first = n
+        u, v = first_of_four(mean[j, 0], mean[j, 1], scale)
+        for quarter in range(4):
+            d = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+            while d >= 0:
+                y0, y1 = centre[d, 0] - mean[j, 0], centre[d, 1] - mean[j, 1]
+                a, b = covariance[j, 0] + R[d, 0], covariance[j, 1] + R[d, 1]
+                e = covariance[j, 2] + R[d, 2]
+                det = a * e - b * b
+                d2 = (e * y0 * y0 - 2 * b * y0 * y1 + a * y1 * y1) / det
+                if y0 * y0 + y1 * y1 <= distance_max * distance_max and not d2 > gate * gate:
+                    at = n
+                    while at > first and pairs.detection[at - 1] > d:
+                        pairs.squared[at], pairs.beside[at] = pairs.squared[at - 1], pairs.beside[at - 1]
+                        pairs.detection[at] = pairs.detection[at - 1]
+                        at -= 1
+                    pairs.squared[at], pairs.beside[at], pairs.detection[at] = d2, det, d
+                    pairs.of_detection[d] += 1
+                    pairs.landmark[n] = j
+                    n += 1
+                d = cells.following[d]
+    return n
+
+
+@compiled_borrowing
+def _is_one_to_one(pairs: _Pairs, n: int) -> bool:
+    """Whether no landmark and no detection has a choice."""
+    clear = True
+    for d in range(pairs.of_detection.shape[0]):
+        clear = clear and pairs.of_detection[d] <= 1
+    for k in range(1, n):
+        clear = clear and pairs.landmark[k] != pairs.landmark[k - 1]
+    return clear

@@ -1,0 +1,98 @@
+"""One scan in compiled code: all particles learn from it, and what they say of the pose."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
+from pipeline.slam.candidate_pairs import room_for
+from pipeline.slam.motion import Wheels, moved_pose, moved_poses, weighted_pose
+from pipeline.slam.particle_maps import ROOM, Maps, blocks_in_reach, known_near, with_room
+from pipeline.slam.particle_update import Rules, near_for, observe, predict
+from pipeline.slam.resampling import normalised
+from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
+from pipeline.slam.scan_statistics import TOLD, mean_told
+from pipeline.slam.shared_errors import Measured
+from pipeline.slam.slip_detection import SEARCH, ByTrees, motion_by_trees
+
+
+@compiled
+def against_slip(
+    pose: Float,
+    maps: Maps,
+    best: int,
+    motion: Float,
+    motion_covariance: Float,
+    driven: float,
+    wheels: Wheels,
+    centre: Float,
+    R: Float,
+    rules: Rules,
+) -> ByTrees:
+    """What the scan tells of the motion by the map of the best particle: see `slip.motion_by_trees`.
+
+    Args:
+        pose: shape (P, 3) before the motion; maps: of the particles; best: which one is asked.
+        motion, motion_covariance, centre, R, rules: See `update.observe`.
+        driven, wheels: How far the odometry may be wrong, see away_from_trees.
+    """
+    if centre.shape[0] < FEWEST_PAIRS:
+        return ByTrees(False, motion.copy(), motion_covariance.copy(), False)
+    at = moved_pose(pose[best], motion)
+    known, spread, hits = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
+    return motion_by_trees(
+        pose[best], motion, motion_covariance, driven, wheels, centre, R, known, spread, hits,
+        rules.hits_to_weigh, rules.gate,
+    )  # fmt: skip
+
+
+@compiled
+def use_scan(
+    pose: Float,
+    log_weight: Float,
+    maps: Maps,
+    motion: Float,
+    motion_covariance: Float,
+    noise: Float,
+    centre: Float,
+    R: Float,
+    clear_range: Float,
+    first_birth: int,
+    rules: Rules,
+    measured: Measured,
+) -> tuple[Maps, Float, Float, float]:
+    """Update every particle in place; the arguments are those of `update.observe`.
+
+    Returns:
+        The maps, in which room was made; the weights, shape (P,); and what `mean_told` gives.
+    """
+    found = centre.shape[0]
+    reach = 0.0
+    for d in range(found):
+        reach = max(reach, centre[d, 0] * centre[d, 0] + centre[d, 1] * centre[d, 1])
+    reach = max(rules.view_range, np.sqrt(reach) + rules.distance_max) if found else rules.view_range
+    moved = predict(pose, motion, motion_covariance, noise, rules.use_proposal)
+    blocks, lengths, rows = blocks_in_reach(maps, moved, reach, found)
+    maps = with_room(maps, found, rows)
+    landmarks = lengths.max() * ROOM + found
+    near, room = near_for(landmarks), room_for(found, landmarks)
+    told = np.zeros((pose.shape[0], TOLD))
+    observe(
+        pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
+        clear_range, reach, first_birth, rules, near, room, told, measured, np.empty(3), np.zeros((3, 3)),
+    )  # fmt: skip
+    log_weight -= log_weight.max()
+    weights = normalised(log_weight)
+    mean, odometry = mean_told(told, weights, motion_covariance)
+    return maps, weights, mean, odometry
+
+
+@compiled
+def estimated(
+    pose: Float, weights: Float, motion: Float, motion_covariance: Float
+) -> tuple[Float, Float, Float, float]:
+    """The particles now, shape (P, 3), their mean and covariance (see `weighted_pose`), and N_eff."""
+    particles = moved_poses(pose, motion)
+    mean, covariance = weighted_pose(particles, weights, motion, motion_covariance)
+    return particles, mean, covariance, 1.0 / (weights * weights).sum()

@@ -1,0 +1,40 @@
+"""What was driven, by one drive or by several on one path."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.batch.driven_distance import breaks_of, driven
+from app.batch.saved_run import RunSource
+from pipeline.types.records import Path
+
+STEP = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.integers(1, 10**10))
+
+
+def path_of(steps):
+    """A path from the origin by steps x, y [m], time [ns]."""
+    rows = np.cumsum([(0.0, 0.0), *((x, y) for x, y, _ in steps)], axis=0)
+    stamps = np.cumsum([0, *(t for _, _, t in steps)])
+    still = np.zeros(len(rows))
+    return Path(stamps, rows[:, 0], rows[:, 1], still, still)
+
+
+@given(st.lists(STEP, max_size=20), st.lists(STEP, max_size=20), STEP)
+def test_two_drives_are_as_long_as_each_of_them(first, second, jump):
+    both = driven(path_of([*first, jump, *second]), [len(first) + 1])
+    apart = np.add(driven(path_of(first)), driven(path_of(second)))
+    assert both == pytest.approx(apart, abs=1e-9)
+
+
+def test_the_same_drive_that_goes_on_is_one():
+    starts = ("origin", "resume", "constellation", "given", "last", "merged")
+    sources = [RunSource("run", "", 10 * k, start, (0, 0, 0), 0, 0) for k, start in enumerate(starts)]
+    assert breaks_of(sources) == [20, 30, 40, 50]
+
+
+def test_no_path_is_no_drive():
+    nothing = np.zeros(0)
+    assert driven(Path(nothing.astype(np.int64), nothing, nothing, nothing, nothing)) == (0.0, 0.0)

@@ -1,0 +1,305 @@
+"""What became of the runs, through the API: recorded, listed, compared, renamed, deleted, played again."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from app.batch.compare import compare
+from app.common.settings import Settings
+from app.dashboard import run_recorder
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.run_recorder import MOST_PATH_POINTS, thinned
+from app.sources import sandbox
+from app.sources.opening import options_of
+from app.sources.source_options import chosen_again, plain_of_options
+from app.worker.internal_protocol import Begin, Shown
+from app.worker.protocol import Open
+from pipeline.errors import SourceError, StemmapError
+from pipeline.io.readers.base import SourceOptions
+from pipeline.types.records import TruthTrees
+from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
+from tests.app.server_for_tests import BEARER, Running, running
+
+TRUTH = truth_trees()
+NAMED = {"Cookie": "stemmap_name=Ann%20B"}
+
+
+async def play(
+    dashboard: Dashboard,
+    uri: str = "fake:",
+    scan: int = 2,
+    n_trees: int = 4,
+    run: int = 1,
+    wanted: Open | None = None,
+    truth: TruthTrees | None = TRUTH,
+) -> None:
+    """A run is opened and shown up to a scan; its record is written when this returns."""
+    await dashboard.open(wanted or Open(uri))
+    await dashboard.receive(opened(uri, truth=truth, run=run))
+    await show(dashboard, scan, n_trees, run)
+    async with asyncio.timeout(20):
+        while dashboard.logbook.record is None:
+            await asyncio.sleep(0.01)
+
+
+async def show(dashboard: Dashboard, scan: int, n_trees: int, run: int = 1) -> None:
+    stamp = 5_000_000_000 + scan * 100_000_000
+    picture = frame(scan, stamp, x=1.0, n_trees=n_trees)
+    await dashboard.receive(Shown(run, 0.1 * scan, picture, 0, path([0.5 * k for k in range(scan + 1)])))
+
+
+async def runs(client: httpx.AsyncClient) -> list[dict[str, Any]]:
+    listed: list[dict[str, Any]] = (await client.get("/api/runs")).json()["runs"]
+    return listed
+
+
+async def test_a_run_that_was_mapped_is_listed_and_shown(both: Running) -> None:
+    client, dashboard = both
+    assert await runs(client) == []
+    await play(dashboard)
+    (row,) = await runs(client)
+    assert (row["name"], row["uri"], row["scans"], row["trees"]) == ("fake:", "fake:", 3, 3)
+    assert (row["all_scans"], row["distance_m"], row["preset"]) == (5, 1.0, "forest")
+    assert "map" not in row
+    whole = (await client.get(f"/api/runs/{row['key']}")).json()
+    assert [tree["number"] for tree in whole["map"]["trees"]] == [1, 2, 3]
+    assert whole["map"]["path"] == [[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]]
+    assert len(whole["map"]["truth"]) == 3
+    assert whole["parameters"]["clustering.eps"] == 0.15
+    assert (await client.get("/api/runs")).json()["open"] == row["id"]
+
+
+async def test_what_comes_later_is_written_when_the_run_is_left(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard, scan=1)
+    await show(dashboard, 4, 6)
+    await show(dashboard, 0, 2)  # going back takes nothing away
+    await play(dashboard, "other:", run=2)
+    rows = {row["uri"]: row for row in await runs(client)}
+    assert (rows["fake:"]["scans"], rows["fake:"]["trees"]) == (5, 5)
+    assert rows["other:"]["scans"] == 3
+
+
+async def test_what_the_database_refused_is_written_when_it_answers_again(
+    both: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, dashboard = both
+    monkeypatch.setattr(run_recorder, "_PAUSE_S", 0.01)
+    await play(dashboard, scan=1)
+    refused = asyncio.Event()
+
+    async def refuse(_work: object) -> None:
+        refused.set()
+        raise StemmapError("the disk is full")
+
+    with monkeypatch.context() as full:
+        full.setattr(dashboard.keeper, "ask", refuse)
+        await show(dashboard, 4, 6)
+        await asyncio.wait_for(refused.wait(), 20)
+    async with asyncio.timeout(20):
+        while (await runs(client))[0]["scans"] != 5:
+            await asyncio.sleep(0.01)
+
+
+async def test_a_run_that_showed_nothing_leaves_no_record(both: Running) -> None:
+    client, dashboard = both
+    await dashboard.receive(opened())
+    await dashboard.open(Open("other:"))
+    assert await runs(client) == []
+
+
+async def test_who_changed_which_parameter_when(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard)
+    for eps in (0.2, 0.3):  # a slider that moves
+        await client.patch("/api/parameters", json={"changes": {"clustering.eps": eps}}, headers=NAMED)
+    await client.patch("/api/parameters", json={"changes": {"clustering.min_points": 9}})
+    await dashboard.logbook.close()
+    (row,) = await runs(client)
+    changes = (await client.get(f"/api/runs/{row['key']}")).json()["revisions"]
+    assert [(each["who"], each["changes"]) for each in changes] == [
+        ("Ann B", {"clustering.eps": [0.15, 0.3]}),
+        ("somebody", {"clustering.min_points": [8, 9]}),
+    ]
+    assert all(each["time_s"] == 0.2 and each["at_s"] > 0 for each in changes)
+
+
+async def test_rename_delete_and_undo(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard)
+    (row,) = await runs(client)
+    at = f"/api/runs/{row['id']}"
+    assert (await client.patch(at, json={"name": " north  stand "})).status_code == 200
+    assert (await runs(client))[0]["name"] == "north stand"
+    for name in ("", "  ", "a\x00b", "x" * 201):
+        assert (await client.patch(at, json={"name": name})).status_code == 422
+    refused = await client.delete(at)
+    assert (refused.status_code, refused.json()["error"]["what"]) == (409, "this run is open")
+    await play(dashboard, "other:", run=2)
+    assert (await client.delete(at)).status_code == 200
+    assert [each["uri"] for each in await runs(client)] == ["other:"]
+    assert (await client.get(at)).status_code == 404
+    assert (await client.delete(at)).status_code == 404
+    assert (await client.post(f"{at}/restore")).status_code == 200
+    assert {each["name"] for each in await runs(client)} == {"north stand", "other:"}
+
+
+@pytest.mark.parametrize("key", ["99", "nothing", "folder:nothing", "-1", "99999999999999999999"])
+async def test_a_run_that_is_not_there(both: Running, key: str) -> None:
+    client, _ = both
+    assert (await client.get(f"/api/runs/{key}")).status_code == 404
+    assert (await client.post(f"/api/runs/{key}/replay")).status_code == 404
+    assert (await client.get("/api/runs/compare", params={"a": key, "b": key})).status_code == 404
+
+
+async def test_a_run_is_played_again_with_its_parameters(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard)
+    await client.patch("/api/parameters", json={"changes": {"clustering.eps": 0.4}})
+    await show(dashboard, 4, 4)
+    await play(dashboard, "other:", run=2)
+    await client.post("/api/parameters/preset", json={"name": "paper"})
+    key = next(row["key"] for row in await runs(client) if row["uri"] == "fake:")
+    assert (await client.post(f"/api/runs/{key}/replay")).status_code == 202
+    await dashboard.receive(opened("fake:", run=3))
+    worker = dashboard.worker
+    assert isinstance(worker, FakeWorker)
+    assert worker.commands[-2] == Open("fake:")
+    begun = worker.commands[-1]
+    assert isinstance(begun, Begin)
+    assert begun.values["clustering"]["eps"] == 0.4
+    assert (dashboard.parameters.preset, begun.play) == ("forest", True)
+
+
+async def test_a_run_is_played_again_with_its_topics_and_mounting(both: Running) -> None:
+    client, dashboard = both
+    chosen = Open("fake:", topics={"scan": "/other"}, mount=(0.0, 0.1, 2.0, 0.0, 0.0, 0.5))
+    await play(dashboard, wanted=chosen)
+    await play(dashboard, "other:", run=2)
+    key = next(row["key"] for row in await runs(client) if row["uri"] == "fake:")
+    assert (await client.post(f"/api/runs/{key}/replay")).status_code == 202
+    worker = dashboard.worker
+    assert isinstance(worker, FakeWorker)
+    asked = [each for each in worker.commands if isinstance(each, Open)]
+    assert asked[-3:] == [chosen, Open("other:"), chosen]
+
+
+@pytest.mark.parametrize("kept", [None, 7, {"topics": {"lidar": "/x"}}, {"mount": [1]}, {"mount": ["a"] * 6}])
+def test_a_damaged_choice_was_none(kept: object):
+    assert chosen_again(Open("fake:", seed=3), kept) == Open("fake:", seed=3)
+
+
+def test_the_choice_of_a_run_without_a_browser_is_kept_as_well():
+    wanted = Open("", topics={"imu": "/imu"}, mount=(1.0, 2.0, 3.0, 0.1, -0.2, 0.3))
+    again = chosen_again(Open(""), plain_of_options(options_of(wanted)))
+    assert again.topics == wanted.topics
+    np.testing.assert_allclose(again.mount or (), wanted.mount or ())
+    assert plain_of_options(SourceOptions(seed=5)) is None
+
+
+async def test_from_afar_a_run_of_a_hidden_file_is_not_opened() -> None:
+    async with running(Settings(host="0.0.0.0")) as (client, dashboard):  # noqa: S104
+        client.headers.update(BEARER)
+        await play(dashboard, "/etc/secret.mcap")
+        (row,) = await runs(client)
+        assert (await client.post(f"/api/runs/{row['key']}/replay")).status_code == 403
+
+
+async def test_two_runs_of_one_recording_are_compared(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard, n_trees=4)
+    await client.patch("/api/parameters", json={"changes": {"clustering.eps": 0.4}})
+    await play(dashboard, n_trees=5, run=2)
+    new, old = (row["key"] for row in await runs(client))
+    told = (await client.get("/api/runs/compare", params={"a": old, "b": new})).json()
+    assert told["how"] == "same recording"
+    assert (told["only_a"], told["only_b"], told["moved"]) == ([], [4], 0)
+    assert [(pair["a"], pair["b"], pair["shift_m"]) for pair in told["pairs"]] == [
+        (1, 1, 0),
+        (2, 2, 0),
+        (3, 3, 0),
+    ]
+    assert told["parameters"] == [{"name": "clustering.eps", "a": 0.15, "b": 0.4}]
+
+
+def a_run(places: list[tuple[float, float]]) -> dict[str, Any]:
+    trees = [
+        {
+            "number": k + 1,
+            "x": x,
+            "y": y,
+            "ellipse": [0.02, 0.02, 0.0],
+            "dbh_cm": 20.0 + k,
+            "sigma_dbh_cm": 1.0,
+        }
+        for k, (x, y) in enumerate(places)
+    ]
+    return {"map": {"trees": trees, "path": [[0.0, 0.0]]}, "parameters": {"a": 1}}
+
+
+async def test_runs_of_two_recordings_are_laid_upon_one_another() -> None:
+    rng = np.random.default_rng(3)
+    there = rng.uniform(-15, 15, (24, 2))
+    c, s = np.cos(0.7), np.sin(0.7)
+    here = (there - [3.0, -2.0]) @ np.array([[c, -s], [s, c]])
+    told = await compare(a_run(list(map(tuple, there))), a_run(list(map(tuple, here))), same_source=False)
+    assert told["how"] == "laid upon one another by 24 stems"
+    assert (told["only_a"], told["only_b"], len(told["pairs"])) == ([], [], 24)
+    np.testing.assert_allclose(told["pose"], [3.0, -2.0, 0.7], atol=0.02)
+    few = await compare(a_run([(0, 0)]), a_run([(0.3, 0), (9, 9)]), same_source=False)
+    assert few["how"].startswith("as they stand")
+    assert (few["only_b"], few["moved"], few["pairs"][0]["shift_m"]) == ([2], 1, 0.3)
+    empty = await compare(a_run([]), a_run([(1, 1)]), same_source=True)
+    assert (empty["only_b"], empty["shift_rms_m"]) == ([1], None)
+
+
+async def test_a_finished_folder_in_the_data_folder_is_listed_and_read(tmp_path: Path) -> None:
+    from app.cli import main
+
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    assert main(["map", "sim:stand?duration=3", "--out", str(folder / "north")]) == 0
+    (folder / "broken").mkdir()
+    (folder / "broken" / "run.json").write_text("{")
+    (folder / "broken" / "trees.csv").write_text("")
+    (tmp_path / "outside").mkdir()
+    (folder / "link").symlink_to(tmp_path / "outside")
+    async with running(Settings(folder=tmp_path)) as (client, _):
+        client.headers.update(BEARER)
+        listed = (await client.get("/api/runs")).json()["folders"]
+        assert [each["name"] for each in listed] == ["broken", "north"]
+        whole = (await client.get("/api/runs/folder:north")).json()
+        assert (whole["uri"], whole["scans"], whole["preset"]) == ("sim:stand?duration=3", 30, "forest")
+        assert len(whole["map"]["trees"]) == whole["trees"] > 0
+        assert whole["scores"]["TA"]["of"] > 0
+        refused = await client.get("/api/runs/folder:broken")
+        assert (refused.status_code, "run.json is damaged" in refused.text) == (409, True)
+        for key in ("folder:..", "folder:../recordings/north", "folder:outside", "folder:link"):
+            assert (await client.get(f"/api/runs/{key}")).status_code == 404
+
+
+async def test_a_reader_that_dies_or_hangs_is_an_error_for_people() -> None:
+    import sys
+
+    dies = (sys.executable, "-c", "import os; os.abort()")
+    with pytest.raises(SourceError, match="ended without an answer"):
+        await sandbox.ask({"ask": "recording", "path": "x"}, command=dies)
+    hangs = (sys.executable, "-c", "import threading; threading.Event().wait()")
+    with pytest.raises(sandbox.TookTooLongError):
+        await sandbox.ask({"ask": "recording", "path": "x"}, command=hangs, patience_s=0.2)
+    with pytest.raises(SourceError, match="no such file"):
+        await sandbox.ask({"ask": "recording", "path": "/no/such.mcap"})
+
+
+def test_a_long_path_is_thinned_and_keeps_its_ends() -> None:
+    xy = np.stack([np.arange(10_000.0), np.zeros(10_000)], axis=1)
+    thin = thinned(xy)
+    assert len(thin) == MOST_PATH_POINTS
+    assert (thin[0], thin[-1]) == ([0.0, 0.0], [9999.0, 0.0])
+    assert thinned(xy[:0]) == []

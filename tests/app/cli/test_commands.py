@@ -1,0 +1,503 @@
+"""The command line: what it says, what it returns, and that it never answers with a traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from app.cli import COMMANDS, main
+from pipeline.config import PRESETS, field_specs, from_toml, preset
+
+RUN = "sim:paper?duration=2"
+
+
+class Told:
+    """What a command said and returned."""
+
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+    def refused(self, code: int, *says: str) -> None:
+        """It ended with a code and one clear line on stderr, and wrote nothing to stdout."""
+        assert (self.code, self.out) == (code, ""), self.err
+        assert self.err.count("\n") == 1, self.err
+        assert self.err.startswith("stemmap")
+        for words in says:
+            assert words in self.err
+
+
+def stemmap(capsys: pytest.CaptureFixture[str], *words: object) -> Told:
+    """Run a command in this process."""
+    code = main([str(word) for word in words])
+    told = capsys.readouterr()
+    return Told(code, told.out, told.err)
+
+
+def test_an_option_that_is_mistyped_is_named(capsys):
+    stemmap(capsys, "map", RUN, "--out", "x", "--presset", "forest").refused(
+        2, "stemmap map does not know --presset", "Did you mean --preset?"
+    )
+
+
+def test_a_request_to_stop_that_came_while_kernels_were_loaded_is_one(capsys, monkeypatch):
+    def ended(_arguments):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as stop:
+            raise SystemError("returned a result with an exception set") from stop
+
+    monkeypatch.setattr("app.cli.params.run", ended)
+    stemmap(capsys, "params").refused(1, "stopped")
+
+
+# --- help -----------------------------------------------------------------------------------------
+
+
+def test_help_names_every_command(capsys):
+    told = stemmap(capsys, "--help")
+    assert told.code == 0
+    assert all(f"\n    {name} " in told.out for name in COMMANDS)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_each_command_has_help_that_a_person_can_follow(capsys, name):
+    told = stemmap(capsys, name, "--help")
+    assert told.code == 0
+    assert told.out.startswith(f"usage: stemmap {name}")
+    assert told.err == ""
+    assert max(map(len, told.out.splitlines())) <= 130
+
+
+def test_the_version_is_that_of_the_distribution(capsys):
+    from importlib.metadata import version
+
+    assert stemmap(capsys, "--version").out == f"stemmap {version('stemmap')}\n"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["map"],
+        ["map", RUN],
+        ["map", RUN, "--out"],
+        ["map", RUN, "--out", "x", "--speed", "3"],
+        ["map", RUN, "--out", "x", "--seed", "-1"],
+        ["map", RUN, "--out", "x", "--seed", "1.5"],
+        ["map", RUN, "--out", "x", "--odometry", "legs"],
+        ["params", "--format", "xml"],
+        ["evaluate"],
+        ["--nothing"],
+        ["serve", "--port", "70000"],
+        ["serve", "--port", "-1"],
+    ],
+    ids=" ".join,
+)
+def test_wrong_words_are_wrong_usage(capsys, words):
+    stemmap(capsys, *words).refused(2, "--help")
+
+
+# --- parameters -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_as_toml_is_that_preset(capsys, name):
+    told = stemmap(capsys, "params", "--preset", name, "--format", "toml")
+    assert told.code == 0
+    assert from_toml(told.out, preset("forest"), "x") == preset(name)
+
+
+def test_a_file_of_parameters_goes_in_as_it_came_out(capsys, tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text(stemmap(capsys, "params", "--set", "clustering.eps=0.31", "--format", "toml").out)
+    told = stemmap(capsys, "params", "--config", file, "--set", "slam.particles=7", "--format", "toml")
+    assert from_toml(told.out, preset("paper"), "x").changes_from(preset("forest")) == {
+        "clustering.eps": 0.31,
+        "slam.particles": 7,
+    }
+
+
+def test_the_table_names_every_parameter_with_its_value(capsys):
+    told = stemmap(capsys, "params", "--preset", "paper")
+    for spec in field_specs():
+        assert f"{spec.name} = {preset('paper').flat()[spec.name]}   [" in told.out
+        assert spec.doc in told.out
+
+
+def test_markdown_has_a_column_a_preset(capsys):
+    head = stemmap(capsys, "params", "--format", "markdown").out.splitlines()[0]
+    assert all(f"`{name}`" in head for name in PRESETS)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--set", "clustering.eps=9"], ["clustering.eps = 9", "less than or equal to 5"]),
+        (["--set", "clustering.eps=0"], ["clustering.eps = 0", "greater than or equal to 0.01"]),
+        (["--set", "clustering.eps=nan"], ["finite"]),
+        (["--set", "clustering.eps=wide"], ["'wide'", "number"]),
+        (["--set", "clustering.epz=1"], ["clustering.epz", "clustering.eps"]),
+        (["--set", "clustering.eps"], ["stage.name=value"]),
+        (["--set", "filters.x_min=5", "--set", "filters.x_max=5"], ["filters.x_min", "filters.x_max"]),
+        (["--preset", "wood"], ["wood", "forest"]),
+        (["--config", "none.toml"], ["none.toml"]),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("command", ["params", "map"])
+def test_a_parameter_that_does_not_fit_is_wrong_usage(capsys, tmp_path, monkeypatch, command, words, says):
+    monkeypatch.chdir(tmp_path)
+    first = ["map", RUN, "--out", tmp_path / "out"] if command == "map" else ["params"]
+    stemmap(capsys, *first, *words).refused(2, *says)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"[clustering]\neps = 99\n", b"\xff\xfe", b"eps = 1", b"[[["])
+def test_a_file_of_parameters_that_does_not_fit_is_named(capsys, tmp_path, content):
+    file = tmp_path / "mine.toml"
+    file.write_bytes(content)
+    told = stemmap(capsys, "params", "--config", file)
+    if content == b"":
+        assert told.code == 0
+    else:
+        told.refused(2, "mine.toml")
+
+
+# --- sources --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "code", "says"),
+    [
+        ("sim:wood", 2, "sim:stand"),
+        ("sim:paper?speed=3", 2, "speed"),
+        ("sim:paper?duration=x", 2, "duration"),
+        ("none.mcap", 1, "no such file"),
+        ("dds:robot", 1, "no address"),
+        ("ftp://host/x", 2, "ftp"),
+        ("x\0y", 1, "no such file"),
+    ],
+)
+def test_a_source_that_is_none_fails_in_one_line(capsys, tmp_path, monkeypatch, source, code, says):
+    monkeypatch.chdir(tmp_path)
+    stemmap(capsys, "map", source, "--out", "out").refused(code, says)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a.pcap", "a.zip", "a.db3", "a.bin", "a"])
+@pytest.mark.parametrize("content", [b"", b"\0" * 5000, b"hello world\n" * 99])
+def test_a_file_that_is_no_recording_fails_in_one_line(capsys, tmp_path, name, content):
+    file = tmp_path / name
+    file.write_bytes(content)
+    stemmap(capsys, "map", file, "--out", tmp_path / "out").refused(1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_of_truth_that_is_none_fails_before_the_mapping(capsys, tmp_path):
+    file = tmp_path / "truth.csv"
+    file.write_text("x,y\n1,abc\n")
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path / "out", "--truth", file)
+    told.refused(1, "line 2", "abc", "truth.csv")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "out", "--truth", tmp_path / "no.csv").refused(
+        1, "no.csv"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_made_fails_in_one_line(capsys, tmp_path):
+    (tmp_path / "file").write_text("x")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "file").refused(1, "cannot write")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "file" / "below").refused(1, "cannot write")
+
+
+@pytest.mark.parametrize(("word", "meant"), [("mpa", "map"), ("maps", "map"), ("evalute", "evaluate")])
+def test_a_mistyped_command_is_named(capsys, tmp_path, monkeypatch, word, meant):
+    monkeypatch.chdir(tmp_path)
+    stemmap(capsys, word, RUN, "--out", "out").refused(2, f"no command '{word}'", f"`stemmap {meant}`")
+    stemmap(capsys, word).refused(2, f"`stemmap {meant}`")
+
+
+@pytest.mark.parametrize("ask", ["SIGINT", "SIGTERM"])
+def test_a_mapping_that_is_stopped_leaves_nothing_half_written(tmp_path, capsys, monkeypatch, ask):
+    from pipeline.io.result_files import RunFiles
+
+    add, scans = RunFiles.add, []
+
+    def then_stop(self, frame, start_ns):
+        add(self, frame, start_ns)
+        scans.append(frame.index)
+        if len(scans) == 3:
+            os.kill(os.getpid(), getattr(signal, ask))
+
+    monkeypatch.setattr(RunFiles, "add", then_stop)
+    before = signal.getsignal(signal.SIGTERM)
+    # A shell that starts the tests in the background has them ignore Ctrl-C.
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        stemmap(capsys, "map", RUN, "--out", tmp_path / "out").refused(1, "stopped")
+    finally:
+        signal.signal(signal.SIGINT, inherited)
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert scans[:3] == [0, 1, 2]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_source_without_a_file_is_not_served(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stemmap(capsys, "serve", "none.mcap").refused(1, "none.mcap")
+    stemmap(capsys, "none.mcap").refused(1, "none.mcap")
+
+
+# --- map and evaluate -----------------------------------------------------------------------------
+
+FILES = {
+    "trees.csv", "path.csv", "trees.geojson", "detections.csv", "terrain.csv", "run.json", "state.zip",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of four seconds, mapped once."""
+    folder = tmp_path_factory.mktemp("mapped") / "run"
+    assert main(["map", "sim:paper?duration=4", "--out", str(folder)]) == 0
+    return folder
+
+
+def test_mapping_twice_gives_the_same_bytes(mapped, tmp_path, capsys):
+    told = stemmap(capsys, "map", "sim:paper?duration=4", "--out", tmp_path)
+    assert told.code == 0
+    assert {file.name for file in mapped.iterdir()} == FILES == {file.name for file in tmp_path.iterdir()}
+    for name in FILES:
+        assert (mapped / name).read_bytes() == (tmp_path / name).read_bytes(), name
+
+
+def test_another_seed_gives_other_bytes(mapped, tmp_path, capsys):
+    assert stemmap(capsys, "map", "sim:paper?duration=4", "--out", tmp_path, "--seed", "1").code == 0
+    assert (mapped / "path.csv").read_bytes() != (tmp_path / "path.csv").read_bytes()
+
+
+def test_a_mapping_says_what_came_of_it(tmp_path, capsys):
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path / "out")
+    assert told.code == 0
+    assert all(line.startswith("warning: ") for line in told.err.splitlines())
+    assert told.out.startswith(f"{RUN}: 20 scans, 1.9 s")
+    for words in (
+        "found (TA) ",
+        "left out (TR) ",
+        "for trees (FA) ",
+        "missed (FR) ",
+        "completeness",
+        "mean pair error",
+        "path: RMS",
+        "median",
+    ):
+        assert words in told.out
+
+
+def test_the_record_holds_what_is_needed_to_map_again(mapped):
+    record = json.loads((mapped / "run.json").read_text())
+    assert record["source"]["uri"] == "sim:paper?duration=4"
+    assert len(record["source"]["sha256"]) == 64
+    assert record["seed"] == 0
+    assert (record["preset"], record["changed"]) == ("forest", {})
+    assert record["parameters"] == json.loads(json.dumps(preset("forest").model_dump()))
+    assert record["scans"] == 40
+    assert record["duration_s"] == 3.9
+    points = record["points"]
+    assert sum(points.values()) - points["without a value"] == 2 * points["returns"]
+    rows = (mapped / "detections.csv").read_text().splitlines()[1:]
+    assert sum(record["verdicts"].values()) == len(rows)
+    assert record["trees"] == len((mapped / "trees.csv").read_text().splitlines()) - 1
+    assert len((mapped / "path.csv").read_text().splitlines()) == 41
+
+
+def test_what_differs_from_the_preset_is_said_and_recorded(tmp_path, capsys):
+    (tmp_path / "mine.toml").write_text("[slam]\nparticles = 7\n")
+    words = ["--config", tmp_path / "mine.toml", "--set", "clustering.eps=0.2", "--preset", "forest"]
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path / "out", *words)
+    assert "preset forest with clustering.eps = 0.2, slam.particles = 7" in told.out.splitlines()
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["changed"] == {"clustering.eps": 0.2, "slam.particles": 7}
+    assert stemmap(capsys, "params", *words).out.startswith("Preset forest with clustering.eps = 0.2, slam.")
+    assert "preset forest" in stemmap(capsys, "map", RUN, "--out", tmp_path / "out").out.splitlines()
+
+
+def test_one_is_not_many(tmp_path, capsys):
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path / "out", "--stop-after", "1")
+    assert f"{RUN}: 1 scan, 0.0 s" in told.out
+    frames = stemmap(capsys, "export", tmp_path / "out", "--out", tmp_path / "states").out
+    assert frames.startswith("1 frame with ")
+
+
+def test_evaluating_again_says_what_the_mapping_said(mapped, capsys):
+    told = stemmap(capsys, "evaluate", mapped, "--json")
+    assert json.loads(told.out) == json.loads((mapped / "run.json").read_text())["evaluation"]
+
+
+def test_evaluating_prints_the_lines_of_the_mapping(mapped, capsys):
+    told = stemmap(capsys, "evaluate", mapped)
+    assert told.code == 0
+    begin = [line.split(" ")[0] for line in told.out.splitlines()]
+    assert begin == ["trees", "other", "completeness", "position"]
+
+
+def test_evaluating_by_a_table_and_by_other_distances(mapped, tmp_path, capsys):
+    from pipeline.simulation.scenarios import SCENARIOS
+
+    table = tmp_path / "truth.csv"
+    rows = [f"{p.x},{p.y},{p.kind}" for p in SCENARIOS["paper"].placed]
+    table.write_text("\n".join(["x_m,y_m,class", *rows]) + "\n")
+    told = json.loads(stemmap(capsys, "evaluate", mapped, "--truth", table, "--json").out)
+    own = json.loads(stemmap(capsys, "evaluate", mapped, "--json").out)
+    assert told["TA"] == own["TA"]
+    assert told["dbh_count"] == 0
+    wide = json.loads(stemmap(capsys, "evaluate", mapped, "--reach", "200", "--json").out)
+    assert wide["TA"]["of"] == 7
+    stemmap(capsys, "evaluate", mapped, "--match-distance", "99").refused(2, "evaluation.match_distance")
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ("", "no ground truth lies within"),
+        ("900,900\n", "no ground truth lies"),
+        ("1,0\n", "none of 1 true tree has"),
+    ],
+)
+def test_truth_that_judges_nothing_ends_with_1(mapped, tmp_path, capsys, rows, words):
+    table = tmp_path / "truth.csv"
+    table.write_text(f"x_m,y_m\n{rows}")
+    stemmap(capsys, "evaluate", mapped, "--truth", table).refused(1, words)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("run.json", None),
+        ("trees.csv", None),
+        ("run.json", ""),
+        ("run.json", "[]"),
+        ("run.json", "{}"),
+        ("run.json", '{"parameters": 3}'),
+        ("run.json", '{"parameters": {"clustering": {"eps": 99}}}'),
+        ("run.json", "[" * 100_000),
+        ("trees.csv", "a,b\n"),
+        ("trees.csv", "\xff"),
+        ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n1,2\n"),
+        ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n1,2,3,4,five\n"),
+        ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n,,,,\n"),
+    ],
+)
+def test_a_damaged_run_is_said_in_one_line(mapped, tmp_path, capsys, name, content):
+    for file in mapped.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    if content is None:
+        (tmp_path / name).unlink()
+    else:
+        (tmp_path / name).write_text(content, encoding="latin-1")
+    stemmap(capsys, "evaluate", tmp_path).refused(1, str(tmp_path))
+
+
+@pytest.mark.parametrize("part", ["source", "seed"])
+def test_a_record_without_its_source_is_said_in_one_line(mapped, tmp_path, capsys, part):
+    for file in mapped.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    record = json.loads((mapped / "run.json").read_text())
+    del record[part]
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    stemmap(capsys, "evaluate", tmp_path).refused(1, str(tmp_path))
+
+
+def test_a_folder_without_a_run_is_said(tmp_path, capsys):
+    stemmap(capsys, "evaluate", tmp_path).refused(1, "stemmap map")
+    stemmap(capsys, "evaluate", tmp_path / "none").refused(1, "none")
+
+
+def test_a_failed_mapping_leaves_the_old_files(mapped, tmp_path, capsys, monkeypatch):
+    for file in mapped.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+
+    def breaks(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pipeline.io.result_files.detection_rows", breaks)
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path, "--force")
+    told.refused(1, "No space left")
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == {
+        file.name: file.read_bytes() for file in mapped.iterdir()
+    }
+
+
+def test_the_map_of_another_source_is_overwritten_when_asked_alone(mapped, tmp_path, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(mapped, folder)
+    stemmap(capsys, "map", RUN, "--out", folder).refused(1, "sim:paper?duration=4", "--force")
+    assert (folder / "trees.csv").read_bytes() == (mapped / "trees.csv").read_bytes()
+    told = stemmap(capsys, "map", "sim:paper?duration=4", "--out", folder, "--stop-after", "3")
+    assert f"files in {folder}, in place of" in told.out
+    assert stemmap(capsys, "map", RUN, "--out", folder, "--force").code == 0
+    assert json.loads((folder / "run.json").read_text())["source"]["uri"] == RUN
+    (folder / "run.json").write_text("{")
+    stemmap(capsys, "map", RUN, "--out", folder).refused(1, "run.json", "--force")
+
+
+def test_files_of_that_name_that_are_of_no_run_are_kept(tmp_path, capsys):
+    (tmp_path / "trees.csv").write_text("mine")
+    stemmap(capsys, "map", RUN, "--out", tmp_path).refused(1, "trees.csv", "--force")
+    assert (tmp_path / "trees.csv").read_text() == "mine"
+
+
+def test_losses_are_said_and_told_by_the_exit_code(tmp_path, capsys, monkeypatch):
+    from pipeline.io.readers.simulated import SimulatedSource
+
+    whole = SimulatedSource.records
+
+    def with_a_scan_twice(self, start_ns=None):
+        for record in whole(self, start_ns):
+            yield record
+            yield record
+
+    monkeypatch.setattr(SimulatedSource, "records", with_a_scan_twice)
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path)
+    assert told.code == 3
+    assert "left out: scans" in told.err
+    assert json.loads((tmp_path / "run.json").read_text())["scans"] == 20
+
+
+def test_standing_still_is_warned_of(tmp_path, capsys):
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path, "--odometry", "static")
+    assert told.code == 0
+    assert "warning:" in told.err
+    assert "standing still" in told.err
+    assert json.loads((tmp_path / "run.json").read_text())["odometry"] == "static"
+
+
+def test_presets_and_values_are_taken(tmp_path, capsys):
+    told = stemmap(
+        capsys, "map", RUN, "--out", tmp_path, "--preset", "paper", "--set", "slam.particles=5", "--seed", "3"
+    )
+    assert told.code == 0
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert (record["preset"], record["seed"]) == ("paper", 3)
+    assert record["parameters"]["slam"]["particles"] == 5
+    assert record["parameters"]["clustering"]["eps"] == 0.25
+
+
+@pytest.mark.parametrize("library", ["json", "zenoh"])
+def test_the_program_ends_with_the_code_and_all_it_said(tmp_path, library):
+    pytest.importorskip(library)
+    code = f"import {library}; from app.cli import command; command()"
+    words = [sys.executable, "-c", code, "info", str(tmp_path / "none.mcap")]
+    refused = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (refused.returncode, refused.stdout) == (1, "")
+    assert "none.mcap" in refused.stderr
+    words[3:] = ["--version"]
+    told = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (told.returncode, told.stderr) == (0, "")
+    assert told.stdout.startswith("stemmap")

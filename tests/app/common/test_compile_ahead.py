@@ -1,0 +1,146 @@
+"""Two processes compile what one mapper calls: no more, no less, and nobody waits when it is kept."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from app.common import compile_ahead
+from pipeline.jit import on_compiling
+
+ROOT = Path(__file__).resolve().parents[3]
+
+# Which types the kernels of the package were called with, before and after a run is mapped.
+PROGRAM = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from app.worker.numba_warmup import warm_eyes, warm_map, warm_up
+from app.worker.process import new_session
+from pipeline.config import Parameters
+
+def seen():
+    return {
+        (kernel.__module__, kernel.__name__, str(signature))
+        for name, module in list(sys.modules.items()) if name.startswith("pipeline.")
+        for kernel in vars(module).values() if isinstance(kernel, Dispatcher)
+        for signature in kernel.signatures
+    }
+
+warm_eyes()
+warm_map()
+before = seen()
+assert len(before) > 20, before
+warm_up()
+session = new_session()
+session.open("sim:stand?duration=1", "auto", 0)
+session.set_parameters(Parameters(), 0)
+session.advance(10)
+while session.pace == "hurry":
+    session.work()
+for revision, change in enumerate([{"gathering.tree_share": 0.7}, {"detection.e_max": 20.0}]):
+    session.set_parameters(Parameters().replace(change), revision + 1, whole=True)
+    assert session.is_remapping
+    while session.is_remapping:
+        session.remap(8)
+session.close()
+print(*sorted(seen() - before), sep="\\n", end="")
+"""
+
+
+def test_the_halves_compile_what_the_mapper_and_a_slider_call():
+    run = [sys.executable, "-c", PROGRAM]
+    told = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)
+    assert not told.stdout
+
+
+def test_nobody_is_started_where_all_is_kept(monkeypatch):
+    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: True)
+    monkeypatch.setattr(compile_ahead, "_started", lambda half: pytest.fail(half))
+    compile_ahead.compile_ahead()
+
+
+def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
+    started = []
+
+    def start(half: str) -> subprocess.Popen[bytes]:
+        program = f"import time; time.sleep(0.5); open({str(tmp_path / half)!r}, 'w').close()"
+        started.append(subprocess.Popen([sys.executable, "-c", program]))
+        return started[-1]
+
+    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: False)
+    monkeypatch.setattr(compile_ahead, "_started", start)
+    monkeypatch.setattr(compile_ahead, "_cores", lambda: 2)
+    told = []
+    with on_compiling(lambda: told.append(1)):
+        compile_ahead.compile_ahead()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["warm_eyes", "warm_map"]
+    assert [process.returncode for process in started] == [0, 0]
+    assert told
+
+
+def test_who_comes_second_waits_and_finds_all_kept(monkeypatch, tmp_path):
+    fcntl = pytest.importorskip("fcntl", reason="no locks of files on this system")
+    monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path))
+    first = (tmp_path / "compiling.lock").open("w")
+    fcntl.flock(first, fcntl.LOCK_EX)
+    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: first.closed)
+    monkeypatch.setattr(compile_ahead, "_started", lambda half: pytest.fail(half))
+    monkeypatch.setattr(compile_ahead, "_cores", lambda: 2)
+    with on_compiling(first.close):  # the first is done while the second waits
+        compile_ahead.compile_ahead()
+    assert first.closed
+
+
+def test_a_person_who_waits_no_longer_leaves_none_behind(monkeypatch):
+    started = []
+
+    def start(half: str) -> subprocess.Popen[bytes]:
+        del half
+        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]))
+        return started[-1]
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: False)
+    monkeypatch.setattr(compile_ahead, "_started", start)
+    monkeypatch.setattr(compile_ahead, "_cores", lambda: 2)
+    with on_compiling(interrupt), pytest.raises(KeyboardInterrupt):
+        compile_ahead.compile_ahead()
+    assert [process.poll() is None for process in started] == [False, False]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_who_is_ended_without_a_word_takes_both_along():
+    program = """
+import os, sys, time
+from app.common import compile_ahead
+compile_ahead._PROGRAM = (
+    "from app.common.parent_watch import end_with; end_with({parent}); import time; time.sleep(60)"
+)
+print(*(compile_ahead._started(half).pid for half in ("a", "b")), flush=True)
+time.sleep(0.5)
+os._exit(0)
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    left = [int(pid) for pid in told.stdout.split()]
+    assert len(left) == 2
+    until = time.monotonic() + 60.0
+    while left and time.monotonic() < until:
+        left = [pid for pid in left if is_alive(pid)]
+        time.sleep(0.1)
+    assert not left
+
+
+def is_alive(pid: int) -> bool:
+    """Whether it runs; one that nobody waited for yet does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

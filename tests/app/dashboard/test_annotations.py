@@ -1,0 +1,370 @@
+"""Annotating through the API: what it does, whom it tells, what it refuses, what the scores make of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import pytest_asyncio
+from websockets.asyncio.client import connect
+from websockets.typing import Origin
+
+from app.common.settings import Settings
+from app.dashboard.annotations import Annotating
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.ground_truth import contents_of, counted, laid_over, truth_of
+from app.store.async_store import Keeper
+from app.store.records import Annotation, Content
+from app.web.auth import session_value
+from app.worker.internal_protocol import Shown
+from pipeline.io.ground_truth import parse_truth_trees
+from pipeline.types.records import TruthTrees
+from tests.app.fakes import frame, opened, path, truth_trees
+from tests.app.server_for_tests import BEARER, TOKEN, Running, running, served
+
+ANN = {"browser": "a" * 16, "who": "Ann"}
+BOB = {"browser": "b" * 16, "who": "Bob"}
+
+
+@pytest_asyncio.fixture
+async def both() -> AsyncIterator[Running]:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        yield client, dashboard
+
+
+async def show(dashboard: Dashboard, truth: bool = False) -> None:
+    await dashboard.receive(opened(truth=truth_trees() if truth else None))
+    await dashboard.receive(
+        Shown(1, 0.2, frame(2, 5_200_000_000, x=1.0, n_trees=4), 0, path([0.0, 0.5, 1.0]))
+    )
+
+
+async def edit(client: httpx.AsyncClient, method: str, where: str = "", **body: Any) -> httpx.Response:
+    run = (await client.get("/api/annotations")).json()["run"]
+    said = {"run": run, **ANN, **body}
+    return await client.request(method, f"/api/annotations{where}", json=said)
+
+
+async def rows(client: httpx.AsyncClient) -> list[dict[str, Any]]:
+    answer: list[dict[str, Any]] = (await client.get("/api/annotations")).json()["trees"]
+    return answer
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not condition():
+            await asyncio.sleep(0.02)
+
+
+async def test_a_tree_is_added_changed_deleted_and_all_is_undone(both: Running) -> None:
+    client, _ = both
+    added = await edit(client, "POST", x=1.25, y=-2.0, dbh_cm=31.5)
+    assert added.status_code == 201
+    assert (added.json()["undo"], added.json()["redo"]) == (1, 0)
+    (row,) = await rows(client)
+    assert (row["x"], row["y"], row["kind"], row["dbh_cm"], row["who"], row["version"]) == (
+        1.25,
+        -2.0,
+        "tree",
+        31.5,
+        "Ann",
+        1,
+    )
+    where = f"/{row['id']}"
+    assert (await edit(client, "PATCH", where, version=1, x=1.0, y=-2.0, kind="pole")).status_code == 200
+    assert [(r["x"], r["kind"], r["dbh_cm"], r["version"]) for r in await rows(client)] == [
+        (1.0, "pole", None, 2)
+    ]
+    assert (await edit(client, "DELETE", where, version=2)).status_code == 200
+    assert await rows(client) == []
+    for expected in ([("pole", 1.0)], [("tree", 1.25)], []):
+        await edit(client, "POST", "/undo")
+        assert [(r["kind"], r["x"]) for r in await rows(client)] == expected
+    nothing = await edit(client, "POST", "/undo")
+    assert nothing.status_code == 409
+    assert "nothing to undo" in nothing.json()["error"]["what"]
+    assert (await edit(client, "POST", "/redo")).json()["redo"] == 2
+    assert [r["kind"] for r in await rows(client)] == ["tree"]
+
+
+async def test_a_stale_edit_is_refused_and_says_who_changed_it_when(both: Running) -> None:
+    client, _ = both
+    number = (await edit(client, "POST", x=0.0, y=0.0)).json()["id"]
+    await edit(client, "PATCH", f"/{number}", version=1, x=0.5, y=0.0, **BOB)
+    for method, body in (("PATCH", {"x": 9.0, "y": 9.0}), ("DELETE", {})):
+        refused = await edit(client, method, f"/{number}", version=1, **body)
+        assert refused.status_code == 409
+        assert f"annotation {number} was changed by Bob at 20" in refused.json()["error"]["what"]
+    assert [r["x"] for r in await rows(client)] == [0.5]
+    # Ann's own step is no longer hers alone.
+    assert (await edit(client, "POST", "/undo")).status_code == 409
+    await edit(client, "DELETE", f"/{number}", version=2, **BOB)
+    gone = await edit(client, "PATCH", f"/{number}", version=2, x=1.0, y=1.0)
+    assert gone.status_code == 409
+    assert "deleted by Bob" in gone.json()["error"]["what"]
+
+
+async def test_an_edit_for_a_run_that_was_left_does_not_land_in_the_next(both: Running) -> None:
+    client, dashboard = both
+    run = dashboard.annotating.run
+    await dashboard.receive(opened("other:", run=2))
+    refused = await client.post("/api/annotations", json={"run": run, **ANN, "x": 0.0, "y": 0.0})
+    assert refused.status_code == 409
+    assert "another run" in refused.json()["error"]["what"]
+    await dashboard.receive(opened(run=3))
+    assert dashboard.annotating.run == run, "the same source is the same run"
+
+
+@pytest.mark.parametrize(
+    ("body", "word"),
+    [
+        ({"x": "1", "y": 0.0}, "x"),
+        ({"x": True, "y": 0.0}, "x"),
+        ({"x": 1e9, "y": 0.0}, "x"),
+        ({"y": 0.0}, "x"),
+        ({"x": 0.0, "y": 0.0, "kind": "shrub"}, "shrub"),
+        ({"x": 0.0, "y": 0.0, "dbh_cm": 0.0}, "dbh_cm"),
+        ({"x": 0.0, "y": 0.0, "dbh_cm": 1001.0}, "dbh_cm"),
+        ({"x": 0.0, "y": 0.0, "more": 1}, "more"),
+        ({"x": 0.0, "y": 0.0, "who": "=cmd()"}, "who"),
+        ({"x": 0.0, "y": 0.0, "who": ""}, "who"),
+        ({"x": 0.0, "y": 0.0, "who": "Ann\n"}, "who"),
+        ({"x": 0.0, "y": 0.0, "who": "A" * 41}, "who"),
+        ({"x": 0.0, "y": 0.0, "browser": "Z" * 16}, "browser"),
+    ],
+)
+async def test_what_is_no_annotation_is_refused(both: Running, body: dict[str, Any], word: str) -> None:
+    client, _ = both
+    answer = await edit(client, "POST", **body)
+    assert answer.status_code == 422
+    assert word in answer.json()["error"]["what"]
+    assert await rows(client) == []
+
+
+async def test_what_is_not_there_is_said(both: Running) -> None:
+    client, _ = both
+    assert (await edit(client, "PATCH", "/77", version=1, x=0.0, y=0.0)).status_code == 404
+    assert (await edit(client, "DELETE", f"/{2**31 - 1}", version=1)).status_code == 404
+    assert (await edit(client, "DELETE", f"/{10**30}", version=1)).status_code == 422
+    await edit(client, "POST", x=0.0, y=0.0)
+    assert len(await rows(client)) == 1
+
+
+async def test_a_table_goes_in_and_comes_out(both: Running) -> None:
+    client, _ = both
+    table = "Easting,Northing,DBH,class\n1.5,2.5,0.31,tree\n3.0,4.0,,pole\n"
+    unsaid = await edit(client, "POST", "/import", table=table)
+    assert unsaid.status_code == 422
+    assert "unit" in unsaid.json()["error"]["what"]
+    answer = (await edit(client, "POST", "/import", table=table, dbh_unit="m")).json()
+    assert (answer["added"], answer["left_out"], answer["undo"]) == (2, 0, 1)
+    again = (await edit(client, "POST", "/import", table=table, dbh_unit="m")).json()
+    assert (again["added"], again["left_out"], again["undo"]) == (0, 2, 1)
+    out = await client.get("/api/annotations.csv")
+    assert 'filename="truth.csv"' in out.headers["content-disposition"]
+    read = contents_of(parse_truth_trees(out.text, where="here"))
+    assert read == [Content(1.5, 2.5, "tree", 0.31), Content(3.0, 4.0, "pole", None)]
+    assert out.text.splitlines()[0] == "x_m,y_m,dbh_cm,class,who,edited"
+    told = json.loads((await client.get("/api/annotations.geojson")).text)
+    assert told["coordinateFrame"]["type"] == "local"
+    assert [f["geometry"]["coordinates"] for f in told["features"]] == [[1.5, 2.5], [3.0, 4.0]]
+    assert told["features"][0]["properties"]["dbh_cm"] == 31.0
+    await edit(client, "POST", "/undo")
+    assert await rows(client) == []
+
+
+@pytest.mark.parametrize(
+    ("table", "word"),
+    [
+        ("", "position"),
+        ("a,b\n1,2\n", "position"),
+        ("x_m,y_m\n1,up\n", "line 2"),
+        ("x_m,y_m\n1,nan\n", "line 2"),
+        ("x_m,y_m\n1e9,0\n", "row 1"),
+        ("x_m,y_m,dbh_m\n1,0,31\n", "DBH"),
+        ("x_m,y_m,class\n1,0,shrub\n", "shrub"),
+        ("x_m,y_m\n" + "".join(f"{k},0\n" for k in range(5001)), "5000"),
+    ],
+)
+async def test_a_table_that_cannot_be_used_adds_nothing(both: Running, table: str, word: str) -> None:
+    client, _ = both
+    answer = await edit(client, "POST", "/import", table=table)
+    assert answer.status_code == 422
+    assert word in answer.json()["error"]["what"]
+    assert await rows(client) == []
+
+
+async def test_a_body_that_is_too_large_is_refused(both: Running) -> None:
+    client, _ = both
+    assert (await edit(client, "POST", "/import", table="x" * 1_000_001)).status_code == 413
+
+
+async def test_the_scores_follow_each_edit(both: Running) -> None:
+    client, dashboard = both
+    assert (await client.get("/api/evaluation")).json() is None
+    number = (await edit(client, "POST", x=0.1, y=0.0)).json()["id"]
+    await until(lambda: dashboard.scores.latest is not None)
+    score = dashboard.scores.latest
+    assert score is not None
+    # Trees are found at 0, 2 and 4 m; one of them is judged, two are taken for wrong until they are.
+    assert (score["TA"], score["spurious"]) == ({"count": 1, "of": 1, "rate": 1.0}, 2)
+    await edit(client, "PATCH", f"/{number}", version=1, x=0.1, y=0.0, kind="pole")
+    await until(lambda: (dashboard.scores.latest or {}).get("FA", {}).get("count") == 1)
+    await edit(client, "POST", "/undo")
+    await until(lambda: (dashboard.scores.latest or {}).get("TA", {}).get("count") == 1)
+    await edit(client, "POST", "/undo")
+    await until(lambda: dashboard.scores.latest is None)
+
+
+async def test_annotations_lie_over_the_truth_of_the_source() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard, truth=True)
+        assert dashboard.annotating.as_plain()["used"] == "source"
+        # The source has trees at 0.05 and 2 m and a pole at 9 m.
+        await edit(client, "POST", x=2.2, y=0.1, kind="pole")
+        assert dashboard.truth is not None
+        assert dashboard.truth.x.tolist() == [0.05, 9.0, 2.2]
+        assert dashboard.truth.kind == ("tree", "pole", "pole")
+        assert dashboard.annotating.as_plain()["used"] == "both"
+        await edit(client, "POST", "/undo")
+        assert dashboard.truth.x.tolist() == [0.05, 2.0, 9.0]
+
+
+async def test_what_agrees_leaves_the_truth_of_the_source_exact_and_a_person_chooses_what_counts() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard, truth=True)
+        exact = dashboard.truth
+        assert exact is not None
+
+        async def choose(against: str) -> dict[str, Any]:
+            answer = await client.put("/api/annotations/against", json={"against": against})
+            assert answer.status_code == 200
+            told: dict[str, Any] = answer.json()
+            return told
+
+        await edit(client, "POST", x=2.2, y=0.1)  # the tree that was found there is one
+        assert dashboard.truth is not None
+        assert sorted(dashboard.truth.x.tolist()) == sorted(exact.x.tolist())
+        assert dashboard.annotating.as_plain()["contradicting"] == 0
+        await edit(client, "POST", x=0.1, y=0.0, kind="pole")
+        await edit(client, "POST", x=30.0, y=0.0, kind="pole")  # nobody knew of it
+        assert (await client.get("/api/annotations")).json()["contradicting"] == 1
+        await edit(client, "POST", "/undo")
+        told = await choose("own")
+        assert (told["used"], told["own"]) == ("source", len(exact.x))
+        assert dashboard.truth is exact
+        assert (await choose("annotations"))["used"] == "annotations"
+        assert sorted(dashboard.truth.x.tolist()) == [0.1, 2.2]
+        await edit(client, "POST", "/undo")
+        assert dashboard.truth.x.tolist() == [2.2]
+        await edit(client, "POST", "/undo")
+        # Who asked for annotations alone is not told the source's truth.
+        assert dashboard.annotating.as_plain()["used"] == "none"
+        assert dashboard.annotating.truth is None
+        assert (await choose("both"))["used"] == "source"
+        assert dashboard.truth is exact
+        refused = await client.put("/api/annotations/against", json={"against": "nothing"})
+        assert refused.status_code == 422
+
+
+def test_without_annotations_the_truth_is_that_of_the_source() -> None:
+    assert laid_over(None, []) is None
+    own = truth_trees()
+    assert laid_over(own, []) is own
+    alone = laid_over(None, [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", 0, 1)])
+    assert alone is not None
+    assert (alone.x.tolist(), alone.dbh.tolist()) == ([1.0], [0.3])
+
+
+def test_who_confirms_one_stem_of_two_says_nothing_of_the_other() -> None:
+    own = TruthTrees(np.array([0.0, 0.4]), np.zeros(2), np.array([0.2, 0.3]), ("tree", "bush"))
+    one = Annotation(1, Content(0.05, 0.0, "tree", None), "Ann", 0, 1)
+    laid = laid_over(own, [one])
+    assert laid is not None
+    assert (laid.x.tolist(), laid.kind) == ([0.4, 0.0], ("bush", "tree"))
+    # The second is of what the first, which is nearer, leaves.
+    both = laid_over(own, [Annotation(2, Content(0.15, 0.0, "bush", None), "Ann", 0, 1), one])
+    assert both is not None
+    assert (both.x.tolist(), both.kind) == ([0.4, 0.0], ("bush", "tree"))
+
+
+async def test_every_browser_is_told() -> None:
+    async with served() as (host, dashboard):
+        await show(dashboard)
+        port = int(host.rpartition(":")[2])
+        cookie = {"Cookie": f"stemmap_{port}={session_value(TOKEN, port)}"}
+        listen = partial(
+            connect,
+            f"ws://{host}/api/live",
+            additional_headers=cookie,
+            origin=Origin(f"http://{host}"),
+        )
+        async with (
+            listen() as one,
+            listen() as other,
+            httpx.AsyncClient(base_url=f"http://{host}", headers=BEARER) as client,
+        ):
+            number = (await edit(client, "POST", x=1.0, y=2.0)).json()["id"]
+            for browser in (one, other):
+                async with asyncio.timeout(20):
+                    while True:
+                        message = json.loads(await browser.recv())
+                        if message["type"] == "annotations" and message["trees"]:
+                            break
+                assert [(t["id"], t["who"]) for t in message["trees"]] == [(number, "Ann")]
+
+
+async def test_what_was_annotated_is_there_after_a_restart(tmp_path: Path) -> None:
+    for expected in ([], [1.0]):
+        async with running(Settings(folder=tmp_path)) as (client, dashboard):
+            client.headers.update(BEARER)
+            await show(dashboard)
+            assert [row["x"] for row in await rows(client)] == expected
+            if not expected:
+                await edit(client, "POST", x=1.0, y=0.0)
+
+
+async def test_a_store_that_cannot_be_used_is_said_and_the_map_goes_on(tmp_path: Path, caplog: Any) -> None:
+    (tmp_path / "annotations.sqlite").write_bytes(b"no database" * 500)
+    async with running(Settings(folder=tmp_path)) as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard, truth=True)
+        told = (await client.get("/api/annotations")).json()
+        assert "annotations.sqlite" in told["problem"]
+        assert len(caplog.records) == 1
+        refused = await client.post("/api/annotations", json={"run": 1, **ANN, "x": 0.0, "y": 0.0})
+        assert refused.status_code == 409
+        assert "annotations.sqlite" in refused.json()["error"]["what"]
+        assert dashboard.truth is not None
+        assert len((await client.get("/api/trees")).json()["trees"]) == 3
+
+
+async def test_the_store_works_beside_the_event_loop() -> None:
+    import threading
+
+    keeper = Keeper(None)
+    annotating = Annotating(keeper)
+    await annotating.begin("d", "u", None)
+    assert annotating.run is not None
+    name = await annotating.edit(annotating.run, lambda _: threading.current_thread().name)
+    assert name.startswith("store")
+    assert threading.current_thread().name != name
+    await keeper.close()
+
+
+def test_who_asks_for_one_of_two_truths_is_not_told_the_other() -> None:
+    rows = [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", 0, 1)]
+    assert truth_of(None, rows, "own") is None
+    assert truth_of(truth_trees(), [], "annotations") is None
+    assert (counted(None, rows, "both"), counted(None, rows, "annotations")) == ("annotations",) * 2

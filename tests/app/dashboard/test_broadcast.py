@@ -1,0 +1,99 @@
+"""Browsers are told states: the newest counts, a slow one skips, the path comes in pieces."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from typing import Any
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.dashboard.broadcast import Live
+from app.dashboard.payload import clearance_payload, ellipses, first_difference
+from pipeline.types.clearance import Clearance, Zone
+
+
+async def following(stream: Any, n: int) -> list[dict[str, Any]]:
+    async with asyncio.timeout(10):
+        return [json.loads(await anext(stream)) for _ in range(n)]
+
+
+async def test_a_late_browser_is_told_all_states_once_in_order() -> None:
+    live = Live()
+    live.tell("status", {"state": "playing"})
+    live.tell("truth", None)
+    live.tell("status", {"state": "paused"})
+    with live.listener() as listener:
+        messages = await following(listener.messages(), 2)
+    assert messages == [{"type": "truth", "value": None}, {"type": "status", "state": "paused"}]
+
+
+async def test_only_the_newest_map_is_sent_with_all_of_the_path() -> None:
+    live = Live()
+    with live.listener() as listener:
+        stream = listener.messages()
+        xy = np.zeros((0, 2))
+        live.show({"type": "map", "index": 0}, xy)
+        assert (await following(stream, 1))[0]["path"] == {"start": 0, "points": []}
+        for k in range(1, 6):
+            xy = np.array([[float(i), 0.5] for i in range(k)])
+            live.show({"type": "map", "index": k}, xy)
+        (newest,) = await following(stream, 1)
+        assert newest["index"] == 5
+        assert newest["path"] == {"start": 0, "points": xy.tolist()}
+        rewritten = np.vstack([xy[:3], [[9.0, 9.0]]])
+        live.show({"type": "map", "index": 6}, rewritten)
+        (cut,) = await following(stream, 1)
+        assert cut["path"] == {"start": 3, "points": [[9.0, 9.0]]}
+
+
+async def test_what_did_not_change_is_not_told_again() -> None:
+    live = Live()
+    with live.listener() as listener:
+        stream = listener.messages()
+        live.tell("status", {"state": "paused"})
+        await following(stream, 1)
+        live.tell("status", {"state": "paused"})
+        live.tell("selection", {"tree": 3})
+        assert await following(stream, 1) == [{"type": "selection", "tree": 3}]
+
+
+async def test_maps_wait_for_their_round_and_states_do_not() -> None:
+    live = Live()
+    with live.listener() as listener:
+        stream = listener.messages()
+        live.show({"type": "map", "index": 0}, np.zeros((0, 2)))
+        await following(stream, 1)
+        live.show({"type": "map", "index": 1}, np.zeros((0, 2)))
+        live.tell("status", {"state": "paused"})
+        kinds = [message["type"] for message in await following(stream, 2)]
+    assert kinds == ["status", "map"]
+    assert live.listeners == 0
+
+
+@given(st.lists(st.integers(0, 2), max_size=6), st.lists(st.integers(0, 2), max_size=6))
+def test_a_path_is_cut_where_it_first_differs(old: list[int], new: list[int]) -> None:
+    a = np.array([[x, 0.0] for x in old]).reshape(-1, 2)
+    b = np.array([[x, 0.0] for x in new]).reshape(-1, 2)
+    start = first_difference(a, b)
+    assert old[:start] == new[:start]
+    assert start == min(len(old), len(new)) or old[start] != new[start]
+
+
+@given(st.floats(0.01, 3), st.floats(0.01, 3), st.floats(-3, 3))
+def test_the_ellipse_gives_the_covariance_back(a: float, b: float, angle: float) -> None:
+    major, minor = max(a, b), min(a, b)
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    covariance = R @ np.diag([major**2, minor**2]) @ R.T
+    ((big, small, direction),) = ellipses(covariance[None])
+    R = np.array([[np.cos(direction), -np.sin(direction)], [np.sin(direction), np.cos(direction)]])
+    np.testing.assert_allclose(R @ np.diag([big**2, small**2]) @ R.T, covariance, atol=2e-3)
+    assert big >= small
+
+
+def test_the_page_is_told_how_far_the_way_is_free() -> None:
+    assert clearance_payload(None) is None
+    told = clearance_payload(Clearance(Zone.SLOW, 1.23456, within=3.0))
+    assert told == {"zone": "slow", "ahead_m": 1.235, "beside_m": None, "within_m": 3.0}

@@ -1,0 +1,118 @@
+"""The marks on the timeline: each event once, where it happened first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.dashboard.events import Events
+from pipeline.types.pose_health import Health
+from tests.app.fakes import frame
+
+
+def seen(index: int, trees: int, health: Health | None = None):
+    shot = frame(index, index, n_trees=trees)
+    all_of_them = replace(shot.trees, confirmed=np.ones(trees, np.bool_))
+    estimate = replace(shot.estimate, health=health or shot.health)
+    return replace(shot, trees=all_of_them, estimate=estimate)
+
+
+def marks(events: Events, *, before: bool = False) -> list[tuple[float, str, str]]:
+    told = events.as_plain()["events"]
+    return [(e["t"], e["kind"], e["text"]) for e in told if e.get("before", False) == before]
+
+
+def test_a_tree_is_marked_where_it_was_confirmed_first():
+    events = Events()
+    assert events.shown(seen(0, 1), 0.0)
+    assert not events.shown(seen(1, 1), 0.1)
+    assert events.shown(seen(2, 2), 0.2)
+    assert not events.shown(seen(1, 2), 0.1)  # the run went back
+    assert marks(events) == [(0.0, "tree", "Tree 1 confirmed"), (0.2, "tree", "Tree 2 confirmed")]
+
+
+def test_health_is_marked_when_it_changes_and_a_warning_when_it_is_new():
+    events = Events()
+    weak = Health(state="weak", reason="the wheels slip")
+    assert events.shown(seen(3, 0, weak), 0.3)
+    assert not events.shown(seen(4, 0, weak), 0.4)
+    assert events.shown(seen(5, 0), 0.5)
+    assert events.warned(["jumped"], 0.6)
+    assert not events.warned(["jumped"], 0.7)
+    assert marks(events) == [
+        (0.3, "health", "SLAM weak: the wheels slip"),
+        (0.5, "health", "SLAM good"),
+        (0.6, "warning", "jumped"),
+    ]
+
+
+def test_a_slider_that_moves_is_one_change_and_one_that_came_back_is_none():
+    events = Events()
+    events.shown(seen(0, 1), 0.0)
+    events.shown(seen(9, 2), 0.9)
+    events.changed({"a": 1, "b": 2}, {"a": 1.5, "b": 2}, 0.5)
+    events.changed({"a": 1.5, "b": 2}, {"a": 2, "b": 2}, 0.5)
+    assert marks(events) == [(0.0, "tree", "Tree 1 confirmed"), (0.5, "change", "a: 1 → 2")]
+    events.changed({"a": 2, "b": 2}, {"a": 1, "b": 2}, 0.5)
+    assert [kind for _, kind, _ in marks(events)] == ["tree"]
+
+
+def test_after_a_rerun_the_marks_of_the_part_that_is_still_to_come_stay_until_it_comes():
+    events = Events()
+    for index, trees in [(0, 1), (9, 2), (20, 3)]:
+        events.shown(seen(index, trees), 0.1 * index)
+    events.changed({"a": 1}, {"a": 2}, 0.5)  # the run had gone back
+    later = [(0.9, "tree", "Tree 2 confirmed"), (2.0, "tree", "Tree 3 confirmed")]
+    assert marks(events, before=True) == later
+    events.remapped([(1, 0.2)], 0.5)
+    now = [(0.2, "tree", "Tree 1 confirmed"), (0.5, "change", "a: 1 → 2")]
+    assert (marks(events), marks(events, before=True)) == (now, later)
+    assert events.shown(seen(12, 2), 1.2)
+    assert marks(events) == [*now, (1.2, "tree", "Tree 2 confirmed")]
+    assert marks(events, before=True) == later[1:]
+    assert events.shown(seen(20, 2), 2.0)  # a mark that is none any more
+    assert marks(events, before=True) == []
+
+
+def test_what_was_passed_over_is_marked_where_it_was_and_not_where_it_was_shown():
+    events = Events()
+    events.shown(seen(30, 2), 3.0, np.array([0.4, np.nan]))
+    assert marks(events) == [(0.4, "tree", "Tree 1 confirmed"), (3.0, "tree", "Tree 2 confirmed")]
+
+
+def test_edits_at_one_time_are_one_mark_that_counts_them_and_stay_when_parameters_change():
+    events = Events()
+    events.annotated("Ann", 1, 0.5)
+    assert marks(events) == [(0.5, "annotation", "Ann edited an annotation")]
+    events.annotated("Bob", 2, 0.5)
+    events.annotated("", 1, 0.9)
+    events.changed({"a": 1}, {"a": 2}, 0.1)
+    assert [(t, text) for t, kind, text in marks(events) if kind == "annotation"] == [
+        (0.5, "Bob edited 3 annotations"),
+        (0.9, "Somebody edited an annotation"),
+    ]
+
+
+def test_of_more_trees_than_marks_none_is_confirmed_again():
+    events = Events()
+    assert events.shown(seen(0, 600), 0.0)
+    told = marks(events)
+    assert not events.shown(seen(1, 600), 0.1)
+    assert marks(events) == told
+    assert {t for t, _, _ in told} == {0.0}
+
+
+@given(st.lists(st.tuples(st.integers(0, 900), st.integers(0, 60)), max_size=40))
+def test_they_are_bounded_and_in_order(scans: list[tuple[int, int]]):
+    events = Events()
+    for index, trees in scans:
+        events.shown(seen(index, trees), 0.1 * index)
+        events.warned([f"{index} {trees} {k}" for k in range(trees)], 0.1 * index)
+    told = marks(events)
+    assert len(told) <= 400
+    assert [t for t, _, _ in told] == sorted(t for t, _, _ in told)
+    events.forget()
+    assert marks(events) == []

@@ -1,0 +1,110 @@
+"""A story says what the map says, and its figures are those that decided."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.worker.session import Session
+from pipeline.errors import StemmapError
+from pipeline.types.records import Frame, Verdict
+
+
+def frame_of(session: Session) -> Frame:
+    assert session.frame is not None
+    return session.frame
+
+
+def test_the_verdict_of_every_cluster_is_that_of_its_first_check_that_fails(session: Session):
+    frame = frame_of(session)
+    assert len(frame.clusters.size) > 20
+    for row in range(len(frame.clusters.size)):
+        story = session.cluster_story(frame, row)
+        failed = [check.verdict for check in story.checks if check.fails]
+        assert story.verdict == (failed[0] if failed else "tree")
+        assert story.verdict == Verdict(int(frame.clusters.verdict[row])).label
+        assert story.size == frame.clusters.size[row]
+        assert len(story.points) == min(story.size, 400)
+
+
+def test_the_fit_that_is_drawn_is_the_fit_that_was_judged(session: Session):
+    frame = frame_of(session)
+    for row in frame.detections.cluster:
+        story = session.cluster_story(frame, int(row))
+        assert story.circle is not None
+        assert story.circle.radius == pytest.approx(frame.clusters.radius[row], rel=1e-9)
+        assert story.circle.arc_deg == pytest.approx(np.degrees(frame.clusters.arc[row]), rel=1e-9)
+        points = np.array(story.points)
+        reach = np.hypot(points[:, 0], points[:, 1])
+        np.testing.assert_allclose(reach - story.circle.radius, story.residual, atol=1e-12)
+        angle = np.arctan2(points[:, 1], points[:, 0])
+        beyond = (angle - story.circle.arc_start) % (2 * np.pi)
+        # Of many points some are fitted, and the arc is theirs.
+        inside = (beyond <= np.radians(story.circle.arc_deg) + 1e-9) | (beyond > 2 * np.pi - 1e-9)
+        assert inside.mean() > 0.9
+        # The sensor looks from below, so what it sees of a trunk is its lower side.
+        assert points[:, 1].mean() < 0.0
+
+
+def test_a_cluster_of_a_tree_names_the_tree(session: Session):
+    frame = frame_of(session)
+    trees = frame.trees
+    named = [session.cluster_story(frame, int(row)) for row in frame.detections.cluster]
+    with_tree = [story for story in named if story.tree is not None]
+    assert len(with_tree) > 10
+    for story in with_tree:
+        place = trees.position[trees.number == story.tree][0]
+        gap = np.hypot(place[0] - story.position[0], place[1] - story.position[1])
+        assert gap == pytest.approx(story.tree_distance, abs=1e-9)
+        assert trees.confirmed[trees.number == story.tree][0]
+
+
+def test_a_tree_tells_its_votes_its_sides_and_how_it_became_sure(session: Session):
+    trees = frame_of(session).trees
+    rows = np.flatnonzero(trees.confirmed & (trees.observations >= 12))
+    assert len(rows) > 5
+    for row in rows:
+        story = session.tree_story(int(trees.number[row]))
+        assert 10 * sum(story.sides) == pytest.approx(story.coverage_deg)
+        assert story.gathered is not None
+        assert story.gathered.verdict == "tree"
+        assert sum(story.gathered.votes.values()) == pytest.approx(1.0, abs=0.01)  # leaves are rounded
+        assert story.gathered.by_votes
+        assert story.gathered.votes["tree"] >= story.gathered.tree_share
+        sizes = [abs(told.effect) for told in story.gathered.told]
+        assert sizes == sorted(sizes, reverse=True)
+        assert len(story.history.x) == story.observations
+        assert story.history.major[-1] == pytest.approx(story.ellipse[0])
+        assert story.history.major[-1] < story.history.major[0]
+        assert (story.history.x[-1], story.history.y[-1]) == story.position
+
+
+def test_what_is_not_there_is_refused_in_words(session: Session):
+    frame = frame_of(session)
+    with pytest.raises(StemmapError, match="no cluster 9999"):
+        session.cluster_story(frame, 9999)
+    with pytest.raises(StemmapError, match="tree 9999 is not known"):
+        session.tree_story(9999)
+
+
+def test_a_preset_that_fits_no_circle_is_told_without_one(session: Session):
+    from app.worker.process import new_session
+    from pipeline.config import preset
+
+    mapped = new_session()
+    mapped.open("sim:paper?duration=1", "auto", 3)
+    mapped.set_parameters(preset("paper"), 1)
+    mapped.play()
+    while mapped.pace == "replay":
+        mapped.work()
+    frame = frame_of(mapped)
+    assert len(frame.clusters.size) > 0
+    for row in range(len(frame.clusters.size)):
+        story = mapped.cluster_story(frame, row)
+        assert story.circle is None
+        assert story.residual == []
+        assert story.gathered is None
+        # The axes are those of the eccentricity.
+        (a, b), (c, d) = story.axes
+        if np.isfinite(story.eccentricity):
+            assert (a * a + b * b) / (c * c + d * d) == pytest.approx(story.eccentricity, rel=1e-3)

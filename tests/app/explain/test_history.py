@@ -1,0 +1,73 @@
+"""The history of a tree: bounded, and never of a future that was left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.explain import estimate_history as module
+from app.explain.estimate_history import TreeHistory, half_axes
+from tests.app.fakes import PERIOD_NS, START_NS, frame
+
+
+def seen(index: int, x: float, numbers: tuple[int, ...] = (1, 2), observations: int = 1):
+    """A frame whose trees of these numbers were seen just now, at x."""
+    shot = frame(index, START_NS + index * PERIOD_NS, n_trees=3)
+    now = np.isin(shot.trees.number, numbers)
+    position = shot.trees.position.copy()
+    position[:, 0] = x
+    trees = replace(
+        shot.trees,
+        position=position,
+        last_seen_ns=np.where(now, shot.stamp_ns, START_NS - 1),
+        observations=np.full(3, observations),
+    )
+    return replace(shot, trees=trees)
+
+
+@given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
+def test_what_is_told_is_the_newest_pass_up_to_the_newest_scan(scans: list[int]):
+    history = TreeHistory()
+    known: dict[int, float] = {}
+    for turn, index in enumerate(scans):
+        history.record(seen(index, float(turn)), START_NS)
+        known = {k: x for k, x in known.items() if k < index} | {index: float(turn)}
+    told = history.of(1)
+    assert told.x == [known[k] for k in sorted(known)]
+    assert told.time_s == pytest.approx([0.1 * k for k in sorted(known)])
+    assert history.of(3).x == []
+
+
+def test_it_is_bounded_and_keeps_the_first_views(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "_MOST_ROWS", 200)
+    history = TreeHistory()
+    for index in range(3000):
+        history.record(seen(index, float(index), observations=index + 1), START_NS)
+        assert len(history) <= 200
+    told = history.of(2)
+    assert told.x[:10] == [float(k) for k in range(10)]
+    assert told.x[-1] > 2500
+
+
+def test_a_long_history_is_told_with_its_ends():
+    history = TreeHistory()
+    for index in range(1500):
+        history.record(seen(index, float(index)), START_NS)
+    told = history.of(1)
+    assert len(told.x) <= 200
+    assert told.x[0] == 0.0
+    assert told.x[-1] == 1499.0
+
+
+@given(st.floats(0.1, 5.0), st.floats(0.01, 1.0), st.floats(-1.5, 1.5))
+def test_half_axes_give_the_ellipse_back(major: float, part: float, angle: float):
+    minor = part * major
+    C = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    a, b, turned = half_axes((C @ np.diag([major**2, minor**2]) @ C.T)[None])[0]
+    assert (a, b) == pytest.approx((major, minor), rel=1e-6)
+    if part < 0.99:
+        assert np.sin(turned - angle) == pytest.approx(0.0, abs=1e-5)

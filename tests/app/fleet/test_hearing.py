@@ -1,0 +1,76 @@
+"""What one robot publishes of itself harms neither its own card nor those of others."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import pytest
+
+from app.fleet.hearing import Hearing
+from app.fleet.results import UNREADABLE, Results
+from app.robot.inbox import Inbox
+from app.robot.ros_graph import Publisher
+from app.robot.zenoh_link import ZenohLink
+from pipeline.io.readers.container import Channel, Message
+from pipeline.io.recording import outputs
+from pipeline.types.clearance import Clearance, Zone
+from tests.app.fakes import START_NS, frame
+
+
+class FakeLink:
+    """A router at which some publish."""
+
+    version, problem, place = 1, "", "connected to a fake"
+
+    def __init__(self, topics: Sequence[str]) -> None:
+        self.numbers: dict[str, int] = {}
+        self._topics = topics
+
+    def publishers(self) -> list[Publisher]:
+        return [Publisher("", topic, outputs.TYPES[topic.rpartition("/")[2]]) for topic in self._topics]
+
+    def subscribe(self, channels: Sequence[Channel]) -> None:
+        self.numbers |= {channel.topic: channel.number for channel in channels}
+
+
+def published(within: float) -> dict[str, bytes]:
+    seen = replace(frame(3, START_NS), clearance=Clearance(Zone.STOP, 0.75, within=within))
+    return outputs.scan_messages(seen)
+
+
+@pytest.mark.parametrize("within", [math.inf, -math.inf, math.nan])
+def test_a_range_that_is_none_is_counted_and_the_last_one_stays(within: float):
+    results = Results()
+    for messages in (published(3.0), published(within)):
+        for topic in (outputs.ZONE, outputs.CLEARANCE):
+            results.take(topic, messages[topic], 1.0)
+    told = json.loads(json.dumps(results.as_plain(1.0), allow_nan=False))
+    assert told["clearance"]["within_m"] == 3.0
+    assert told["unreadable"] == 1
+
+
+def test_a_robot_of_which_nothing_can_be_said_is_begun_anew_and_the_others_are_heard_on(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    link, inbox = FakeLink(["/red/stemmap/odometry", "/blue/stemmap/odometry"]), Inbox()
+    hearing = Hearing(cast(ZenohLink, link), inbox)
+    hearing.look_around()
+    for number in link.numbers.values():
+        inbox.put(Message(number, 0, published(3.0)[outputs.ODOMETRY]), is_scan=False)
+    hearing.take(1.0)
+    honest = Results.as_plain
+
+    def as_plain(results: Results, now_s: float) -> dict[str, Any]:
+        told = honest(results, now_s)
+        return {**told, "distance_m": math.inf} if results is red else told
+
+    red = hearing._robots["red"]
+    monkeypatch.setattr(Results, "as_plain", as_plain)
+    told = json.loads(hearing.said(1.5))["robots"]
+    assert (told["red"]["silence_s"], told["red"]["unreadable"]) == (None, 1)
+    assert (told["blue"]["silence_s"], told["blue"]["unreadable"]) == (0.5, 0)
+    assert hearing._robots["red"].losses == {UNREADABLE: 1}

@@ -1,0 +1,166 @@
+"""Messages as they come become the records that a recording of them gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import SourceError
+from pipeline.io.readers import SourceOptions, open_source
+from pipeline.io.readers.clock_step_filter import SteppingClock
+from pipeline.io.readers.container import Channel, Message
+from pipeline.io.readers.live_reader import OPENING_LIMIT, ArrivalReader
+from pipeline.io.readers.mcap_file import McapFile
+from pipeline.io.readers.rostypes import ODOMETRY, POINT_CLOUD
+from pipeline.types.records import Notice, Odometry, PoseMeasurement, Record, Scan
+from tests.app.robot.conftest import SCANS
+from tests.pipeline.io.recordings import START_NS, STEP_NS, write_recording
+from tests.pipeline.io.test_more_ros import straight
+
+SECOND = 1_000_000_000
+SCAN, WHEELS = 1, 2
+
+
+def read(channels: list[Channel], messages: Iterator[Message]) -> tuple[ArrivalReader, list[Record]]:
+    reader = ArrivalReader("here", "live", channels, SourceOptions())
+    records = [record for message in messages for record in reader.add(message)]
+    return reader, records + reader.finish()
+
+
+def test_a_row_of_messages_gives_the_records_of_its_file(drive: Path):
+    with closing(McapFile(drive)) as container, closing(open_source(str(drive))) as source:
+        numbers = [channel.number for channel in container.channels]
+        reader, records = read(container.channels, container.messages(numbers, None, {}))
+        assert reader.description is not None
+        assert reader.description.in_order_of_arrival
+        assert reader.description.has_odometry
+        np.testing.assert_allclose(reader.description.T_base_lidar.t, source.description.T_base_lidar.t)
+        assert reader.losses == {}
+        ours = [record.stamp_ns for record in records if isinstance(record, Scan)]
+        theirs = [record.stamp_ns for record in source.records() if isinstance(record, Scan)]
+        assert ours == theirs
+        assert len(ours) == SCANS
+        assert not any(isinstance(record, Notice) for record in records)
+
+
+def test_a_planar_laser_and_fixes_count_live_too(tmp_path: Path):
+    drive = write_recording("mcap", tmp_path, lambda author, write: straight(author, write, metres=120.0))
+    with closing(McapFile(next(drive.rglob("*.mcap")))) as container:
+        numbers = [channel.number for channel in container.channels]
+        messages = list(container.messages(numbers, None, {}))
+        reader, records = read(container.channels, iter(messages))
+        again = ArrivalReader("here", "live", container.channels, SourceOptions())
+        again.from_ns = messages[-1].log_ns - SECOND
+        late = [record for message in messages for record in again.add(message)]
+    assert reader.description is not None
+    assert reader.description.preset == "laser2d"
+    assert "drove far enough" in reader.description.gnss
+    assert sum(isinstance(record, Scan) for record in records) == 60
+    assert [n.text for n in records if isinstance(n, Notice) and "north is known" in n.text]
+    measured = [record for record in records if isinstance(record, PoseMeasurement)]
+    assert len(measured) >= 2
+    for pose in measured:
+        ahead = 120.0 * (pose.stamp_ns - START_NS) / STEP_NS / 59
+        np.testing.assert_allclose([pose.T_map_base.x, pose.T_map_base.y], [ahead, 0.0], atol=1.0)
+    # Going on from a later time gives the very same poses.
+    told = [repr(record) for record in late if isinstance(record, PoseMeasurement)]
+    assert told
+    assert told == [repr(pose) for pose in measured][-len(told) :]
+
+
+def test_fixes_beside_a_robot_that_stands_tell_nothing(tmp_path: Path):
+    drive = write_recording("mcap", tmp_path, lambda author, write: straight(author, write, metres=3.0))
+    with closing(McapFile(next(drive.rglob("*.mcap")))) as container:
+        numbers = [channel.number for channel in container.channels]
+        _, records = read(container.channels, container.messages(numbers, None, {}))
+    assert not any(isinstance(record, PoseMeasurement) for record in records)
+
+
+def test_nothing_is_known_before_a_scan_and_memory_is_bounded(drive: Path):
+    with closing(McapFile(drive)) as container:
+        wheels = next(c.number for c in container.channels if c.msgtype == ODOMETRY)
+        reader = ArrivalReader("here", "live", container.channels, SourceOptions())
+        (first, *_) = container.messages([wheels], None, {})
+        for k in range(2 * OPENING_LIMIT):
+            assert reader.add(replace(first, log_ns=k)) == []
+        assert reader.description is None
+        assert len(reader._opening) <= OPENING_LIMIT
+
+
+def test_scans_that_nobody_can_read_are_an_error_in_the_end():
+    channel = Channel(1, "/points", POINT_CLOUD, "cdr", "", "", 0)
+    reader = ArrivalReader("here", "live", [channel], SourceOptions())
+
+    def send() -> None:
+        for k in range(200):
+            reader.add(Message(1, k * SECOND // 10, b"\x00\x01\x00\x00" + bytes(40)))
+
+    with pytest.raises(SourceError, match="cannot be read"):
+        send()
+
+
+def clock() -> SteppingClock:
+    return SteppingClock([0, 0])
+
+
+@given(st.integers(-2_000_000_000, 4 * 10**9), st.integers(1, 400), st.integers(-SECOND // 4, SECOND // 4))
+def test_times_go_on_evenly_when_the_clock_is_set(step_s: int, delay_ms: int, jitter_ns: int):
+    """Stamps of two topics at 10 Hz; after the tenth their clock is set, each message comes late by
+    something of its own."""
+    ours = clock()
+    step_ns = step_s * SECOND
+    late = delay_ms * 1_000_000
+    times: dict[int, list[int]] = {SCAN: [], WHEELS: []}
+    start = 2_000_000_000 * SECOND
+    for k in range(30):
+        true_ns = start + k * SECOND // 10
+        stamp_ns = true_ns + (step_ns if k >= 10 else 0)
+        for channel, extra in ((WHEELS, 0), (SCAN, late + (jitter_ns if k % 2 else 0) // 1000)):
+            found = ours.time_of(stamp_ns, Message(channel, true_ns + extra, b""))
+            assert found is not None
+            times[channel].append(found)
+    expected = 0 if abs(step_s) > 2 else step_ns
+    spacing = np.diff(times[WHEELS])
+    if abs(step_s) > 2:
+        assert len(ours.notices) == 1
+        # The step is measured by one arrival, whose lateness nobody knows.
+        assert np.all(np.abs(spacing - SECOND // 10) <= SECOND // 2)
+        shift = np.array(times[SCAN]) - np.array(times[WHEELS])
+        assert np.all(shift == 0), "both topics take the same shift"
+    else:
+        assert expected == step_ns
+
+
+def test_late_messages_are_no_step():
+    ours = clock()
+    start = 1_700_000_000 * SECOND
+    arrivals = [0.0, 0.1, 0.2, 8.0, 8.001, 8.002, 8.1]  # the network stood still for eight seconds
+    stamps = [0.0, 0.1, 0.2, 0.3, 4.0, 7.9, 8.1]
+    for came, stamped in zip(arrivals, stamps, strict=True):
+        stamp_ns = start + round(stamped * SECOND)
+        assert ours.time_of(stamp_ns, Message(SCAN, start + round(came * SECOND), b"")) == stamp_ns
+    assert ours.notices == []
+
+
+def test_stamps_that_became_zero_are_told_by_their_arrival():
+    ours = clock()
+    start = 1_700_000_000 * SECOND
+    assert ours.time_of(start, Message(SCAN, start, b"")) == start
+    assert ours.time_of(0, Message(SCAN, start + SECOND, b"")) == start + SECOND
+    assert ours.time_of(None, Message(WHEELS, start + SECOND, b"")) is None
+
+
+def test_odometry_is_in_its_own_order(drive: Path):
+    with closing(McapFile(drive)) as container:
+        numbers = [channel.number for channel in container.channels]
+        _, records = read(container.channels, container.messages(numbers, None, {}))
+    stamps = [record.stamp_ns for record in records if isinstance(record, Odometry)]
+    assert stamps == sorted(stamps)
+    assert len(stamps) == 5 * SCANS + 1

@@ -1,0 +1,187 @@
+"""A session on a robot: waits, maps what comes, says when nothing comes; with a link of our own."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.robot.address import ZenohAddress, parse_address
+from app.robot.inbox import Inbox
+from app.robot.ros_graph import Publisher
+from app.robot.source import LiveSource
+from app.worker.internal_protocol import Begin, FromWorker, Opened, Report, Shown, ToWorker
+from app.worker.loop import Driver
+from app.worker.protocol import Advance, Open, Pause, Seek
+from app.worker.session import Session
+from pipeline.config import Parameters
+from pipeline.io.readers import SourceOptions
+from pipeline.io.readers.container import Channel, Message
+from pipeline.io.readers.mcap_file import McapFile
+from pipeline.io.readers.rostypes import POINT_CLOUD
+from pipeline.odometry.synchroniser import steps
+from tests.app.fakes import FakeMapper
+from tests.app.robot.conftest import SCANS, until
+
+URI = "zenoh:tcp/robot:7447"
+
+
+class FakeLink:
+    """Gives what the test puts into the inbox."""
+
+    def __init__(self, _address: ZenohAddress, inbox: Inbox) -> None:
+        self.inbox = inbox
+        self.problem, self.losses, self.scans, self.version = "", {"scans lost on the way": 2}, 0, 0
+        self.silence_s: float | None = None
+        self.there: list[Publisher] = []
+        self.channels: Sequence[Channel] = ()
+        self.place, self.nothing = "connected to a test", "no scans of a robot are announced"
+        self.session: Any = None
+        self.closed = False
+
+    def publishers(self) -> list[Publisher]:
+        return self.there
+
+    def robots(self) -> list[str]:
+        return sorted({p.robot for p in self.there if p.msgtype == POINT_CLOUD})
+
+    def subscribe(self, channels: Sequence[Channel]) -> None:
+        self.channels = channels
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Stage:
+    """A driver in a thread, its session's robot, and what it says."""
+
+    def __init__(self) -> None:
+        self.said: list[FromWorker] = []
+        self.commands: queue.Queue[ToWorker | None] = queue.Queue()
+        self.links: list[FakeLink] = []
+        self.session = Session(
+            open_source=lambda uri, _options: LiveSource(parse_address(uri), SourceOptions(), self._link),
+            make_mapper=lambda _source, p, seed, watch: FakeMapper(p, seed, watch),
+            make_synchroniser=lambda _odometry: steps,
+            parameters=Parameters(),
+        )
+
+    def _link(self, address: ZenohAddress, inbox: Inbox) -> FakeLink:
+        self.links.append(FakeLink(address, inbox))
+        return self.links[-1]
+
+    @property
+    def status(self) -> Any:
+        reports = [m.status for m in list(self.said) if isinstance(m, Report)]
+        return reports[-1] if reports else None
+
+    @property
+    def shown(self) -> list[int]:
+        return [message.frame.index for message in list(self.said) if isinstance(message, Shown)]
+
+    def opened(self) -> list[Opened]:
+        return [message for message in list(self.said) if isinstance(message, Opened)]
+
+
+@contextmanager
+def stage() -> Iterator[Stage]:
+    made = Stage()
+    thread = threading.Thread(target=Driver(made.session, made.commands, made.said.append).run)
+    thread.start()
+    try:
+        yield made
+    finally:
+        made.commands.put(None)
+        thread.join(30)
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def sending(drive: Path) -> Callable[[FakeLink, int, int], None]:
+    """Puts the messages of some scans, and what lies between them, into a link's inbox."""
+    with closing(McapFile(drive)) as container:
+        topics = {c.number: c for c in container.channels}
+        messages = list(container.messages(list(topics), None, {}))
+
+    def send(link: FakeLink, first: int, last: int) -> None:
+        numbers = {channel.topic: channel.number for channel in link.channels}
+        scan = -1
+        for message in messages:
+            channel = topics[message.channel]
+            is_scan = channel.msgtype == POINT_CLOUD
+            scan += is_scan
+            if first <= max(scan, 0) < last and channel.topic in numbers:
+                put = Message(numbers[channel.topic], message.log_ns, message.payload)
+                link.inbox.put(put, is_scan=is_scan)
+        link.silence_s = 0.0
+
+    send.topics = list(topics.values())  # type: ignore[attr-defined]
+    return send
+
+
+def announce(link: FakeLink, sending: Any) -> None:
+    link.there = [Publisher("robot1", c.topic, c.msgtype) for c in sending.topics]
+    link.version += 1
+
+
+def test_a_robot_is_waited_for_mapped_lost_and_back(sending):
+    with stage() as on:
+        on.commands.put(Open(URI))
+        until(lambda: on.status and "no scans of a robot" in on.status.detail)
+        assert on.status.state == "waiting"
+        assert on.status.live
+        link = on.links[0]
+        announce(link, sending)
+        until(lambda: link.channels)
+        sending(link, 0, 11)
+        until(on.opened)
+        (opened,) = on.opened()
+        assert (opened.kind, opened.scans, opened.end_s) == ("ROS 2 over Zenoh", None, None)
+        on.commands.put(Begin(opened.run, Parameters().model_dump(), 3, True))
+        until(lambda: on.shown and on.shown[-1] == 10)
+        until(lambda: on.status.state == "playing")
+        assert (on.status.robot, on.status.robots, on.status.scans) == ("robot1", ["robot1"], None)
+        assert "scans lost on the way (2)" in on.status.warnings
+        link.silence_s, link.there, link.version = 7.0, [], 5
+        until(lambda: on.status.state == "waiting")
+        until(lambda: on.status.detail.startswith("Nothing heard for 7 s: robot robot1 is gone"))
+        until(lambda: "robot robot1 is lost" in on.status.warnings)
+        announce(link, sending)
+        sending(link, 11, SCANS)
+        until(lambda: on.shown[-1] == SCANS - 1)
+        until(lambda: "robot robot1 is back" in on.status.warnings)
+        assert on.status.state == "playing"
+        assert on.shown == sorted(set(on.shown)), "each scan is shown once"
+
+
+def test_a_live_run_can_be_paused_and_not_stepped(sending):
+    with stage() as on:
+        on.commands.put(Open(URI))
+        until(lambda: on.links)
+        link = on.links[0]
+        announce(link, sending)
+        until(lambda: link.channels)
+        sending(link, 0, 11)
+        until(on.opened)
+        on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
+        until(lambda: on.shown and on.shown[-1] == 10)
+        for command in (Pause(), Seek(0.0), Advance(1)):
+            on.commands.put(command)
+        until(lambda: on.status.state == "paused")
+        until(lambda: any("open its recording" in warning for warning in on.status.warnings))
+        sending(link, 11, SCANS)
+        assert on.shown[-1] == 10
+
+
+def test_another_run_leaves_a_robot_that_was_never_heard():
+    with stage() as on:
+        on.commands.put(Open(URI))
+        on.commands.put(Open(URI + "?robot=red"))
+        until(lambda: len(on.links) == 2 and on.links[0].closed)
+        until(lambda: on.status.source.endswith("robot=red") and on.status.state == "waiting")
+    assert on.links[1].closed

@@ -1,0 +1,77 @@
+"""The surface of the ground, and what stands on it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from app.scene import Scene
+from app.scene.ground_node import MOST_CELLS, raster, surface
+from pipeline.types.records import HeightMap
+from tests.app.scene.frames import make_frame
+
+PATH = np.column_stack([0.05 * np.arange(50), np.zeros(50)])
+
+
+def make_ground(side: int, slope: float = 0.2) -> HeightMap:
+    """A square of known cells around the origin that rises along x."""
+    i, j = (axis.ravel() - side // 2 for axis in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
+    place = np.stack([i, j], axis=1).astype(np.int32)
+    height = (slope * 0.5 * (i + 0.5)).astype(np.float32)
+    return HeightMap(0.5, place, height, np.full(len(i), 0.03, np.float32), np.ones(len(i), np.int32))
+
+
+def node(scene: Scene, name: str):
+    handle = scene._server.scene.get_handle_by_name(name)
+    assert handle is not None, name
+    return handle
+
+
+def test_a_square_of_known_cells_is_two_triangles_each_seen_from_above():
+    vertices, faces = surface(*raster(make_ground(5)))
+    assert vertices.shape == (25, 3)
+    assert faces.shape == (32, 3)
+    np.testing.assert_allclose(vertices[:, 2], 0.2 * vertices[:, 0], atol=1e-6)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    assert np.all(np.cross(b - a, c - a)[:, 2] > 0.0)
+
+
+def test_a_hole_stays_a_hole():
+    ground = make_ground(5)
+    kept = np.any(ground.place != 0, axis=1)
+    columns = {name: getattr(ground, name)[kept] for name in ("place", "height", "sigma", "views")}
+    _, faces = surface(*raster(HeightMap(cell=0.5, **columns)))
+    assert len(faces) == 32 - 8
+
+
+def test_a_large_map_is_shown_with_larger_cells():
+    grid, _, cell = raster(make_ground(300))
+    assert cell == 1.0
+    assert np.count_nonzero(np.isfinite(grid)) <= MOST_CELLS
+
+
+def test_trees_and_robot_stand_on_the_ground_and_the_surface_is_sent_once(scene: Scene):
+    frame = dataclasses.replace(make_frame(0), ground=make_ground(120), base_z=0.4)
+    scene.show(frame, PATH[:1])
+    assert node(scene, "/world/surface").visible
+    feet = node(scene, "/world/trees").batched_positions
+    np.testing.assert_allclose(feet[:, 2], 0.2 * feet[:, 0], atol=0.11)
+    assert node(scene, "/world/robot").position[2] == 0.4
+    assert node(scene, "/world").position[2] == -0.4
+    before = scene.messages
+    scene.show(dataclasses.replace(frame, ground=None), PATH[:1])
+    assert scene.messages == before
+
+
+def test_the_switch_hides_the_surface(scene: Scene):
+    scene.show(dataclasses.replace(make_frame(0), ground=make_ground(40)), PATH[:1])
+    scene.choose("ground", False)
+    assert not node(scene, "/world/surface").visible
+    scene.choose("ground", True)
+    assert node(scene, "/world/surface").visible
+
+
+def test_without_a_height_map_there_is_no_surface(scene: Scene):
+    scene.show(make_frame(0), PATH[:1])
+    assert not node(scene, "/world/surface").visible

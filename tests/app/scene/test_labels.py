@@ -1,0 +1,83 @@
+"""What is written above clusters and trees."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.scene import Scene
+from app.scene.labels import BEHIND, MOST_LABELS, Label, Labels, apart, cluster_labels, short
+from tests.app.scene.frames import make_frame
+
+PATH = np.zeros((1, 2))
+
+
+def test_labels_say_eccentricity_and_verdict(scene: Scene):
+    scene.show(make_frame(0), PATH)
+    assert "e 5.0 tree" in scene._scan.texts
+    assert "e ∞ too long" in scene._scan.texts
+
+
+@pytest.mark.parametrize(
+    ("label_by", "expected"), [("verdict", "too long"), ("DBH", "30 cm"), ("none", None)]
+)
+def test_labels_say_what_was_chosen(scene: Scene, label_by: str, expected: str | None):
+    scene.show(make_frame(0), PATH)
+    scene.choose("label_by", label_by)
+    assert scene._scan.texts == [] if expected is None else expected in scene._scan.texts
+
+
+def test_trees_come_first_when_there_are_too_many():
+    frame = make_frame(0, clusters=200)
+    wide = 20.0 + 20.0 * (np.arange(200) // 2 % 2)  # on two rings, so that none lies upon another
+    centroid = frame.clusters.centroid * np.column_stack([wide, wide, np.ones(200)])
+    frame = replace(frame, clusters=replace(frame.clusters, centroid=centroid))
+    labels = cluster_labels(frame, np.arange(200), "verdict")
+    assert len(labels) == MOST_LABELS
+    assert {label.text for label in labels} == {"tree"}
+
+
+@given(st.lists(st.tuples(st.floats(-40, 40), st.floats(-40, 40)), min_size=1, max_size=40), st.randoms())
+def test_no_label_lies_upon_another_and_none_is_left_out_without_one_that_covers_it(at, rng):
+    places, robot, width = np.array(at), np.array([1.0, 2.0]), 0.1
+    order = np.array(rng.sample(range(len(at)), len(at)))
+    kept = apart(places, order, robot, width, 100)
+    assert kept[0] == order[0]
+    for k, row in enumerate(order.tolist()):
+        room = width * (BEHIND + np.linalg.norm(places[row] - robot))
+        before = [other for other in kept if other in order[:k]]
+        is_free = all(np.linalg.norm(places[row] - places[other]) >= room for other in before)
+        assert (row in kept) == is_free
+    assert apart(places, order, robot, width, 3) == kept[:3]
+
+
+async def test_a_label_that_says_the_same_costs_nothing(scene: Scene):
+    labels = Labels(scene._server.scene, "/some")
+    labels.show([Label(1, "a", (0.0, 0.0, 0.0)), Label(2, "b", (1.0, 0.0, 0.0))])
+    before = scene.messages
+    labels.show([Label(2, "b", (1.05, 0.0, 0.0)), Label(1, "a", (0.0, 0.05, 0.0))])
+    assert scene.messages == before
+    labels.show([Label(3, "c", (9.0, 0.0, 0.0))])
+    assert labels.texts == ["c"]
+
+
+@pytest.mark.parametrize(("value", "text"), [(3.2189, "3.2"), (16.457, "16"), (123.4, "100"), (np.inf, "∞")])
+def test_figures_that_tremble_are_short(value: float, text: str):
+    assert short(value) == text
+
+
+def test_a_stem_of_another_program_is_labelled_and_drawn_without_eccentricity_and_height(scene: Scene):
+    frame = make_frame(0)
+    unknown = np.full(len(frame.clusters.size), np.nan)
+    extent = np.column_stack([frame.clusters.extent[:, :2], unknown])
+    ready = replace(frame.clusters, eccentricity=unknown, extent=extent)
+    scene.show(replace(frame, clusters=ready), PATH)
+    assert set(scene._scan.texts) == {"tree", "too long"}
+    scene.choose("colour_by", "eccentricity")
+    fits = scene._server.scene.get_handle_by_name("/world/robot/scan/fits")
+    assert fits is not None
+    assert np.isfinite(fits.batched_scales).all()  # type: ignore[attr-defined]

@@ -1,0 +1,124 @@
+"""The layers that are made while people want to see them: voxels, the accumulated map, errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.scene import Scene
+from app.scene.error_node import errors
+from app.scene.map_cloud import BLOCK, SIDE, STEP, Accumulated
+from pipeline.config import preset
+from pipeline.config.stages import Evaluation
+from pipeline.geometry.poses import Pose2
+from pipeline.types.records import TruthTrees
+from tests.app.scene.frames import make_frame, make_trees
+
+PATH = np.column_stack([0.05 * np.arange(50), np.zeros(50)])
+
+
+def node(scene: Scene, name: str):
+    handle = scene._server.scene.get_handle_by_name(name)
+    assert handle is not None, name
+    return handle
+
+
+def frames(poses: list[tuple[float, float]]):
+    return [make_frame(k, pose=Pose2(x, 0.0, yaw)) for k, (x, yaw) in enumerate(poses)]
+
+
+@given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-3, 3)), min_size=1, max_size=6))
+def test_each_cell_has_one_point_and_going_back_forgets_what_came_later(poses: list[tuple[float, float]]):
+    run = frames(poses)
+    gathered = Accumulated()
+    after = []
+    for frame in run:
+        gathered.take(frame)
+        after.append(gathered.points.copy())
+    cells = np.unique(np.floor(gathered.points.astype(np.float64) / SIDE), axis=0)
+    assert len(cells) >= 0.98 * len(gathered.points)  # float32 may round a point over a border
+    for index in reversed(range(len(run))):
+        gathered.take(run[index])
+        np.testing.assert_array_equal(gathered.points, after[index])
+
+
+def test_a_robot_that_stands_gathers_nothing_new():
+    gathered = Accumulated()
+    assert gathered.take(make_frame(0, pose=Pose2(0.0, 0.0, 0.0)))
+    count = len(gathered.points)
+    assert not gathered.take(make_frame(1, pose=Pose2(0.5 * STEP, 0.0, 0.0)))
+    assert len(gathered.points) == count
+    assert gathered.take(make_frame(2, pose=Pose2(0.5 * STEP, 0.0, 0.5)))
+
+
+def test_what_has_no_room_is_counted(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("app.scene.map_cloud.MOST_POINTS", 50)
+    gathered = Accumulated()
+    gathered.take(make_frame(0))
+    assert len(gathered.points) == 50
+    assert gathered.left_out > 0
+
+
+async def test_the_accumulated_map_is_shown_when_it_is_asked_for(scene: Scene):
+    scene.show(make_frame(0, pose=Pose2(0.0, 0.0, 0.0)), PATH[:1])
+    assert scene.counts["gathered"] > 0
+    assert scene._server.scene.get_handle_by_name("/world/gathered/0") is None
+    scene.choose("gathered", True)
+    block = node(scene, "/world/gathered/0")
+    assert block.visible
+    assert len(block.points) == scene.counts["gathered"] < BLOCK
+    scene.show(make_frame(1, pose=Pose2(3.0, 0.0, 0.0)), PATH[:2])
+    assert len(block.points) == scene.counts["gathered"]
+    scene._renew()  # a scene that is built anew has what the old one had
+    assert len(node(scene, "/world/gathered/0").points) == scene.counts["gathered"]
+    scene.clear()
+    assert scene.counts["gathered"] == 0
+
+
+async def test_voxels_are_as_large_as_the_filter_has_them(scene: Scene):
+    frame = make_frame(0)
+    scene.show(frame, PATH[:1])
+    assert scene.counts["voxels"] == 0
+    scene.show_parameters(preset("forest").replace({"filters.voxel_size": 0.2}), "forest")
+    scene.choose("voxels", True)
+    boxes = node(scene, "/world/robot/scan/voxels")
+    wanted = np.unique(np.floor(frame.filtered.astype(np.float64) / 0.2), axis=0)
+    assert scene.counts["voxels"] == len(wanted)
+    np.testing.assert_allclose(boxes.batched_positions, 0.2 * wanted, atol=1e-5)
+    np.testing.assert_allclose(boxes.batched_scales, 0.2, atol=1e-6)
+    scene.show_parameters(preset("forest").replace({"filters.voxel_size": 0.0}), "forest")
+    scene.show(frame, PATH[:1])
+    assert (scene.counts["voxels"], boxes.visible) == (0, False)
+
+
+def truth_of(x: list[float], y: list[float], kind: tuple[str, ...]) -> TruthTrees:
+    return TruthTrees(np.array(x), np.array(y), np.full(len(x), np.nan), kind)
+
+
+def test_errors_are_offsets_missed_and_false_trees():
+    trees = make_trees(4)
+    trees = replace(trees, position=np.array([[0.0, 0.1], [5.0, 5.0], [3.0, 0.0], [90.0, 0.0]]))
+    truth = truth_of([0.0, 2.0, 3.05, 200.0], [0.0, 7.0, 0.0, 0.0], ("tree", "tree", "pole", "tree"))
+    offsets, missed, false = errors(trees, truth, PATH, Evaluation(match_distance=0.5, reach=20.0))
+    np.testing.assert_allclose(offsets, [[[0.0, 0.0], [0.0, 0.1]]])
+    np.testing.assert_allclose(missed, [[2.0, 7.0]])  # the farthest is out of reach
+    np.testing.assert_allclose(false, [[5.0, 5.0], [3.0, 0.0]])  # a pole that was taken for a tree is one too
+
+
+async def test_errors_are_drawn_while_they_are_wanted(scene: Scene):
+    frame = make_frame(0)
+    scene.show_truth(truth_of([1.0], [1.0], ("tree",)))
+    scene.show(frame, PATH)
+    assert scene.counts["errors"] == 0
+    scene.choose("errors", True)
+    lines = node(scene, "/world/errors")
+    assert lines.visible
+    assert scene.counts["errors"] > 0
+    assert lines.points.shape == lines.colors.shape
+    scene.show_truth(None)
+    scene.show(frame, PATH)
+    assert (lines.visible, scene.counts["errors"]) == (False, 0)

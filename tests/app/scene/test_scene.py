@@ -1,0 +1,233 @@
+"""What reaches viser when a frame is shown."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.scene import Scene
+from app.scene import scene as scene_module
+from app.scene.cloud import Cloud
+from pipeline.geometry.poses import Pose2
+from pipeline.types.records import TruthTrees
+from tests.app.scene.frames import make_frame, make_trees
+from tests.app.scene.recorder import buffered
+
+PATH = np.column_stack([0.05 * np.arange(1000), np.zeros(1000)])
+
+
+def node(scene: Scene, name: str):
+    handle = scene._server.scene.get_handle_by_name(name)
+    assert handle is not None, name
+    return handle
+
+
+def test_the_first_frame_makes_the_nodes(scene: Scene):
+    frame = make_frame(3)
+    scene.show(frame, PATH[:4])
+    raw = node(scene, "/world/robot/scan/raw")
+    assert raw.points.shape == frame.raw.shape
+    assert raw.points.dtype == np.float16
+    np.testing.assert_allclose(raw.points, frame.raw, atol=0.01)
+    assert node(scene, "/world/particles").points.dtype == np.float32
+    assert len(node(scene, "/world/trees").batched_positions) == len(frame.trees.number)
+    assert len(node(scene, "/world/robot/scan/fits").batched_positions) == len(frame.detections.cluster)
+
+
+def test_points_stand_where_the_sensor_sees_them(scene: Scene):
+    """The parents of the points compose to T_map_base and the sensor's offset, up to the world's shift."""
+    pose = Pose2(3.0, -2.0, 0.7)
+    frame = make_frame(1, pose=pose)
+    scene.show(frame, PATH[:2])
+    robot, sensor = node(scene, "/world/robot"), node(scene, "/world/robot/scan")
+    yaw = 2.0 * np.arctan2(robot.wxyz[3], robot.wxyz[0])
+    assert yaw == pytest.approx(pose.yaw)
+    np.testing.assert_allclose(robot.position, [pose.x, pose.y, 0.0])
+    np.testing.assert_allclose(sensor.position, frame.sensor_offset)
+    np.testing.assert_allclose(node(scene, "/world").position, [-pose.x, -pose.y, 0.0])
+
+
+def test_a_later_frame_adds_no_node(scene: Scene):
+    scene.show(make_frame(0), PATH[:1])
+    scene.show(make_frame(1), PATH[:2])
+    nodes = set(scene._server.scene._handle_from_node_name)
+    for index in range(2, 12):
+        scene.show(make_frame(index), PATH[: index + 1])
+    assert set(scene._server.scene._handle_from_node_name) == nodes
+
+
+def test_a_frame_costs_few_messages(scene: Scene):
+    scene.show(make_frame(0), PATH[:1])
+    before = scene.messages
+    for index in range(1, 21):
+        scene.show(make_frame(index), PATH[: index + 1])
+    assert (scene.messages - before) / 20 < 30  # two million last for more than an hour and a half
+
+
+def test_the_same_frame_twice_sends_nothing(scene: Scene):
+    frame = make_frame(5)
+    scene.show(frame, PATH[:6])
+    before = scene.messages
+    scene.show(frame, PATH[:6])
+    assert scene.messages == before
+
+
+def test_a_thousand_trees_are_one_mesh(scene: Scene):
+    scene.show(make_frame(0, trees=1000), PATH[:1])
+    trees = node(scene, "/world/trees")
+    assert trees.batched_positions.shape == (1000, 3)
+    assert trees.batched_colors.shape == (1000, 3)
+    dbh = make_trees(1000).dbh
+    known = np.isfinite(dbh)
+    np.testing.assert_allclose(trees.batched_scales[known, 0], 0.5 * dbh[known], atol=0.001)
+    labels = [
+        name for name in scene._server.scene._handle_from_node_name if name.startswith("/world/numbers/")
+    ]
+    assert len(labels) <= 20
+
+
+def test_trees_that_are_not_confirmed_are_not_shown(scene: Scene):
+    trees = make_trees(9)
+    frame = dataclasses.replace(
+        make_frame(0), trees=dataclasses.replace(trees, confirmed=np.arange(9) % 3 == 0)
+    )
+    scene.show(frame, PATH[:1])
+    assert len(node(scene, "/world/trees").batched_positions) == 3
+
+
+def test_colours_are_as_many_as_points(scene: Scene):
+    for name in ("verdict", "stage", "cluster", "height", "eccentricity"):
+        scene.choose("colour_by", name)
+        scene.show(make_frame(2, clusters=5), PATH[:3])
+        for cloud in ("raw", "filtered", "clusters"):
+            handle = node(scene, f"/world/robot/scan/{cloud}")
+            assert handle.colors.shape == handle.points.shape, (name, cloud)
+
+
+def test_a_scan_without_points_or_clusters_is_shown(scene: Scene):
+    full = make_frame(0)
+    empty = dataclasses.replace(
+        make_frame(1, clusters=0, trees=0),
+        raw=np.zeros((0, 3), dtype=np.float32),
+        filtered=np.zeros((0, 3), dtype=np.float32),
+        labels=np.zeros(0, dtype=np.int32),
+    )
+    for frame in (empty, full, empty):
+        scene.show(frame, PATH[:1])
+    assert not node(scene, "/world/robot/scan/raw").visible
+    assert not node(scene, "/world/trees").visible
+    scene.show(full, PATH[:1])
+    assert node(scene, "/world/robot/scan/raw").visible
+
+
+def test_a_hidden_layer_sends_nothing_and_comes_back_with_the_newest_scan(scene: Scene):
+    scene.show(make_frame(0), PATH[:1])
+    scene.choose("raw", False)
+    raw = node(scene, "/world/robot/scan/raw")
+    old = raw.points.copy()
+    frame = make_frame(1)
+    scene.show(frame, PATH[:2])
+    np.testing.assert_array_equal(raw.points, old)
+    scene.choose("raw", True)
+    np.testing.assert_allclose(raw.points, frame.raw, atol=0.01)
+    assert raw.visible
+
+
+def test_the_picture_stays_where_it_is_when_following_ends(scene: Scene):
+    scene.show(make_frame(0, pose=Pose2(4.0, 1.0, 0.0)), PATH[:1])
+    scene.choose("follow", False)
+    scene.show(make_frame(1, pose=Pose2(6.0, 1.0, 0.0)), PATH[:2])
+    np.testing.assert_allclose(node(scene, "/world").position, [-4.0, -1.0, 0.0])
+
+
+def test_selection_is_marked_and_named(scene: Scene):
+    scene.show(make_frame(0), PATH[:1])
+    scene.select(7)
+    assert node(scene, "/world/selection").visible
+    assert any(text.startswith("tree 7, DBH") for text in scene._map.texts)
+    scene.select(None)
+    assert not node(scene, "/world/selection").visible
+    assert not any(text.startswith("tree") for text in scene._map.texts)
+
+
+def test_a_click_or_a_look_around_sends_no_points(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    scene.show(make_frame(0), PATH[:1])
+    touched: list[str] = []
+    monkeypatch.setattr(Cloud, "show", lambda self, *_: touched.append(self.node.name))
+    scene.select(7)
+    assert touched == []
+    monkeypatch.undo()
+    handle = type(node(scene, "/world/robot/scan/raw"))
+    queue = handle._queue_update
+
+    def remember(self: Any, name: str, value: Any) -> None:
+        touched.append(name)
+        queue(self, name, value)
+
+    monkeypatch.setattr(handle, "_queue_update", remember)
+    scene.choose("follow", False)
+    assert touched == []
+    scene.choose("colour_by", "height")
+    assert "points" not in touched
+    assert "colors" in touched
+
+
+def test_truth_comes_and_goes(scene: Scene):
+    truth = TruthTrees(
+        x=np.array([1.0, 2.0]), y=np.zeros(2), dbh=np.array([0.3, np.nan]), kind=("tree", "pole")
+    )
+    scene.show_truth(truth)
+    rings = node(scene, "/world/truth")
+    assert rings.visible
+    assert rings.points.shape == (64, 2, 3)
+    reach = np.linalg.norm(rings.points[:32, 0, :2] - [1.0, 0.0], axis=1)
+    np.testing.assert_allclose(reach, 0.15 + 0.12, atol=1e-6)
+    scene.show_truth(None)
+    assert not rings.visible
+
+
+def test_clear_forgets_the_run_and_keeps_the_panel(scene: Scene):
+    scene.show(make_frame(0), PATH[:1])
+    widgets = len(scene._server.gui._gui_input_handle_from_uuid)
+    scene.clear()
+    assert not node(scene, "/world/trees").visible
+    assert len(scene._server.gui._gui_input_handle_from_uuid) == widgets
+    scene.show(make_frame(1), PATH[:1])
+    assert node(scene, "/world/trees").visible
+
+
+def test_a_run_that_never_moves_is_not_shown_in_the_last_runs_frame(scene: Scene):
+    scene.show(make_frame(0, pose=Pose2(3.0, -2.0, 1.3)), PATH[:1])
+    scene.clear()
+    scene.show(make_frame(0, pose=Pose2()), PATH[:1])
+    sent = buffered(scene)  # a browser that had the last run still has its poses: unsaid is not the origin
+    for name in ("/world", "/world/robot", "/world/robot/scan"):
+        handle = node(scene, name)
+        np.testing.assert_allclose(sent[f"SetOrientationMessage {name}"].wxyz, handle.wxyz)
+        np.testing.assert_allclose(sent[f"SetPositionMessage {name}"].position, handle.position)
+    np.testing.assert_allclose(sent["SetOrientationMessage /world/robot"].wxyz, [1.0, 0.0, 0.0, 0.0])
+
+
+def test_the_server_is_renewed_before_message_numbers_hurt(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    scene.show(make_frame(0), PATH[:1])
+    scene.select(3)
+    old = scene.port
+    monkeypatch.setattr(scene_module, "RENEW_AFTER", 10)
+    scene.show(make_frame(1), PATH[:2])
+    assert scene.port != old
+    assert node(scene, "/world/selection").visible
+    assert len(node(scene, "/world/trees").batched_positions) == 25
+
+
+def test_the_path_by_odometry_begins_with_the_path_and_follows_a_jump_back(scene: Scene):
+    scene.choose("odometry", True)
+    for index in (0, 1, 2, 3, 1):
+        scene.show(make_frame(index), PATH[: index + 1])
+    last = make_frame(1)
+    segments = node(scene, "/world/odometry/0").points
+    assert len(segments) == 1
+    np.testing.assert_allclose(segments[0, 0, :2], [0.0, 0.0])
+    np.testing.assert_allclose(segments[0, 1, :2], [last.T_odom_base.x, last.T_odom_base.y], rtol=1e-6)

@@ -1,0 +1,44 @@
+"""Stands to learn from: the trees of the scenario, and more of all else; scans left out cost nothing."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from app.training.stands import FURNITURE, furnished_stand
+from pipeline.io.readers.simulated import SimulatedSource
+from pipeline.simulation.run import open_run
+from pipeline.simulation.scenarios import SCENARIOS
+from pipeline.simulation.uri import parse_uri
+from pipeline.types.records import Scan
+
+
+@pytest.mark.parametrize("name", FURNITURE)
+def test_a_furnished_stand_keeps_its_trees_and_has_more_of_all_else(name):
+    uri = f"sim:{name}?seed=3&odometry=exact"
+    plain, furnished = open_run(parse_uri(uri)).scene, open_run(furnished_stand(uri)).scene
+    assert furnished.trees == plain.trees
+    count = Counter(furnished.truth.kind)
+    poles, standing, bushes, boxes, _ = FURNITURE[name]
+    assert poles > SCENARIOS[name].poles
+    assert [count[kind] for kind in ("pole", "person", "bush", "other")] == [poles, standing, bushes, boxes]
+
+
+def test_a_scenario_without_an_entry_stays_as_it_is():
+    uri = "sim:paper?seed=3"
+    plain, same = open_run(parse_uri(uri)).scene.truth, open_run(furnished_stand(uri)).scene.truth
+    assert same.kind == plain.kind
+    np.testing.assert_array_equal(same.x, plain.x)
+
+
+def test_scans_that_are_left_out_change_nothing_of_the_others():
+    source = SimulatedSource("", open_run(parse_uri("sim:paper?duration=1")))
+    every, some = list(source.records()), list(source.records(every=4))
+    scans = [record for record in every if isinstance(record, Scan)]
+    made = [record for record in some if isinstance(record, Scan)]
+    assert [scan.stamp_ns for scan in made] == [scan.stamp_ns for scan in scans[::4]]
+    for one, same in zip(made, scans[::4], strict=True):
+        np.testing.assert_array_equal(one.points, same.points)
+    assert len(every) - len(some) == len(scans) - len(made)

@@ -1,0 +1,133 @@
+"""A set's scores are those of mapping with it, whether or not the scans were looked at for another set."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import msgspec
+import pytest
+
+from app.cli import main
+from app.tuning.sweep.asking import Named, ready
+from app.tuning.sweep.jobs import Answer, Job, code_digest
+from app.tuning.sweep.scoring import Scorer, score_text
+from pipeline.config import preset
+from pipeline.errors import StemmapError
+
+RUN = "sim:paper?duration=1"
+LONGER = "sim:paper?duration=6"  # long enough for what is known of a run before to be gone on from
+SETS: tuple[tuple[dict[str, float], bool], ...] = (
+    ({}, True),
+    ({"tracking.hits_to_confirm": 9}, False),
+    ({"evaluation.match_distance": 0.05}, False),
+    ({"detection.radius_max": 0.1}, False),
+    ({"detection.radius_max": 0.1, "tracking.gate": 2.0}, False),
+    ({"slam.particles": 7}, False),
+    ({"clustering.eps": 0.3}, True),
+    ({"clustering.eps": 0.3, "gathering.tree_share": 0.9}, False),
+)
+
+
+def named(name: str, **given: object) -> Named:
+    """A run as on the command line."""
+    flags = {"seed": 3, "odometry": "auto", "topics": {}, "mount": (), "truth": None, **given}
+    return Named(name, **flags)  # type: ignore[arg-type]
+
+
+def test_scores_are_those_of_mapping(tmp_path, capsys):
+    job = Job(
+        ready(named(RUN)).asked, preset("forest").replace({"slam.gate": 2.0}).model_dump(), code_digest()
+    )
+    answer = Scorer().score(job)
+    assert main(["map", RUN, "--seed", "3", "--out", str(tmp_path), "--set", "slam.gate=2"]) == 0
+    mapped = json.loads((tmp_path / "run.json").read_text())
+    assert answer.scores is not None, answer.error
+    assert {k: v for k, v in answer.scores.items() if k not in ("scans", "trees")} == mapped["evaluation"]
+    assert (answer.scores["scans"], answer.scores["trees"]) == (mapped["scans"], mapped["trees"])
+
+
+def test_scans_are_looked_at_once_for_like_sets_and_the_scores_are_those_of_looking_anew():
+    run, one = ready(named(LONGER)), Scorer()
+    for changes, looks in SETS:
+        job = Job(run.asked, preset("forest").replace(changes).model_dump(), code_digest())
+        answer, fresh = one.score(job), Scorer()
+        assert answer.scores == fresh.score(job).scores is not None, changes
+        assert answer.looked == looks, changes
+        fresh.close()
+    one.close()
+
+
+def test_what_was_kept_and_is_damaged_is_looked_at_again(monkeypatch):
+    run, scorer = ready(named(RUN)), Scorer()
+    job = Job(run.asked, preset("forest").model_dump(), code_digest())
+    first = scorer.score(job)
+    monkeypatch.setattr("pipeline.remapping.scan_cache.KeptScans.scan", _damaged)
+    second = scorer.score(job)
+    scorer.close()
+    assert (second.scores, second.looked) == (first.scores, True)
+
+
+def _damaged(_kept: object, index: int) -> object:
+    raise StemmapError(f"what was kept of scan {index} is damaged")
+
+
+def test_a_worker_of_another_version_or_with_another_recording_says_so():
+    run = ready(named(RUN))
+    fine = Job(run.asked, preset("forest").model_dump(), code_digest())
+    older = msgspec.structs.replace(fine, code="0.0.1")
+    other = msgspec.structs.replace(fine, run=msgspec.structs.replace(run.asked, digest="another"))
+    gone = msgspec.structs.replace(fine, run=msgspec.structs.replace(run.asked, uri="gone.mcap"))
+    for job, fault, says in (
+        (older, "version", "same version"),
+        (other, "worker", "another"),
+        (gone, "worker", "gone"),
+    ):
+        answer = msgspec.json.decode(score_text(msgspec.json.encode(job)), type=Answer)
+        assert (answer.scores, answer.fault) == (None, fault)
+        assert says in answer.error
+
+
+@pytest.mark.parametrize("text", [b"", b"{}", b"[1]", b'{"run": 3}', b"\xff"])
+def test_what_is_no_job_is_answered(text):
+    assert msgspec.json.decode(score_text(text), type=Answer).error.startswith("this is no job")
+
+
+def test_truth_far_from_the_path_is_no_score():
+    run = ready(named(RUN))
+    far = msgspec.structs.replace(run.asked.truth, x=[x + 900.0 for x in run.asked.truth.x])
+    asked = msgspec.structs.replace(run.asked, truth=far)
+    scorer = Scorer()
+    answer = scorer.score(Job(asked, preset("forest").model_dump(), code_digest()))
+    scorer.close()
+    assert answer.scores is None
+    assert "no ground truth lies within 10 m" in answer.error
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["none.mcap", "--param-grid", "slam.gate=2,3"], 1, "none.mcap"),
+        ([RUN, "--param-grid", "slam.gate=2,300"], 2, "0.5 to 20"),
+        ([RUN, "--param-grid", "filters.x_min=1", "--param-grid", "filters.x_max=-1"], 2, "none of 1 set"),
+        ([RUN, "--param-grid", "slam.gate=2", "--jobs", "0"], 2, "1 to 1024"),
+        ([RUN, "--param-grid", "slam.gate=2", "--dask", "http://x:1"], 2, "tcp://host:port"),
+        ([RUN, "--out", "x"], 2, "--param-grid"),
+        ([RUN, "--truth", "a", "--truth", "b"], 2, "2 tables of true trees for 1 runs"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_cannot_be_is_said_in_one_line(capsys, words, code, says):
+    assert main(["evaluate", *words]) == code
+    told = capsys.readouterr()
+    assert (told.out, told.err.count("\n")) == ("", 1)
+    assert says in told.err
+
+
+def test_without_the_extra_dask_is_named(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(["evaluate", RUN, "--param-grid", "slam.gate=2", "--dask", "tcp://127.0.0.1:1"]) == 2
+    assert "stemmap[dask]" in capsys.readouterr().err

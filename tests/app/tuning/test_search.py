@@ -1,0 +1,263 @@
+"""The search over a short simulated run: the same each time, stopped and gone on with, shared and refused."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from app.batch.run_folder import read_run_record
+from app.cli import main
+from app.cli.tune import files_of
+from app.dashboard.parameter_sets import read_file
+from app.tuning.plan import Plan, PlannedRun, TruthColumns
+from app.tuning.processes import Helpers
+from app.tuning.result import provenance_in, result_of
+from app.tuning.search import Search, StoppedError
+from app.tuning.space import axes_of
+from app.tuning.trial import Trial
+from pipeline.config import preset
+from pipeline.errors import ParameterError, StemmapError
+
+RUN, OTHER = "sim:stand?duration=1", "sim:stand?duration=1&seed=3"
+OVER = ["detection.e_max=5..200", "gathering.tree_share=0.1..1"]
+
+
+def plan(folder: Path, name: str = "a", **changes: object) -> Plan:
+    """A search over two parameters of a short run."""
+    told = Plan(
+        runs=(PlannedRun(RUN),),
+        axes=axes_of(OVER),
+        start=preset("forest").model_dump(),
+        storage=str(folder / f"{name}.journal"),
+        trials=9,
+    )
+    return msgspec.structs.replace(told, **changes)
+
+
+def exhaust(search: Search) -> None:
+    """Make all trials that are left."""
+    while search.step() is not None:
+        pass
+
+
+def searched(told: Plan, most: int = 1000) -> list[Trial]:
+    """The trials of a search, after so many more."""
+    search = Search(told)
+    try:
+        search.begin()
+        for _ in range(most):
+            if search.step() is None:
+                break
+        return search.trials()
+    finally:
+        search.close()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> list[Trial]:
+    return searched(plan(tmp_path_factory.mktemp("whole")))
+
+
+def test_the_start_is_tried_first_and_is_never_better_than_the_best(whole):
+    assert len(whole) == 9
+    assert whole[0].values == {"detection.e_max": 60.0, "gathering.tree_share": 0.4}
+    assert min(trial.loss for trial in whole) <= whole[0].loss
+    assert len({trial.loss for trial in whole}) > 1
+
+
+def test_a_stopped_search_goes_on_to_the_same_trials(whole, tmp_path):
+    told = plan(tmp_path)
+    assert searched(told, 5) == whole[:5]
+    # Stopped in the middle of a trial, and killed while it wrote.
+    stops: list[bool] = []
+    search = Search(told, stop=lambda: bool(stops))
+    search.begin()
+    stops.append(True)
+    with pytest.raises(StoppedError):
+        exhaust(search)
+    search.close()
+    with Path(told.storage).open("ab") as journal:
+        journal.write(b'{"op_code": 5, "wor')
+    assert searched(told) == whole
+
+
+def test_what_a_trial_scores_is_what_map_scores(whole, tmp_path):
+    trial = whole[3]
+    sets = [word for name, value in trial.values.items() for word in ("--set", f"{name}={value}")]
+    assert main(["map", RUN, "--out", str(tmp_path / "out"), *sets]) == 0
+    told = read_run_record(tmp_path / "out")["evaluation"]
+    score = trial.training[0]
+    assert (score.TA, score.FA, score.spurious) == (
+        told["TA"]["count"],
+        told["FA"]["count"],
+        told["spurious"],
+    )
+    assert (score.position_rmse, score.pair_error) == (told["position_rmse"], told["mean_pair_error_percent"])
+
+
+def test_a_journal_of_another_search_is_left_alone(tmp_path):
+    told = plan(tmp_path, trials=1)
+    searched(told)
+    before = Path(told.storage).read_bytes()
+    for changes, words in (
+        ({"goal": "position"}, "another goal"),
+        ({"axes": axes_of(OVER[:1])}, "other parameters or bounds"),
+        ({"seed": 7}, "other runs or another truth, another seed"),
+        ({"start": preset("paper").model_dump()}, "to begin with"),
+    ):
+        with pytest.raises(StemmapError, match=words):
+            Search(msgspec.structs.replace(told, **changes))
+    assert Path(told.storage).read_bytes() == before
+
+
+def test_a_journal_of_another_version_is_told(tmp_path, monkeypatch):
+    told = plan(tmp_path, trials=1)
+    searched(told)
+    monkeypatch.setattr("app.tuning.plan.version", lambda: "9.9.9")
+    with pytest.raises(StemmapError, match="another version of stemmap"):
+        Search(told)
+
+
+@pytest.mark.parametrize("text", [b"x_m,y_m\n1,2\n", b'{"op_code": 0}\n{"op_code": "?"}\n', b"\xff\xfe\n"])
+def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
+    told = plan(tmp_path)
+    Path(told.storage).write_bytes(text)
+    with pytest.raises(StemmapError, match="journal"):
+        Search(told)
+    assert Path(told.storage).read_bytes() == text
+
+
+def test_sets_that_contradict_themselves_are_counted_and_left_out(tmp_path):
+    told = plan(tmp_path, axes=axes_of(["detection.e_min=1..100", "detection.e_max=10..100"]), trials=6)
+    search = Search(told)
+    search.begin()
+    exhaust(search)
+    result = result_of(search)
+    search.close()
+    assert result.made == 6
+    assert 0 < result.refused < 6
+    preset("forest").replace(dict(result.best.values))  # else it would say what contradicts
+
+
+@pytest.mark.slow  # the process starts and compiles
+def test_a_process_that_is_killed_is_started_again_and_its_trial_made(whole, tmp_path):
+    told = plan(tmp_path, trials=4)
+    search = Search(told)
+    search.begin()
+    helpers = Helpers(told, 1)
+    try:
+        (pid,) = helpers.pids
+        while not search.is_under_way:  # until it makes a trial of its own
+            assert helpers.pids == [pid]
+            time.sleep(0.02)
+        os.kill(pid, signal.SIGKILL)
+        while helpers.pids:
+            time.sleep(0.02)
+        exhaust(search)
+        helpers.watch()
+        assert helpers.lost == 1
+    finally:
+        helpers.close()
+        search.close()
+    made = search.trials()
+    assert [trial.number for trial in made] == [0, 1, 2, 3]
+    assert made[0] == whole[0]
+
+
+# --- the command ----------------------------------------------------------------------------------
+
+
+def test_the_command_writes_a_set_with_its_provenance(tmp_path, capsys):
+    words = ["tune", RUN, "--held-out", OTHER, "--trials", "3", "--out", str(tmp_path / "best.toml")]
+    words += [word for text in OVER for word in ("--over", text)]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert "3 trials over 2 parameters" in said.out
+    assert "held out (1 run)" in said.out
+    text = (tmp_path / "best.toml").read_text()
+    name, values = read_file(text, "best.toml")
+    assert name == "forest"
+    told = provenance_in(text)
+    assert [run["uri"] for run in told["run"]] == [RUN, OTHER]
+    changed = values.changes_from(preset("forest"))
+    assert set(changed) <= {"detection.e_max", "gathering.tree_share"}
+    # The same command goes on with its journal, and another one with more trials makes them.
+    assert main([*words, "--trials", "4"]) == 0
+    said = capsys.readouterr()
+    assert "going on after 3 trials" in said.err
+    assert provenance_in((tmp_path / "best.toml").read_text())["tuned"]["trials"] == 4
+
+
+@pytest.mark.slow  # the process starts
+def test_ctrl_c_keeps_what_is_there(tmp_path):
+    out = tmp_path / "best.toml"
+    code = "import sys; from app.cli import main; sys.exit(main())"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "tune", RUN, "--over", OVER[0], "--trials", "100000", "--out", str(out)],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("trial 0"):
+            break
+    process.send_signal(signal.SIGINT)
+    said, told = process.communicate(timeout=120)
+    assert process.returncode == 3, told
+    assert "the same command goes on" in told
+    assert provenance_in(out.read_text())["tuned"]["trials"] >= 1
+    assert "written to" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        (["sim:stand?duration=1", "--truth", "{far}"], 1, "no ground truth lies within"),
+        (["sim:stand?duration=1", "--truth", "{aside}"], 1, "has a mapped tree within"),
+        (["{room}"], 1, "brings no true trees"),
+        (["sim:nowhere"], 2, "nowhere"),
+        ([RUN, RUN], 2, "named twice"),
+        (["zenoh:tcp/127.0.0.1:7447"], 2, "live run"),
+        ([RUN, "--over", "detection.e_min=9..1"], 2, "must be less"),
+        ([RUN, "--storage", "mysql://somewhere"], 2, "no address of a PostgreSQL"),
+        ([RUN, OTHER, "--truth", "{far}"], 2, "Say which run each is of"),
+    ],
+)
+def test_bad_input_is_told_in_a_line(words, code, told, tmp_path, capsys):
+    (tmp_path / "far.csv").write_text("x_m,y_m\n900,900\n")
+    (tmp_path / "aside.csv").write_text("x_m,y_m\n0.5,0.1\n")
+    room = tmp_path / "room"
+    room.mkdir()
+    import numpy as np
+
+    np.random.default_rng(0).normal(size=(200, 4)).astype("<f4").tofile(room / "000000.bin")
+    places = {"far": tmp_path / "far.csv", "aside": tmp_path / "aside.csv", "room": room}
+    given = [word.format(**places) for word in words]
+    out = tmp_path / "best.toml"
+    assert main(["tune", *given, "--trials", "2", "--out", str(out)]) == code
+    said = capsys.readouterr().err.strip().splitlines()
+    assert told in said[-1]
+    assert not out.exists()
+
+
+def test_truths_are_given_in_order_or_by_name():
+    a, b = "sim:stand?seed=1", "sim:stand?seed=1&x=2"
+    assert files_of([a, b], ["1.csv", "2.csv"]) == {a: "1.csv", b: "2.csv"}
+    assert files_of([a, b], [f"{b}=2.csv"]) == {b: "2.csv"}
+    assert files_of([a, b], [f"{b}=2.csv", "1.csv"]) == {a: "1.csv", b: "2.csv"}
+    for wrong in (["1.csv"], [f"{a}=1.csv", f"{a}=2.csv"]):
+        with pytest.raises(ParameterError):
+            files_of([a, b], wrong)
+
+
+def test_truth_goes_through_as_plain_values():
+    columns = TruthColumns([1.0], [2.0], [None], ["tree"])
+    assert TruthColumns.of(columns.as_record()) == columns

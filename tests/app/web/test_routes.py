@@ -1,0 +1,430 @@
+"""The API: what it gives, what it refuses and with which words."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import httpx
+import msgspec
+import pytest
+
+from app.common.settings import Settings
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.map_changes import MapChanges
+from app.web.routes.run import what_may_be_opened
+from app.worker.internal_protocol import Answer, AskCluster, Remapped, Report, Rough, Shown
+from app.worker.protocol import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
+from pipeline.config import field_specs, preset
+from tests.app.explain.stories import cluster_story
+from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
+from tests.app.server_for_tests import BEARER, Running, running
+
+
+def told(dashboard: Dashboard) -> list[Any]:
+    worker = dashboard.worker
+    assert isinstance(worker, FakeWorker)
+    return worker.commands
+
+
+async def show(dashboard: Dashboard, n_trees: int = 4, truth: bool = True) -> None:
+    await dashboard.receive(opened(truth=truth_trees() if truth else None))
+    picture = frame(2, 5_200_000_000, x=1.0, n_trees=n_trees)
+    await dashboard.receive(Shown(1, 0.2, picture, 0, path([0.0, 0.5, 1.0])))
+
+
+async def test_status_is_what_the_worker_said(both: Running) -> None:
+    client, dashboard = both
+    await dashboard.receive(Report(Status("paused", time_s=3.5, trees=7)))
+    answer = (await client.get("/api/status")).json()
+    assert (answer["state"], answer["time_s"], answer["trees"]) == ("paused", 3.5, 7)
+    assert "type" not in answer
+
+
+@pytest.mark.parametrize(
+    ("body", "command"),
+    [
+        ({"type": "play"}, Play()),
+        ({"type": "pause"}, Pause()),
+        ({"type": "advance", "scans": -3}, Advance(-3)),
+        ({"type": "seek", "time_s": 12.5}, Seek(12.5)),
+        ({"type": "seek", "time_s": 12}, Seek(12.0)),
+        ({"type": "set_speed", "factor": 0}, SetSpeed(0.0)),
+    ],
+)
+async def test_commands_reach_the_worker(both: Running, body: dict[str, Any], command: Any) -> None:
+    client, dashboard = both
+    assert (await client.post("/api/command", json=body)).status_code == 202
+    assert told(dashboard)[-1] == command
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        (b"", "does not fit"),
+        (b"[1]", "does not fit"),
+        (b"{", "does not fit"),
+        (b'{"type": "explode"}', "explode"),
+        (b'{"type": "open", "uri": "/etc/passwd"}', "open"),
+        (b'{"type": "set_parameters", "values": {}, "revision": 1}', "set_parameters"),
+        (b'{"type": "seek"}', "time_s"),
+        (b'{"type": "seek", "time_s": "1"}', "time_s"),
+        (b'{"type": "seek", "time_s": NaN}', "does not fit"),
+        (b'{"type": "seek", "time_s": 1e999}', "time_s"),
+        (b'{"type": "seek", "time_s": -1}', "time_s"),
+        (b'{"type": "set_speed", "factor": -1}', "factor"),
+        (b'{"type": "set_speed", "factor": 1e9}', "factor"),
+        (b'{"type": "set_speed", "factor": 1e999}', "factor"),
+        (b'{"type": "set_speed", "factor": NaN}', "does not fit"),
+        (b'{"type": "seek", "time_s": 1e10}', "time_s"),
+        (b'{"type": "advance", "scans": 1.5}', "scans"),
+        (b'{"type": "advance", "scans": 100000000000000000000000}', "scans"),
+        (b'{"type": "advance", "scans": -1000000001}', "scans"),
+        (b"[" * 5000, "does not fit"),
+        (b"\xff\xfe", "does not fit"),
+    ],
+)
+async def test_what_is_no_command_is_refused(both: Running, body: bytes, words: str) -> None:
+    client, dashboard = both
+    before = list(told(dashboard))
+    answer = await client.post("/api/command", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 422
+    assert words in answer.json()["error"]["what"]
+    assert told(dashboard) == before
+
+
+async def test_a_form_of_another_page_is_no_json(both: Running) -> None:
+    client, _ = both
+    answer = await client.post(
+        "/api/command", content=b'{"type":"play"}', headers={"Content-Type": "text/plain"}
+    )
+    assert answer.status_code == 422
+
+
+async def test_parameters_tell_values_specs_and_presets(both: Running) -> None:
+    client, _ = both
+    answer = (await client.get("/api/parameters")).json()
+    assert answer["values"] == preset("forest").flat()
+    assert [spec["name"] for spec in answer["specs"]] == [spec.name for spec in field_specs()]
+    assert {"name", "doc"} == set(answer["presets"][0])
+    assert (answer["preset"], answer["changed"]) == ("forest", [])
+
+
+async def test_a_change_reaches_worker_scene_and_answer(both: Running) -> None:
+    client, dashboard = both
+    answer = await client.patch("/api/parameters", json={"changes": {"clustering.eps": 1}})
+    assert answer.json()["values"]["clustering.eps"] == 1.0
+    assert answer.json()["changed"] == ["clustering.eps"]
+    assert answer.json()["revision"] == 1
+    sent = told(dashboard)[-1]
+    assert isinstance(sent, SetParameters)
+    assert (sent.values["clustering"]["eps"], sent.revision) == (1.0, 1)
+    reset = await client.post("/api/parameters/reset", json={"names": ["clustering.eps"]})
+    assert (reset.json()["changed"], reset.json()["revision"]) == ([], 2)
+    paper = await client.post("/api/parameters/preset", json={"name": "paper"})
+    assert paper.json()["values"] == preset("paper").flat()
+
+
+async def test_what_a_change_acts_on_is_told_to_the_worker(both: Running) -> None:
+    client, dashboard = both
+    assert (await client.get("/api/parameters")).json()["whole"] is True
+    for whole in (False, True):
+        answer = await client.put("/api/parameters/reach", json={"whole": whole})
+        assert answer.json()["whole"] is whole
+        sent = told(dashboard)[-1]
+        assert isinstance(sent, SetParameters)
+        assert sent.whole is whole
+    assert (await client.put("/api/parameters/reach", json={"whole": "yes"})).status_code == 422
+
+
+async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    await dashboard.select_tree(2)
+    changes = MapChanges(
+        revision=1,
+        scans=3,
+        time_s=0.2,
+        before=4,
+        after=2,
+        ghost=[(0.0, 1.0, None)],
+        renamed=[(3, 1), (4, 5)],  # of a map before the one that was shown last
+        followed=[(1, 1), (2, 5)],
+        changes=[],
+        confirmed=[(1, 0.1), (5, 0.2)],
+    )
+    frame = dashboard.shown.frame if dashboard.shown else None
+    assert frame is not None
+    await dashboard.receive(Rough(7, 1, frame.trees))  # of a run that was left
+    assert "places" not in json.loads(dashboard.live._messages["rough"][1])
+    await dashboard.receive(Rough(1, 1, frame.trees))
+    rough = json.loads(dashboard.live._messages["rough"][1])
+    assert (rough["revision"], len(rough["places"])) == (1, len(frame.trees.number))
+    await dashboard.receive(Remapped(7, changes))  # of a run that was left
+    assert dashboard.selecting.selection.tree == 2
+    await dashboard.receive(Remapped(1, changes))
+    assert dashboard.selecting.selection.tree == 5
+    marks = [e for e in dashboard.events.as_plain()["events"] if e["kind"] == "tree"]
+    assert [(e["t"], e["text"]) for e in marks] == [(0.1, "Tree 1 confirmed"), (0.2, "Tree 5 confirmed")]
+    assert (await client.get("/api/trees")).status_code == 200
+    await dashboard.receive(Remapped(1, msgspec.structs.replace(changes, followed=[(1, 1)])))
+    assert dashboard.selecting.selection.tree is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"clustering.eps": 1e9}, "clustering.eps = 1000000000.0: should be less than or equal to 5"),
+        ({"clustering.eps": "wide"}, "clustering.eps"),
+        ({"clustering.eps": True}, "clustering.eps"),
+        ({"clustering.min_points": 1.5}, "clustering.min_points"),
+        ({"clustering.epz": 0.2}, "no parameter 'clustering.epz'"),
+        ({"filters.x_min": 50.0}, "filters.x_min = 50.0 must be less than filters.x_max"),
+        ({"clustering.eps": None}, "does not fit"),
+        ({"clustering.eps": [0.1]}, "does not fit"),
+        ({"__class__": 1}, "no parameter"),
+        ({}, "does not fit"),
+    ],
+)
+async def test_a_bad_change_names_parameter_and_bound(
+    both: Running, changes: dict[str, Any], words: str
+) -> None:
+    client, dashboard = both
+    before = dashboard.parameters.as_plain()
+    answer = await client.patch("/api/parameters", json={"changes": changes})
+    assert answer.status_code == 422
+    assert words in answer.json()["error"]["what"]
+    assert dashboard.parameters.as_plain() == before
+
+
+async def test_an_unknown_preset_or_name_is_refused(both: Running) -> None:
+    client, _ = both
+    assert (await client.post("/api/parameters/preset", json={"name": "best"})).status_code == 422
+    assert (await client.post("/api/parameters/reset", json={"names": ["best"]})).status_code == 422
+
+
+async def test_the_download_is_what_config_takes(both: Running) -> None:
+    client, _ = both
+    await client.patch("/api/parameters", json={"changes": {"slam.particles": 33}})
+    answer = await client.get("/api/parameters.toml")
+    assert tomllib.loads(answer.text)["slam"]["particles"] == 33
+    assert "parameters.toml" in answer.headers["content-disposition"]
+
+
+async def test_opening_tells_the_worker(both: Running) -> None:
+    client, dashboard = both
+    body = {"uri": "sim:slope", "odometry": "static", "seed": 4}
+    assert (await client.post("/api/open", json=body)).status_code == 202
+    assert told(dashboard)[-1] == Open("sim:slope", "static", 4)
+    assert (await client.get("/api/status")).json()["state"] == "starting"
+
+
+@pytest.mark.parametrize(
+    "body", [{}, {"uri": ""}, {"uri": 5}, {"uri": "sim:stand", "odometry": "guess"}, {"uri": "a", "seed": -1}]
+)
+async def test_what_cannot_be_opened_is_refused(both: Running, body: dict[str, Any]) -> None:
+    client, _ = both
+    assert (await client.post("/api/open", json=body)).status_code == 422
+
+
+async def test_from_the_network_only_offered_files_are_opened(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").touch()
+    (tmp_path / "link.mcap").symlink_to("/etc/passwd")
+    settings = Settings(host="0.0.0.0", recordings=tmp_path)  # noqa: S104
+    async with running(settings) as (client, dashboard):
+        client.headers.update(BEARER)
+        for uri, status in [
+            ("sim:stand", 202),
+            (str(tmp_path / "run.mcap"), 202),
+            ("/etc/passwd", 403),
+            (str(tmp_path / ".." / "other"), 403),
+            ("nul\0byte", 403),
+            (str(tmp_path / "link.mcap"), 403),
+            ("~/x", 403),
+            ("~nobody-of-this-name/x", 403),
+            (f"file://{tmp_path / 'run.mcap'}", 202),
+            ("file:///etc/passwd", 403),
+            ("file:/etc/passwd", 403),
+            (f"file://file://{tmp_path / 'run.mcap'}", 403),
+            ("http://127.0.0.1/", 403),
+        ]:
+            answer = await client.post("/api/open", json={"uri": uri})
+            assert answer.status_code == status, uri
+            if status == 202 and not uri.startswith("sim:"):
+                assert told(dashboard)[-1] == Open(str((tmp_path / "run.mcap").resolve()))
+
+
+async def test_a_home_in_the_working_folder_is_not_the_home(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is looked at is what is opened: `~` is a home here as it is where files are opened."""
+    (tmp_path / "~").mkdir()
+    (tmp_path / "~" / "x").touch()
+    (tmp_path / "file:").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/elsewhere")
+    settings = Settings(host="0.0.0.0", recordings=tmp_path)  # noqa: S104
+    assert what_may_be_opened("~/x", settings) is None
+    assert what_may_be_opened("file:///etc/passwd", settings) is None
+    assert what_may_be_opened("sim:stand", settings) == "sim:stand"
+    assert what_may_be_opened("~/x", Settings()) == "~/x"
+
+
+async def test_sources_offer_scenarios_and_recordings(tmp_path: Path) -> None:
+    for name in ("b.mcap", "a.pcap", ".hidden"):
+        (tmp_path / name).touch()
+    async with running(Settings(recordings=tmp_path)) as (client, _):
+        answer = (await client.get("/api/sources", headers=BEARER)).json()
+    assert "sim:stand" in [scenario["uri"] for scenario in answer["scenarios"]]
+    assert answer["recordings"] == [str(tmp_path / "a.pcap"), str(tmp_path / "b.mcap")]
+
+
+async def test_results_before_the_first_scan_are_empty(both: Running) -> None:
+    client, _ = both
+    assert (await client.get("/api/trees")).json() == {"trees": []}
+    assert (await client.get("/api/evaluation")).json() is None
+    assert (await client.get("/api/pairs")).json()["numbers"] == []
+    assert (await client.get("/api/trees.csv")).text.count("\n") == 1
+    assert (await client.get("/api/path.csv")).text.count("\n") == 1
+
+
+async def test_trees_and_path_as_json_and_tables(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    trees = (await client.get("/api/trees")).json()["trees"]
+    assert [tree["number"] for tree in trees] == [1, 2, 3]  # the fourth is not confirmed
+    assert [tree["dbh_cm"] for tree in trees] == [30.0, None, 30.0]
+    assert trees[1]["ellipse"][:2] == [0.2, 0.1]
+    assert (trees[0]["first_seen_s"], trees[0]["last_seen_s"]) == (0.0, 0.1)
+    table = (await client.get("/api/trees.csv")).text.splitlines()
+    assert table[0].startswith("tree,x_m,y_m")
+    assert len(table) == 4
+    rows = (await client.get("/api/path.csv")).text.splitlines()
+    assert rows[1].startswith("0.000,0.0000")
+    assert len(rows) == 4
+
+
+async def test_pairs_have_distances_and_errors_of_matched_trees(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    pairs = (await client.get("/api/pairs")).json()
+    assert pairs["numbers"] == [1, 2, 3]
+    assert pairs["distance_m"] == [[0.0, 2.0, 4.0], [2.0, 0.0, 2.0], [4.0, 2.0, 0.0]]
+    true_distance = (1.95**2 + 0.1**2) ** 0.5
+    assert pairs["error_percent"][0][1] == pytest.approx(
+        100 * abs(2 - true_distance) / true_distance, abs=0.01
+    )
+    assert pairs["error_percent"][0][2] is None
+    await show(dashboard, truth=False)
+    assert (await client.get("/api/pairs")).json()["error_percent"] is None
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../pyproject.toml",
+        "/static/%2e%2e/pyproject.toml",
+        "/static/..%2fpyproject.toml",
+        "/static//etc/passwd",
+        "/static/.hidden",
+        "/static/%00",
+        "/static/",
+        "/static/js",
+        f"/static/{'x' * 5000}",
+        f"/static/{'x' * 300}/{'y/' * 3000}z",
+        "/viser/index.html",
+        "/docs",
+        "/openapi.json",
+    ],
+)
+async def test_nothing_else_is_served(both: Running, path: str) -> None:
+    client, _ = both
+    answer = await client.get(path)
+    assert answer.status_code == 404
+    assert answer.json()["error"]["what"]
+
+
+async def test_the_wrong_method_is_said(both: Running) -> None:
+    client, _ = both
+    answer = await client.get("/api/command")
+    assert answer.status_code == 405
+    assert answer.json()["error"]["what"] == "method not allowed"
+
+
+async def test_the_page_and_its_libraries_are_served(both: Running) -> None:
+    client, _ = both
+    page = await client.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert page.headers["cache-control"] == "no-cache"
+    plotly = await client.get("/static/plotly.min.js")
+    assert "javascript" in plotly.headers["content-type"]
+    assert len(plotly.content) > 1_000_000
+    viser = await client.get("/viser/")
+    assert "Viser" in viser.text
+    assert viser.headers["cache-control"] == "no-cache"
+
+
+async def test_what_a_browser_has_already_is_not_sent_again(both: Running) -> None:
+    client, _ = both
+    first = await client.get("/static/plotly.min.js")
+    headers = {"If-None-Match": f'"other", W/{first.headers["etag"]}'}
+    again = await client.get("/static/plotly.min.js", headers=headers)
+    assert (again.status_code, again.content) == (304, b"")
+    assert (await client.get("/", headers=headers)).status_code == 200
+
+
+async def test_a_fault_is_an_answer_and_stands_in_the_log(
+    both: Running, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    _, dashboard = both
+    transport = httpx.ASGITransport(dashboard_app(both), raise_app_exceptions=False)
+    monkeypatch.setattr(type(dashboard.parameters), "as_plain_with_specs", None)
+    async with httpx.AsyncClient(transport=transport, base_url=str(both[0].base_url)) as client:
+        answer = await client.get("/api/parameters", headers=BEARER)
+    assert answer.status_code == 500
+    assert "fault in stemmap" in answer.json()["error"]["what"]
+    assert "TypeError" in caplog.text
+
+
+def dashboard_app(both: Running) -> Any:
+    transport = both[0]._transport
+    assert isinstance(transport, httpx.ASGITransport)
+    return transport.app
+
+
+async def test_stories_are_told_and_refused_in_words(both: Running) -> None:
+    client, dashboard = both
+    refused = await client.get("/api/story/tree/3")
+    assert refused.status_code == 404
+    assert "nothing is mapped yet" in refused.json()["error"]["what"]
+    await show(dashboard)
+    asking = asyncio.create_task(client.get("/api/story/cluster/4?scan=231"))
+    while not (asked := [m for m in told(dashboard) if isinstance(m, AskCluster)]):
+        await asyncio.sleep(0.01)
+    assert (asked[0].scan, asked[0].cluster) == (231, 4)
+    await dashboard.receive(Answer(asked[0].ticket, cluster=cluster_story(eccentricity=float("inf"))))
+    story = (await asking).json()
+    assert story["verdict"] == "too long"
+    assert story["eccentricity"] is None
+    assert story["checks"][0]["title"] == "Eccentricity max"
+    for wrong in ("cluster/-1", "cluster/4?scan=x", "tree/99999999999", "tree/first"):
+        assert (await client.get(f"/api/story/{wrong}")).status_code == 422
+
+
+async def test_a_loop_is_set_and_left_and_a_wrong_one_refused(both: Running) -> None:
+    client, dashboard = both
+    assert (await client.post("/api/loop", json={"from_s": 1.0, "to_s": 4.0})).status_code == 202
+    assert dashboard.loop.span == (1.0, 4.0)
+    for wrong in (
+        {"from_s": 4.0, "to_s": 4.2},
+        {"from_s": 9.0, "to_s": 1.0},
+        {"from_s": -1.0, "to_s": 5.0},
+        {},
+    ):
+        assert (await client.post("/api/loop", json=wrong)).status_code == 422
+    assert dashboard.loop.span == (1.0, 4.0)
+    assert (await client.post("/api/loop", json={"from_s": None, "to_s": None})).status_code == 202
+    assert dashboard.loop.span is None

@@ -1,0 +1,380 @@
+"""A run that is mapped again is as if its parameters had been in force from its first scan on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+import pytest
+
+from app.dashboard.map_changes import MapChanges
+from app.worker.process import new_session
+from app.worker.session import Session
+from pipeline.config import Parameters
+from pipeline.errors import SourceError
+from pipeline.front_end import Looked
+from pipeline.mapper import Mapper
+from pipeline.types.records import Frame, Step
+
+URI = "sim:paper?duration=4&odometry=poor"
+LAST = 39
+BASE = Parameters()
+FEWER = BASE.replace({"detection.e_max": 12.0, "slam.particles": 60})  # judged anew
+LATER = BASE.replace({"tracking.gate": 2.0, "gathering.tree_share": 0.3})  # tracked anew alone
+JUDGED = BASE.replace({"detection.radius_max": 0.2})  # from the first scan on that it touches
+WIDER = BASE.replace({"clustering.eps": 0.25})  # looked at anew
+
+
+def told(record: object) -> object:
+    """Everything that a record holds, bit by bit."""
+    if is_dataclass(record):
+        return tuple(told(getattr(record, f.name)) for f in fields(record))
+    if isinstance(record, np.ndarray):
+        return (record.dtype.str, record.shape, record.tobytes())
+    return repr(record)
+
+
+def settle(session: Session) -> None:
+    """Work until nothing is sought any more."""
+    while session.pace == "hurry":
+        session.work()
+
+
+@pytest.fixture
+def session() -> Iterator[Session]:
+    """A run that stands at its last scan but one."""
+    with closing(new_session()) as opened:
+        opened.open(URI, "auto", 3)
+        opened.set_parameters(BASE, 0)
+        opened.advance(LAST)
+        settle(opened)
+        yield opened
+
+
+@contextmanager
+def mapped_from_start(parameters: Parameters, last: int) -> Iterator[Session]:
+    """A run that was mapped with some parameters from the start."""
+    with closing(new_session()) as opened:
+        opened.open(URI, "auto", 3)
+        opened.set_parameters(parameters, 0)
+        opened.advance(last + 1)
+        settle(opened)
+        yield opened
+
+
+def mapped_with(parameters: Parameters, last: int) -> tuple[object, object]:
+    """The scan and the path of such a run."""
+    with mapped_from_start(parameters, last) as opened:
+        return told(opened.frame), told(opened.path)
+
+
+def remapped(session: Session, scans: int = 7) -> tuple[Frame, MapChanges]:
+    """Map again until it is done."""
+    while session.is_remapping:
+        done = session.remap(scans)
+        if done is not None:
+            return done
+    raise AssertionError("it was given up")
+
+
+@pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER, JUDGED])
+def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters):
+    standing = session.status().scan_index
+    session.set_parameters(parameters, 1, whole=True)
+    assert session.is_remapping
+    frame, changes = remapped(session)
+    assert (told(frame), told(session.path)) == mapped_with(parameters, standing)
+    assert changes.revision == 1
+    assert changes.scans == standing + 1
+    assert session.status().remapped is None
+    assert not any(thread.name.startswith("look") for thread in threading.enumerate()), "none is left"
+
+
+@pytest.mark.parametrize("parameters", [FEWER, WIDER])
+def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parameters, monkeypatch):
+    begun: list[Parameters] = []
+    begin = session._run._begin
+
+    def beginning(wanted: Parameters) -> None:
+        begun.append(wanted)
+        begin(wanted)
+
+    monkeypatch.setattr(session._run, "_begin", beginning)
+    maps: dict[int, object] = {}
+    marks: dict[int, dict[int, float]] = {}
+    for revision, (wanted, anew) in enumerate(
+        [(parameters, 1), (BASE, 0), (parameters, 0), (LATER, 1), (parameters, 0), (BASE, 0), (FEWER, None)]
+    ):
+        begun.clear()
+        session.set_parameters(wanted, revision, whole=True)
+        frame, changes = remapped(session)
+        assert anew is None or len(begun) == anew, "what is there is not mapped again"
+        assert changes.revision == revision
+        now: tuple[object, ...] = (told(frame), told(session.path))
+        now += (told(session._run.confirmed_s(frame.trees)),)
+        assert marks.setdefault(id(wanted), dict(changes.confirmed)) == dict(changes.confirmed)
+        assert maps.setdefault(id(wanted), now) == now
+    for wanted in (parameters, BASE, LATER):
+        with mapped_from_start(wanted, LAST - 1) as other:
+            assert other.frame is not None
+            assert other.run is not None
+            since = told(other.run.confirmed_s(other.frame.trees))
+            assert marks[id(wanted)] == other.run._told.confirmed_s, "those that went again too"
+            assert maps[id(wanted)] == (told(other.frame), told(other.path), since)
+
+
+def test_where_there_is_no_room_a_map_that_was_left_is_made_again(session, monkeypatch):
+    monkeypatch.setattr("app.worker.map_cache.MOST_BYTES", 1)
+    standing = session.status().scan_index
+    for revision, wanted in enumerate([FEWER, BASE]):
+        session.set_parameters(wanted, revision, whole=True)
+        frame, _ = remapped(session)
+        assert (told(frame), told(session.path)) == mapped_with(wanted, standing)
+
+
+def test_once_the_run_goes_on_a_map_that_was_left_is_made_again(session):
+    session.set_parameters(FEWER, 1, whole=True)
+    remapped(session)
+    session.set_parameters(BASE, 2, whole=True)
+    session.advance(1)
+    settle(session)
+    session.set_parameters(BASE, 3, whole=True)
+    frame, _ = remapped(session)
+    assert (told(frame), told(session.path)) == mapped_with(BASE, frame.index)
+
+
+@pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER])
+def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parameters):
+    session.set_parameters(parameters, 1, whole=True)
+    remapped(session)
+    for index in (12, 25):
+        session.seek(0.1 * index)
+        settle(session)
+        assert (told(session.frame), told(session.path)) == mapped_with(parameters, index)
+
+
+def test_a_rough_answer_is_there_before_the_exact_one_and_before_the_standing_scan(session, monkeypatch):
+    heard: list[tuple[int, int]] = []
+    session.on_rough = lambda revision, trees: heard.append((revision, len(trees.number)))
+    again = session._run.map_again
+
+    def mapped_again() -> object:
+        heard.append((-1, 0))
+        return again()
+
+    monkeypatch.setattr(session._run, "map_again", mapped_again)
+    for revision, change in enumerate([{"clustering.eps": 0.25}, {"detection.e_max": 12.0}]):
+        session.set_parameters(BASE.replace(change), revision + 1, whole=True)
+        assert [told_of for told_of, _ in heard] == [revision + 1, -1]
+        trees = heard[0][1]
+        heard.clear()
+        frame, _ = remapped(session)
+        assert abs(int(frame.trees.confirmed.sum()) - trees) <= 2
+    assert heard == []
+
+
+@pytest.mark.parametrize("begun_before", [False, True])
+def test_where_the_scan_is_sought_first_it_comes_once_the_scan_is_there(session, begun_before):
+    heard: list[int] = []
+    session.on_rough = lambda revision, _: heard.append(revision)
+    if begun_before:
+        session.set_parameters(WIDER, 1, whole=True)
+        assert heard == [1]
+        session.seek(2.0)
+        settle(session)
+        assert heard == [1]
+    session.seek(1.5)
+    session.set_parameters(FEWER, 2, whole=True)
+    assert heard == [1] * begun_before
+    settle(session)
+    assert heard == [*[1] * begun_before, 2]
+
+
+def test_a_newer_change_stops_an_older_one(session):
+    session.set_parameters(WIDER, 1, whole=True)
+    session.remap(5)
+    session.set_parameters(FEWER, 2, whole=True)
+    frame, _ = remapped(session)
+    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+
+
+def test_what_a_held_slider_changes_is_told_against_the_map_before_it_was_taken(session):
+    def told_after(parameters: Parameters, revision: int, step: int) -> MapChanges:
+        session.set_parameters(parameters, revision, whole=True, step=step)
+        return remapped(session)[1]
+
+    def named(renamed: list[tuple[int, int]], side: int) -> set[int]:
+        return {pair[side] for pair in renamed}
+
+    none = BASE.replace({"gathering.tree_share": 1.0, "tracking.hits_to_confirm": 30})
+    first = told_after(FEWER, 1, 1)
+    assert first.followed == first.renamed
+    second = told_after(none, 2, 1)
+    third = told_after(FEWER, 3, 1)
+    assert first.ghost == second.ghost == third.ghost
+    assert (first.before, first.after, first.changes) == (third.before, third.after, third.changes)
+    assert second.after < second.before
+    assert named(third.followed, 0) <= named(second.renamed, 1) | {c.number for c in second.changes}
+    other = told_after(BASE, 4, 2)
+    assert other.before == third.after
+    assert other.followed == other.renamed
+
+
+def test_a_change_from_here_on_leaves_the_map_before_it(session):
+    session.set_parameters(WIDER, 1, whole=True)
+    session.remap(5)
+    session.set_parameters(FEWER, 2)
+    assert not session.is_remapping
+    assert session.status().remapped is None
+
+
+@pytest.mark.parametrize("done", [3, 30])
+def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done):
+    session.set_parameters(FEWER, 1, whole=True)
+    session.remap(done)
+    session.seek(1.5)
+    assert not session.is_remapping  # until it is there
+    settle(session)
+    frame, _ = remapped(session)
+    assert frame.index == 15
+    assert told(frame) == mapped_with(FEWER, 15)[0]
+
+
+def test_it_goes_on_while_the_run_plays(session):
+    session.seek(1.0)
+    settle(session)
+    session.set_parameters(FEWER, 1, whole=True)
+    session.play()
+    done = None
+    while done is None:
+        session.work()
+        done = session.remap(2)
+    frame, _ = done
+    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+    after = session.work()
+    assert told(after) == mapped_with(FEWER, frame.index + 1)[0]
+
+
+def test_what_is_no_part_of_the_map_begins_nothing(session):
+    session.set_parameters(BASE.replace({"evaluation.match_distance": 0.3}), 1, whole=True)
+    assert not session.is_remapping
+
+
+def test_what_cannot_be_read_again_leaves_the_map_and_says_so(session, monkeypatch):
+    run = session._run
+    before = told(session.frame)
+
+    def nothing() -> Iterator[object]:
+        raise SourceError("the disk is gone")
+
+    monkeypatch.setattr(run, "_reread", nothing)
+    session.set_parameters(WIDER, 1)
+    at_hand = told(session.frame)
+    session.set_parameters(WIDER, 2, whole=True)
+    assert session.remap(5) is None
+    assert not session.is_remapping
+    assert told(session.frame) == at_hand != before
+    assert any("was not mapped again" in w and "the disk is gone" in w for w in session.status().warnings)
+
+
+def test_it_tells_which_trees_came_and_went_and_why():
+    with closing(new_session()) as session:
+        session.open("sim:paper?duration=12", "auto", 3)
+        session.set_parameters(BASE, 0)
+        session.advance(120)
+        settle(session)
+        frame = session.frame
+        assert frame is not None
+        known = int(np.count_nonzero(frame.trees.confirmed))
+        assert known >= 2
+        assert session.run is not None
+        marked = dict(session.run._told.confirmed_s)
+        # No column is ever a tree now; then all are back.
+        session.set_parameters(BASE.replace({"gathering.tree_share": 1.0}), 1, whole=True)
+        _, none = remapped(session)
+        session.set_parameters(BASE, 2, whole=True)
+        again, back = remapped(session)
+    assert (none.before, none.after) == (known, known - sum(c.kind == "vanished" for c in none.changes))
+    gone = [change for change in none.changes if change.kind == "vanished"]
+    assert gone
+    assert all("votes for a tree" in change.why or "does not confirm" in change.why for change in gone)
+    assert [(c.x, c.y) for c in back.changes if c.kind == "appeared"] == [(c.x, c.y) for c in gone]
+    assert back.after == known
+    assert told(again) == told(frame)
+    assert dict(back.confirmed) == marked, "also of those that went again, where each was confirmed first"
+    assert set(marked) >= set(frame.trees.number[frame.trees.confirmed].tolist())
+    assert all(0.0 <= time_s <= 12.0 for _, time_s in back.confirmed)
+    assert [time_s for _, time_s in back.confirmed] == sorted(marked.values())
+
+
+@pytest.mark.parametrize("begun_before", [False, True])
+def test_a_change_on_the_way_to_another_scan_acts_on_the_whole_run_there(session, begun_before):
+    if begun_before:
+        session.set_parameters(WIDER, 1, whole=True)
+        session.remap(5)
+    session.seek(2.0)
+    session.set_parameters(FEWER, 2, whole=True)
+    assert not session.is_remapping
+    settle(session)
+    frame, changes = remapped(session)
+    assert changes.revision == 2
+    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+    session.play()
+    assert told(session.work()) == mapped_with(FEWER, frame.index + 1)[0]
+
+
+def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
+    session.set_parameters(FEWER, 1, whole=True)
+    session.remap(3)
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(session._run._remapping.rerun.mapper, "map", broken)
+    with pytest.raises(ZeroDivisionError):
+        session.remap(3)
+    assert not session.is_remapping
+    session.set_parameters(WIDER, 2, whole=True)
+    session.fail("the run stopped")
+    assert not session.is_remapping
+
+
+def test_what_was_kept_when_it_was_open_before_is_used_by_who_is_in_a_hurry(tmp_path, monkeypatch):
+    looked, mapped = [], []
+
+    def counted(self: Mapper, step: Step) -> Looked:
+        looked.append(step.index)
+        return look(self, step)
+
+    look = Mapper.look
+    monkeypatch.setattr(Mapper, "look", counted)
+    for _ in range(2):
+        looked.clear()
+        with closing(new_session(tmp_path)) as session:
+            session.open(URI, "auto", 3)
+            session.set_parameters(BASE, 0)
+            session.advance(11)
+            settle(session)
+            assert session.frame is not None
+            assert len(session.frame.raw)
+            mapped.append((told(session.frame), told(session.path)))
+            assert session.status().warnings == []
+    assert looked == [10]
+    assert mapped[0] == mapped[1]
+    assert [path.suffix for path in tmp_path.iterdir()] == [".scans"]
+
+
+def test_without_room_for_the_scans_they_are_read_once_more_and_that_is_said(monkeypatch):
+    monkeypatch.setattr("pipeline.remapping.scan_cache.SPARE_BYTES", 1 << 62)
+    with closing(new_session()) as session:
+        session.open(URI, "auto", 3)
+        session.set_parameters(BASE, 0)
+        session.advance(8)
+        settle(session)
+        session.set_parameters(FEWER, 1, whole=True)
+        assert any("from scan 0 on nothing is kept" in warning for warning in session.status().warnings)
+        frame, _ = remapped(session)
+        assert told(frame) == mapped_with(FEWER, frame.index)[0]

@@ -1,0 +1,474 @@
+"""The laws of a session: a scan's picture depends on the source, the seed and the parameters that each
+scan was mapped with, and on nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from app.worker.session import Session
+from app.worker.session_status import Said, describe
+from pipeline.config import Parameters
+from pipeline.errors import SourceError
+from pipeline.types.records import Frame, Step
+from tests.app.fakes import PERIOD_NS, START_NS, FakeMapper, FakeSource, make_session, scan
+
+SCANS = 130  # more than two kept states
+
+
+def parameters(eps: float) -> Parameters:
+    return Parameters().replace({"clustering.eps": eps})
+
+
+def settle(session: Session) -> Frame | None:
+    """Work until nothing is sought any more."""
+    while session.pace == "hurry":
+        session.work()
+    return session.frame
+
+
+def opened(scans: int = SCANS, **source: object) -> Session:
+    session = make_session(FakeSource(scans, **source))  # type: ignore[arg-type]
+    session.open("fake:", "auto", 7)
+    return session
+
+
+def played(eps_of: dict[int, float], last: int) -> float:
+    """The checksum after a plain run to a scan, with eps set from scans on."""
+    from pipeline.odometry.synchroniser import steps
+
+    mapper, eps, chain = FakeMapper(Parameters(), 7), 0.15, 0.0
+    for step in steps(FakeSource(SCANS).records()):
+        eps = eps_of.get(step.index, eps)
+        mapper.parameters = parameters(eps)
+        chain = mapper.process(step).estimate.T_map_base.x
+        if step.index == last:
+            break
+    return chain
+
+
+def checksum(session: Session) -> float:
+    assert session.frame is not None
+    return session.frame.estimate.T_map_base.x
+
+
+@pytest.mark.parametrize("index", [0, 1, 49, 50, 51, 100, 129])
+def test_seeking_gives_what_playing_gives(index: int) -> None:
+    session = opened()
+    session.seek(12.9)  # to the last scan, so that every index lies behind
+    settle(session)
+    session.seek(index * 0.1)
+    settle(session)
+    assert session.status().scan_index == index
+    assert checksum(session) == played({}, index)
+    assert session.path is not None
+    assert len(session.path.x) == index + 1
+
+
+def test_seeking_forward_again_uses_what_is_known_and_gives_the_same() -> None:
+    session = opened()
+    session.seek(12.0)
+    settle(session)
+    session.seek(0.2)
+    settle(session)
+    session.advance(117)
+    steps_taken = 0
+    while session.pace == "hurry":
+        session.work()
+        steps_taken += 1
+    assert steps_taken <= 51
+    assert checksum(session) == played({}, 119)
+
+
+def test_a_change_on_the_standing_scan_counts_it_once() -> None:
+    session = opened()
+    session.advance(31)
+    settle(session)
+    for eps in (0.3, 0.7, 0.4):
+        shown = session.set_parameters(parameters(eps), 1)
+        assert shown is session.frame
+        assert checksum(session) == played({30: eps}, 30)
+    session.advance(1)
+    settle(session)
+    assert checksum(session) == played({30: 0.4}, 31)
+
+
+def test_a_change_while_playing_acts_from_the_next_scan() -> None:
+    session = opened()
+    session.play()
+    for _ in range(20):
+        session.work()
+    assert session.set_parameters(parameters(0.5), 3) is None
+    session.work()
+    assert checksum(session) == played({20: 0.5}, 20)
+    assert session.status().revision == 3
+
+
+def test_going_back_keeps_the_map_as_it_was_and_the_parameters_as_they_are() -> None:
+    session = opened()
+    session.advance(101)
+    settle(session)
+    session.set_parameters(parameters(0.5), 1)
+    session.seek(6.0)
+    settle(session)
+    assert checksum(session) == played({60: 0.5}, 60)
+    session.advance(60)
+    settle(session)
+    assert checksum(session) == played({60: 0.5}, 120)
+
+
+@dataclass
+class Model:
+    """What a session must show, by the plain definition."""
+
+    eps_of: dict[int, float] = field(default_factory=dict)
+    eps: float = 0.15
+    standing: int = -1
+
+    def stand(self, index: int) -> None:
+        index = min(max(index, 0), SCANS - 1)
+        if index <= self.standing and index != self.standing:
+            self._from(index)
+        self.standing = index
+
+    def change(self, eps: float) -> None:
+        self.eps = eps
+        self._from(max(self.standing, 0))
+
+    def _from(self, index: int) -> None:
+        self.eps_of = {k: v for k, v in self.eps_of.items() if k < index}
+        self.eps_of[index] = self.eps
+
+
+commands = st.lists(
+    st.one_of(
+        st.tuples(st.just("seek"), st.integers(0, SCANS + 5)),
+        st.tuples(st.just("advance"), st.integers(-60, 60)),
+        st.tuples(st.just("play"), st.integers(0, 30)),
+        st.tuples(st.just("change"), st.sampled_from([0.15, 0.3, 0.5])),
+    ),
+    max_size=8,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(commands)
+def test_whatever_is_done_the_picture_is_that_of_a_plain_run(done: list[tuple[str, float]]) -> None:
+    session, model = opened(), Model()
+    for name, value in done:
+        if name == "seek":
+            session.seek(value * 0.1)
+            model.stand(int(value))
+        elif name == "advance":
+            session.advance(int(value))
+            model.stand(model.standing + int(value))
+        elif name == "play":
+            if session.status().state == "finished":
+                model.standing = SCANS  # playing begins anew: it goes back to the first scan
+                model.stand(0)
+            session.play()
+            settle(session)
+            for _ in range(int(value)):
+                session.work()
+                if session.status().state == "playing":
+                    assert session.frame is not None
+            session.pause()
+            model.standing = session.status().scan_index
+        else:
+            session.set_parameters(parameters(value), 1)
+            model.change(value)
+        settle(session)
+        assert session.status().scan_index == model.standing
+        if model.standing >= 0:
+            assert checksum(session) == played(model.eps_of, model.standing)
+
+
+impatient = st.lists(
+    st.tuples(
+        st.one_of(
+            st.tuples(st.just("seek"), st.integers(0, SCANS - 2)),
+            st.tuples(st.just("advance"), st.integers(-60, 40)),
+            st.tuples(st.sampled_from(["play", "pause"]), st.just(0)),
+        ),
+        st.integers(0, 70),
+    ),
+    max_size=8,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(impatient)
+def test_however_commands_overtake_one_another_a_scan_is_mapped_the_same(
+    done: list[tuple[tuple[str, int], int]],
+) -> None:
+    session = opened()
+    for (name, value), scans in done:
+        if name == "seek":
+            session.seek(value * 0.1)
+        elif name == "advance":
+            session.advance(value)
+        elif name == "play":
+            session.play()
+        else:
+            session.pause()
+        for _ in range(scans):
+            session.work()
+    settle(session)
+    if session.status().scan_index >= 0:
+        assert checksum(session) == played({}, session.status().scan_index)
+
+
+@settings(max_examples=30, deadline=None)
+@given(start=st.integers(0, 128), target=st.integers(0, 128), after=st.integers(0, 140), known=st.booleans())
+def test_a_change_on_the_way_acts_from_the_sought_scan_on(
+    start: int, target: int, after: int, known: bool
+) -> None:
+    session = opened()
+    if known:
+        session.advance(SCANS)
+        settle(session)
+    session.advance(start - session.status().scan_index)
+    settle(session)
+    session.seek(target * 0.1)
+    for _ in range(after):
+        if session.pace == "hurry":
+            session.work()
+    session.set_parameters(parameters(0.5), 1)
+    settle(session)
+    assert session.status().scan_index == target
+    assert checksum(session) == played({target: 0.5}, target)
+
+
+def test_targets_that_are_overtaken_cost_nothing() -> None:
+    source = FakeSource(SCANS)
+    session = make_session(source)
+    session.open("fake:", "auto", 7)
+    session.advance(120)
+    settle(session)
+    for index in range(100, 0, -1):
+        session.seek(index * 0.1)
+    settle(session)
+    assert len(source.reads) == 2
+    assert checksum(session) == played({}, 1)
+
+
+def test_a_run_ends_keeps_its_picture_and_begins_anew() -> None:
+    session = opened(5)
+    session.play()
+    while session.pace != "idle":
+        session.work()
+    assert session.status().state == "finished"
+    assert session.status().scan_index == 4
+    session.play()
+    settle(session)
+    assert session.status().state == "playing"
+    assert session.status().scan_index == 0
+    assert checksum(session) == played({}, 0)
+
+
+def test_pausing_while_seeking_stands_at_the_sought_scan() -> None:
+    session = opened()
+    session.play()
+    session.seek(8.0)
+    session.work()
+    session.pause()
+    settle(session)
+    assert (session.status().state, session.status().scan_index) == ("paused", 80)
+
+
+def test_seeking_while_playing_goes_on_playing() -> None:
+    session = opened()
+    session.play()
+    session.seek(8.0)
+    settle(session)
+    assert session.status().state == "playing"
+    session.work()
+    assert session.status().scan_index == 81
+
+
+@pytest.mark.parametrize("time_s", [float("nan"), float("inf"), -1e300, 1e300])
+def test_odd_times_do_no_harm(time_s: float) -> None:
+    session = opened(4)
+    session.seek(time_s)
+    settle(session)
+    assert session.status().scan_index in (-1, 0, 3)
+
+
+def test_seeking_to_the_time_that_is_shown_stays_there() -> None:
+    session = opened()
+    session.advance(78)
+    settle(session)
+    session.seek(session.status().time_s)
+    settle(session)
+    assert session.status().scan_index == 77
+
+
+def test_a_failing_source_says_so_and_what_came_before_can_be_seen() -> None:
+    session = opened(fails_at=70)
+    session.play()
+    for _ in range(70):
+        session.work()
+    with pytest.raises(SourceError, match="ends here"):
+        session.work()
+    session.fail("the file ends here (scan 70)")
+    assert session.status().state == "failed"
+    assert session.status().scan_index == 69
+    assert session.pace == "idle"
+    session.seek(2.0)
+    settle(session)
+    assert checksum(session) == played({}, 20)
+    session.advance(60)
+    with pytest.raises(SourceError, match="ends here"):
+        settle(session)
+
+
+def test_a_fault_in_the_mapper_is_survived_by_playing_anew() -> None:
+    session = opened()
+    session.advance(10)
+    settle(session)
+    with pytest.raises(ZeroDivisionError):
+        session.set_parameters(parameters(5.0), 1)
+    session.fail("a fault")
+    session.set_parameters(parameters(0.15), 2)
+    session.play()
+    for _ in range(12):
+        session.work()
+    assert checksum(session) == played({}, 11)
+
+
+def test_a_seek_after_a_fault_starts_from_a_sound_state() -> None:
+    session = opened()
+    session.advance(10)
+    settle(session)
+    with pytest.raises(ZeroDivisionError):
+        session.set_parameters(parameters(5.0), 1)
+    session.fail("a fault")
+    session.set_parameters(parameters(0.15), 2)
+    session.advance(1)
+    settle(session)
+    assert checksum(session) == played({}, 10)
+
+
+def test_the_status_says_where_a_seek_goes_until_it_is_there() -> None:
+    session = opened()
+    session.seek(6.55)
+    assert session.status().going_to == "0:06"
+    assert session.status().going_to_s == pytest.approx(6.55)
+    session.work()
+    assert (session.status().state, session.status().going_to) == ("paused", "0:06")
+    settle(session)
+    assert session.status().going_to == ""
+    session.advance(-55)
+    assert session.status().going_to == "0:01"
+    session.advance(100)
+    assert (session.status().going_to, session.status().going_to_s) == ("scan 110", None)
+    settle(session)
+    assert (session.status().going_to, session.status().going_to_s) == ("", None)
+
+
+def test_what_the_odometry_means_is_a_warning_or_a_failure() -> None:
+    source = FakeSource(5)
+    session = make_session(source)
+    session.open("fake:", "static", 0)
+    assert ["static" in warning for warning in session.status().warnings] == [True]
+    source.description = replace(source.description, has_odometry=False, scans=1)
+    session.open("fake:", "auto", 0)
+    assert ["no odometry" in warning for warning in session.status().warnings] == [True]
+    with pytest.raises(SourceError, match="no odometry"):
+        session.open("fake:", "wheels", 0)
+    assert source.closed
+
+
+def test_opening_another_source_closes_the_first() -> None:
+    source = FakeSource(5)
+    session = make_session(source)
+    session.open("fake:", "auto", 0)
+    with pytest.raises(SourceError):
+        session.open("missing:", "auto", 0)
+    assert source.closed
+    session.fail("there is no such file (missing:)")
+    assert session.status().source == "missing:"
+    session.open("fake:", "auto", 0)
+    assert session.status().state == "paused"
+    assert session.frame is None
+
+
+def test_a_source_that_gives_other_scans_the_second_time_cannot_go_back() -> None:
+    session = opened(drifts=True)
+    session.advance(100)
+    settle(session)
+    session.advance(-20)
+    with pytest.raises(SourceError, match="same scans again"):
+        session.work()
+
+
+def test_reading_again_starts_a_second_before() -> None:
+    source = FakeSource(SCANS)
+    session = make_session(source)
+    session.open("fake:", "auto", 0)
+    session.advance(110)
+    settle(session)
+    session.advance(-1)
+    settle(session)
+    assert source.reads == [None, START_NS + 99 * PERIOD_NS - 1_000_000_000]
+
+
+def test_preparing_leaves_no_trace() -> None:
+    session = opened()
+    session.prepare()
+    assert session.status().mapping_ms == 0.0
+    session.advance(3)
+    settle(session)
+    assert checksum(session) == played({}, 2)
+
+
+def test_preparing_maps_with_the_parameters_of_the_first_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[float] = []
+    process = FakeMapper.process
+
+    def remember(self: FakeMapper, step: Step) -> Frame:
+        used.append(self.parameters.clustering.eps)
+        return process(self, step)
+
+    monkeypatch.setattr(FakeMapper, "process", remember)
+    session = opened()
+    session.set_parameters(parameters(0.7), 1)
+    session.prepare()
+    assert used == [0.7]
+
+
+def test_a_source_without_a_scan_cannot_be_prepared() -> None:
+    with pytest.raises(SourceError, match="no scan in it"):
+        opened(0).prepare()
+
+
+def test_status_tells_the_figures_of_the_run() -> None:
+    session = opened()
+    session.advance(3)
+    settle(session)
+    status = session.status()
+    assert (status.kind, status.scans) == ("fake run", SCANS)
+    assert status.end_s == pytest.approx(12.9)
+    assert status.time_s == pytest.approx(0.2)
+    assert status.health == "no trees yet"
+    assert "chain" in status.stage_ms
+    assert session.next_ns() == scan(3).stamp_ns
+
+
+@pytest.mark.parametrize(("waiting", "state"), [(0, "waiting"), (3, "playing")])
+def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str) -> None:
+    robot = SimpleNamespace(
+        waiting_for=lambda: "Nothing heard for 3 s",
+        scans_waiting=waiting,
+        robot="a",
+        robots=["a"],
+        recording="",
+    )
+    told = describe(None, cast(Any, robot), Said("playing", "", "zenoh:", 0.0, (), 0, "", None))
+    assert (told.state, told.detail) == (state, "" if waiting else "Nothing heard for 3 s")

@@ -1,0 +1,194 @@
+"""The worker as a process: it answers, it is started again when it dies, and it never outlives us."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import pytest
+import pytest_asyncio
+
+from app.worker.internal_protocol import FromWorker, Opened, Report, Shown
+from app.worker.protocol import Advance, Open, Play, SetParameters, SetSpeed
+from app.worker.supervisor import WorkerProcess
+from pipeline.config import Parameters
+
+FAKE = (sys.executable, "-m", "tests.app.fake_worker")
+FINE = Parameters().model_dump()
+
+
+class Said:
+    """What a worker said, and waiting for it."""
+
+    def __init__(self) -> None:
+        self.messages: list[FromWorker] = []
+        self._more = asyncio.Condition()
+
+    async def __call__(self, message: FromWorker) -> None:
+        async with self._more:
+            self.messages.append(message)
+            self._more.notify_all()
+
+    async def wait(self, wanted: Callable[[FromWorker], bool]) -> Any:
+        """The first message that is wanted; those up to it are forgotten."""
+        async with asyncio.timeout(40), self._more:
+            while True:
+                for k, message in enumerate(self.messages):
+                    if wanted(message):
+                        del self.messages[: k + 1]
+                        return message
+                await self._more.wait()
+
+    async def state(self, state: str) -> Any:
+        report = await self.wait(lambda m: isinstance(m, Report) and m.status.state == state)
+        return report.status
+
+    async def scan(self, index: int) -> Any:
+        return await self.wait(lambda m: isinstance(m, Shown) and m.frame.index == index)
+
+    async def opened(self) -> Any:
+        return await self.wait(lambda m: isinstance(m, Opened))
+
+
+@pytest_asyncio.fixture
+async def both() -> AsyncIterator[tuple[WorkerProcess, Said]]:
+    said = Said()
+    worker = WorkerProcess(said, FAKE)
+    await worker.start()
+    yield worker, said
+    await worker.close()
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+async def test_it_opens_and_maps(both: tuple[WorkerProcess, Said]) -> None:
+    worker, said = both
+    await worker.send(SetSpeed(0.0))
+    await worker.send(Open("fake:30"))
+    assert (await said.opened()).kind == "fake run"
+    await worker.send(Advance(8))
+    picture = await said.scan(7)
+    assert picture.path_start + picture.path.x.size == 8
+    await worker.send(Play())
+    assert (await said.state("finished")).scan_index == 29
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
+async def test_killed_it_is_started_again_with_all_it_must_know(
+    both: tuple[WorkerProcess, Said], number: signal.Signals
+) -> None:
+    worker, said = both
+    await worker.send(SetParameters(FINE, 9))
+    await worker.send(Open("fake:30"))
+    await said.opened()
+    first = worker.pid
+    assert first is not None
+    os.kill(first, number)
+    assert f"signal {number.value}, {number.name}" in (await said.state("failed")).detail
+    assert (await said.opened()).uri == "fake:30"
+    assert worker.restarts == 1
+    assert worker.pid != first
+    assert (await said.state("paused")).revision == 9
+    await worker.send(Advance(2))
+    await said.scan(1)
+
+
+async def test_a_print_of_a_library_disturbs_nothing(both: tuple[WorkerProcess, Said]) -> None:
+    worker, said = both
+    await worker.send(Open("prints:5"))
+    await said.opened()
+    await worker.send(Advance(1))
+    await said.scan(0)
+    assert worker.restarts == 0
+
+
+async def test_a_failed_source_is_a_state_and_not_a_death(both: tuple[WorkerProcess, Said]) -> None:
+    worker, said = both
+    await worker.send(Open("missing:"))
+    assert "no such file" in (await said.state("failed")).detail
+    await worker.send(Open("fake:5"))
+    await said.opened()
+    assert worker.restarts == 0
+
+
+async def test_dying_again_and_again_it_waits_for_a_person() -> None:
+    said = Said()
+    worker = WorkerProcess(said, (sys.executable, "-c", "raise SystemExit(7)"), clock=lambda: 0.0)
+    worker_pauses_shortened(worker)
+    await worker.start()
+    try:
+        status = await said.wait(lambda m: isinstance(m, Report) and "5 times" in m.status.detail)
+        assert "exit code 7" in status.status.detail
+        assert "Press play" in status.status.detail
+        stopped_at = worker.restarts
+        assert worker.pid is None
+        await worker.send(Play())
+        await said.state("failed")
+        assert worker.restarts == stopped_at + 1
+    finally:
+        await worker.close()
+
+
+def worker_pauses_shortened(worker: WorkerProcess) -> None:
+    worker._pauses_s = (0.0,) * 5
+
+
+async def test_gibberish_ends_it() -> None:
+    said = Said()
+    worker = WorkerProcess(said, (sys.executable, "-c", "print('hello ' * 5, flush=True)"))
+    await worker.start()
+    try:
+        assert "gibberish" in (await said.state("failed")).detail
+    finally:
+        await worker.close()
+
+
+async def test_a_fault_of_the_listener_does_not_end_the_watch(caplog: pytest.LogCaptureFixture) -> None:
+    said = Said()
+
+    async def listener(message: FromWorker) -> None:
+        await said(message)
+        if isinstance(message, Opened):
+            raise KeyError("a fault on purpose")
+
+    worker = WorkerProcess(listener, FAKE)
+    await worker.start()
+    try:
+        await worker.send(Open("fake:5"))
+        await said.opened()
+        await worker.send(Advance(1))
+        await said.scan(0)
+        assert "a fault on purpose" in caplog.text
+    finally:
+        await worker.close()
+
+
+async def test_closing_ends_it_even_when_it_hangs(both: tuple[WorkerProcess, Said]) -> None:
+    worker, said = both
+    await worker.send(Open("hangs:"))
+    await said.state("starting")
+    pid = worker.pid
+    assert pid is not None
+    await worker.close()
+    assert not is_running(pid)
+    assert worker.pid is None
+
+
+async def test_it_does_not_outlive_the_web_process() -> None:
+    process = await asyncio.create_subprocess_exec(
+        *FAKE, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+    )
+    assert process.stdin is not None
+    process.stdin.close()
+    async with asyncio.timeout(20):
+        assert await process.wait() == 0

@@ -1,0 +1,253 @@
+"""Gathering: what stands over many scans is told from what does not, and going back in time is exact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.classification import Forest, Gathering, View, depth_image, no_columns
+from pipeline.classification.column_classifier import FOLD
+from pipeline.classification.decision_rule import GONE_SCANS
+from pipeline.classification.forest import CLASSES
+from pipeline.config import preset
+from pipeline.detection.free_space import BINS
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.ground.terrain import SECTORS
+from pipeline.mapper import Mapper
+from pipeline.tracking import Tracker
+from pipeline.tracking.track_classification import DUE_NS
+from pipeline.types.records import Columns, Float32, Scan, Sensor, Step, Verdict
+from tests.pipeline.classification.clouds import bush, trunk
+from tests.pipeline.strategies import detections
+
+FOREST = preset("forest")
+NOWHERE_FREE = np.zeros(BINS)
+NOTHING_SEEN = depth_image(np.zeros((0, 3), np.float32))
+
+
+def view(free=NOWHERE_FREE, pose=None):
+    """From the origin, 1 m above flat ground, as steep as 45 degrees."""
+    flat = np.full((SECTORS, 200), -1.0)
+    return View(pose or Pose2(), np.zeros(3), free, np.ones(BINS), NOTHING_SEEN, flat)
+
+
+def gathered(*clouds: Float32, free=NOWHERE_FREE, scans=1):
+    gathering = Gathering(FOREST.gathering, all_around=True)
+    points = np.concatenate(clouds) if clouds else np.zeros((0, 3), np.float32)
+    for k in range(scans):
+        gathering.add(points, points[:, 2].copy(), k, view(free))
+    return gathering
+
+
+def at(columns: Columns, x: float, y: float) -> int:
+    return int(np.hypot(columns.axis[:, 0] - x, columns.axis[:, 1] - y).argmin())
+
+
+def test_a_trunk_is_a_tree_and_a_bush_is_none():
+    columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), bush(-5.0, 2.0, 0.7), scans=3).columns
+    tree = at(columns, 5.0, 1.0)
+    assert columns.verdict[tree] == Verdict.TREE
+    assert columns.axis[tree, :2] == pytest.approx([5.0, 1.0], abs=0.03)
+    in_bush = np.hypot(columns.axis[:, 0] + 5.0, columns.axis[:, 1] - 2.0) < 0.8
+    assert (columns.verdict[in_bush] != Verdict.TREE).all()
+    assert columns.share.sum(axis=1) == pytest.approx(1.0, abs=0.02)
+
+
+def test_nothing_gathered_is_no_column():
+    assert len(gathered().columns.verdict) == 0
+
+
+def test_who_walked_on_is_moving():
+    gathering = gathered(trunk(5.0, 1.0, 0.15, top=1.7), scans=2)
+    nothing = np.zeros((0, 3), np.float32)
+    for k in range(GONE_SCANS + 3):
+        gathering.add(nothing, np.zeros(0, np.float32), 2 + k, view(np.full(BINS, np.inf)))
+    columns = gathering.columns
+    assert columns.verdict[at(columns, 5.0, 1.0)] == Verdict.MOVING
+    assert columns.absent.max() == GONE_SCANS + 3
+
+
+def test_how_high_a_scan_looked_is_told_from_the_ground():
+    columns = gathered(trunk(3.0, 0.0, 0.15)).columns
+    assert columns.viewed[at(columns, 3.0, 0.0)] == pytest.approx(
+        4.0, abs=0.05
+    )  # 3 m out at 45 degrees, plus 1 m
+
+
+def test_another_forest_votes_on_all_columns_from_the_next_scan_on():
+    def sure(name: str, _all_around: bool) -> Forest:
+        one, none = np.zeros(1, np.int32), np.full(1, -1, np.int32)
+        kind = 0 if name == "package" else 1
+        return Forest(one, none, np.zeros(1), one, one, np.eye(len(CLASSES))[kind : kind + 1])
+
+    gathering = Gathering(FOREST.gathering, all_around=True, forests=sure)
+    points = trunk(5.0, 1.0, 0.15, top=5.9)
+    gathering.add(points, points[:, 2].copy(), 0, view())
+    tree = at(gathering.columns, 5.0, 1.0)
+    assert gathering.columns.verdict[tree] == Verdict.TREE
+    before = gathering.snapshot()
+    other = FOREST.replace({"gathering.forest": "0" * 16}).gathering
+    nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+    for restored in (False, True):
+        gathering.parameters = other
+        if restored:
+            gathering.restore(before)
+        gathering.add(nothing, none, 1, view())
+        assert gathering.columns.share[:, 1].tolist() == [1.0] * len(gathering.columns.verdict)
+        assert gathering.columns.verdict[tree] == Verdict.POLE
+    assert before.columns.verdict[tree] == Verdict.TREE, "a snapshot stays as it was"
+
+
+def test_going_back_gives_the_same_again():
+    clouds = [trunk(4.0 + 0.001 * k, 1.0, 0.1, points=300, seed=k) for k in range(FOLD + 20)]
+    gathering = Gathering(FOREST.gathering, all_around=True)
+    states, seen = {}, {}
+    for k, cloud in enumerate(clouds):
+        if k in (0, 5, FOLD - 1, FOLD, FOLD + 7):
+            states[k] = gathering.snapshot()
+        gathering.add(cloud, cloud[:, 2].copy(), k, view())
+        seen[k] = gathering.columns
+    for k, state in reversed(states.items()):
+        gathering.restore(state)
+        for again in range(k, k + 3):
+            gathering.add(clouds[again], clouds[again][:, 2].copy(), again, view())
+            for name in ("axis", "figures", "share", "verdict", "present", "absent"):
+                assert np.array_equal(getattr(gathering.columns, name), getattr(seen[again], name)), (
+                    k,
+                    again,
+                    name,
+                )
+
+
+def test_a_tree_that_no_scan_showed_begins_a_track_and_keeps_its_number():
+    columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
+    tracker = Tracker(FOREST.tracking)
+    for _ in range(3):
+        tracker.judge(1, columns, FOREST.gathering)
+    trees = tracker.trees()
+    assert trees.number.tolist() == [1]
+    assert trees.confirmed.tolist() == [True]
+    assert trees.observations.tolist() == [0]
+    assert np.isnan(trees.dbh[0])
+    assert trees.position[0] == pytest.approx([5.0, 1.0], abs=0.03)
+
+
+@pytest.mark.parametrize(("x", "stays"), [(6.0, False), (15.0, True)])
+def test_hits_make_no_tree_where_a_column_is_overdue(x, stays):
+    """Beside a true trunk something is seen that never stands upright; from afar nobody can say so yet."""
+    columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
+    tracker = Tracker(FOREST.tracking)
+    second = 1_000_000_000
+    shown = []
+    for k in range(6):
+        found = detections([[5.0, 1.0], [x, -3.0]])
+        tracker.process(k * second, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+        if k >= 4:
+            tracker.judge(k * second, columns, FOREST.gathering)
+            shown.append(tracker.trees().confirmed.tolist())
+    assert 5 * second == DUE_NS
+    assert shown == [[True, True], [True, stays]]
+    late = gathered(trunk(x, -3.0, 0.15, top=5.9), scans=3).columns
+    tracker.judge(2 * DUE_NS, late, FOREST.gathering)
+    assert tracker.trees().confirmed.tolist() == [True, True], "a column that comes late counts"
+
+
+def test_hits_count_where_returns_are_gathered_only_from_nearer():
+    """Nobody can miss a column at 6 m who remembers no return from farther than 5 m."""
+    nothing, near = no_columns(), FOREST.gathering.model_copy(update={"range_max": 5.0})
+    for parameters, stays in ((FOREST.gathering, False), (near, True)):
+        tracker = Tracker(FOREST.tracking)
+        for stamp_ns in (0, DUE_NS // 2, DUE_NS):
+            far = detections([[6.0, -3.0]])
+            tracker.process(stamp_ns, Pose2(), np.eye(3) * 1e-6, far, NOWHERE_FREE, 15.0)
+        tracker.judge(DUE_NS, nothing, parameters)
+        assert tracker.trees().confirmed.tolist() == [stays]
+
+
+@pytest.mark.parametrize(
+    ("seen_s", "unseen_s", "stays"),
+    [
+        (0.4, 0.9, True),
+        (0.4, 1.1, False),
+        (3.0, 2.9, True),
+        (3.0, 3.1, False),
+        (20.0, 4.9, True),
+        (20.0, 5.1, False),
+        (0.4, 61.0, True),  # of another drive, or put back by a loop
+    ],
+)
+def test_hits_make_no_tree_of_who_walked_on(seen_s, unseen_s, stays):
+    """Far away, where nothing is gathered and no miss is counted."""
+    tracker, scans = Tracker(FOREST.tracking), 5
+    for k in range(scans):
+        stamp_ns = round(1e9 * seen_s * k / (scans - 1))
+        found = detections([[20.0, -3.0]])
+        tracker.process(stamp_ns, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+    assert tracker.trees().confirmed.tolist() == [True]
+    tracker.judge(round(1e9 * (seen_s + unseen_s)), no_columns(), FOREST.gathering)
+    assert tracker.trees().confirmed.tolist() == [stays]
+
+
+def test_a_tree_does_not_outlive_its_column_beside_something_else():
+    """Who stood beside the robot was a tree by the first votes; their circle lies half a metre off."""
+    columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
+    for kind, off, stays in (
+        (Verdict.MOVING, 0.5, False),
+        (Verdict.PERSON, 0.65, False),
+        (Verdict.BUSH, 0.75, True),
+    ):
+        tracker = Tracker(FOREST.tracking)
+        tracker.judge(0, columns, FOREST.gathering)
+        assert tracker.trees().confirmed.tolist() == [True]
+        place = tracker.trees().position[0]
+        moved = replace(columns, axis=columns.axis.copy(), verdict=np.full_like(columns.verdict, kind))
+        moved.axis[:, :2] = place + np.array([0.0, off])
+        tracker.judge(1, moved, FOREST.gathering)
+        assert tracker.trees().confirmed.tolist() == [stays], kind.label
+
+
+def test_a_piece_that_is_joined_does_not_take_the_verdict_away():
+    """A person's arm begins a track of its own for one scan, and is the person's again in the next one."""
+    columns = gathered(trunk(5.0, 1.0, 0.15, top=1.7), scans=3).columns
+    columns = replace(columns, verdict=np.full(len(columns.verdict), Verdict.PERSON, np.int32))
+    tracker = Tracker(FOREST.tracking)
+    for k in range(5):
+        found = detections([[5.0, 1.0]] if k < 4 else [[5.0, 1.0], [5.0, 1.3]])
+        tracker.process(k, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+        if k == 3:
+            tracker.judge(k, columns, FOREST.gathering)
+            assert tracker.trees().confirmed.tolist() == [False]
+    assert tracker.trees().confirmed.tolist() == [False]
+
+
+def test_the_paper_gathers_nothing():
+    frame = mapped("paper", trunk(5.0, 1.0, 0.15))
+    assert frame.columns is None
+
+
+def mapped(name, points, scans=3):
+    sensor = Sensor("VLP-16", 16, float(np.radians(2.0)), 0.0035)
+    mapper = Mapper(preset(name), sensor=sensor, T_base_lidar=Pose3.identity(), seed=0)
+    frame = None
+    for k in range(scans):
+        frame = mapper.process(Step(k, Scan(k * 100_000_000, points.astype(np.float32)), Pose2()))
+    assert frame is not None
+    return frame
+
+
+RNG = np.random.default_rng(0)
+POOR = {
+    "nothing": np.zeros((0, 3)),
+    "ten identical points": np.repeat([[3.0, 1.0, 0.5]], 10, axis=0),
+    "one plane": np.column_stack([RNG.uniform(-20, 20, (20000, 2)), np.full(20000, -1.0)]),
+    "a wall": np.column_stack([np.full(20000, 5.0), RNG.uniform(-8, 8, 20000), RNG.uniform(-1, 3, 20000)]),
+    "no ground": RNG.uniform(-20, 20, (20000, 3)),
+}
+
+
+@pytest.mark.parametrize("kind", POOR)
+def test_a_poor_cloud_gives_a_frame_and_no_tree(kind):
+    frame = mapped("forest", POOR[kind])
+    assert not frame.trees.confirmed.any()

@@ -1,0 +1,155 @@
+"""The forest: it is read strictly, votes as it was grown, and says nothing else."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from app.training.fit_forest import DOUBTFUL, PLANS, Examples, as_json, grow, grow_free_end, shares
+from pipeline.classification.features import COUNT, NAMES
+from pipeline.classification.forest import (
+    ALL_AROUND,
+    CLASSES,
+    FILE,
+    FREE_END,
+    ONE_WAY,
+    forest_of,
+    read_forest,
+    standard_forest,
+    vote,
+)
+from pipeline.errors import StemmapError
+
+LEAF = {"share": [1.0, 0, 0, 0, 0, 0]}
+OTHER = {"share": [0, 0, 0, 0, 0, 1.0]}
+
+
+def written(tmp_path, **changes: object):
+    node = {"figure": "tilt", "at_most": 0.1, "yes": LEAF, "no": OTHER}
+    data = {"classes": [kind.label for kind in CLASSES], ALL_AROUND: [node], ONE_WAY: [LEAF], **changes}
+    file = tmp_path / "forest.json"
+    file.write_text(json.dumps(data))
+    return file
+
+
+def test_a_figure_decides_at_its_threshold(tmp_path):
+    forest = read_forest(written(tmp_path), ALL_AROUND)
+    figures = np.zeros((3, COUNT))
+    figures[:, NAMES.index("tilt")] = 0.05, 0.1, 0.11
+    assert vote(figures, forest)[:, 0].tolist() == [1.0, 1.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"classes": ["tree"]},
+        {ALL_AROUND: []},
+        {ALL_AROUND: 3},
+        {ALL_AROUND: [{"share": [1.0]}]},
+        {ALL_AROUND: [{"share": [7.0, 0, 0, 0, 0, 0]}]},
+        {ALL_AROUND: [{"figure": "colour", "at_most": 1.0, "yes": LEAF, "no": LEAF}]},
+        {ALL_AROUND: [{"figure": "tilt", "at_most": "high", "yes": LEAF, "no": LEAF}]},
+        {ALL_AROUND: [{"figure": "tilt", "at_most": 1.0, "yes": LEAF}]},
+        {ALL_AROUND: [{"figure": "tilt", "at_most": 10**400, "yes": LEAF, "no": LEAF}]},
+    ],
+)
+def test_a_damaged_file_is_refused_with_a_remedy(tmp_path, changes):
+    with pytest.raises(StemmapError, match="decision trees cannot be read"):
+        read_forest(written(tmp_path, **changes), ALL_AROUND)
+
+
+def test_a_file_that_is_missing_too_large_or_no_json_is_refused(tmp_path):
+    file = tmp_path / "f.json"
+    with pytest.raises(StemmapError):
+        read_forest(file, ONE_WAY)
+    file.write_text("{")
+    with pytest.raises(StemmapError):
+        read_forest(file, ONE_WAY)
+    file.write_bytes(b" " * 4_000_001)
+    with pytest.raises(StemmapError, match="too large"):
+        read_forest(file, ONE_WAY)
+
+
+def test_the_forest_of_the_package_votes_in_shares():
+    figures = np.random.default_rng(0).uniform(-1.0, 5.0, (50, COUNT))
+    for all_around in (True, False):
+        votes = vote(figures, standard_forest(all_around))
+        assert votes.sum(axis=1) == pytest.approx(1.0, abs=0.02)
+        assert (votes >= 0.0).all()
+    assert FILE.stat().st_size < 1_200_000
+
+
+def test_what_was_grown_votes_the_same_as_json():
+    rng = np.random.default_rng(1)
+    figures = rng.uniform(0.0, 1.0, (300, COUNT))
+    label = np.where(figures[:, 3] > 0.5, 0, 1 + (figures[:, 5] > 0.5))
+    label[:20] = DOUBTFUL
+    examples = [
+        Examples("a", False, kind == ALL_AROUND, np.zeros((300, 5)), figures, label) for kind in PLANS
+    ]
+    for kind in PLANS:
+        grown = grow(examples, kind)
+        forest = forest_of(as_json({kind: grown}, []), kind)
+        ours, theirs = vote(figures.astype(np.float32).astype(np.float64), forest), shares(grown, figures)
+        # Thresholds are rounded to four digits: a figure that lies within the rounding may turn.
+        assert np.mean(np.abs(ours - theirs).max(axis=1) < 0.02) > 0.95
+        sure = label != DOUBTFUL
+        assert np.mean((ours[sure, 0] >= 0.5) == (label[sure] == 0)) > 0.95
+
+
+def test_the_same_examples_grow_the_same_trees():
+    rng = np.random.default_rng(2)
+    figures = rng.uniform(0.0, 1.0, (100, COUNT))
+    examples = [
+        Examples("a", False, True, np.zeros((100, 5)), figures, (figures[:, 0] > 0.5).astype(np.int64))
+    ]
+    assert as_json({"k": grow(examples, ALL_AROUND)}, []) == as_json({"k": grow(examples, ALL_AROUND)}, [])
+
+
+def ending(top: float, free: float):
+    figures = np.zeros((1, COUNT))
+    figures[0, NAMES.index("highest return")], figures[0, NAMES.index("free above the highest return")] = (
+        top,
+        free,
+    )
+    return figures
+
+
+def test_what_ends_in_free_air_is_asked_whether_it_is_a_pole(tmp_path):
+    pole = {"share": [0.3, 0.7, 0, 0, 0, 0]}
+    forest = read_forest(written(tmp_path, **{FREE_END: [pole]}), ONE_WAY)
+    assert vote(ending(3.0, 1.0), forest)[0].tolist() == [0.0, 1.0, 0, 0, 0, 0]
+    # What is low, or may go on above what was seen, keeps its votes.
+    assert vote(ending(1.8, 3.0), forest)[0].tolist() == LEAF["share"]
+    assert vote(ending(5.0, 0.8), forest)[0].tolist() == LEAF["share"]
+    assert vote(np.zeros((0, COUNT)), forest).shape == (0, len(CLASSES))
+
+
+def test_a_tree_that_ends_in_free_air_stays_one(tmp_path):
+    tree = {"share": [0.5, 0.5, 0, 0, 0, 0]}
+    forest = read_forest(written(tmp_path, **{FREE_END: [tree]}), ONE_WAY)
+    assert vote(ending(3.0, 1.0), forest)[0].tolist() == LEAF["share"]
+
+
+def test_sensors_that_see_all_around_and_older_files_ask_nobody(tmp_path):
+    pole = {"share": [0.0, 1.0, 0, 0, 0, 0]}
+    assert read_forest(written(tmp_path, **{FREE_END: [pole]}), ALL_AROUND).free_end is None
+    assert read_forest(written(tmp_path), ONE_WAY).free_end is None
+    with pytest.raises(StemmapError, match="decision trees cannot be read"):
+        read_forest(written(tmp_path, **{FREE_END: []}), ONE_WAY)
+
+
+def test_poles_that_end_in_free_air_are_told_by_what_was_pasted():
+    rng = np.random.default_rng(2)
+    figures = np.repeat(ending(3.0, 2.0), 200, axis=0)
+    figures[:, NAMES.index("thick")] = rng.uniform(0.0, 0.2, 200)
+    label = (figures[:, NAMES.index("thick")] < 0.1).astype(np.int64)
+    pasted = Examples("a with poles 0", True, False, np.zeros((200, 5)), figures, label)
+    grown = grow_free_end([pasted])
+    assert grown is not None
+    assert np.mean((shares(grown, figures)[:, 0] >= 0.5) == (label == 0)) > 0.95
+    assert grow_free_end([]) is None
+    low = Examples("a with poles 1", True, False, np.zeros((200, 5)), np.zeros((200, COUNT)), label)
+    assert grow_free_end([low]) is None

@@ -1,0 +1,95 @@
+"""The memory: nothing is lost or counted twice, it is bounded, and copies do not know one another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.classification.voxel_map import FIRST_SCANS, MOST_TILES, SIDE, SLICE, SLICES, TILE, Memory
+
+MOST = 1 << 16
+
+
+def cloud(seed: int, n: int = 500, spread: float = 5.0):
+    rng = np.random.default_rng(seed)
+    rows = np.column_stack([spread * rng.standard_normal((n, 2)), rng.uniform(-1.0, 7.0, n)])
+    return rows.astype(np.float32)
+
+
+def remembered(points):
+    return points[(points[:, 2] >= 0.0) & (np.floor(points[:, 2] / SLICE) < SLICES)]
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**16), n=st.integers(0, 400), scans=st.integers(1, 4))
+def test_every_return_is_counted_once_and_the_means_are_theirs(seed, n, scans):
+    memory = Memory.empty(1 << 4, 1 << 1)  # so small that it must grow
+    clouds = [cloud(seed + k, n) for k in range(scans)]
+    for k, points in enumerate(clouds):
+        memory.add(points, k, MOST)
+    kept = remembered(np.concatenate(clouds))
+    returns, mean = memory.returns[: memory.used], memory.mean[: memory.used]
+    assert returns.sum() == len(kept) == memory.tile_returns[: memory.tiles].sum()
+    assert (returns[:, None] * mean).sum(axis=0) == pytest.approx(kept.sum(axis=0), rel=1e-3, abs=0.05)
+    cells = np.floor(kept / np.array([SIDE, SIDE, SLICE], np.float32)).astype(np.int64)
+    assert memory.used == len(np.unique(cells, axis=0))
+
+
+def test_a_voxel_knows_in_how_many_scans_it_was_seen():
+    memory = Memory.empty()
+    point = np.array([[1.05, 2.05, 1.1]], np.float32)
+    for scan in (0, 0, 3, 9):
+        memory.add(point, scan, MOST)
+    assert memory.returns[0] == 4
+    assert memory.scans[0] == 3
+    assert memory.latest[0] == 9
+
+
+def test_a_full_memory_forgets_what_was_seen_longest_ago():
+    memory = Memory.empty(1 << 6, 1 << 4)
+    for scan in range(40):
+        memory.add(cloud(scan, 200), scan, 1 << 10)
+    assert memory.used <= 1 << 10
+    assert memory.latest[: memory.used].min() > 10
+    assert memory.tile_returns[: memory.tiles].sum() == memory.returns[: memory.used].sum()
+
+
+def test_around_a_tile_is_what_lies_there():
+    memory = Memory.empty()
+    memory.add(cloud(1, 3000), 0, MOST)
+    mean, returns = memory.around(np.array([-1, 0]), 1.2)
+    everything = memory.mean[: memory.used]
+    low, high = np.array([-TILE - 1.2, -1.2]), np.array([1.2, TILE + 1.2])
+    inside = np.all((everything[:, :2] >= low) & (everything[:, :2] < high), axis=1)
+    assert len(mean) == np.count_nonzero(inside)
+    assert returns.sum() == memory.returns[: memory.used][inside].sum()
+
+
+def test_a_tile_is_due_when_it_has_grown_and_few_are_due_at_once():
+    memory = Memory.empty()
+    memory.add(cloud(1, 3000), 0, MOST)
+    first = memory.judge_anew(1.1)
+    assert len(first) == memory.tiles > MOST_TILES
+    assert len(memory.judge_anew(1.1)) == 0
+    for k in range(FIRST_SCANS):
+        memory.add(cloud(2 + k, 3000), 1 + k, MOST)
+    assert len(memory.judge_anew(1.1)) == MOST_TILES
+
+
+def test_a_copy_stays_as_it_was():
+    memory = Memory.empty()
+    memory.add(cloud(1), 0, MOST)
+    copy = memory.copy()
+    before = copy.mean[: copy.used].copy()
+    memory.add(cloud(2), 1, MOST)
+    assert copy.used == len(before) < memory.used
+    assert np.array_equal(copy.mean[: copy.used], before)
+
+
+def test_positions_that_are_no_numbers_or_too_far_are_left_out():
+    memory = Memory.empty()
+    bad = np.array([[np.nan, 0, 1], [0, np.inf, 1], [0, 0, np.nan], [1e9, 0, 1], [0, 0, 1]], np.float32)
+    memory.add(bad, 0, MOST)
+    assert memory.used == 1

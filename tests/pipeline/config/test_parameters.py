@@ -1,0 +1,300 @@
+"""Every tunable value is declared once, is checked at the door, and comes back from its text."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.config import (
+    PRESETS,
+    Parameters,
+    assign,
+    field_specs,
+    from_toml,
+    markdown_table,
+    preset,
+    to_toml,
+)
+from pipeline.errors import ParameterError
+from tests.pipeline.strategies import LAW
+
+SPECS = field_specs()
+NUMBERS = [spec for spec in SPECS if spec.kind in ("float", "int")]
+UNITS = {"", "m", "m/m", "m/s", "m/s²", "m/√m", "deg", "deg/√m", "deg/√rad", "sigma", "m²"}
+
+
+def replaced(name: str, value: object) -> Parameters | str:
+    """The preset forest with one value changed, or why that cannot be."""
+    try:
+        return preset("forest").replace({name: value})
+    except ParameterError as error:
+        return str(error)
+
+
+def test_the_preset_paper_is_table_1():
+    values = preset("paper").flat()
+    table_1 = {
+        "slam.particles": 100,
+        "detection.e_max": 20.0,
+        "filters.voxel_size": 0.01,
+        "clustering.eps": 0.25,
+        "clustering.min_points": 20,
+        "clustering.method": "dbscan",
+        "tracking.proximity_radius": 1.0,
+        "detection.cylindrical_stddev_thresh": 0.1,
+        "filters.x_min": 0.0,
+        "filters.x_max": 10.0,
+        "filters.y_min": -10.0,
+        "filters.y_max": 10.0,
+        "filters.z_min": -0.5,
+        "filters.z_max": 0.0,
+    }
+    assert {name: values[name] for name in table_1} == table_1
+
+
+def test_the_preset_paper_switches_off_what_the_paper_does_not_have():
+    p = preset("paper")
+    assert p.ground.method == "none"
+    assert p.acquisition.level == "none"
+    assert not p.acquisition.deskew
+    assert p.shape.centre == "centroid"
+    assert p.detection.e_min == 1.0
+
+
+def test_the_text_of_the_paper_differs_from_its_table_by_one_bound():
+    assert preset("paper-text").changes_from(preset("paper")) == {"detection.e_min": 10.0}
+
+
+def test_forest_is_the_default():
+    assert preset("forest") == Parameters()
+    assert next(iter(PRESETS)) == "forest"
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_lies_within_the_bounds_and_says_where_it_comes_from(name):
+    values: dict[str, Any] = dict(preset(name).flat())
+    for spec in NUMBERS:
+        assert spec.minimum is not None
+        assert spec.maximum is not None
+        assert spec.minimum <= values[spec.name] <= spec.maximum
+    assert PRESETS[name][0]
+    assert "  " not in PRESETS[name][0]
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)
+def test_every_parameter_is_said_to_people(spec):
+    assert spec.title
+    assert spec.title[0].isupper() or spec.title[0] in "xyz"
+    assert spec.doc.endswith(".")
+    assert len(spec.doc) > 20
+    assert "|" not in spec.doc + spec.title, "it would break the table in README"
+    assert spec.unit in UNITS
+    assert spec.stage
+
+
+@pytest.mark.parametrize("spec", NUMBERS, ids=lambda s: s.name)
+def test_every_number_has_bounds_a_step_and_a_default_between(spec):
+    assert spec.minimum < spec.maximum
+    assert 0 < spec.step <= spec.maximum - spec.minimum
+    assert spec.minimum <= spec.default <= spec.maximum
+    assert spec.kind == "float" or spec.step == 1
+
+
+@pytest.mark.parametrize("spec", NUMBERS, ids=lambda s: s.name)
+def test_bounds_belong_to_the_range_and_nothing_beyond(spec):
+    number = int if spec.kind == "int" else float
+    beyond = 1 if spec.kind == "int" else 1e-6
+    for value in (number(spec.minimum - beyond), number(spec.maximum + beyond)):
+        with pytest.raises(ParameterError, match=spec.name.replace(".", r"\.")):
+            preset("forest").replace({spec.name: value})
+    for bound in (spec.minimum, spec.maximum):
+        told = replaced(spec.name, number(bound))
+        if isinstance(told, str):  # the other end of a pair stands in its way, and is named
+            assert "must be less than" in told
+        else:
+            assert told.flat()[spec.name] == bound
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), True, "0.3", None, [0.3], 1j])
+def test_what_is_no_number_is_refused(value):
+    with pytest.raises(ParameterError, match=r"clustering\.eps"):
+        preset("forest").replace({"clustering.eps": value})
+
+
+@pytest.mark.parametrize("value", [True, 3.0, 3.5, "3", None])
+def test_what_is_no_whole_number_is_refused(value):
+    with pytest.raises(ParameterError, match=r"clustering\.min_points"):
+        preset("forest").replace({"clustering.min_points": value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("acquisition.deskew", 1), ("acquisition.level", "imuu"), ("clustering.engine", 0)]
+)
+def test_what_is_no_choice_is_refused(name, value):
+    with pytest.raises(ParameterError, match=name.replace(".", r"\.")):
+        preset("forest").replace({name: value})
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ("filters.x_min", "filters.x_max"),
+        ("filters.y_min", "filters.y_max"),
+        ("filters.z_min", "filters.z_max"),
+        ("ground.height_min", "ground.height_max"),
+        ("acquisition.range_min", "acquisition.range_max"),
+        ("detection.e_min", "detection.e_max"),
+        ("detection.radius_min", "detection.radius_max"),
+    ],
+)
+@pytest.mark.parametrize("apart", [0.0, 0.5])
+def test_two_bounds_that_cross_are_both_named(low, high, apart):
+    with pytest.raises(ParameterError) as caught:
+        preset("forest").replace({low: 1.5 + apart, high: 1.5})
+    assert low in str(caught.value)
+    assert high in str(caught.value)
+
+
+def test_crossing_bounds_may_be_moved_together():
+    moved = preset("forest").replace({"filters.z_min": 30.0, "filters.z_max": 40.0})
+    assert (moved.filters.z_min, moved.filters.z_max) == (30.0, 40.0)
+
+
+def test_a_set_does_not_change_when_another_is_made_of_it():
+    before = preset("forest")
+    after = before.replace({"clustering.eps": 0.3})
+    assert after.changes_from(before) == {"clustering.eps": 0.3}
+    assert before == Parameters()
+    with pytest.raises(ValueError, match="frozen"):
+        before.clustering.eps = 0.3
+
+
+@pytest.mark.parametrize("name", ["clustering.epz", "clustering", "", ".", "clusterin.eps", "a.b.c"])
+def test_an_unknown_name_is_refused_and_the_nearest_said(name):
+    with pytest.raises(ParameterError) as caught:
+        preset("forest").replace({name: 1.0})
+    assert "\n" not in str(caught.value)
+    if name == "clustering.epz":
+        assert "clustering.eps" in str(caught.value)
+
+
+def test_an_unknown_preset_names_the_known_ones():
+    with pytest.raises(ParameterError) as caught:
+        preset("wood")
+    assert all(name in str(caught.value) for name in PRESETS)
+
+
+# --- text -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_toml_brings_every_preset_back(name):
+    assert from_toml(to_toml(preset(name)), preset("forest"), "x.toml") == preset(name)
+
+
+@LAW
+@given(st.data())
+def test_toml_brings_any_values_back(data):
+    spec = data.draw(st.sampled_from(NUMBERS))
+    lowest, highest = spec.minimum, spec.maximum
+    value = (
+        data.draw(st.integers(int(lowest), int(highest)))
+        if spec.kind == "int"
+        else data.draw(st.floats(lowest, highest))
+    )
+    chosen = replaced(spec.name, value)
+    if isinstance(chosen, str):
+        assert "must be less than" in chosen
+        return
+    assert from_toml(to_toml(chosen), preset("paper"), "x.toml") == chosen
+    assert assign(preset("forest"), [f"{spec.name}={value!r}"]) == chosen
+
+
+def test_toml_may_leave_things_out_and_write_lengths_as_whole_numbers():
+    chosen = from_toml("[clustering]\neps = 1\n", preset("paper"), "x.toml")
+    assert chosen.changes_from(preset("paper")) == {"clustering.eps": 1.0}
+    assert from_toml("", preset("paper"), "x.toml") == preset("paper")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "eps = 1",
+        "[clustering",
+        "[clustering]\neps = 'a'",
+        "[clustering]\neps = nan",
+        "[clustering]\neps = true",
+        "[clustering]\nmin_points = 3.0",
+        "[clustering]\nepz = 0.3",
+        "[nothing]\neps = 0.3",
+        "[clustering.eps]\na = 1",
+        "[[clustering]]\neps = 0.3",
+        "clustering = 3",
+        "[filters]\nx_min = 5.0\nx_max = 5.0",
+        "[clustering]\neps = 1" + 400 * "0",
+        "[clustering]\neps = 1" + 5000 * "0",
+        "[clustering]\neps = " + 3000 * "[" + 3000 * "]",
+    ],
+    ids=lambda text: repr(text[:28]),
+)
+def test_a_toml_that_does_not_fit_is_one_line_with_the_name_of_the_file(text):
+    with pytest.raises(ParameterError) as caught:
+        from_toml(text, preset("forest"), "mine.toml")
+    message = str(caught.value)
+    assert "mine.toml" in message
+    assert "\n" not in message
+    assert len(message) < 500
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("clustering.eps", "stage.name=value"),
+        ("=1", "no parameter"),
+        ("clustering.eps=", "should be a number"),
+        ("clustering.eps=abc", "should be a number"),
+        ("clustering.eps=nan", "finite"),
+        ("clustering.eps=1e999", "finite"),
+        ("clustering.eps=99", "less than or equal to 5"),
+        ("clustering.min_points=8.0", "whole number"),
+        ("clustering.min_points=0", "greater than or equal to 1"),
+        ("acquisition.deskew=yes", "boolean"),
+        ("acquisition.level=IMU", "'none' or 'imu'"),
+        ("clustering.epz=1", "clustering.eps"),
+    ],
+)
+def test_an_assignment_that_does_not_fit_says_why(text, says):
+    with pytest.raises(ParameterError) as caught:
+        assign(preset("forest"), [text])
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_assignments_are_laid_over_one_another():
+    chosen = assign(
+        preset("forest"),
+        ["clustering.eps=0.3", " clustering.eps = 0.4 ", "acquisition.deskew=false", "slam.particles=7"],
+    )
+    assert chosen.clustering.eps == 0.4
+    assert chosen.acquisition.deskew is False
+    assert chosen.slam.particles == 7
+
+
+def test_the_table_has_a_row_a_parameter_and_a_column_a_preset():
+    table = markdown_table({name: preset(name) for name in PRESETS}).splitlines()
+    assert len(table) == 2 + len(SPECS)
+    assert len({line.count("|") for line in table}) == 1
+    for spec, line in zip(SPECS, table[2:], strict=True):
+        assert line.startswith(f"| `{spec.name}` |")
+        for name in PRESETS:
+            value = preset(name).flat()[spec.name]
+            assert (f"{value:g}" if isinstance(value, float) else str(value)) in line
+
+
+def test_values_are_plain_python_numbers():
+    for value in preset("forest").replace({"clustering.eps": np.float64(0.3)}).flat().values():
+        assert type(value) in (int, float, bool, str)

@@ -1,0 +1,108 @@
+"""A missing tree is told from a hidden one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.detection.free_space import BINS, FIELD, clear_range, in_free_view
+from pipeline.geometry.azimuth_bins import direction_bin
+from tests.pipeline.strategies import LAW, seeds
+
+AROUND = np.linspace(-np.pi, np.pi, 1440, endpoint=False)
+POSE = np.array([1.0, 2.0, 0.5])
+
+
+def circle(radius, angles=AROUND):
+    """Points around the sensor, float32, shape (N, 3)."""
+    return np.stack([radius * np.cos(angles), radius * np.sin(angles), 0 * angles], axis=1).astype(np.float32)
+
+
+def free_at(bearing, reach, raw, filtered, view_range=50.0):
+    """Whether a place in a direction of the base was free to see."""
+    free = clear_range(raw, filtered, np.zeros(3))
+    a = bearing + POSE[2]
+    place = POSE[:2] + reach * np.array([[np.cos(a), np.sin(a)]])
+    return bool(in_free_view(place, POSE, free, view_range)[0])
+
+
+def test_open_ground_is_free_as_far_as_is_asked():
+    raw = circle(20.0)
+    nothing = np.zeros((0, 3), np.float32)
+    assert free_at(0.3, 10.0, raw, nothing)
+    assert not free_at(0.3, 10.0, raw, nothing, view_range=9.9)
+
+
+@pytest.mark.parametrize("bearing", [0.0, 1.2, np.pi, -np.pi / 2, -3.1])
+def test_behind_a_trunk_nothing_is_free_and_beside_it_all_is(bearing):
+    raw = circle(20.0)
+    trunk = circle(5.0, bearing + np.linspace(-0.03, 0.03, 12))
+    assert free_at(bearing, 3.9, raw, trunk)
+    assert not free_at(bearing, 4.5, raw, trunk), "what stands so near behind proves nothing"
+    assert not free_at(bearing, 8.0, raw, trunk)
+    assert free_at(bearing + 0.3, 8.0, raw, trunk)
+
+
+def test_where_the_sensor_does_not_look_nothing_is_free():
+    ahead = circle(20.0, np.linspace(-0.6, 0.6, 300))
+    nothing = np.zeros((0, 3), np.float32)
+    assert free_at(0.0, 5.0, ahead, nothing)
+    assert not free_at(1.5, 5.0, ahead, nothing)
+    assert not free_at(np.pi, 5.0, ahead, nothing)
+
+
+def test_an_empty_scan_frees_nothing():
+    nothing = np.zeros((0, 3), np.float32)
+    np.testing.assert_array_equal(clear_range(nothing, nothing, np.zeros(3)), np.zeros(BINS))
+
+
+def test_distances_count_from_the_base_and_not_from_the_sensor():
+    raw = circle(20.0)
+    trunk = circle(5.0, np.linspace(-0.02, 0.02, 9))
+    free = clear_range(raw, trunk, np.array([2.0, 0.0, 0.8]))
+    assert np.min(free) == pytest.approx(7.0, abs=0.01)
+
+
+@LAW
+@given(st.floats(-np.pi, np.pi), st.floats(0.01, 100.0), st.integers(1, 400))
+def test_bins_of_direction_cover_the_circle_whatever_the_length(angle, length, bins):
+    x, y = np.cos(angle), np.sin(angle)
+    k = direction_bin(x * length, y * length, bins)
+    assert 0 <= k < bins
+    nudged = direction_bin(x, y, bins)
+    assert (k - nudged) % bins in (0, 1, bins - 1)
+
+
+@pytest.mark.parametrize("bins", [72, 360, 7])
+def test_bins_ascend_with_the_angle_and_differ_by_at_most_twofold(bins):
+    angles = np.linspace(-np.pi, np.pi, 200_000, endpoint=False)
+    told = np.array([direction_bin(np.cos(a), np.sin(a), bins) for a in angles[::20]])
+    assert np.all(np.diff(told) >= 0)
+    assert set(told.tolist()) == set(range(bins))
+    if bins == 72:
+        widths = np.bincount(told)
+        assert widths.max() <= 2.1 * widths.min()
+
+
+def test_the_origin_has_a_direction_too():
+    assert direction_bin(0.0, 0.0, 360) == direction_bin(1.0, 0.0, 360)
+    assert direction_bin(-0.0, -0.0, 360) == 180
+
+
+@LAW
+@given(seeds, st.floats(0.0, 40.0))
+def test_the_free_distance_is_that_of_the_nearest_point_by_direction(seed, spread):
+    random = np.random.default_rng(seed)
+    raw = random.normal(0.0, spread, (300, 3)).astype(np.float32)
+    raw[:60, :2] = np.round(raw[:60, :2])  # on the axes, on the diagonals, at the origin
+    sensor = np.array([0.25, -0.5, 1.0]) * float(random.integers(0, 2))
+    nearest, looked = np.full(BINS, np.inf), np.zeros(BINS, bool)
+    for x, y in raw[:, :2] + sensor[:2]:
+        k = direction_bin(x, y, BINS)
+        looked[[(k + j) % BINS for j in range(-FIELD, FIELD + 1)]] = True
+        nearest[k] = min(nearest[k], np.hypot(x, y))
+    free = np.where(looked, nearest, 0.0)
+    wanted = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
+    np.testing.assert_allclose(clear_range(raw, raw, sensor), wanted)

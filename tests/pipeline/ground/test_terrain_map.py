@@ -1,0 +1,94 @@
+"""The height map: planes come out as they are, from any side, and going back leaves nothing behind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.config import preset
+from pipeline.geometry.poses import Pose2
+from pipeline.ground import find_terrain
+from pipeline.ground.terrain_map import HeightMapper, PackedHeightMap
+from pipeline.ground.terrain_map import fusion as fusion_module
+from pipeline.io.checkpoints.codec import decode, encode
+from tests.pipeline.ground.test_ground import SENSOR_HEIGHT, _rings
+
+FOREST = preset("forest").ground
+OFFSET = np.array([0.0, 0.0, SENSOR_HEIGHT])
+
+
+def _driven(slope, uphill, poses):
+    """A mapper that saw a plane from each pose, as a level sensor above it sees it."""
+    mapper = HeightMapper()
+    for pose in poses:
+        terrain = find_terrain(_rings(slope, uphill - pose.yaw), FOREST)
+        mapper.add(terrain, pose, OFFSET)
+    return mapper
+
+
+def _poses(uphill, n):
+    return [Pose2(0.4 * k * np.cos(uphill), 0.4 * k * np.sin(uphill), 0.1 * k) for k in range(n)]
+
+
+@pytest.mark.parametrize("slope", [0.0, 8.0, 15.0])
+def test_a_plane_that_was_driven_up_is_a_plane(slope):
+    uphill = 0.7
+    record = _driven(slope, uphill, _poses(uphill, 25)).record()
+    middle = (record.place + 0.5) * record.cell
+    true = np.tan(np.radians(slope)) * (middle @ [np.cos(uphill), np.sin(uphill)])
+    near = np.hypot(*middle.T) < 10.0
+    error = (record.height - true)[near]
+    assert np.count_nonzero(near) > 500
+    assert np.sqrt(np.mean(error**2)) < 0.02 + 0.006 * slope
+    assert np.all(record.sigma > 0.0)
+    assert 15 <= record.views.max() <= 25
+
+
+def test_height_is_asked_for_at_any_place():
+    mapper = _driven(0.0, 0.0, _poses(0.0, 3))
+    heights = mapper.heights(np.array([[3.2, 0.1], [500.0, 0.0]]))
+    assert heights[0] == pytest.approx(0.0, abs=1e-4)
+    assert np.isnan(heights[1])
+
+
+def test_a_state_is_not_changed_by_what_comes_after_it():
+    poses = _poses(0.0, 12)
+    mapper = _driven(10.0, 0.0, poses[:6])
+    state = mapper.state
+    before = PackedHeightMap.of(state)
+    for pose in poses[6:]:
+        mapper.add(find_terrain(_rings(10.0, -pose.yaw), FOREST), pose, OFFSET)
+    after = PackedHeightMap.of(state)
+    np.testing.assert_array_equal(before.cells, after.cells)
+    np.testing.assert_array_equal(before.tile, after.tile)
+    last = mapper.record()
+    mapper.state = state
+    for pose in poses[6:]:
+        mapper.add(find_terrain(_rings(10.0, -pose.yaw), FOREST), pose, OFFSET)
+    for column in ("place", "height", "sigma", "views"):
+        np.testing.assert_array_equal(getattr(mapper.record(), column), getattr(last, column))
+
+
+def test_a_saved_map_is_the_same_to_the_bit():
+    state = _driven(10.0, 0.0, _poses(0.0, 4)).state
+    tree, arrays = encode(PackedHeightMap.of(state))
+    again = decode(PackedHeightMap, tree, arrays).unpacked()
+    assert list(again.tiles) == list(state.tiles)
+    assert all(np.array_equal(again.tiles[key], state.tiles[key]) for key in state.tiles)
+    assert (again.sensor_z, again.scans) == (state.sensor_z, state.scans)
+
+
+def test_memory_is_bounded(monkeypatch):
+    monkeypatch.setattr(fusion_module, "MOST_TILES", 40)
+    far = [Pose2(30.0 * k, 0.0, 0.0) for k in range(6)]
+    state = _driven(0.0, 0.0, far).state
+    assert len(state.tiles) == 40
+    assert max(i for i, _ in state.tiles) * fusion_module.TILE > 130.0  # what was seen last is kept
+
+
+def test_a_sensor_that_comes_back_higher_by_mistake_finds_its_height_again():
+    mapper = _driven(0.0, 0.0, _poses(0.0, 5))
+    points = _rings(0.0, 0.0) - np.array([0.0, 0.0, 0.3], np.float32)  # it stands on a log
+    mapper.add(find_terrain(points, FOREST), Pose2(), OFFSET)
+    assert mapper.state.sensor_z == pytest.approx(SENSOR_HEIGHT + 0.3, abs=0.01)
+    assert np.abs(mapper.record().height).max() < 0.01

@@ -1,0 +1,111 @@
+"""A whole cloud in every command: told of, driven through, mapped, judged, and refused where nobody drove."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from app.cli import main
+from pipeline.errors import SourceError
+from pipeline.io.readers import open_source
+from pipeline.io.readers.clouds import open_cloud
+from tests.app.cli.test_commands import stemmap
+from tests.pipeline.inventory.plots import PLACES, hill, plot, write_las
+
+UTM = (470600.0, 3810200.0, 2278.0)
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory):
+    """A plot with nine stems."""
+    folder = tmp_path_factory.mktemp("cloud")
+    points = plot(np.random.default_rng(1), slope=0.1, per_m2=900)
+    return write_las(folder / "plot.laz", points, offset=UTM, crs="EPSG:26912")
+
+
+@pytest.fixture(scope="module")
+def mapped(cloud):
+    """Its map."""
+    folder = cloud.parent / "map"
+    assert main(["map", str(cloud), "--out", str(folder)]) == 0
+    return folder
+
+
+def test_info_tells_what_is_in_a_cloud_and_what_to_do_with_it(cloud, capsys, monkeypatch):
+    monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
+    told = stemmap(capsys, "info", cloud)
+    assert (told.code, told.err) == (0, "")
+    said = {line[:10].strip(): line[10:] for line in told.out.splitlines()}
+    assert said["kind"].startswith("whole cloud, LAS 1.4 compressed")
+    assert said["CRS"] == "NAD83 / UTM zone 12N (EPSG:26912)"
+    assert said["extent"].startswith("15.0 x 15.0 m, ")
+    assert "intensity" in said["each has"]
+    assert f"stemmap map {cloud} --out out" in told.out
+    record = json.loads(stemmap(capsys, "info", cloud, "--json").out)
+    assert record["points"] == int(said["points"].replace(",", ""))
+    assert record["low_m"][:2] == pytest.approx(UTM[:2], abs=0.1)
+
+
+def test_a_robot_drives_through_a_cloud_that_is_opened_as_a_run(cloud):
+    opened, named = open_source(str(cloud)), open_source(f"sim:cloud?file={cloud}")
+    assert opened.description.kind.startswith("simulated drive through a whole cloud (LAS 1.4")
+    assert opened.description.uri == str(cloud)
+    assert opened.description.digest == named.description.digest
+    truth = opened.truth()
+    assert truth is not None
+    assert truth.trees is None
+
+
+def test_a_cloud_without_a_way_says_what_to_do_instead(tmp_path):
+    wall = np.random.default_rng(3).uniform(0.0, 2.0, (60_000, 3))
+    with pytest.raises(SourceError, match=r"no free way .* `stemmap map`"):
+        open_source(str(write_las(tmp_path / "full.laz", wall)))
+
+
+def test_the_ground_is_written_where_the_cloud_shows_it(mapped):
+    with (mapped / "terrain.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    x, y, z = (np.array([float(row[name]) for row in rows]) for name in ("x_m", "y_m", "z_m"))
+    assert 400 < len(rows) <= 31 * 31
+    off = z - UTM[2] - hill(x - UTM[0], y - UTM[1], 0.1)
+    assert np.percentile(np.abs(off), 90) < 0.15
+    assert {(row["sigma_m"], row["views"]) for row in rows} == {("", "")}
+
+
+def test_the_map_of_a_cloud_is_judged_as_a_whole(mapped, tmp_path, capsys):
+    table = tmp_path / "stems.csv"
+    rows = "".join(f"{x + UTM[0]},{y + UTM[1]},{200 * r}\n" for x, y, r in PLACES)
+    table.write_text("x_m,y_m,dbh_cm\n" + rows)
+    told = stemmap(capsys, "evaluate", mapped, "--truth", table)
+    assert told.out.startswith("trees found (TA) 9/9 (100.0 %), missed (FR) 0/9 (0.0 %) in the whole cloud\n")
+    stemmap(capsys, "evaluate", mapped).refused(1, "--truth", "cloud")
+
+
+def test_what_needs_a_drive_is_refused_for_a_cloud_in_its_own_words(mapped, cloud, tmp_path, capsys):
+    stemmap(capsys, "export", mapped, "--out", tmp_path / "states").refused(1, "nobody drove")
+    words = ["map", "sim:paper?duration=2", "--continue", mapped, "--out", tmp_path / "both"]
+    stemmap(capsys, *words).refused(1, "whole cloud", "no drive goes on")
+    stemmap(capsys, "merge", mapped, mapped, "--out", tmp_path / "both").refused(1, "whole cloud")
+    stemmap(capsys, "map", cloud, "--continue", mapped, "--out", tmp_path / "both").refused(2, "--continue")
+    assert not (tmp_path / "both").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (OSError("the disk is gone"), "the disk is gone"),
+        (OSError(5, "Input/output error"), "Input/output error"),
+        (MemoryError(), "memory"),
+        (RuntimeError(), "RuntimeError"),
+    ],
+)
+def test_why_a_cloud_cannot_be_opened_is_said(cloud, monkeypatch, error, says):
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("pipeline.io.readers.clouds.las.LasCloud", fails)
+    with pytest.raises(SourceError, match=says):
+        open_cloud(str(cloud))

@@ -1,0 +1,267 @@
+"""Whole clouds in PLY, NumPy and PCD files: what an independent library wrote, and nothing believed."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import zipfile
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.cli import main
+from pipeline.errors import SourceError
+from pipeline.io.readers import open_source
+from pipeline.io.readers.clouds import is_cloud, open_cloud
+from pipeline.io.readers.point_files import open_table, read_columns
+from pipeline.io.readers.scan_folder import ScanFileError
+from tests.pipeline.inventory.plots import plot
+
+UTM = np.array([470600.0, 3810200.0, 2278.0])
+TEXT = (
+    "ply\nformat ascii 1.0\nelement vertex {n}\n"
+    "property float x\nproperty float y\nproperty float z\nend_header\n"
+)
+
+
+@pytest.fixture(scope="module")
+def points():
+    return plot(np.random.default_rng(1), per_m2=900)
+
+
+def write(path: Path, points: np.ndarray, how: str = "") -> Path:
+    """Write points with Open3D (PLY, PCD) or NumPy."""
+    if path.suffix in (".ply", ".pcd"):
+        import open3d as o3d
+
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        ascii_, packed = how == "write_ascii", how == "compressed"
+        assert o3d.io.write_point_cloud(path, cloud, write_ascii=ascii_, compressed=packed)
+    elif path.suffix == ".npy":
+        np.save(path, points)
+    else:
+        np.savez_compressed(path, other=np.arange(5), points=points)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "how", "kind"),
+    [
+        ("c.ply", "", "PLY binary"),
+        ("c.ply", "write_ascii", "PLY text"),
+        ("c.pcd", "", "PCD binary"),
+        ("c.pcd", "write_ascii", "PCD ascii"),
+        ("c.pcd", "compressed", "PCD binary_compressed"),
+        ("c.npy", "", "NumPy .npy"),
+        ("c.npz", "", "NumPy .npz, its array points"),
+    ],
+)
+def test_the_points_that_another_library_wrote(tmp_path, points, name, how, kind):
+    points = points[::2]
+    file = write(tmp_path / name, points, how)
+    cloud = open_cloud(str(file))
+    assert is_cloud(str(file)) == (name != "c.pcd")
+    assert (cloud.description.kind, cloud.description.points) == (kind, len(points))
+    for _ in range(2):  # as often as asked for
+        read = np.concatenate(list(cloud.parts()))
+        assert read.dtype == np.float32
+        np.testing.assert_allclose(read, points, atol=1e-4)  # texts have six digits
+    assert not cloud.losses
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_numpy_tables_of_all_layouts(tmp_path, points, dtype, order):
+    table = np.asarray(np.column_stack([points[:1000], np.arange(1000)]), dtype, order=order)
+    np.save(tmp_path / "a.npy", table)
+    np.savez(tmp_path / "b.npz", scan=table)
+    np.savez(tmp_path / "c.npz", **dict(zip(("x", "y", "z", "intensity"), table.T, strict=True)))
+    fields = np.zeros(1000, [("X", dtype), ("Y", dtype), ("name", "S3"), ("Z", dtype), ("Intensity", "u2")])
+    for field, column in zip(("X", "Y", "Z", "Intensity"), table.T, strict=True):
+        fields[field] = column
+    np.save(tmp_path / "d.npy", fields)
+    for name in ("a.npy", "b.npz", "c.npz", "d.npy"):
+        columns = read_columns(tmp_path / name, {})
+        assert set(columns) == {"x", "y", "z", "intensity"}, name
+        for axis, column in zip(("x", "y", "z", "intensity"), table.T, strict=True):
+            np.testing.assert_array_equal(columns[axis], column)
+
+
+def test_coordinates_of_a_map_keep_their_millimetres(tmp_path, points):
+    cloud = open_cloud(str(write(tmp_path / "c.npy", points + UTM)))
+    read = np.concatenate(list(cloud.parts())) + cloud.description.offset
+    assert np.abs(read - (points + UTM)).max() < 1e-4
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_ply_of_both_byte_orders_with_other_elements_before_and_after(tmp_path, order):
+    form = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = (
+        f"ply\r\nformat {form} 1.0\r\ncomment made by hand\r\nelement camera 2\r\nproperty double t\r\n"
+        "element vertex 3\r\nproperty uchar red\r\nproperty double x\r\nproperty float y\r\n"
+        "property short z\r\n"
+        "property float scalar_Intensity\r\nelement face 1\r\n"
+        "property list uchar int vertex_indices\r\nend_header\r\n"
+    )
+    rows = [(1, 1.5, -2.0, 3, 0.25), (2, 4.5, 5.0, -6, 0.5), (3, 7.0, 8.0, 9, 0.75)]
+    body = struct.pack(order + "2d", 0.0, 1.0)
+    body += b"".join(struct.pack(order + "Bdfhf", *row) for row in rows)
+    body += struct.pack(order + "B3i", 3, 0, 1, 2)
+    (tmp_path / "c.ply").write_bytes(head.encode() + body)
+    columns = read_columns(tmp_path / "c.ply", {})
+    read = np.column_stack([columns[name] for name in ("red", "x", "y", "z", "intensity")])
+    np.testing.assert_array_equal(read, rows)
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\n\n", "\r\n"])
+def test_a_ply_text_is_read_to_its_last_line(tmp_path, end):
+    text = TEXT.format(n=2).replace("element", "element note 1\nproperty float n\nelement", 1)
+    (tmp_path / "c.ply").write_text(text + "7\n1 2 3\n4 5 6" + end)
+    losses: dict[str, int] = {}
+    columns = read_columns(tmp_path / "c.ply", losses)
+    np.testing.assert_array_equal(columns["z"], [3.0, 6.0])
+    assert not losses
+
+
+@pytest.mark.parametrize("body", ["1 2 3\n4 5 x\n7 8 9\n", "1 2 3\n4 5\n", "1 2 3\n"])
+def test_what_a_text_promises_and_does_not_hold_is_counted(tmp_path, body):
+    (tmp_path / "c.ply").write_text(TEXT.format(n=3) + body)
+    losses: dict[str, int] = {}
+    columns = read_columns(tmp_path / "c.ply", losses)
+    np.testing.assert_array_equal(columns["x"], [1.0])
+    assert losses == {"points that the files promise but do not hold": 2}
+
+
+def test_what_stands_before_the_points_of_a_text_is_passed_over_once(tmp_path):
+    """Two million short lines: copying the rest of the text at each of them would take minutes."""
+    lines = 2_000_000
+    text = TEXT.format(n=2).replace("element", f"element note {lines}\nproperty float n\nelement", 1)
+    (tmp_path / "c.ply").write_bytes(text.encode() + b"7\n" * lines + b"1 2 3\n4 5 6\n")
+    np.testing.assert_array_equal(read_columns(tmp_path / "c.ply", {})["x"], [1.0, 4.0])
+
+
+@pytest.mark.parametrize("body", ["1 2 3 4\n4 5 6 7\n", "\n1 2 3 4 5 6\n", "1 2 3 x\n4 5 6 x\n"])
+def test_rows_longer_than_the_header_says_are_refused(tmp_path, body):
+    (tmp_path / "c.ply").write_text(TEXT.format(n=2) + body)
+    with pytest.raises(ScanFileError, match=r"have [46] numbers, its header names 3"):
+        read_columns(tmp_path / "c.ply", {})
+
+
+@pytest.mark.parametrize("body", ["1 2 3\n4 5 6 7\n7 8 9\n", "1 2 3\n4 5\n6 7 8 9\n"])
+def test_no_point_is_made_of_two_rows(tmp_path, body):
+    (tmp_path / "c.ply").write_text(TEXT.format(n=3) + body)
+    losses: dict[str, int] = {}
+    np.testing.assert_array_equal(read_columns(tmp_path / "c.ply", losses)["x"], [1.0])
+    assert losses == {"points that the files promise but do not hold": 2}
+
+
+def test_points_that_are_none_are_counted(tmp_path, points):
+    some = points[:500].copy()
+    some[3], some[7, 1] = np.nan, 1e12
+    cloud = open_cloud(str(write(tmp_path / "c.npy", some)))
+    assert sum(len(part) for part in cloud.parts()) == 498
+    assert cloud.losses == {"points without coordinates": 2}
+
+
+@pytest.mark.parametrize("name", ["c.ply", "c.pcd", "c.npy"])
+def test_a_file_that_is_cut_gives_what_is_there(tmp_path, points, name):
+    file = write(tmp_path / name, points[:10_000])
+    file.write_bytes(file.read_bytes()[:-1000])
+    cloud = open_cloud(str(file))
+    read = np.concatenate(list(cloud.parts()))
+    assert 9_900 < len(read) < 10_000
+    np.testing.assert_allclose(read, points[: len(read)], atol=2e-5)
+    assert cloud.losses == {"points that the files promise but do not hold": 10_000 - len(read)}
+
+
+def npy(shape, dtype="<f4", fortran=False):
+    """A header alone."""
+    file = io.BytesIO()
+    header = {"descr": dtype, "fortran_order": fortran, "shape": shape}
+    np.lib.format.write_array_header_1_0(file, header)
+    return file.getvalue()
+
+
+REFUSED = {
+    "objects.npy": npy((2, 3), "|O") + b"\x80\x04.",
+    "too_many.npy": npy((1 << 60, 3)) + bytes(12),
+    "columns.npy": npy((1 << 30, 3), "<f8", fortran=True) + bytes(24),
+    "two.npy": npy((50, 2)) + bytes(400),
+    "complex.npy": npy((50, 3), "<c8") + bytes(1200),
+    "text.npy": npy((50,), "<U8") + bytes(1600),
+    "empty.npy": npy((0, 3)),
+    "nothing.npy": npy((5, 3)),
+    "header.npy": b"\x93NUMPY\x01\x00\x10\x00{'descr': [[[[[[",
+    "no_zip.npz": b"PK\x03\x04" + bytes(40),
+    "few.ply": TEXT.format(n=1 << 40).encode(),
+    "lists.ply": TEXT.format(n=3).replace("float z", "list uchar int z").encode() + b"1 2 1 3\n",
+    "flat.ply": TEXT.format(n=1).replace("float z", "float w").encode() + b"1 2 3\n",
+    "rows.ply": TEXT.format(n=2).encode() + b"1 2 3 4\n4 5 6 7\n",
+    "kind.ply": TEXT.format(n=1).replace("float z", "real z").encode() + b"1 2 3\n",
+    "form.ply": TEXT.format(n=1).replace("ascii", "xml").encode() + b"1 2 3\n",
+    "endless.ply": b"ply\n" + b"comment \n" * 10_000,
+    "huge.pcd": b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 99999999999999\n"
+    b"HEIGHT 1\nPOINTS 99999999999999\nDATA binary\n" + bytes(24),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_read_is_one_line_and_leaves_no_folder(tmp_path, capsys, name):
+    (tmp_path / name).write_bytes(REFUSED[name])
+    arguments = ["map", str(tmp_path / name), "--as", "plot", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 1
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1, told
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_archive_that_would_unpack_to_more_than_it_says_stays_small(tmp_path):
+    with zipfile.ZipFile(tmp_path / "c.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", npy((1 << 28, 3)) + bytes(1 << 20))
+    with pytest.raises(ScanFileError, match="too many for one scan"):
+        read_columns(tmp_path / "c.npz", {})
+    cloud = open_cloud(str(tmp_path / "c.npz"))
+    assert sum(len(part) for part in cloud.parts()) == (1 << 20) // 12
+
+
+def test_damaged_files_never_crash(tmp_path, points):
+    rng = np.random.default_rng(5)
+    for name in ("c.ply", "c.npy", "c.npz", "c.pcd"):
+        whole = write(tmp_path / name, points[:2000]).read_bytes()
+        for k in range(150):
+            content = bytearray(whole[: int(rng.integers(1, len(whole)))] if k % 3 == 0 else whole)
+            for at in rng.integers(0, min(len(content), 400 if k % 2 else len(content)), 6):
+                content[at] = int(rng.integers(0, 256))
+            (tmp_path / name).write_bytes(bytes(content))
+            with suppress(SourceError):
+                assert sum(len(part) for part in open_cloud(str(tmp_path / name)).parts()) <= 2000
+            with suppress(ScanFileError):
+                read_columns(tmp_path / name, {})
+
+
+def test_a_cloud_is_mapped_driven_through_and_told_of_like_a_las_file(tmp_path, points, capsys):
+    file = write(tmp_path / "plot.ply", points)
+    out = tmp_path / "out"
+    assert main(["map", str(file), "--out", str(out)]) == 0
+    assert json.loads((out / "run.json").read_text())["trees"] == 9
+    capsys.readouterr()
+    assert main(["info", str(file)]) == 0
+    assert "whole cloud, PLY binary" in capsys.readouterr().out
+    opened, named = open_source(str(file)), open_source(f"sim:cloud?file={file}")
+    assert opened.description.digest == named.description.digest
+    assert opened.description.kind == "simulated drive through a whole cloud (PLY binary)"
+
+
+def test_one_pcd_file_is_a_scan_unless_it_is_called_a_plot(tmp_path, points):
+    file = write(tmp_path / "plot.pcd", points)
+    assert open_source(str(file)).description.scans == 1
+    assert main(["map", str(file), "--as", "plot", "--out", str(tmp_path / "out")]) == 0
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["trees"] == 9
+
+
+def test_tables_tell_what_they_hold_before_they_are_read(tmp_path, points):
+    table = open_table(write(tmp_path / "c.ply", points))
+    assert (table.points, table.names[:3]) == (len(points), ("x", "y", "z"))

@@ -1,0 +1,151 @@
+"""Ground truth from tables that other tools write; what does not fit is named by line and column."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SourceError
+from pipeline.io.ground_truth import KINDS, read_truth_trees
+
+
+def read(tmp_path, text, **rest: Any):
+    """Read a table from its text."""
+    path = tmp_path / "trees.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_truth_trees(path, **rest)
+
+
+def test_our_own_header(tmp_path):
+    told = read(tmp_path, "x_m,y_m,dbh_cm,class\n1.5,-2,30,tree\n3,4,,pole\n")
+    np.testing.assert_allclose(told.x, [1.5, 3])
+    np.testing.assert_allclose(told.y, [-2, 4])
+    np.testing.assert_allclose(told.dbh, [0.3, np.nan])
+    assert told.kind == ("tree", "pole")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "X,Y",
+        "x,y",
+        "TreeLocationX,TreeLocationY",
+        "Easting,Northing",
+        " x_m , y_m ",
+        "\ufeffx_m,y_m",
+        "id,x_m,y_m,notes",
+    ],
+)
+def test_headers_of_other_tools(tmp_path, header):
+    columns = len(header.split(","))
+    row = "1,2" if columns == 2 else "7,1,2,tall"
+    told = read(tmp_path, f"{header}\n{row}\n")
+    assert (told.x[0], told.y[0]) == (1.0, 2.0)
+    assert told.kind == ("tree",)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+@pytest.mark.parametrize("ending", ["\n", "\r\n"])
+def test_delimiters_and_line_ends(tmp_path, delimiter, ending):
+    rows = [["x", "y", "dbh_mm"], ["1", "2", "250"]]
+    told = read(tmp_path, ending.join(delimiter.join(row) for row in rows) + ending)
+    assert told.dbh[0] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "x", "y"), [(0, 0, 2), (90, 2, 0), (180, 0, -2), (270, -2, 0), (45, 2**0.5, 2**0.5)]
+)
+def test_azimuths_run_clockwise_from_north(tmp_path, azimuth, x, y):
+    told = read(tmp_path, f"azimuth_deg,distance_m\n{azimuth},2\n")
+    np.testing.assert_allclose([told.x[0], told.y[0]], [x, y], atol=1e-12)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 25.0), ("cm", 0.25), ("mm", 0.025)])
+def test_a_diameter_without_a_unit_is_asked_for(tmp_path, unit, metres):
+    text = "x,y,DBH\n0,0,25\n"
+    with pytest.raises(SourceError, match="--dbh-unit"):
+        read(tmp_path, text)
+    assert read(tmp_path, text, dbh_unit=unit).dbh[0] == pytest.approx(metres)
+
+
+def test_a_column_that_says_its_unit_is_not_overruled(tmp_path):
+    assert read(tmp_path, "x,y,dbh_cm\n0,0,25\n", dbh_unit="m").dbh[0] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("unknown", ["", "nan", "NA", "0", "0.000", "-3"])
+def test_a_diameter_that_was_not_measured_is_not_a_number(tmp_path, unknown):
+    """Some tools write 0.000 for "not measured", one gives -3 cm."""
+    assert np.isnan(read(tmp_path, f"x,y,dbh_cm\n0,0,{unknown}\n").dbh[0])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_class_is_known_in_any_case(tmp_path, kind):
+    assert read(tmp_path, f"x,y,class\n0,0,{kind.upper()}\n").kind == (kind,)
+
+
+def test_a_header_alone_is_a_table_of_nothing(tmp_path):
+    told = read(tmp_path, "x_m,y_m\n")
+    assert len(told.x) == len(told.dbh) == len(told.kind) == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "no position"),
+        ("a,b\n1,2\n", "no position"),
+        ("x_m\n1\n", "no position"),
+        ("x_m,y_m\n1,2\n3,abc\n", "line 3: y_m = 'abc'"),
+        ("x_m,y_m\n1\n", "line 2: y_m = ''"),
+        ("x_m,y_m\nnan,2\n", "line 2: x_m = 'nan'"),
+        ("x_m,y_m\n1,inf\n", "line 2: y_m = 'inf'"),
+        ("x_m,y_m,dbh_cm\n1,2,thick\n", "line 2: dbh_cm = 'thick'"),
+        ("x_m,y_m,class\n1,2,tree\n1,2,cow\n", "line 3: class 'cow'"),
+        ("x_m,y_m\n1,2\n\n\n3,abc\n", "line 5: y_m = 'abc'"),
+        ("x_m,y_m,class\n\n1,2,cow\n", "line 3: class 'cow'"),
+        (b"x_m,y_m\n\xff\xfe,2\n", "not text"),
+        (b"x_m,y_m\n\x00,2\n", "line 2"),
+    ],
+    ids=lambda v: repr(v)[:40],
+)
+def test_what_does_not_fit_is_said_with_line_and_column(tmp_path, text, says):
+    with pytest.raises(SourceError) as caught:
+        read(tmp_path, text)
+    assert says in str(caught.value)
+    assert "trees.csv" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_and_a_folder(tmp_path):
+    for path in (tmp_path / "none.csv", tmp_path):
+        with pytest.raises(SourceError, match="cannot read"):
+            read_truth_trees(path)
+
+
+# --- real tables ----------------------------------------------------------------------------------
+
+
+def test_the_field_survey_reads_by_map_grid_and_by_polar_alike(shared_data, tmp_path):
+    path = shared_data / "stem_maps" / "prf025_field.csv"
+    grid = read_truth_trees(path)
+    assert len(grid.x) == 62
+    assert 0.05 < np.nanmedian(grid.dbh) < 0.5
+    lines = path.read_text().splitlines()
+    keep = [k for k, name in enumerate(lines[0].split(",")) if name not in ("easting", "northing")]
+    polar = read(tmp_path, "\n".join(",".join(line.split(",")[k] for k in keep) for line in lines))
+    centre = np.array([np.median(grid.x - polar.x), np.median(grid.y - polar.y)])
+    apart = np.hypot(grid.x - polar.x - centre[0], grid.y - polar.y - centre[1])
+    assert np.median(apart) < 0.5
+
+
+def test_diameters_in_metres_are_not_taken_for_centimetres(shared_data):
+    told = read_truth_trees(shared_data / "stem_maps" / "prf025_lidar.csv")
+    assert len(told.x) == 93
+    assert 0.02 < np.nanmedian(told.dbh) < 0.5
+
+
+def test_the_stems_of_the_pine_plot(shared_data):
+    told = read_truth_trees(shared_data / "forest" / "pine_plot_stems.csv")
+    assert len(told.x) == 16
+    assert 0.1 < np.nanmedian(told.dbh) < 0.4

@@ -1,0 +1,208 @@
+"""Planar lasers and GNSS in recordings, and what `info` says of every topic; written by rosbags."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pyproj import Geod
+
+from app.cli import main
+from pipeline.geometry.poses import Pose2
+from pipeline.io.readers import SourceOptions
+from pipeline.io.readers.gnss import BEST_SIGMA, UNKNOWN_SIGMA, Fix, align
+from pipeline.types.records import PoseMeasurement, Scan
+from tests.pipeline.io.conftest import Opened
+from tests.pipeline.io.recordings import START_NS, STEP_NS, Author, Write, points_of, write_recording
+
+KINDS = ["bag", "db3", "mcap"]
+BEAMS = 541
+LATITUDE, LONGITUDE, BEARING = 61.5, 23.8, 37.0  # the robot begins there and looks so far from north [deg]
+SIGMA = 0.3
+
+
+def laser(author: Author, stamp_ns: int, **changes: Any) -> Any:
+    """Half a circle and more of beams, 5 m each; the first too near, the last not a number."""
+    ranges = np.full(BEAMS, 5.0, np.float32)
+    ranges[0], ranges[-1] = 0.01, np.nan
+    form = {
+        "angle_min": -2.36, "angle_max": 2.36, "angle_increment": 4.72 / (BEAMS - 1), "time_increment": 1e-5,
+        "scan_time": 0.1, "range_min": 0.1, "range_max": 30.0, "ranges": ranges,
+        "intensities": np.ones(BEAMS, np.float32),
+    }  # fmt: skip
+    message = author.store.types["sensor_msgs/msg/LaserScan"]
+    return message(author.header(stamp_ns, "laser"), *{**form, **changes}.values())
+
+
+def fix(author: Author, stamp_ns: int, east_north: tuple[float, float], status: int = 0) -> Any:
+    """A NavSatFix so many metres from where the robot began."""
+    east, north = east_north
+    azimuth, distance = np.degrees(np.arctan2(east, north)), np.hypot(east, north)
+    longitude, latitude, _ = Geod(ellps="WGS84").fwd(LONGITUDE, LATITUDE, azimuth, distance)
+    told = author.store.types["sensor_msgs/msg/NavSatStatus"](status, 1)
+    covariance = np.diag([SIGMA**2, SIGMA**2, 1.0]).ravel()
+    message = author.store.types["sensor_msgs/msg/NavSatFix"]
+    return message(author.header(stamp_ns, "gps"), told, latitude, longitude, 100.0, covariance, 2)
+
+
+def straight(author: Author, write: Write, *, metres: float = 40.0, odometry: bool = True) -> None:
+    """A robot that drives along its x axis, with fixes twice a second and one message without a fix."""
+    steps = 60
+    rng = np.random.default_rng(1)
+    for step in range(steps):
+        stamp_ns, x = START_NS + step * STEP_NS, metres * step / (steps - 1)
+        if odometry:
+            write("/odom", "nav_msgs/msg/Odometry", stamp_ns, author.odometry(stamp_ns, x, 0.0))
+        if step % 5 == 0:
+            bearing = np.radians(BEARING)
+            noise = rng.normal(0.0, 0.1, 2)
+            east_north = (x * np.sin(bearing) + noise[0], x * np.cos(bearing) + noise[1])
+            message = fix(author, stamp_ns, east_north, status=-1 if step == 50 else 0)
+            write("/gps/fix", "sensor_msgs/msg/NavSatFix", stamp_ns, message)
+        write("/scan", "sensor_msgs/msg/LaserScan", stamp_ns, laser(author, stamp_ns))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_planar_laser_is_a_source_with_its_preset(kind: str, tmp_path: Path, opened: Opened):
+    source = opened(write_recording(kind, tmp_path, straight))
+    known = source.description
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    assert (known.preset, known.sensor.rings, known.sensor.name) == ("laser2d", 1, "planar laser")
+    assert known.sensor.azimuth_step == pytest.approx(4.72 / (BEAMS - 1), rel=1e-3)
+    assert len(scans) == 60
+    assert (len(scans[0].points), scans[0].dropped) == (BEAMS - 2, 2)
+    np.testing.assert_allclose(np.linalg.norm(scans[0].points, axis=1), 5.0, rtol=1e-6)
+    assert np.arctan2(scans[0].points[0, 1], scans[0].points[0, 0]) == pytest.approx(
+        -2.36 + 4.72 / (BEAMS - 1)
+    )
+    assert scans[0].offset_ns is not None
+    assert scans[0].offset_ns[0] == 10_000
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_fixes_are_poses_in_the_frame_of_the_map(kind: str, tmp_path: Path, opened: Opened):
+    source = opened(write_recording(kind, tmp_path, straight))
+    measured = [record for record in source.records() if isinstance(record, PoseMeasurement)]
+    assert len(measured) == 11
+    for pose in measured:
+        step = (pose.stamp_ns - START_NS) / STEP_NS
+        assert pose.is_sound()
+        assert pose.T_map_base.x == pytest.approx(40.0 * step / 59, abs=0.5)
+        assert pose.T_map_base.y == pytest.approx(0.0, abs=0.5)
+        assert SIGMA**2 < pose.covariance[0, 0] < 1.0
+    assert source.losses == {"GNSS messages without a fix": 1}
+    assert "laid over 37 m of the way" in source.description.gnss
+
+
+@pytest.mark.parametrize(
+    ("fill", "why"),
+    [
+        (lambda author, write: straight(author, write, metres=3.0), "too little to tell the direction"),
+        (lambda author, write: straight(author, write, odometry=False), "without odometry"),
+    ],
+)
+def test_fixes_that_cannot_be_laid_into_the_map_are_left_aside_with_a_word(
+    fill: Callable[[Author, Write], None], why: str, tmp_path: Path, opened: Opened
+):
+    source = opened(write_recording("mcap", tmp_path, fill))
+    assert any(why in warning for warning in source.description.warnings)
+    assert not any(isinstance(record, PoseMeasurement) for record in source.records())
+    assert source.description.gnss == ""
+
+
+@given(
+    yaw=st.floats(-3.0, 3.0), latitude=st.floats(-80.0, 80.0), longitude=st.floats(-179.0, 179.0),
+    seed=st.integers(0, 99),
+)  # fmt: skip
+def test_any_plane_is_found_again(yaw: float, latitude: float, longitude: float, seed: int):
+    rng = np.random.default_rng(seed)
+    way = np.cumsum(rng.normal(0.5, 1.0, (60, 2)), axis=0)
+    geod = Geod(ellps="WGS84")
+    c, s = np.cos(-yaw), np.sin(-yaw)
+    stamps = [k * 10**9 for k in range(60)]
+    fixes = []
+    for stamp_ns, (x, y) in zip(stamps, way, strict=True):
+        east, north = c * x - s * y, s * x + c * y
+        lon, lat, _ = geod.fwd(
+            longitude, latitude, np.degrees(np.arctan2(east, north)), np.hypot(east, north)
+        )
+        fixes.append(Fix.of(stamp_ns, lat, lon, [0.01, 0, 0, 0, 0.01, 0, 0, 0, 1], 2))
+    found, why = align(fixes, stamps, way)
+    if np.hypot(*np.ptp(way, axis=0)) < 10.0:
+        assert found is None
+        return
+    assert found is not None, why
+    assert found.laid.residual < 0.02
+    for wanted, fix_ in zip(way, fixes, strict=True):
+        pose = found.measured(fix_).T_map_base
+        assert isinstance(pose, Pose2)
+        assert np.hypot(pose.x - wanted[0], pose.y - wanted[1]) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("variance", "kind", "sigma"),
+    [
+        (0.0, 1, UNKNOWN_SIGMA),
+        (0.0, 2, UNKNOWN_SIGMA),
+        (0.0, 0, UNKNOWN_SIGMA),
+        (0.04, 2, 0.2),
+        (1e-6, 3, BEST_SIGMA),
+    ],
+)
+def test_variances_of_zero_are_not_filled_in(variance: float, kind: int, sigma: float):
+    covariance = [variance, 0, 0, 0, variance, 0, 0, 0, variance]
+    assert Fix.of(0, 60.0, 24.0, covariance, kind).sigma == pytest.approx(sigma)
+
+
+def test_a_lidar_is_taken_before_the_bumper_and_info_says_why(
+    tmp_path: Path, opened: Opened, capsys: pytest.CaptureFixture[str]
+):
+    def fill(author: Author, write: Write) -> None:
+        straight(author, write)
+        for step in range(12):
+            stamp_ns = START_NS + step * STEP_NS
+            cloud = author.cloud(stamp_ns, points_of(step))
+            write("/points", "sensor_msgs/msg/PointCloud2", stamp_ns, cloud)
+            word = author.make("String", "hello")
+            write("/talk", "std_msgs/msg/String", stamp_ns, word)
+
+    path = write_recording("mcap", tmp_path, fill)
+    source = opened(path)
+    by_name = {topic.name: topic for topic in source.description.topics}
+    assert (by_name["/points"].read_as, by_name["/gps/fix"].read_as) == ("scan", "gnss")
+    assert by_name["/scan"].why_not == "/points sees in space"
+    assert by_name["/talk"].why_not == "nothing is made of this type"
+    chosen = opened(path, SourceOptions(topics={"scan": "/scan"}))
+    assert chosen.description.sensor.rings == 1
+    assert main(["info", str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any("/scan" in line and "not read: /points sees in space, could be scan" in line for line in lines)
+    assert any("/points" in line and "10.0 Hz" in line and "read as scan" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"angle_increment": 0.0}, {"angle_increment": float("nan")}, {"angle_min": float("inf")},
+        {"angle_increment": 0.5}, {"ranges": np.full(BEAMS, np.inf, np.float32)}, {"time_increment": 1e9},
+        {"intensities": np.ones(3, np.float32)},
+    ],
+)  # fmt: skip
+def test_laser_scans_that_contradict_themselves_do_no_harm(
+    changes: dict[str, Any], tmp_path: Path, opened: Opened
+):
+    def fill(author: Author, write: Write) -> None:
+        for step in range(4):
+            stamp_ns = START_NS + step * STEP_NS
+            message = laser(author, stamp_ns, **(changes if step == 2 else {}))
+            write("/scan", "sensor_msgs/msg/LaserScan", stamp_ns, message)
+
+    source = opened(write_recording("mcap", tmp_path, fill))
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    assert len(scans) + sum(source.losses.values()) == 4
+    assert all(np.isfinite(scan.points).all() for scan in scans)

@@ -1,0 +1,76 @@
+"""What `open_source` says about what it cannot open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SourceError
+from pipeline.io.readers import open_source
+from tests.pipeline.io.conftest import Opened
+
+
+@pytest.mark.parametrize("uri", ["ros2:robot", "udp://0.0.0.0:2368"])
+def test_live_input_is_refused_with_a_remedy(uri: str):
+    with pytest.raises(SourceError, match=r"does not read (ros2|udp): live.*over Zenoh"):
+        open_source(uri)
+
+
+def test_an_unknown_scheme_names_what_can_be_read():
+    with pytest.raises(SourceError, match=r"unknown kind of source 'http'.*\.mcap.*\.pcap.*sim:"):
+        open_source("http://example.org/run.mcap")
+
+
+@pytest.mark.parametrize("name", ["nowhere.mcap", "nowhere", "no\0where", ""])
+def test_what_is_not_there_is_told(name: str, tmp_path: Path):
+    uri = str(tmp_path / name) if name else "  "
+    with pytest.raises(SourceError, match="no such file or folder"):
+        open_source(uri)
+
+
+def test_a_folder_without_scans_is_told(tmp_path: Path):
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(SourceError, match="nothing in the folder can be read"):
+        open_source(str(tmp_path))
+
+
+def test_an_unknown_file_is_told(tmp_path: Path):
+    path = tmp_path / "notes.txt"
+    path.write_text("hello")
+    with pytest.raises(SourceError, match=r"unknown format.*Readable are"):
+        open_source(str(path))
+
+
+def test_a_newer_capture_is_told_how_to_convert(tmp_path: Path):
+    path = tmp_path / "capture.pcap"
+    path.write_bytes(b"\x0a\x0d\x0d\x0a" + bytes(100))
+    with pytest.raises(SourceError, match="editcap"):
+        open_source(str(path))
+
+
+def test_errors_are_one_line(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    with pytest.raises(SourceError) as caught:
+        open_source(str(path))
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_a_folder_that_is_no_run_names_what_can_be_opened_in_it(tmp_path: Path):
+    for k in range(7):
+        (tmp_path / f"day{k}.bag").touch()
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(SourceError, match=r"no run.*day0.bag, .*day4.bag and 2 more"):
+        open_source(str(tmp_path))
+
+
+def test_recordings_beside_scans_are_said_to_be_left_aside(tmp_path: Path, opened: Opened):
+    np.ones((200, 4), "<f4").tofile(tmp_path / "000000.bin")
+    assert opened(tmp_path).description.warnings == ()
+    (tmp_path / "run.bag").touch()
+    assert opened(tmp_path).description.warnings == (
+        "not part of this run are run.bag: open each by its name",
+    )

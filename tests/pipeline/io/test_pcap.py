@@ -1,0 +1,162 @@
+"""Velodyne captures: the real one, and what is made of it by cutting and mixing."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import velodyne_decoder
+from scipy.spatial import cKDTree
+
+from pipeline.errors import SourceError
+from pipeline.io.readers.pcd_file import read_pcd
+from pipeline.io.readers.velodyne import SENSORS, is_data_packet
+from pipeline.types.records import Scan
+from tests.pipeline.io.conftest import Opened
+
+
+def frames(capture: bytes) -> list[tuple[int, int, bytes]]:
+    """Seconds, microseconds and frame of each packet of a little-endian capture."""
+    found, at = [], 24
+    while at < len(capture):
+        seconds, fraction, length, _ = struct.unpack_from("<IIII", capture, at)
+        found.append((seconds, fraction, capture[at + 16 : at + 16 + length]))
+        at += 16 + length
+    return found
+
+
+def capture_of(packets: list[tuple[int, int, bytes]], order: str = "<", *, nano: bool = False) -> bytes:
+    """A capture in either byte order, with micro- or nanoseconds."""
+    head = struct.pack(order + "IHHIIII", 0xA1B23C4D if nano else 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    body = [
+        struct.pack(order + "IIII", s, f * 1000 if nano else f, len(frame), len(frame)) + frame
+        for s, f, frame in packets
+    ]
+    return head + b"".join(body)
+
+
+@pytest.fixture(scope="module")
+def real(shared_data: Path) -> Path:
+    """The real capture."""
+    return shared_data / "velodyne" / "vlp16.pcap"
+
+
+def scans_of(opened: Opened, path: Path, start_ns: int | None = None) -> list[Scan]:
+    """All scans of a source."""
+    return [record for record in opened(path).records(start_ns) if isinstance(record, Scan)]
+
+
+def test_the_real_capture_gives_four_scans_of_a_vlp_16(real: Path, opened: Opened):
+    source = opened(real)
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    assert source.description.sensor.name == "VLP-16"
+    assert source.description.scans == len(scans) == 4
+    assert [source.description.start_ns, source.description.end_ns] == [scans[0].stamp_ns, scans[-1].stamp_ns]
+    assert all(14_000 < len(scan.points) < 15_500 for scan in scans)
+    assert np.all(np.diff([scan.stamp_ns for scan in scans]) > 99_000_000)
+    assert source.losses == {}
+
+
+def test_the_scans_agree_with_the_reference(real: Path, shared_data: Path, opened: Opened):
+    columns = read_pcd(shared_data / "velodyne" / "vlp16_reference.pcd", {})
+    reference = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    assert len(reference) == 14_831
+    distances = [cKDTree(scan.points).query(reference)[0] for scan in scans_of(opened, real)]
+    best = min(distances, key=lambda each: float(np.median(each)))
+    assert np.mean(best < 0.02) > 0.97
+
+
+def test_the_decoder_s_own_reader_finds_as_many_points(real: Path, opened: Opened):
+    config = velodyne_decoder.Config(model=velodyne_decoder.Model.VLP16)
+    expected = sum(len(points) for _, points in velodyne_decoder.read_pcap(str(real), config))
+    assert sum(len(scan.points) for scan in scans_of(opened, real)) == expected
+
+
+@pytest.mark.parametrize(("order", "nano"), [("<", False), (">", False), ("<", True), (">", True)])
+def test_byte_order_and_unit_make_no_difference(
+    order: str, nano: bool, real: Path, tmp_path: Path, opened: Opened
+):
+    path = tmp_path / "other.pcap"
+    path.write_bytes(capture_of(frames(real.read_bytes()), order, nano=nano))
+    for ours, theirs in zip(scans_of(opened, path), scans_of(opened, real), strict=True):
+        assert ours.stamp_ns == theirs.stamp_ns
+        np.testing.assert_array_equal(ours.points, theirs.points)
+
+
+def test_reading_from_a_time_leaves_out_the_start(real: Path, opened: Opened):
+    everything = scans_of(opened, real)
+    later = scans_of(opened, real, everything[1].stamp_ns + 1)
+    assert [scan.stamp_ns for scan in later] == [scan.stamp_ns for scan in everything[2:]]
+    np.testing.assert_array_equal(later[0].points, everything[2].points)
+
+
+def test_packets_of_other_lengths_senders_and_garbage_are_counted(real: Path, tmp_path: Path, opened: Opened):
+    packets = frames(real.read_bytes())
+    seconds, fraction, frame = packets[10]
+    short = frame[:38] + struct.pack(">H", 8 + 554) + frame[40 : 42 + 554]
+    garbage = frame[:42] + bytes(1206)
+    stranger = frame[:26] + bytes([10, 0, 0, 1]) + frame[30:]
+    extra = (
+        [(seconds, fraction, short)] * 2
+        + [(seconds, fraction, garbage)] * 3
+        + [(seconds, fraction, stranger)]
+    )
+    path = tmp_path / "mixed.pcap"
+    path.write_bytes(capture_of(packets[:11] + extra + packets[11:]))
+    source = opened(path)
+    assert sum(len(scan.points) for scan in source.records() if isinstance(scan, Scan)) == sum(
+        len(scan.points) for scan in scans_of(opened, real)
+    )
+    assert source.losses == {
+        "packets to the LiDAR's port of another length": 2,
+        "packets that are no data packets of a known sensor": 3,
+        "packets of other senders": 1,
+    }
+
+
+def test_a_cut_capture_gives_what_is_whole(real: Path, tmp_path: Path, opened: Opened):
+    path = tmp_path / "cut.pcap"
+    path.write_bytes(real.read_bytes()[:400_000])
+    source = opened(path)
+    assert 2 <= len(list(source.records())) <= 3
+    assert list(source.losses) == ["bytes at the end of a capture that was cut"]
+
+
+def test_a_capture_of_other_traffic_is_refused(real: Path, tmp_path: Path, opened: Opened):
+    path = tmp_path / "web.pcap"
+    web = [
+        (s, f, frame[:36] + struct.pack(">H", 80) + frame[38:600])
+        for s, f, frame in frames(real.read_bytes())
+    ]
+    path.write_bytes(capture_of(web))
+    with pytest.raises(SourceError, match="no data packets of a known Velodyne sensor"):
+        opened(path)
+
+
+def test_garbage_of_the_right_length_is_no_data_packet(real: Path):
+    packet = frames(real.read_bytes())[0][2][42:]
+    assert is_data_packet(packet)
+    assert not is_data_packet(packet[:-1])
+    assert not is_data_packet(bytes(1206))
+    assert not is_data_packet(packet[:2] + b"\xff\xff" + packet[4:])
+    assert not is_data_packet(packet[:-1] + b"\x00")
+
+
+@pytest.mark.parametrize("product", sorted(SENSORS))
+def test_every_model_that_names_itself_is_read_as_that_model(
+    product: int, real: Path, tmp_path: Path, opened: Opened
+):
+    """No capture of the others is at hand: the real packets with another model's number in them."""
+    named = [(s, f, frame[:-1] + bytes([product])) for s, f, frame in frames(real.read_bytes())]
+    path = tmp_path / "other.pcap"
+    path.write_bytes(capture_of(named))
+    source = opened(path)
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    assert source.description.sensor == SENSORS[product]
+    assert scans
+    for scan in scans:
+        assert np.isfinite(scan.points).all()
+        assert scan.ring is not None
+        assert 0 <= scan.ring.min() <= scan.ring.max() < SENSORS[product].rings

@@ -1,0 +1,256 @@
+"""Parts of ROS recordings: definitions in the file, clocks, order, packed blocks, transforms."""
+
+from __future__ import annotations
+
+import bz2
+import zlib
+from pathlib import Path
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.container import Channel
+from pipeline.io.readers.decompression import UnpackError, unpack
+from pipeline.io.readers.ordering import WINDOW_NS, Stamped, by_stamp
+from pipeline.io.readers.rostypes import POINT_CLOUD, MessageDecoder
+from pipeline.io.readers.tf_tree import TransformTree
+from pipeline.types.records import Scan
+from tests.pipeline.io.conftest import Opened
+from tests.pipeline.io.recordings import START_NS, STEP_NS, Author, drive, points_of, write_recording
+
+CLOUD_TEXT = """std_msgs/Header header
+uint32 serial
+uint32 height
+uint32 width
+sensor_msgs/PointField[] fields
+bool is_bigendian
+uint32 point_step
+uint32 row_step
+bool is_dense
+uint8[] data
+================================================================================
+MSG: sensor_msgs/PointField
+uint8 FLOAT32=7
+string name
+uint32 offset
+uint8 datatype
+uint32 count
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+
+def mcap_of(
+    path: Path, definition: str, payloads: list[bytes], *, pack: CompressionType, index: bool = True
+) -> None:
+    """An MCAP with one topic of clouds."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=pack, use_chunking=index, use_statistics=index)
+        writer.start("ros2", "")
+        schema = writer.register_schema(POINT_CLOUD, "ros2msg", definition.encode())
+        channel = writer.register_channel("/points", "cdr", schema)
+        for index_, payload in enumerate(payloads):
+            writer.add_message(channel, START_NS + index_ * STEP_NS, payload, START_NS)
+        writer.finish()
+
+
+def cloud_payloads(count: int) -> list[bytes]:
+    """Clouds in the standard definition."""
+    author = Author("mcap")
+    clouds = [author.cloud(START_NS + k * STEP_NS, points_of(k)) for k in range(count)]
+    return [bytes(author.store.serialize_cdr(cloud, POINT_CLOUD)) for cloud in clouds]
+
+
+def test_the_definition_in_the_file_is_used_where_it_differs(tmp_path: Path, opened: Opened):
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(CLOUD_TEXT, POINT_CLOUD))
+    author = Author("mcap")
+    author.store = store
+    known = Author("mcap").cloud(START_NS, points_of(0))
+    fields = [author.make("PointField", f.name, f.offset, f.datatype, f.count) for f in known.fields]
+    header = author.header(START_NS, "velodyne")
+    data = np.asarray(known.data)
+    cloud = store.types[POINT_CLOUD](header, 9, 1, known.width, fields, False, 32, known.row_step, True, data)
+    path = tmp_path / "run.mcap"
+    payload = bytes(store.serialize_cdr(cloud, POINT_CLOUD))
+    mcap_of(path, CLOUD_TEXT, [payload], pack=CompressionType.NONE)
+    (scan,) = opened(path).records()
+    assert isinstance(scan, Scan)
+    assert len(scan.points) == len(points_of(0)) - 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("uint32 serial", "Empty[] serial\n"),
+        ("uint32 serial", "uint8[2000000000] serial"),
+        ("uint32 serial", "import_os/system serial"),
+        ("uint32 height", "uint32 height" + " " * 70_000),
+        ("std_msgs/Header header", "sensor_msgs/PointCloud2 header"),
+    ],
+)
+def test_definitions_that_could_do_harm_are_not_used(change: tuple[str, str]):
+    text = CLOUD_TEXT.replace(*change)
+    if "Empty" in text:
+        text += "=" * 80 + "\nMSG: sensor_msgs/Empty\n"
+    channel = Channel(1, "/points", POINT_CLOUD, "cdr", text, "ros2msg", 1)
+    decoder = MessageDecoder([channel])
+    assert decoder.refused == ["/points"] or change[1].startswith("sensor_msgs/PointCloud2")
+    if decoder.refused:
+        message = decoder.decode(channel, cloud_payloads(1)[0])
+        assert getattr(message, "point_step", None) == 32
+
+
+@pytest.mark.parametrize("pack", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+@pytest.mark.parametrize("index", [True, False])
+def test_every_packing_with_and_without_an_index_is_read(
+    pack: CompressionType, index: bool, tmp_path: Path, opened: Opened
+):
+    path = tmp_path / "run.mcap"
+    mcap_of(path, "", cloud_payloads(5), pack=pack, index=index)
+    source = opened(path)
+    assert source.description.scans == len(list(source.records())) == 5
+    assert len(list(source.records(START_NS + 2 * STEP_NS))) == 3
+
+
+def test_messages_packed_one_by_one_are_read(tmp_path: Path, opened: Opened):
+    payloads = [zstandard.ZstdCompressor().compress(payload) for payload in cloud_payloads(3)]
+    path = tmp_path / "run.mcap"
+    mcap_of(path, "", payloads, pack=CompressionType.NONE)
+    source = opened(path)
+    assert len(list(source.records())) == 3
+    assert source.losses == {}
+
+
+def test_times_of_writing_serve_where_stamps_do_not(tmp_path: Path, opened: Opened):
+    def unstamped(author, write):
+        for k in range(3):
+            cloud = author.cloud(0, points_of(k))
+            write("/points", "sensor_msgs/msg/PointCloud2", START_NS + k * STEP_NS, cloud)
+
+    source = opened(write_recording("db3", tmp_path, unstamped))
+    assert [record.stamp_ns for record in source.records()] == [START_NS + k * STEP_NS for k in range(3)]
+    assert "times of writing" in " ".join(source.description.warnings)
+
+
+def test_a_single_impossible_stamp_is_counted(tmp_path: Path, opened: Opened):
+    def stamped(author, write):
+        for k in range(4):
+            stamp_ns = START_NS + k * STEP_NS + (10**15 if k == 1 else 0)
+            cloud = author.cloud(stamp_ns, points_of(k))
+            write("/points", "sensor_msgs/msg/PointCloud2", START_NS + k * STEP_NS, cloud)
+
+    source = opened(write_recording("bag", tmp_path, stamped))
+    assert [(record.stamp_ns - START_NS) // STEP_NS for record in source.records()] == [0, 2, 3]
+    assert source.losses == {"messages with an impossible time stamp": 1}
+
+
+def test_without_a_transform_the_mounting_is_taken_as_none_and_said(tmp_path: Path, opened: Opened):
+    def bare(author, write):
+        for k in range(2):
+            stamp_ns = START_NS + k * STEP_NS
+            write("/odom", "nav_msgs/msg/Odometry", stamp_ns, author.odometry(stamp_ns, 0.0, 0.0))
+            write("/points", "sensor_msgs/msg/PointCloud2", stamp_ns, author.cloud(stamp_ns, points_of(k)))
+
+    known = opened(write_recording("mcap", tmp_path, bare)).description
+    np.testing.assert_array_equal(known.T_base_lidar.R, np.eye(3))
+    assert known.warnings == (
+        "no fixed transform from velodyne to base_link: the LiDAR is taken to stand at the base",
+    )
+
+
+def test_rings_numbered_from_above_are_turned_round(tmp_path: Path, opened: Opened):
+    def turned(author, write):
+        table = points_of(0)
+        table["ring"] = 15 - table["ring"]
+        write("/points", "sensor_msgs/msg/PointCloud2", START_NS, author.cloud(START_NS, table))
+
+    (scan,) = opened(write_recording("mcap", tmp_path, turned)).records()
+    assert isinstance(scan, Scan)
+    np.testing.assert_array_equal(scan.ring, np.delete(points_of(0)["ring"], [3, 5]))
+
+
+def test_reading_twice_gives_the_same_and_losses_do_not_add_up(tmp_path: Path, opened: Opened):
+    source = opened(write_recording("db3", tmp_path, drive))
+    first = [record.stamp_ns for record in source.records()]
+    assert first == [record.stamp_ns for record in source.records()]
+    assert source.losses == {}
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 10 * WINDOW_NS), st.integers(0, WINDOW_NS)), max_size=60))
+def test_what_comes_less_than_a_second_late_finds_its_place(arrivals: list[tuple[int, int]]):
+    ordered = sorted(arrivals, key=lambda arrival: arrival[0] + arrival[1])
+    losses: dict[str, int] = {}
+    sorted_ = list(by_stamp([Stamped(stamp, 0, stamp) for stamp, _late in ordered], losses))
+    assert [stamped.content for stamped in sorted_] == sorted(stamp for stamp, _late in arrivals)
+    assert losses == {}
+
+
+def test_what_comes_too_late_is_counted():
+    losses: dict[str, int] = {}
+    stamps = [0, 3 * WINDOW_NS, 1, 5 * WINDOW_NS]
+    kept = [s.content for s in by_stamp([Stamped(stamp, 0, stamp) for stamp in stamps], losses)]
+    assert kept == [0, 1, 3 * WINDOW_NS, 5 * WINDOW_NS]
+    kept = [s.content for s in by_stamp([Stamped(stamp, 0, stamp) for stamp in [0, *stamps[1:], 2]], losses)]
+    assert kept == [0, 1, 3 * WINDOW_NS, 5 * WINDOW_NS]
+    assert losses == {"records that came too late to be put in order": 1}
+
+
+PACKERS = {
+    "lz4": lz4.frame.compress,
+    "zstd": zstandard.ZstdCompressor().compress,
+    "bz2": bz2.compress,
+    "": bytes,
+}
+
+
+@pytest.mark.parametrize("name", PACKERS)
+def test_blocks_are_unpacked_to_the_promised_size_only(name: str):
+    content = bytes(1000) + b"end"
+    packed = PACKERS[name](content)
+    assert unpack(packed, name, len(content)) == content
+    for size in (0, 1002, 1004, 1 << 40):
+        with pytest.raises(UnpackError):
+            unpack(packed, name, size)
+    with pytest.raises(UnpackError):
+        unpack(packed[: len(packed) // 2], name, len(content))
+
+
+@pytest.mark.parametrize("name", ["lz4", "zstd", "bz2"])
+def test_a_bomb_is_not_unpacked_beyond_its_promise(name: str):
+    with pytest.raises(UnpackError, match="another size"):
+        unpack(PACKERS[name](bytes(64 << 20)), name, 1000)
+
+
+@pytest.mark.parametrize("name", ["xz", "zlib"])
+def test_unknown_packings_are_refused(name: str):
+    with pytest.raises(UnpackError, match="unknown compression"):
+        unpack(zlib.compress(b"x"), name, 1)
+
+
+def test_transforms_are_chained_over_the_fewest_links():
+    tree = TransformTree()
+    steps = [Pose3.from_euler([1.0, 0.1 * k, 0.0], 0.1, 0.0, 0.3) for k in range(3)]
+    for k, step in enumerate(steps):
+        tree.add(f"f{k}", f"f{k + 1}", step)
+    chain = tree.find("f0", "f3")
+    assert chain is not None
+    np.testing.assert_allclose(chain.t, (steps[0] @ steps[1] @ steps[2]).t, atol=1e-12)
+    back = tree.find("f3", "f0")
+    assert back is not None
+    np.testing.assert_allclose((back @ chain).t, 0.0, atol=1e-12)
+    assert tree.find("f0", "elsewhere") is None

@@ -1,0 +1,124 @@
+"""Folders of scans in every format, written by other libraries, with times and poses beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import laspy
+import numpy as np
+import open3d as o3d
+import pytest
+
+from pipeline.geometry.poses import Pose3
+from pipeline.types.records import Odometry, Scan
+from tests.pipeline.io.conftest import Opened
+from tests.pipeline.io.test_kitti import curve, matrices
+
+START_S = 1_645_000_000
+
+
+def points(number: int) -> np.ndarray:
+    """A scan of 200 points that differs from scan to scan."""
+    rng = np.random.default_rng(number)
+    return rng.uniform(-20.0, 20.0, (200, 3)).round(3)
+
+
+def write(path: Path, number: int) -> None:
+    """One scan by a library that is not ours."""
+    xyz = points(number)
+    if path.suffix == ".npy":
+        np.save(path, xyz.astype(np.float32))
+    elif path.suffix == ".npz":
+        np.savez(path, points=xyz)
+    elif path.suffix == ".bin":
+        np.hstack([xyz, np.zeros((len(xyz), 1))]).astype("<f4").tofile(path)
+    elif path.suffix in (".las", ".laz"):
+        las = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
+        las.header.scales = [0.001] * 3
+        las.x, las.y, las.z = xyz.T
+        las.write(str(path))
+    else:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(xyz))
+        assert o3d.io.write_point_cloud(path, cloud)
+
+
+def tum(poses: list[Pose3], first_s: float = START_S) -> str:
+    """Rows t x y z qx qy qz qw, ten a second."""
+    rows = []
+    for k, pose in enumerate(poses):
+        w, x, y, z = pose.quaternion()
+        rows.append(
+            f"{first_s + k // 10}.{k % 10}00000000 {pose.t[0]} {pose.t[1]} {pose.t[2]} {x} {y} {z} {w}"
+        )
+    return "# t x y z qx qy qz qw\n" + "\n".join(rows) + "\n"
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".pcd", ".ply", ".npy", ".npz", ".las", ".laz"])
+def test_a_folder_of_any_format_is_a_run(suffix: str, tmp_path: Path, opened: Opened):
+    for number in range(4):
+        write(tmp_path / f"{number:04d}{suffix}", number)
+    (tmp_path / "poses.txt").write_text(matrices(curve(4)))
+    source = opened(tmp_path)
+    records = list(source.records())
+    scans = [record for record in records if isinstance(record, Scan)]
+    poses = [record.T_odom_base for record in records if isinstance(record, Odometry)]
+    assert [len(scan.points) for scan in scans] == [200] * 4
+    np.testing.assert_allclose(scans[2].points, points(2), atol=2e-3)
+    np.testing.assert_allclose([pose.t for pose in poses], [pose.t for pose in curve(4)], atol=1e-9)
+    assert source.losses == {}
+
+
+@pytest.mark.parametrize("stem", ["{s}.{d}00000000", "{s}{d}00000000", "cloud_{s}_{d}00000000"])
+def test_names_may_be_times_and_rows_of_tum_belong_to_them(stem: str, tmp_path: Path, opened: Opened):
+    for k in range(0, 8, 2):  # every other pose has a scan, and the last lies between two
+        write(tmp_path / (stem.format(s=START_S, d=k) + ".npy"), k)
+    (tmp_path / "poses.txt").write_text(tum(curve(9)))
+    source = opened(tmp_path)
+    records = list(source.records())
+    stamps = [record.stamp_ns for record in records if isinstance(record, Scan)]
+    poses = [record.T_odom_base for record in records if isinstance(record, Odometry)]
+    assert stamps == [START_S * 10**9 + k * 10**8 for k in range(0, 8, 2)]
+    np.testing.assert_allclose([pose.t for pose in poses], [curve(9)[k].t for k in range(0, 8, 2)], atol=1e-9)
+
+
+def test_rows_of_tum_give_their_times_to_scans_without_any(tmp_path: Path, opened: Opened):
+    for k in range(3):
+        write(tmp_path / f"{k:06d}.ply", k)
+    (tmp_path / "trajectory.txt").write_text(tum(curve(3)))
+    source = opened(tmp_path)
+    assert source.description.has_odometry
+    assert (source.description.start_ns, source.description.end_ns) == (
+        START_S * 10**9,
+        START_S * 10**9 + 2 * 10**8,
+    )
+
+
+def test_poses_of_another_time_are_left_aside_with_a_word(tmp_path: Path, opened: Opened):
+    for k in range(3):
+        write(tmp_path / f"{START_S}.{k}00000000.pcd", k)
+    (tmp_path / "poses.txt").write_text(tum(curve(3), START_S + 5000))
+    source = opened(tmp_path)
+    assert not source.description.has_odometry
+    assert "its times are not those of the scans" in source.description.warnings[0]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["1 2 3\n", "1 0 0 0 0 0 0 0\n", "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "nan 0 0 0 0 0 0 1\n", "\0\1\2"],
+)
+def test_poses_that_are_none_are_said(text: str, tmp_path: Path, opened: Opened):
+    write(tmp_path / "0.npy", 0)
+    (tmp_path / "poses.txt").write_text(text)
+    source = opened(tmp_path)
+    assert not source.description.has_odometry
+    assert source.description.warnings[0].startswith("poses.txt is not used")
+
+
+def test_a_damaged_scan_is_counted_and_the_others_are_read(tmp_path: Path, opened: Opened):
+    for k in range(3):
+        write(tmp_path / f"{k}.laz", k)
+    whole = (tmp_path / "1.laz").read_bytes()
+    (tmp_path / "1.laz").write_bytes(whole[:100])
+    source = opened(tmp_path)
+    assert sum(isinstance(record, Scan) for record in source.records()) == 2
+    assert source.losses == {"scan files that cannot be read": 1}

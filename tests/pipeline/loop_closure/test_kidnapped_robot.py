@@ -1,0 +1,185 @@
+"""A kidnapped robot: it says that it is lost, finds itself again, and leaves no false tree behind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.config import preset
+from pipeline.geometry.poses import Pose2
+from pipeline.io.checkpoints.saved_map import SavedMap
+from pipeline.io.readers import open_source
+from pipeline.loop_closure.kidnapped_robot import Recovery, RecoveryState
+from pipeline.mapper import Mapper
+from pipeline.odometry.synchroniser import steps
+from pipeline.slam import Motion, SlamState
+from pipeline.types.sensor_data import PoseMeasurement
+from tests.pipeline.strategies import NOTHING_SEEN, detections
+from tests.pipeline.test_mapper import as_bytes
+
+URI = "sim:stand?duration=22&seed=3"
+JUMP, BACK, AFTER = 160, 40, 50  # scan of the jump, the one where it lands, and how many are driven then
+
+
+@cache
+def drive():
+    """The steps of a drive through a stand, its true path, and what is known of its source."""
+    source = open_source(URI)
+    truth = source.truth()
+    assert truth is not None
+    return list(steps(source.records())), truth.path, source.description
+
+
+def kidnapped(landing=BACK):
+    """The drive up to JUMP, and from `landing` on once more without a word of the wheels about it."""
+    whole, _, _ = drive()
+    before, last = whole[:JUMP], whole[JUMP - 1]
+    T = last.T_odom_base @ whole[landing].T_odom_base.inverse()
+    after = [
+        replace(
+            step,
+            index=JUMP + k,
+            T_odom_base=T @ step.T_odom_base,
+            scan=replace(step.scan, stamp_ns=last.scan.stamp_ns + (k + 1) * 10**8),
+        )
+        for k, step in enumerate(whole[landing : landing + AFTER])
+    ]
+    return before, after
+
+
+def mapper(**changes: Any):
+    """A mapper for the drive."""
+    d = drive()[2]
+    return Mapper(preset("forest").replace(changes), sensor=d.sensor, T_base_lidar=d.T_base_lidar, seed=1)
+
+
+def confirmed(frame):
+    """Numbers of the trees on the map."""
+    return set(frame.trees.number[frame.trees.confirmed].tolist())
+
+
+@cache
+def mapped():
+    """The frames before and after the jump."""
+    m = mapper()
+    before, after = kidnapped()
+    return [m.process(step) for step in before], [m.process(step) for step in after]
+
+
+def test_a_drive_without_a_jump_is_never_lost():
+    assert {frame.health.state for frame in mapped()[0]} <= {"good", "weak"}
+
+
+def test_a_kidnapped_robot_says_so_and_is_good_again_within_fifty_scans():
+    states = [frame.health.state for frame in mapped()[1]]
+    assert "lost" in states[:5]
+    assert states[-1] == "good"
+    assert states.count("lost") < 20
+    told = [word for frame in mapped()[1] for word in frame.warnings]
+    assert any("is lost" in word for word in told)
+    assert any("found again" in word for word in told)
+    assert not any("bent" in word for word in told), "who was carried did not drift"
+
+
+def test_no_loop_bends_what_was_driven_before_it_was_put_in_place():
+    m = mapper()
+    before, after = kidnapped()
+    for step in before:
+        m.process(step)
+    state = m.snapshot()
+    assert state.placed == 0
+    told = iter(m.process(step).warnings for step in after)
+    assert any("found again" in word for words in told for word in words)
+    assert m.snapshot().placed == len(m.path.x) == len(m.motion) > JUMP
+    m.restore(state)
+    assert m.snapshot().placed == 0
+
+
+def test_it_stands_where_it_was_put():
+    _, truth, _ = drive()
+    stamp = drive()[0][BACK + AFTER - 1].scan.stamp_ns
+    k = int(np.searchsorted(truth.stamp_ns, stamp))
+    pose = mapped()[1][-1].estimate.T_map_base
+    assert np.hypot(pose.x - truth.x[k], pose.y - truth.y[k]) < 0.15
+
+
+def test_a_jump_leaves_at_most_one_false_tree():
+    before, after = mapped()
+    known, now = confirmed(before[-1]), confirmed(after[-1])
+    place = after[-1].trees.position[after[-1].trees.confirmed]
+    old = before[-1].trees.position[before[-1].trees.confirmed]
+    far = np.hypot(*(place[:, None] - old[None]).transpose(2, 0, 1)).min(axis=1) > 1.0
+    known_truth = open_source(URI).truth()
+    assert known_truth is not None
+    assert known_truth.trees is not None
+    true = np.stack([known_truth.trees.x, known_truth.trees.y], axis=1)
+    false = np.hypot(*(place[far][:, None] - true[None]).transpose(2, 0, 1)).min(axis=1, initial=9.0) > 0.5
+    assert np.count_nonzero(false) <= 1
+    assert len(known - now) <= 2
+
+
+def test_without_relocalisation_it_maps_on():
+    m = mapper(**{"relocalisation.method": "none"})
+    before, after = kidnapped()
+    for step in before:
+        m.process(step)
+    words = [word for step in after[:10] for word in m.process(step).warnings]
+    assert not any("lost" in word for word in words)
+
+
+def test_a_snapshot_taken_while_lost_goes_on_to_the_same_bytes():
+    m = mapper()
+    before, after = kidnapped()
+    for step in before:
+        m.process(step)
+    lost = [m.process(step) for step in after[:5]]
+    assert lost[-1].health.state == "lost"
+    state = m.snapshot()
+    once = [as_bytes(m.process(step)) for step in after[5:15]]
+    m.restore(state)
+    assert [as_bytes(m.process(step)) for step in after[5:15]] == once
+
+
+@pytest.mark.parametrize("landing", [0, 90])
+def test_wherever_it_lands(landing):
+    m = mapper()
+    before, after = kidnapped(landing)
+    for step in before:
+        m.process(step)
+    states = [m.process(step).health.state for step in after]
+    assert states[-1] != "lost"
+
+
+def test_a_map_saved_while_lost_goes_on_to_the_same_bytes():
+    m = mapper()
+    before, after = kidnapped()
+    for step in before:
+        m.process(step)
+    for step in after[:5]:
+        m.process(step)
+    saved = SavedMap.of(m)
+    assert saved.search is not None
+    other, state = mapper(), saved.state()
+    other.load(state, saved.stamp_ns, saved.sigma_xy, saved.motion)
+    once = [as_bytes(m.process(step)) for step in after[5:15]]
+    assert [as_bytes(other.process(step)) for step in after[5:15]] == once
+    with pytest.raises(ValueError, match="search"):
+        replace(saved, search=replace(saved.search, since=10**6)).state()
+
+
+def test_measured_poses_are_of_the_map_and_not_of_the_small_one_of_a_search():
+    recovery: Recovery[Any] = Recovery(0)
+    recovery.state = RecoveryState(local=SlamState.at_origin(20))
+    far = PoseMeasurement(1, Pose2(100.0, 50.0, 1.0), np.eye(3) * 1e-4)
+    seen = detections([[3.0, 1.0], [4.0, -2.0]])
+    for index in (1, 2, 4):  # none of them is one at which it is looked for in the map
+        motion = Motion(Pose2(0.1), measured=far)
+        recovery._search(
+            index, motion, seen, NOTHING_SEEN, preset("forest"), lambda: pytest.fail("nobody asks for trees")
+        )
+    assert recovery.state.local is not None
+    np.testing.assert_allclose(recovery.state.local.pose.mean(axis=0), [0.3, 0.0, 0.0], atol=0.1)

@@ -1,0 +1,197 @@
+"""Sigmas that can be believed: what views of a tree share, what particles no longer show, and the outcome."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.config import preset
+from pipeline.geometry.poses import Pose2
+from pipeline.slam.frame_uncertainty import FrameMemory, at_least, carried
+from pipeline.tracking import Tracker
+from pipeline.tracking.split_covariance_intersection import split, weight
+from tests.benchmarks.cases.consistency import Errors, one_run
+from tests.benchmarks.stands import STRAIGHT
+from tests.pipeline.strategies import LAW, NOTHING_SEEN, detections, seeds
+
+POSE = np.diag([0.1, 0.1, 0.0]) ** 2
+MANY = 1e12  # particles, of which no sampling noise is left
+
+
+def spd(rng, n, scale=1.0):
+    A = rng.normal(size=(n, n))
+    return scale * (A @ A.T + 0.1 * np.eye(n))
+
+
+# --- a tree ---------------------------------------------------------------------------------------
+
+
+def joined(own, shared, R, B, x, z):
+    """One update of a still tree: its place, whole covariance and shared part afterwards."""
+    P = np.zeros((1, 4, 4))
+    P[0, :2, :2] = own + shared
+    part = shared[None].copy()
+    P2 = split(P, part, np.zeros(1, np.int64), R[None], B[None], np.zeros(1), 0.0)[0]
+    K = P[0, :2, :2] @ np.linalg.inv(P[0, :2, :2] + P2)
+    return x + K @ (z - x), (np.eye(2) - K) @ P[0, :2, :2], part[0], K
+
+
+@LAW
+@given(seeds, st.floats(-1.0, 1.0))
+def test_the_told_covariance_bounds_the_true_one_whatever_the_correlation(seed, r):
+    rng = np.random.default_rng(seed)
+    own, shared, R, B = spd(rng, 2), spd(rng, 2, 3.0), spd(rng, 2), spd(rng, 2, 3.0)
+    _, told, part, K = joined(own, shared, R, B, np.zeros(2), np.zeros(2))
+    cross = r * np.linalg.cholesky(shared) @ np.linalg.cholesky(B).T  # of the shared errors, as strong as r
+    rest = np.eye(2) - K
+    true = rest @ (own + shared) @ rest.T + K @ (R + B) @ K.T + rest @ cross @ K.T + K @ cross.T @ rest.T
+    assert np.linalg.eigvalsh(told - true).min() > -1e-9
+    own_after = rest @ own @ rest.T + K @ R @ K.T
+    np.testing.assert_allclose(told, own_after + part, atol=1e-9)
+
+
+@LAW
+@given(seeds)
+def test_without_a_shared_part_it_is_the_kalman_filter(seed):
+    rng = np.random.default_rng(seed)
+    own, R, nothing = spd(rng, 2), spd(rng, 2), np.zeros((2, 2))
+    x, z = rng.normal(size=2), rng.normal(size=2)
+    place, told, part, _ = joined(own, nothing, R, nothing, x, z)
+    A, B = np.linalg.inv(own), np.linalg.inv(R)
+    np.testing.assert_allclose(told, np.linalg.inv(A + B), atol=1e-9)
+    np.testing.assert_allclose(place, np.linalg.solve(A + B, A @ x + B @ z), atol=1e-9)
+    np.testing.assert_array_equal(part, 0.0)
+
+
+@LAW
+@given(*[st.floats(1e-4, 1.0)] * 4)
+def test_the_weight_makes_the_variance_least(own, shared, R, B):
+    def variance(w):
+        return 1.0 / (1.0 / (own + shared / w) + 1.0 / (R + B / (1.0 - w)))
+
+    best = min(variance(w) for w in np.linspace(0.001, 0.999, 999))
+    assert variance(weight(own, shared, R, B)) <= best * (1.0 + 1e-9)
+
+
+def test_many_views_from_one_doubtful_pose_average_out_their_noise_alone():
+    t = Tracker(preset("forest").tracking)
+    for k in range(400):
+        t.process(k, Pose2(), POSE, detections([[5.0, 0.0]], sigma=0.05), NOTHING_SEEN, 0.0)
+    P = t.tracks.P[0, :2, :2]
+    np.testing.assert_allclose(P, np.eye(2) * (0.1**2 + 0.05**2 / 400), rtol=1e-6, atol=1e-9)
+
+
+def test_a_view_from_a_sure_pose_takes_over_from_doubtful_ones():
+    t = Tracker(preset("forest").tracking)
+    for k in range(50):
+        t.process(k, Pose2(0.1, 0.0, 0.0), POSE, detections([[5.0, 0.0]], sigma=0.02), NOTHING_SEEN, 0.0)
+    sure = POSE / 100.0
+    for k in range(50, 60):
+        t.process(k, Pose2(), sure, detections([[5.0, 0.0]], sigma=0.02), NOTHING_SEEN, 0.0)
+    assert abs(t.tracks.x[0, 0] - 5.0) < 0.02
+    assert np.sqrt(t.tracks.P[0, 0, 0]) < 0.03
+
+
+# --- a pose ---------------------------------------------------------------------------------------
+
+
+@LAW
+@given(seeds)
+def test_the_larger_of_two_covariances_is_as_large_as_both(seed):
+    rng = np.random.default_rng(seed)
+    A, B = spd(rng, 3), spd(rng, 3)
+    both = at_least(A, B)
+    assert np.linalg.eigvalsh(both - A).min() > -1e-7
+    assert np.linalg.eigvalsh(both - B).min() > -1e-7
+    np.testing.assert_allclose(at_least(A, 0.5 * A), A, atol=1e-7)
+    np.testing.assert_allclose(at_least(A, 2.0 * A), 2.0 * A, atol=1e-7)
+
+
+def test_an_error_of_the_heading_moves_what_lies_far_from_where_it_was_made():
+    C = carried(np.diag([0.0, 0.0, 0.01**2]), 20.0, 0.0)
+    np.testing.assert_allclose(np.sqrt(np.diag(C)), [0.0, 0.2, 0.01])
+
+
+def test_what_the_particles_forgot_is_remembered_where_the_landmarks_stand():
+    wide, thin = np.eye(3) * 0.04, np.eye(3) * 1e-4
+    here = np.zeros(3)
+    memory = FrameMemory().marked(0, 0, here, wide)
+    landmarks = (np.array([[2.0, 0.0]]), np.array([3]), np.array([5], np.int32), 3)
+    told, memory = memory.told(here, thin, MANY, *landmarks, 10.0)
+    np.testing.assert_allclose(told, wide, atol=1e-9)
+    away = np.array([5.0, 0.0, 0.0])
+    told, _ = memory.told(away, thin, MANY, *landmarks, 1.0)  # no landmark near: what was hidden stays hidden
+    np.testing.assert_allclose(told, thin + carried(wide - thin, 5.0, 0.0), atol=1e-9)
+    older = (np.array([[2.0, 0.0]]), np.array([-1]), np.array([5], np.int32), 3)
+    told, _ = FrameMemory().told(here, thin, MANY, *older, 10.0)
+    np.testing.assert_allclose(told, thin)
+
+
+@LAW
+@given(seeds, st.sampled_from([1.0, 30.0, 1000.0]))
+def test_what_is_larger_by_sampling_noise_alone_counts_for_nothing_and_by_much_for_all(seed, n_eff):
+    rng = np.random.default_rng(seed)
+    A, noise = spd(rng, 3), 4.0 / np.sqrt(n_eff)
+    np.testing.assert_allclose(at_least(A, A * (1.0 + 0.9 * noise), noise), A, rtol=1e-6, atol=1e-9)
+    much = 1.0 + 100.0 * noise
+    both = at_least(A, A * much, noise)
+    np.testing.assert_allclose(both, A * much, rtol=1e-3, atol=1e-6)
+    assert np.linalg.eigvalsh(both - at_least(A, A * (1.0 + 50.0 * noise), noise)).min() > 0.0
+
+
+def test_keeping_the_larger_of_two_noisy_covariances_again_and_again_makes_none_larger():
+    """A hundred marks of one unchanging covariance, each of them and each spread taken from particles."""
+    rng, n = np.random.default_rng(0), 80
+    kept = np.eye(3)
+    for _ in range(100):
+        drawn = rng.normal(size=(n, 3))
+        kept = at_least(drawn.T @ drawn / n, kept, 4.0 / np.sqrt(n))
+    assert np.trace(kept) / 3.0 < 1.25
+
+
+def test_a_spread_along_a_line_may_be_as_long_as_a_forest():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        away = rng.normal(size=3) * [1e3, 1e3, 1.0]
+        line = np.outer(away, away)
+        both = at_least(line, np.eye(3) * 0.01)
+        assert np.all(np.isfinite(both))
+        assert np.linalg.eigvalsh(both - line).min() > -1e-6
+
+
+def test_a_robot_that_heads_backwards_makes_no_marks_while_it_stands():
+    memory = FrameMemory()
+    for k in range(10):
+        yaw = (np.pi - 0.001) * (-1.0) ** k
+        memory = memory.marked(k, k, np.array([0.0, 0.0, yaw]), np.eye(3))
+    assert len(memory.serial) == 1
+
+
+def test_marks_stand_apart():
+    memory = FrameMemory()
+    for k in range(100):
+        memory = memory.marked(k, k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3))
+    assert 15 <= len(memory.serial) <= 20
+    assert np.all(np.diff(memory.pose[:, 0]) > 0.49)
+
+
+# --- the outcome ----------------------------------------------------------------------------------
+
+
+def test_normalised_errors_of_simulated_runs_are_those_of_honest_sigmas():
+    errors = Errors()
+    for seed in range(100, 108):
+        one_run(seed, 60, errors)
+    # Eight runs: three sigma of the means of chi-square, a run's views and trees not being independent.
+    assert 1.0 < np.mean(errors.pose) < 5.6
+    assert 0.4 < np.mean(errors.trees) < 4.2
+    assert 0.7 < np.mean(errors.innovations) < 1.3
+
+
+def test_straight_on_past_few_trees_sigmas_stay_honest_and_no_loop_is_seen():
+    errors = Errors()
+    for seed in range(200, 205):
+        one_run(seed, 60, errors, STRAIGHT)
+    assert errors.astray == 0
+    assert 0.8 < np.mean(errors.pose) < 6.0

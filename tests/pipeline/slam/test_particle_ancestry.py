@@ -1,0 +1,58 @@
+"""The past of the particles: right, immutable, bounded."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.slam.particle_ancestry import BLOCK, RECENT_POSES, Genealogy
+from tests.pipeline.strategies import FEW, seeds
+
+
+def grown(rng, particles, scans):
+    """A genealogy and, beside it, the whole past of every particle, kept without sharing."""
+    genealogy, pasts = Genealogy(), np.zeros((particles, 0, 3))
+    for _ in range(scans):
+        pose = rng.normal(size=(particles, 3))
+        ancestors = rng.integers(0, particles, particles) if rng.random() < 0.3 else None
+        pasts = np.concatenate([pasts, pose[:, None]], axis=1)
+        pasts = pasts if ancestors is None else pasts[ancestors]
+        genealogy = genealogy.with_scan(pose, ancestors, 0)
+    return genealogy, pasts
+
+
+@FEW
+@given(seeds, st.integers(1, 9), st.integers(1, 40))
+def test_a_path_is_the_past_of_its_particle(seed, particles, scans):
+    genealogy, pasts = grown(np.random.default_rng(seed), particles, scans)
+    for leaf in range(particles):
+        np.testing.assert_allclose(genealogy.path(leaf), pasts[leaf], atol=1e-6)
+
+
+@FEW
+@given(seeds, st.integers(1, 9))
+def test_particles_drawn_anew_keep_their_past(seed, particles):
+    rng = np.random.default_rng(seed)
+    genealogy, pasts = grown(rng, particles, 12)
+    rows = rng.integers(0, particles, 15)
+    drawn = genealogy.redrawn(rows)
+    for leaf, row in enumerate(rows):
+        np.testing.assert_allclose(drawn.path(leaf), pasts[row], atol=1e-6)
+    np.testing.assert_allclose(genealogy.path(0), pasts[0], atol=1e-6)
+
+
+def test_a_long_past_is_settled_and_stays():
+    particles = RECENT_POSES // BLOCK
+    genealogy = Genealogy()
+    for k in range(2 * BLOCK + 10):
+        genealogy = genealogy.with_scan(np.full((particles, 3), float(k)), None, 0)
+    assert len(genealogy.settled) == 1
+    assert len(genealogy.recent) < 2 * BLOCK
+    assert len(genealogy) == 2 * BLOCK + 10
+    np.testing.assert_array_equal(genealogy.path(3)[:, 0], np.arange(2 * BLOCK + 10))
+
+
+def test_nothing_has_no_path():
+    assert Genealogy().path(0).shape == (0, 3)
+    assert Genealogy().redrawn(np.zeros(4, np.int64)).path(0).shape == (0, 3)

@@ -1,0 +1,153 @@
+"""Bad days, from the records to the page: each is warned of and told by a state there, leaves at most one
+false tree, and the robot is good again within fifty scans or says that it is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from app.dashboard.payload import health_word
+from app.worker.session import Session
+from pipeline.config import Parameters
+from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.base import SourceDescription
+from pipeline.mapper import Mapper
+from pipeline.odometry.synchroniser import steps
+from pipeline.types.records import Frame, Record, Truth
+from tests.benchmarks.troubled import AFTER, KNOWN, PLACES, SENSOR, TROUBLES, Drive, drive, parameters
+
+WITHIN = 50  # scans
+NO_WORSE = 0.2  # m beyond the error before
+
+
+class Told:
+    """A source of ready records."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.drive = drive
+        self.losses: dict[str, int] = {}
+        self.description = SourceDescription(
+            uri="told:",
+            kind="told records",
+            sensor=SENSOR,
+            T_base_lidar=Pose3.identity(),
+            has_odometry=True,
+            has_imu=False,
+            scans=None,
+            start_ns=0,
+            end_ns=None,
+            digest="0",
+            preset="stems",
+        )
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """All of them: nobody goes back here."""
+        assert start_ns is None
+        yield from self.drive.records
+
+    def truth(self) -> Truth | None:
+        """None."""
+        return None
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Day:
+    """What the page was told: of each scan its number, the picture, the state of SLAM and the warnings."""
+
+    drive: Drive
+    rows: list[tuple[int, Frame, str, tuple[str, ...]]]
+
+    def since(self, scan: int) -> list[tuple[int, Frame, str, tuple[str, ...]]]:
+        """The scans since one, by the time of the drive."""
+        return [row for row in self.rows if row[0] >= scan]
+
+
+def lived(place: str, seed: int, name: str, p: Parameters | None = None) -> Day:
+    """Play a drive in a session, and look at its status after each scan."""
+    trouble = TROUBLES[name]
+    driven = drive(PLACES[place], seed, trouble)
+    session = Session(
+        open_source=lambda _uri, _options: Told(driven),
+        make_mapper=lambda source, p, seed, watch: Mapper(
+            p, sensor=source.description.sensor, T_base_lidar=Pose3.identity(), seed=seed, watch=watch
+        ),
+        make_synchroniser=lambda _odometry: steps,
+        parameters=parameters() if p is None else p,
+    )
+    session.open("told:", "auto", seed)
+    session.play()
+    rows: list[tuple[int, Frame, str, tuple[str, ...]]] = []
+    while (frame := session.work()) is not None:
+        status = session.status()
+        assert set(frame.warnings) <= set(status.warnings), "each warning reaches the page"
+        at = (frame.stamp_ns // 1_000_000 - (trouble.pause_ms if frame.index >= KNOWN else 0)) // 100
+        rows.append((at, frame, frame.health.state, frame.warnings))
+        assert status.health == health_word(frame)
+    session.close()
+    return Day(driven, rows)
+
+
+def assert_survived(name: str, day: Day, slower: int = 1, *, enough: bool = True) -> None:
+    """What is asked of every bad day; `slower`: so many scans pass for one that is used; enough: trees are
+    seen that contradict an odometry for long, else it is weak in the end."""
+    trouble = TROUBLES[name]
+    first, soon_by = 1 if trouble.from_start else KNOWN, slower * trouble.soon
+    soon = [row for row in day.since(first) if row[0] <= first + soon_by]
+    assert any(trouble.said in word for row in soon for word in row[3]), "warned of at once"
+    if not trouble.from_start:
+        assert trouble.state in [row[2] for row in soon], "a state at once"
+        assert {row[2] for row in day.rows if row[0] < KNOWN} == {"good"}
+    if not trouble.once:
+        later = day.since(first + soon_by + 1)
+        warned = [any(trouble.said in word for word in row[3]) for row in later]
+        assert np.mean(warned) > 0.9, "warned of as long as it lasts"
+    _, frame, state, _ = day.rows[-1]
+    assert state == day.rows[-2][2]
+    before = max(day.drive.error(row[0], row[1].estimate.T_map_base) for row in day.rows if row[0] < KNOWN)
+    error = day.drive.error(day.rows[-1][0], frame.estimate.T_map_base)
+    lost = trouble.may_be_lost and state == "lost"
+    word = "good" if enough else "weak"
+    assert lost or error < before + NO_WORSE
+    assert lost or {row[2] for row in day.since(first + WITHIN)} == {word}
+    trees = frame.trees.position[frame.trees.confirmed]
+    assert day.drive.false_trees(trees, before + (0.0 if lost else error)) <= 1
+
+
+@pytest.mark.parametrize("name", TROUBLES)
+@pytest.mark.parametrize(("place", "seed"), [("stand", 1), ("a circle", 2)])
+def test_a_bad_day(name: str, place: str, seed: int) -> None:
+    assert_survived(name, lived(place, seed, name))
+
+
+@pytest.mark.parametrize("name", ["stuck", "odometry ends", "jump of 0.5 m", "kidnapped"])
+@pytest.mark.parametrize(("place", "seed"), [("at 3 m/s", 3), ("few trees", 4), ("dense", 5)])
+def test_elsewhere(name: str, place: str, seed: int) -> None:
+    assert_survived(name, lived(place, seed, name), enough=(name, place) != ("stuck", "few trees"))
+
+
+@pytest.mark.parametrize(("place", "seed"), [("at 3 m/s", 3), ("dense", 5)])
+def test_stuck_from_the_start_where_more_trees_stand_than_people_walk(place: str, seed: int) -> None:
+    assert_survived("stuck from the start", lived(place, seed, "stuck from the start"))
+
+
+@pytest.mark.parametrize("name", ["stuck", "odometry ends", "jump of 0.5 m", "gap, pushed", "kidnapped"])
+@pytest.mark.parametrize("method", ["fastslam1", "graph"])
+def test_by_every_method(name: str, method: str) -> None:
+    if method == "graph":
+        pytest.importorskip("gtsam")
+    day = lived("stand", 6, name, parameters(**{"slam.method": method}))
+    assert_survived(name, day, slower=3 if method == "graph" else 1)
+
+
+def test_stuck_wheels_of_a_filter_that_waits_for_half_a_metre() -> None:
+    """It would wait for ever: no metre is driven."""
+    day = lived("stand", 7, "stuck", parameters(**{"slam.update_distance": 0.5}))
+    assert_survived("stuck", day)
+    assert len(day.since(KNOWN)) == AFTER

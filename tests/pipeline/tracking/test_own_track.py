@@ -1,0 +1,78 @@
+"""A tree's column makes that track a tree which stands at its axis, not whatever is near and seen often."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.config import preset
+from pipeline.tracking import Tracker
+from pipeline.tracking.track_classification import REACH
+from pipeline.tracking.track_table import TrackTable
+from pipeline.types.records import Verdict
+from tests.pipeline.strategies import LAW
+from tests.pipeline.tracking.test_round_fit_override import PLACE, column
+
+FOREST = preset("forest")
+
+
+def told(*tracks: tuple[float, int]):
+    """The verdicts of tracks (distance from the column [m], hits) after its column was judged a tree."""
+    tracker = Tracker(FOREST.tracking)
+    table = TrackTable.empty(len(tracks))
+    for k, (away, hits) in enumerate(tracks):
+        table.x[k, :2] = PLACE + away * np.array([np.cos(2.0 * k), np.sin(2.0 * k)])
+        table.number[k], table.hits[k], table.score[k] = k + 1, hits, 5.0
+    tracker.tracks, tracker.next_number = table, len(tracks) + 1
+    tracker.judge(1, column(Verdict.TREE, tree=0.8), FOREST.gathering)
+    return [Verdict(int(v)) if v >= 0 else None for v in tracker.tracks.verdict]
+
+
+@pytest.mark.parametrize("own", [(0.0, 0), (0.0, 1), (0.05, 3), (0.07, 240), (0.15, 240)])
+@pytest.mark.parametrize("beside", [(0.43, 290), (0.4, 3000)])
+def test_branches_beside_a_stem_that_are_seen_more_often_are_not_it(own, beside):
+    assert told(beside, own) == [Verdict.OTHER, Verdict.TREE]
+    assert told(own, beside) == [Verdict.TREE, Verdict.OTHER]
+
+
+def test_of_two_pieces_of_one_trunk_the_one_with_more_hits_is_it():
+    assert told((0.05, 2), (0.12, 200)) == [Verdict.OTHER, Verdict.TREE]
+    assert told((0.1, 200), (0.1, 2)) == [Verdict.TREE, Verdict.OTHER]
+
+
+def test_what_stands_alone_within_reach_is_it_however_far():
+    assert told((REACH - 0.01, 3)) == [Verdict.TREE]
+    assert told((REACH + 0.01, 3))[1:] == [Verdict.TREE], "the column begins a track of its own"
+
+
+@LAW
+@given(st.lists(st.tuples(st.floats(0.0, 0.44), st.integers(0, 600)), min_size=1, max_size=6))
+def test_none_that_is_both_nearer_and_seen_more_often_is_left_for_another(tracks):
+    verdicts = told(*tracks)
+    (chosen,) = [k for k, verdict in enumerate(verdicts) if verdict is Verdict.TREE]
+    away, hits = tracks[chosen]
+    assert not [t for t in tracks if t[0] < away - 1e-6 and t[1] > hits]
+    assert away <= 1e-6 or not [t for t in tracks if t[0] < away - 1e-6 and t[1] == hits]
+
+
+def between(verdict: Verdict, away: float, hits: int = 3):
+    """The verdict of a track that came since its column was judged, and whether it is a tree of the map."""
+    tracker = Tracker(FOREST.tracking)
+    table = TrackTable.empty(1)
+    table.number[0], table.hits[0], table.score[0] = 1, hits, 3.0
+    table.x[0, :2] = PLACE + np.array([away, 0.0])
+    tracker.tracks, tracker.next_number = table, 2
+    tracker.learn_between(column(verdict))
+    return int(tracker.tracks.verdict[0]), bool(tracker.trees().confirmed[0])
+
+
+@pytest.mark.parametrize("verdict", [Verdict.BUSH, Verdict.PERSON, Verdict.POLE, Verdict.OTHER])
+def test_hits_make_no_tree_where_the_column_is_known_to_be_none(verdict):
+    assert between(verdict, REACH - 0.01) == (int(verdict), False)
+    assert between(verdict, REACH + 0.01) == (-1, True), "of a place where nothing is known hits tell"
+
+
+def test_what_comes_beside_a_tree_is_no_second_one_until_it_is_judged():
+    assert between(Verdict.TREE, 0.3) == (int(Verdict.OTHER), False)

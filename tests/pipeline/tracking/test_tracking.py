@@ -1,0 +1,380 @@
+"""Trees: one Kalman filter each, numbers that stay, merging, vanishing, and what was seen of a trunk."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.config import preset
+from pipeline.geometry.poses import Pose2
+from pipeline.tracking import Tracker
+from pipeline.tracking.kalman import ENGINES, process_noise, transition
+from pipeline.tracking.merge import fuse
+from pipeline.tracking.observation import SECTORS, seen_sides
+from tests.pipeline.strategies import ALL_FREE, FEW, LAW, NOTHING_SEEN, detections, seeds
+
+FOREST = preset("forest").tracking
+PAPER = preset("paper").tracking
+SURE = np.zeros((3, 3))
+
+
+def tracker(**changes: Any):
+    """A tracker with the preset forest."""
+    return Tracker(FOREST.model_copy(update=changes))
+
+
+def show(t, k, centre, *, pose=None, free=NOTHING_SEEN, view_range=15.0, pose_covariance=SURE, **rest: Any):
+    """Give a tracker the detections of scan k, in the base frame, and return its trees."""
+    t.process(k * 100_000_000, pose or Pose2(), pose_covariance, detections(centre, **rest), free, view_range)
+    return t.trees()
+
+
+# --- the Kalman filter ----------------------------------------------------------------------------
+
+
+@LAW
+@given(seeds, st.floats(0.0, 30.0), st.floats(0.0, 1.0), st.integers(1, 6))
+def test_both_engines_give_the_same_numbers(seed, dt, acceleration, trees):
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(trees, 4))
+    A = rng.normal(size=(trees, 4, 4))
+    P = A @ A.transpose(0, 2, 1) + np.eye(4) * 1e-3
+    B = rng.normal(size=(trees, 2, 2))
+    R = B @ B.transpose(0, 2, 1) + np.eye(2) * 1e-3
+    z, rows = rng.normal(size=(trees, 2)), rng.permutation(trees)
+    told = {}
+    for name, engine in ENGINES.items():
+        told[name] = (x.copy(), P.copy())
+        engine(*told[name], rows, np.full(trees, dt), acceleration, z, R)
+    np.testing.assert_allclose(told["compiled"][0], told["filterpy"][0], atol=1e-9, rtol=1e-9)
+    np.testing.assert_allclose(told["compiled"][1], told["filterpy"][1], atol=1e-9, rtol=1e-9)
+    for C in told["compiled"][1]:
+        np.testing.assert_allclose(C, C.T, atol=1e-9)
+        assert np.linalg.eigvalsh(C).min() > -1e-9
+
+
+def test_the_model_is_constant_velocity_with_white_acceleration():
+    np.testing.assert_allclose(transition(0.5) @ [1.0, 2.0, 4.0, -6.0], [3.0, -1.0, 4.0, -6.0])
+    G = np.array([[0.125, 0.0], [0.0, 0.125], [0.5, 0.0], [0.0, 0.5]])
+    np.testing.assert_allclose(process_noise(0.5, 0.3), 0.09 * G @ G.T)
+
+
+def test_a_still_tree_is_the_mean_of_its_views():
+    rng = np.random.default_rng(0)
+    t = tracker()
+    views = np.array([3.0, 1.0]) + rng.normal(0, 0.05, (40, 2))
+    trees = t.trees()
+    for k, view in enumerate(views):
+        trees = show(t, k, [view], sigma=0.05)
+    np.testing.assert_allclose(trees.position, [views.mean(axis=0)], atol=1e-9)
+    np.testing.assert_allclose(trees.velocity, 0.0)
+    np.testing.assert_allclose(t.tracks.P[0, :2, :2], np.eye(2) * 0.05**2 / 40, rtol=1e-6)
+    # What is told to people does not shrink for ever: views of a trunk share an error.
+    assert 0.005 < np.sqrt(trees.covariance[0, 0, 0]) < 0.02
+
+
+@FEW
+@given(seeds)
+def test_a_whole_run_is_the_same_with_both_engines(seed):
+    rng = np.random.default_rng(seed)
+    world = rng.uniform(-8, 8, (8, 2))
+    told = []
+    for engine in ENGINES:
+        t = Tracker(PAPER.model_copy(update={"engine": engine}))
+        noise = np.random.default_rng(seed)
+        trees = t.trees()
+        for k in range(15):
+            trees = show(t, k, world + noise.normal(0, 0.05, world.shape), free=ALL_FREE)
+        told.append(trees)
+    np.testing.assert_array_equal(told[0].number, told[1].number)
+    for column in ("position", "covariance", "velocity", "eccentricity", "dbh", "coverage"):
+        np.testing.assert_allclose(getattr(told[0], column), getattr(told[1], column), atol=1e-9)
+
+
+# --- numbers --------------------------------------------------------------------------------------
+
+
+@FEW
+@given(seeds)
+def test_numbers_never_change_and_are_never_used_twice(seed):
+    rng = np.random.default_rng(seed)
+    t = tracker()
+    gone: set[int] = set()
+    alive: set[int] = set()
+    last = 0
+    for k in range(25):
+        seen = rng.uniform(-6, 6, (rng.integers(0, 7), 2))
+        trees = show(t, k, seen, free=ALL_FREE if k % 3 else NOTHING_SEEN)
+        numbers = trees.number.tolist()
+        assert numbers == sorted(set(numbers))
+        now = set(numbers)
+        assert not now & gone, "a number came back"
+        assert all(number > last for number in now - alive), "a new tree has an old number"
+        gone |= alive - now
+        alive, last = now, max([last, *numbers])
+        assert np.all(trees.observations >= 1)
+        assert np.all(trees.observations <= k + 1), "seen in more scans than there were"
+
+
+def test_a_tree_keeps_its_number_while_others_come_and_go():
+    t = tracker(misses_per_hit=1)
+    show(t, 0, [[3.0, 0.0]], free=NOTHING_SEEN)
+    trees = t.trees()
+    for k in range(1, 10):
+        trees = show(t, k, [[3.0, 0.0], [k, 6.0]], free=ALL_FREE)
+    assert trees.number[0] == 1
+    np.testing.assert_allclose(trees.position[0], [3.0, 0.0])
+
+
+# --- merging --------------------------------------------------------------------------------------
+
+
+def test_merging_keeps_the_older_number_and_adds_up():
+    t = tracker(proximity_radius=0.4)
+    for k in range(3):
+        show(t, k, [[5.0, 1.0], [5.0, 0.0]])
+    show(t, 3, [[5.0, 0.0]])
+    t.parameters = FOREST.model_copy(update={"proximity_radius": 1.1})
+    trees = show(t, 4, [[5.0, 0.0]])
+    assert trees.number.tolist() == [1]
+    assert trees.first_seen_ns.tolist() == [0]
+    assert trees.last_seen_ns.tolist() == [400_000_000]
+    assert 0.2 < trees.position[0, 1] < 0.6
+    assert show(t, 99, [[20.0, 0.0]]).number.tolist() == [1, 3], "2 is not given again"
+
+
+def test_two_trees_farther_apart_than_the_radius_stay_two():
+    t = tracker(proximity_radius=0.4)
+    trees = t.trees()
+    for k in range(5):
+        trees = show(t, k, [[5.0, 0.0], [5.0, 0.41]])
+    assert trees.number.tolist() == [1, 2]
+
+
+def test_of_three_in_a_heap_one_is_left():
+    t = tracker(proximity_radius=0.4)
+    trees = show(t, 0, [[5.0, 0.0], [5.0, 0.3], [5.2, 0.15]])
+    assert trees.number.tolist() == [1]
+
+
+def test_a_trunk_in_two_pieces_is_seen_once_a_scan():
+    t = tracker(proximity_radius=0.4)
+    trees = t.trees()
+    for k in range(4):
+        trees = show(t, k, [[5.0, 0.0], [5.0, 0.3]])
+    assert trees.number.tolist() == [1]
+    assert trees.observations.tolist() == [4], "number of scans it was seen in"
+
+
+def test_no_radius_no_merging():
+    t = tracker(proximity_radius=0.0)
+    assert show(t, 0, [[5.0, 0.0], [5.0, 0.0]]).number.tolist() == [1, 2]
+
+
+@LAW
+@given(seeds)
+def test_fusing_is_the_best_of_two_independent_positions(seed):
+    rng = np.random.default_rng(seed)
+    P, Q = np.zeros((4, 4)), np.zeros((4, 4))
+    for C in (P, Q):
+        root = rng.normal(size=(2, 2))
+        C[:2, :2] = root @ root.T + 0.01 * np.eye(2)
+    x, y = np.r_[rng.normal(size=2), 0, 0], np.r_[rng.normal(size=2), 0, 0]
+    told_x, told_P = fuse(x, P, y, Q)
+    A, B = np.linalg.inv(P[:2, :2]), np.linalg.inv(Q[:2, :2])
+    np.testing.assert_allclose(told_P[:2, :2], np.linalg.inv(A + B), atol=1e-9)
+    np.testing.assert_allclose(told_x[:2], np.linalg.solve(A + B, A @ x[:2] + B @ y[:2]), atol=1e-9)
+
+
+# --- vanishing ------------------------------------------------------------------------------------
+
+
+def test_a_tree_that_is_missed_vanishes_and_a_hidden_one_stays():
+    t = tracker(misses_per_hit=2)
+    for k in range(3):
+        show(t, k, [[5.0, 0.0]])
+    for k in range(3, 50):
+        assert show(t, k, []).number.tolist() == [1], "nothing was seen there"
+    for k in range(50, 55):
+        assert show(t, k, [], free=ALL_FREE).number.tolist() == [1]
+    assert show(t, 55, [], free=ALL_FREE).number.tolist() == [], "3 hits, 6 misses at 2 a hit"
+
+
+def test_a_tree_out_of_view_range_is_not_missed():
+    t = tracker(misses_per_hit=1)
+    show(t, 0, [[5.0, 0.0]])
+    for k in range(1, 20):
+        assert len(show(t, k, [], free=ALL_FREE, view_range=4.9).number) == 1
+
+
+def test_a_felled_tree_vanishes_in_finite_time():
+    t = tracker(misses_per_hit=1)
+    for k in range(500):
+        show(t, k, [[5.0, 0.0]])
+    trees = t.trees()
+    for k in range(500, 530):
+        trees = show(t, k, [], free=ALL_FREE)
+    assert len(trees.number) == 0
+
+
+# --- what is known of a tree ----------------------------------------------------------------------
+
+
+def test_the_pose_turns_and_moves_positions_and_covariances():
+    t = tracker()
+    pose = Pose2(10.0, -3.0, 0.7)
+    trees = show(t, 0, [[4.0, 1.0]], pose=pose)
+    np.testing.assert_allclose(trees.position, pose.apply(np.array([[4.0, 1.0]])))
+    np.testing.assert_allclose(t.tracks.P[0, :2, :2], np.eye(2) * 0.03**2, atol=1e-12)
+
+
+def test_an_unsure_heading_makes_far_trees_unsure_across():
+    t = tracker()
+    show(t, 0, [[10.0, 0.0]], pose_covariance=np.diag([0.0, 0.0, 0.01**2]), sigma=0.01)
+    np.testing.assert_allclose(np.diag(t.tracks.P[0])[:2], [1e-4, 1e-4 + 0.1**2], rtol=1e-9)
+
+
+@pytest.mark.parametrize("breast_height", [1.3, 1.0])
+def test_a_diameter_is_told_for_breast_height(breast_height):
+    t = tracker(dbh_arc_min=0.0, breast_height=breast_height)
+    seen = detections([[5.0, 0.0]], radius=0.2)
+    for k, height in enumerate((0.7, 1.0, 1.6, np.nan)):
+        t.process(k * 100_000_000, Pose2(), SURE, seen, NOTHING_SEEN, 15.0, np.array([height]))
+    above = np.array([0.7, 1.0, 1.6, breast_height]) - breast_height
+    lost = np.average(np.where(above < 0.0, 0.01, 0.005) * above, weights=1.0 / (1.0 + (above / 0.5) ** 2))
+    assert t.trees().dbh[0] == pytest.approx(2.0 * (0.2 + lost))
+
+
+def test_a_diameter_needs_three_radii_and_weighs_them():
+    t = tracker(dbh_arc_min=0.0)
+    for k in range(3):
+        assert np.isnan(show(t, k, [[5.0, 0.0]], radius=np.nan).dbh).all()
+    trees = t.trees()
+    for k in range(2):
+        trees = show(t, 3 + k, [[5.0, 0.0]], radius=0.2)
+    assert np.isnan(trees.dbh[0])
+    trees = show(t, 6, [[5.0, 0.0]], radius=0.26)
+    assert trees.dbh[0] == pytest.approx(2 * (0.2 + 0.2 + 0.26) / 3)
+    assert 0.02 < trees.dbh_sigma[0] < 0.1
+    assert trees.observations.tolist() == [6]
+
+
+def test_confirmation_comes_with_the_hits():
+    t = tracker(hits_to_confirm=3)
+    told = [bool(show(t, k, [[5.0, 0.0]]).confirmed[0]) for k in range(4)]
+    assert told == [False, False, True, True]
+
+
+def test_times_are_those_of_the_first_and_the_last_view():
+    t = tracker()
+    trees = t.trees()
+    for k in (2, 5, 9):
+        trees = show(t, k, [[5.0, 0.0]])
+    show(t, 11, [])
+    assert trees.first_seen_ns.tolist() == [200_000_000]
+    assert t.trees().last_seen_ns.tolist() == [900_000_000]
+
+
+def test_an_infinite_eccentricity_does_not_spoil_the_mean():
+    t = tracker()
+    views = detections([[5.0, 0.0]])
+    for k, e in enumerate((4.0, np.inf, 6.0)):
+        views.eccentricity[0] = e
+        t.process(k, Pose2(), SURE, views, NOTHING_SEEN, 0.0)
+    assert t.trees().eccentricity.tolist() == [5.0]
+
+
+# --- coverage -------------------------------------------------------------------------------------
+
+STEP = 2 * np.pi / SECTORS
+
+
+def sectors(bearing, arc):
+    """The sectors that one view shows."""
+    bits = int(seen_sides(bearing, arc))
+    return {k for k in range(64) if bits >> k & 1}
+
+
+def test_sectors_that_were_wholly_seen_are_kept():
+    assert sectors(STEP, 2 * STEP) == {0, 1}
+    assert sectors(STEP, 1.9 * STEP) == set()
+    assert sectors(0.0, 2 * STEP) == {SECTORS - 1, 0}
+    assert sectors(1.0, 0.0) == set()
+    assert len(sectors(0.0, 2 * np.pi)) == SECTORS
+
+
+@LAW
+@given(st.floats(-10, 10), st.floats(0, 2 * np.pi))
+def test_coverage_is_never_more_than_the_arc_and_at_most_two_sectors_less(bearing, arc):
+    seen = sectors(bearing, arc)
+    assert seen <= set(range(SECTORS))
+    assert arc - 2 * STEP - 1e-6 <= len(seen) * STEP <= arc + 1e-6
+
+
+@LAW
+@given(st.floats(-10, 10), st.floats(0, 3 * np.pi))
+def test_each_sector_is_seen_that_lies_within_the_arc(bearing, arc):
+    first = int(np.ceil((bearing - arc / 2) / STEP - 1e-9))
+    last = int(np.floor((bearing + arc / 2) / STEP + 1e-9))
+    assert sectors(bearing, arc) == {k % SECTORS for k in range(first, last)}
+
+
+def test_walking_around_a_tree_covers_it():
+    t = tracker()
+    trees = t.trees()
+    for k, angle in enumerate(np.arange(0, 2 * np.pi, 0.3)):
+        pose = Pose2(5.0 * np.cos(angle), 5.0 * np.sin(angle), angle + np.pi)
+        trees = show(t, k, [[5.0, 0.0]], pose=pose, arc=2.0)
+    assert len(trees.number) == 1
+    assert trees.coverage[0] == pytest.approx(2 * np.pi)
+
+
+@LAW
+@given(
+    st.floats(1.0, 40.0),
+    st.floats(-3.1, 3.1),
+    st.lists(st.tuples(st.floats(0.02, 0.9), st.floats(0.0, 2.0 * np.pi)), min_size=1, max_size=8),
+)
+def test_views_from_one_place_cover_no_more_than_one_can_show(distance, bearing, views):
+    """From tangent to tangent: 2 arccos(r / d), whatever arc the noise of a fit claims."""
+    t = tracker(dbh_arc_min=180.0)
+    away = distance * np.array([np.cos(bearing), np.sin(bearing)])
+    for k, (radius, arc) in enumerate(views):
+        show(t, k, [away], radius=radius, arc=arc)
+    trees = t.trees()
+    widest = max(min(arc, 2.0 * np.arccos(radius / distance)) for radius, arc in views)
+    assert trees.coverage[0] == pytest.approx(len(sectors(bearing + np.pi, widest)) * STEP)
+    assert trees.coverage[0] <= widest + 1e-6 < np.pi
+    assert np.isnan(trees.dbh[0])
+
+
+def test_a_view_without_a_circle_shows_what_the_others_say():
+    def covered(*radii: float):
+        t = tracker()
+        for k, radius in enumerate(radii):
+            show(t, k, [[1.0, 0.0]], radius=radius, arc=6.0 if np.isnan(radius) else 0.0)
+        return t.trees().coverage[0]
+
+    assert covered(0.5, np.nan) == pytest.approx(np.radians(120.0))  # 2 arccos(0.5)
+    assert covered(np.nan) == 0.0
+    assert covered(0.5) == 0.0
+    assert covered(1.2, np.nan) == 0.0, "a robot within a stem sees nothing of it"
+
+
+def test_a_diameter_needs_half_the_trunk():
+    def seen_from(bearings):
+        t = tracker()
+        trees = t.trees()
+        for k, bearing in enumerate(bearings):
+            pose = Pose2(5.0 * np.cos(bearing), 5.0 * np.sin(bearing), bearing + np.pi)
+            trees = show(t, k, [[5.0, 0.0]], pose=pose, radius=0.2, arc=np.radians(100.0))
+        return trees
+
+    assert np.isnan(seen_from([0.0, 0.1, 0.2, 0.3]).dbh).all()
+    around = seen_from([0.0, 1.0, 2.0, 3.0])
+    assert around.dbh[0] == pytest.approx(0.4)
+    assert around.coverage[0] >= np.pi
