@@ -58,7 +58,7 @@ class Robot(Child):
     """The independent publisher with a recording."""
 
     def __init__(self, port: int, run: Path, name: str) -> None:
-        script = str(ROOT / "tests" / "robot" / "publisher.py")
+        script = str(ROOT / "tests" / "app" / "robot" / "publisher.py")
         super().__init__(script, str(port), str(run), "--robot", name)
         assert json.loads(self.hear()) == {"ready": True}
 
