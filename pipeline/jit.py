@@ -111,7 +111,7 @@ def others_compile() -> None:
 def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
     """Let what is kept of a kernel be good only while no source that it may have taken in has changed."""
     file = kernel._cache._cache_file  # numba has no public place for this
-    file._source_stamp = (file._source_stamp, sources_digest(module))
+    file._source_stamp = sources_digest(module)  # not the file's time: a copy of the sources shares the cache
     # Numba numbers files anew after a change of the sources, and writes its index first: who dies in between,
     # or reads meanwhile, would run machine code of the sources before. No two sources share a name here.
     digest = hashlib.sha256(repr(file._source_stamp).encode()).hexdigest()[:12]
