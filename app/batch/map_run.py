@@ -56,7 +56,7 @@ class OfflineRun:
         stop_after: So many scans.
         revisions: Other parameters, each from a scan on, in their order.
         on_frame: Told of each scan's results.
-        chosen: Topics and mounting that were asked for, see `app.sources.source_options`.
+        chosen: Topics and mounting that were asked for, see `SourceRequest.kept_choices`.
     """
 
     source: Source

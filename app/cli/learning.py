@@ -68,7 +68,7 @@ def _chosen(store: Store, names: list[str]) -> list[AnnotatedRun]:
     from app.training.annotated_runs import annotated_run
 
     sources = store.annotated_sources()
-    known = {word: source for source in sources for word in (source.source, source.uri, source.name)}
+    known = {word: source for source in sources for word in (source.source, source.request.uri, source.name)}
     unknown = [name for name in names if name not in known and str(Path(name).absolute()) not in known]
     if unknown:
         told = ", ".join(source.name for source in sources[:10]) or "none"

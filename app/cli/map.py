@@ -126,7 +126,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     from app.cli.live_commands import begin_recording, heard, recording_of, told_of_frames
     from app.common.compile_ahead import compile_ahead
     from app.sources.opening import open_any
-    from app.sources.source_options import plain_of_options
+    from app.sources.request import request_of_options
     from app.worker.replaying import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
 
@@ -157,7 +157,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             stop_after=arguments.stop_after,
             revisions=revisions,
             on_frame=told_of_frames(opened),
-            chosen=plain_of_options(source_options(arguments)),
+            chosen=request_of_options(arguments.source, source_options(arguments)).kept_choices(),
         )
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)

@@ -79,7 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
     from app.web.serving import serve
     from app.worker.protocol import Open
 
-    sources = [Open(uri, arguments.odometry, arguments.seed, record, arguments.publish) for uri in uris]
+    sources = [
+        Open(uri, arguments.odometry, arguments.seed, record=record, publish=arguments.publish)
+        for uri in uris
+    ]
 
     def make_parameters() -> ParameterState:
         return ParameterState(lambda suggested: chosen_parameters(arguments, suggested))

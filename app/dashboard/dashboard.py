@@ -28,6 +28,7 @@ from app.dashboard.scores import Scores, score_payload
 from app.dashboard.selecting import Selecting
 from app.dashboard.verdict_counts import BeforeAfter, counts_of
 from app.explain.client import Asking
+from app.sources.request import SourceRequest
 from app.store.async_store import Keeper
 from app.tuning.job import TuneSearch
 from app.tuning.sweep.asking_page import question_of
@@ -48,6 +49,7 @@ from app.worker.internal_protocol import (
 from app.worker.loop_playback import Loop
 from app.worker.outbox import joined
 from app.worker.protocol import Open, Play, SetParameters, Status
+from pipeline.config import preset
 from pipeline.config.model import Value
 from pipeline.types.records import Path, Trees, TruthTrees
 
@@ -95,7 +97,7 @@ class Dashboard:
         self.pages, self.scenes = Places(), Places()
         self.viewers_turns = Turns()
         self.scene_hand = SOMEBODY  # who moved something in the scene last
-        self.source = Open("")
+        self.source = SourceRequest("")
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
         self.search = TuneSearch(lambda told: live.tell("search", told))
@@ -111,7 +113,7 @@ class Dashboard:
         """Time of the run's first scan, 0 before one is shown."""
         return 0 if self.shown is None else self.shown.frame.stamp_ns - round(self.shown.time_s * 1e9)
 
-    async def start(self, source: Open) -> None:
+    async def start(self, source: SourceRequest) -> None:
         """Start the worker with a source; it plays as soon as it is open."""
         await self.sets.load()
         self.live.tell("view", self.scene.view)
@@ -149,27 +151,34 @@ class Dashboard:
         self.scene.choose(name, value)
         self.live.tell("view", self.scene.view)
 
-    async def open(self, source: Open) -> None:
-        """Leave the run and open another source."""
+    @property
+    def request(self) -> SourceRequest:
+        """How the open run is mapped now: its source and the parameters in force."""
+        state = self.parameters
+        changed = state.parameters.changes_from(preset(state.preset))
+        return msgspec.structs.replace(self.source, preset=state.preset, parameters=changed)
+
+    async def open(self, request: SourceRequest) -> None:
+        """Leave the run and open another source, with the parameters of the request if it has any.
+
+        Raises:
+            ParameterError: The parameters are not those of this version; nothing is changed.
+        """
+        if request.preset or request.parameters:
+            self.parameters.take(request.preset, request.parameters)
+            self._show_parameters()  # the worker receives them when the source is open
+        command = msgspec.structs.replace(_open_command(request), preset="", parameters={})
+        source = command.request()
         self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self._run, self.source, self.digest = None, source, ""
+        self.live.tell("source", source.for_page())
         self.camera.forget()
         self.logbook.leave()
         self.annotating.leave()
         await self.sensitivity.leave()
         await self.search.leave()
         await self._forget()
-        await self.command(source)
-
-    async def replay(self, source: Open, preset_name: str, values: dict[str, Value]) -> None:
-        """Open a source once more with the parameters of an earlier run of it.
-
-        Raises:
-            ParameterError: They are not those of this version; nothing is changed.
-        """
-        self.parameters.take(preset_name, values)
-        self._show_parameters()  # the worker gets them when the source is open
-        await self.open(source)
+        await self.command(command)
 
     async def change_parameters(self, changes: dict[str, Value], gesture: str = "") -> None:
         """Change values by their dotted names, as part of a gesture (see `ParameterState.change`).
@@ -392,3 +401,10 @@ class Dashboard:
         self.live.tell("status", status)
         if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
             self._tell_events()
+
+
+def _open_command(request: SourceRequest) -> Open:
+    """The command that opens a source; only the command line can ask for a recording or publishing."""
+    if isinstance(request, Open):
+        return request
+    return Open(**{name: getattr(request, name) for name in SourceRequest.__struct_fields__})

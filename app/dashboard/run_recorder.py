@@ -9,16 +9,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from app.dashboard.payload import trees_payload, truth_payload
-from app.sources.source_options import plain_of
+from app.sources.request import SourceRequest
 from app.store.async_store import Keeper
 from app.store.book import Beginning, Change, Standing
 from app.store.store import Store
 from app.worker.internal_protocol import Opened, Shown
-from app.worker.protocol import Open
 from pipeline.config.model import Value
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
@@ -82,7 +82,7 @@ class Logbook:
         """Number of the open run's record; None before something of it was written."""
         return self._page.record if self._page else None
 
-    def begin(self, run: int | None, source: Open, opened: Opened, *, again: bool) -> None:
+    def begin(self, run: int | None, source: SourceRequest, opened: Opened, *, again: bool) -> None:
         """A run was opened.
 
         Args:
@@ -90,14 +90,13 @@ class Logbook:
             source, opened: What was asked for, and what came of it.
             again: The worker died and opened the same run once more: its record goes on.
         """
-        if again and self._page is not None and self._page.beginning.uri == opened.uri:
+        if again and self._page is not None and self._page.beginning.request.uri == opened.uri:
             return
         self.leave()
         if run is None:
             return
         name = FilePath(opened.uri.rstrip("/")).name or opened.uri
-        chosen = plain_of(source)
-        beginning = Beginning(run, name, opened.uri, opened.kind, source.odometry, source.seed, chosen)
+        beginning = Beginning(run, name, opened.kind, msgspec.structs.replace(source, uri=opened.uri))
         self._page = _Page(beginning, opened.scans)
 
     def leave(self) -> None:

@@ -14,6 +14,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from app.sources.request import LONGEST_URI
 from pipeline.errors import StemmapError
 
 HYPOTHESES = 1_000_000
@@ -57,6 +58,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         "uri": run.uri,
         "kind": str(record["source"].get("kind", ""))[:200],
         "source": str(record["source"].get("sha256") or "")[:200],
+        "odometry": str(record.get("odometry") or "auto")[:LONGEST_URI],
         "seed": run.seed,
         "chosen": record.get("chosen"),
         "scans": int(record.get("scans") or 0),

@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from app.robot.address import is_live
 from app.robot.source import LiveSource, open_live
-from app.worker.protocol import Open
-from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import Source, SourceOptions, open_source
-
-
-def options_of(wanted: Open) -> SourceOptions:
-    """What somebody chose about a source."""
-    mounted = None if wanted.mount is None else Pose3.from_euler(wanted.mount[:3], *wanted.mount[3:])
-    return SourceOptions(wanted.topics, mounted, wanted.seed)
 
 
 def open_any(uri: str, options: SourceOptions) -> Source | LiveSource:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Engine, select
+from sqlalchemy import Engine, Row, select
 
+from app.sources.request import SourceRequest, request_of_kept
 from app.store import tables
 from app.store.records import Content
 
@@ -19,19 +19,15 @@ class AnnotatedSource:
     """A source with its annotations.
 
     Attributes:
-        source: Digest of what was recorded, else the URI; uri, name: As it was opened last.
-        seed, odometry, preset, parameters: Of its newest record; of one that was never mapped, those with
-            which every run begins.
-        annotations: That stand.
+        source: Digest of the recording, or its URI where it has no digest.
+        name: Name under which it was opened last.
+        request: How it was mapped last, with its parameters; the defaults where it was never mapped.
+        annotations: The annotations that are not deleted.
     """
 
     source: str
-    uri: str
     name: str
-    seed: int
-    odometry: str
-    preset: str
-    parameters: Mapping[str, Any]
+    request: SourceRequest
     annotations: tuple[Content, ...]
 
 
@@ -54,13 +50,21 @@ def annotated_sources(engine: Engine) -> list[AnnotatedSource]:
             found.append(
                 AnnotatedSource(
                     run.source,
-                    run.uri,
                     run.name,
-                    seed=0 if newest is None else newest.seed,
-                    odometry="auto" if newest is None else newest.odometry,
-                    preset="" if newest is None else newest.preset,
-                    parameters={} if newest is None else newest.parameters,
-                    annotations=tuple(contents[run.id]),
+                    SourceRequest(run.uri) if newest is None else request_of_record(newest, run.uri),
+                    tuple(contents[run.id]),
                 )
             )
     return found
+
+
+def request_of_record(row: Row[Any], uri: str) -> SourceRequest:
+    """Return how a recorded run was mapped, with the path at which its source was opened last."""
+    return request_of_kept(
+        uri,
+        odometry=row.odometry,
+        seed=row.seed,
+        choices=row.chosen,
+        preset=row.preset,
+        parameters=row.parameters,
+    )

@@ -8,6 +8,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Row, Select, delete, insert, select, update
 
+from app.sources.request import SourceRequest
 from app.store import tables
 from app.store.records import UnknownError
 
@@ -22,16 +23,12 @@ _ONE_MOVE_NS = 3_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """How a run begins: number of its source in the store, and as in `Open` and `Opened`; `chosen` as of
-    `app.sources.source_options`."""
+    """How a run begins: number of its source in the store, name, format in words, and how it was opened."""
 
     run: int
     name: str
-    uri: str
     kind: str
-    odometry: str
-    seed: int
-    chosen: Mapping[str, Any] | None = None
+    request: SourceRequest
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +87,11 @@ class RunBook:
             values = {
                 "run": beginning.run,
                 "name": connection.execute(uploaded).scalar() or beginning.name[:200],
-                "uri": beginning.uri,
+                "uri": beginning.request.uri,
                 "kind": beginning.kind[:200],
-                "odometry": beginning.odometry,
-                "seed": beginning.seed,
-                "chosen": None if beginning.chosen is None else dict(beginning.chosen),
+                "odometry": beginning.request.odometry,
+                "seed": beginning.request.seed,
+                "chosen": beginning.request.kept_choices(),
                 "begun_ns": now,
                 "changed_ns": now,
                 **_figures(standing),

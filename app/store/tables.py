@@ -96,7 +96,7 @@ records = Table(
     Column("kind", String(200), nullable=False),
     Column("odometry", String(4096), nullable=False),
     Column("seed", BigInteger, nullable=False),
-    Column("chosen", JSON(none_as_null=True), comment="topics and mounting, see app.sources.source_options"),
+    Column("chosen", JSON(none_as_null=True), comment="topics and mounting, see SourceRequest.kept_choices"),
     Column("begun_ns", BigInteger, nullable=False),
     Column("changed_ns", BigInteger, nullable=False),
     Column("deleted_ns", BigInteger),

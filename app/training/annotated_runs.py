@@ -15,6 +15,7 @@ from app.common.version import version
 from app.robot.source import LiveSource
 from app.sources.odometry import with_odometry
 from app.sources.opening import open_any
+from app.sources.request import SourceRequest
 from app.store.annotated import AnnotatedSource
 from app.store.records import Content
 from app.training.annotated import REACH, SEEN, Judged
@@ -24,7 +25,6 @@ from pipeline.classification.features import NAMES
 from pipeline.classification.forest import PACKAGE
 from pipeline.config import PRESETS, Parameters, preset
 from pipeline.errors import ParameterError, SourceError
-from pipeline.io.readers import SourceOptions
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 
@@ -38,31 +38,29 @@ class AnnotatedRun:
     """A run that people annotated, and how it was mapped then.
 
     Attributes:
-        name, uri, digest: Of its source; seed, odometry: As it was opened.
+        name, digest: Of its source.
+        request: Source, odometry, seed, topics and mounting with which it was mapped.
         parameters: That it was mapped with.
         annotations: In the frame of its map.
     """
 
     name: str
-    uri: str
     digest: str
-    seed: int
-    odometry: str
+    request: SourceRequest
     parameters: Parameters
     annotations: tuple[Content, ...]
 
 
 def annotated_run(source: AnnotatedSource) -> AnnotatedRun:
     """A source of the store with the parameters that it was mapped with, those that this version knows."""
-    start = preset(source.preset if source.preset in PRESETS else "forest")
-    known = {name: value for name, value in source.parameters.items() if name in start.flat()}
+    request = source.request
+    start = preset(request.preset if request.preset in PRESETS else "forest")
+    known = {name: value for name, value in request.parameters.items() if name in start.flat()}
     try:
         parameters = start.replace(known)
     except ParameterError:  # bounds that were wider once
         parameters = start
-    return AnnotatedRun(
-        source.name, source.uri, source.source, source.seed, source.odometry, parameters, source.annotations
-    )
+    return AnnotatedRun(source.name, source.source, request, parameters, source.annotations)
 
 
 def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Examples:
@@ -81,8 +79,9 @@ def _key(run: AnnotatedRun) -> str:
     """What examples hang on: what was recorded, how it is mapped, what was said, what figures there are."""
     told = [
         run.digest,
-        run.seed,
-        run.odometry,
+        run.request.seed,
+        run.request.odometry,
+        run.request.kept_choices(),
         run.parameters.flat(),
         [[a.x, a.y, a.kind] for a in run.annotations],
         [*NAMES, *SEEN, *sorted(REACH.items())],
@@ -92,16 +91,21 @@ def _key(run: AnnotatedRun) -> str:
 
 
 def _looked_through(run: AnnotatedRun, progress: Progress) -> list[Examples]:
-    with closing(open_any(run.uri, SourceOptions(seed=run.seed))) as source:
+    request = run.request
+    with closing(open_any(request.uri, request.options())) as source:
         if isinstance(source, LiveSource):
-            raise SourceError("a robot is not heard again", where=run.uri, remedy="Annotate its recording")
+            raise SourceError(
+                "a robot is not heard again", where=request.uri, remedy="Annotate its recording"
+            )
         known = source.description
         if (known.digest or known.uri) != run.digest:
-            raise SourceError("it is another recording than the one that was annotated", where=run.uri)
-        moving, chosen = with_odometry(source, run.odometry)
+            raise SourceError("it is another recording than the one that was annotated", where=request.uri)
+        moving, chosen = with_odometry(source, request.odometry)
         # Columns and their figures are the same whoever votes on them.
         parameters = run.parameters.replace({"gathering.method": "columns", "gathering.forest": PACKAGE})
-        mapper = Mapper(parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=run.seed)
+        mapper = Mapper(
+            parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=run.request.seed
+        )
         judged = Judged(run.annotations)
         for step in steps(moving.records(), odometry=chosen.steps):
             judged.see(mapper.process(step).columns)

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 
 from app.common.version import version
+from app.sources.request import SourceRequest
 from app.tuning.goal import Goal, GoalName
 from app.tuning.space import Axis
-from app.worker.protocol import Open
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.types.records import TruthTrees
@@ -56,7 +56,7 @@ class PlannedRun(msgspec.Struct, frozen=True):
     truth_name: str = ""
     held_out: bool = False
     annotations: TruthColumns | None = None
-    opened: Open | None = None
+    opened: SourceRequest | None = None
     digest: str = ""
 
 
@@ -119,7 +119,7 @@ def identity(plan: Plan, digests: list[str]) -> dict[str, Any]:
     }
 
 
-def digest_with_truth(digest: str, truth: TruthTrees, opened: Open | None = None) -> str:
+def digest_with_truth(digest: str, truth: TruthTrees, opened: SourceRequest | None = None) -> str:
     """One digest of a source, its truth, and how it is opened where that is not the plan's own way."""
     how = () if opened is None else ([opened.seed, opened.odometry, opened.topics, opened.mount],)
     text = msgspec.json.encode([digest, TruthColumns.of(truth), *how])

@@ -13,12 +13,11 @@ from msgspec import Meta
 
 from app.common.text import count
 from app.robot.address import is_live
-from app.sources.source_options import chosen_again
+from app.sources.request import SourceRequest, request_of_kept
 from app.store.annotated import AnnotatedSource
 from app.tuning.goal import goal_of
 from app.tuning.plan import Plan, PlannedRun, TruthColumns
 from app.tuning.space import axes_of, check
-from app.worker.protocol import Open
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
@@ -59,7 +58,7 @@ class OtherRun(msgspec.Struct, frozen=True):
     records: list[int]
     name: str
     digest: str
-    opened: Open
+    opened: SourceRequest
     annotations: TruthColumns
     why_not: str
 
@@ -96,7 +95,9 @@ def other_runs(
             found[digest].records.append(row["id"])
             continue
         uri = may_be_opened(row["uri"])
-        opened = chosen_again(Open(uri or row["uri"], row["odometry"], row["seed"]), row["chosen"])
+        opened = request_of_kept(
+            uri or row["uri"], odometry=row["odometry"], seed=row["seed"], choices=row["chosen"]
+        )
         said = contents.get(digest, ())
         table = TruthColumns(
             [c.x for c in said], [c.y for c in said], [c.dbh for c in said], [c.kind for c in said]
@@ -111,7 +112,7 @@ def other_runs(
 
 def plan_of(
     asked: SearchAsked,
-    source: Open,
+    source: SourceRequest,
     digest: str,
     truth: TruthTrees | None,
     parameters: Parameters,
@@ -139,7 +140,7 @@ def plan_of(
         raise StemmapError("no true trees are known of this run", remedy="Annotate some in the tab Annotate")
     axes, goal = axes_of(asked.over), goal_of(asked.goal, asked.false_max)
     check(axes, parameters)
-    own = PlannedRun(source.uri, TruthColumns.of(truth), "annotations", opened=source)
+    own = PlannedRun(source.uri, TruthColumns.of(truth), "annotations", opened=source.request())
     return Plan(
         runs=(own, *_planned(asked, others)),
         axes=axes,

@@ -14,13 +14,12 @@ from app.batch.run_totals import far_truth
 from app.common.text import count
 from app.dashboard.ground_truth import contents_of, laid_over
 from app.sources.odometry import with_odometry
-from app.sources.opening import options_of
+from app.sources.request import SourceRequest
 from app.store.records import Annotation
 from app.training.learned_forests import kept_forests
 from app.tuning.goal import RunScore, score_of
 from app.tuning.plan import PlannedRun, digest_with_truth
 from app.worker.mapper_factory import mapper_of
-from app.worker.protocol import Open
 from app.worker.snapshots import Snapshots
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
@@ -98,9 +97,9 @@ class _Drive:
 
     def __init__(self, planned: PlannedRun, seed: int, odometry: str) -> None:
         self.uri, self.held_out = planned.uri, planned.held_out
-        opened = planned.opened or Open(planned.uri, odometry, seed)
+        opened = planned.opened or SourceRequest(planned.uri, odometry, seed)
         self._seed = opened.seed
-        self._source = open_source(planned.uri, options_of(opened))
+        self._source = open_source(planned.uri, opened.options())
         try:
             self._truth = _truth(planned, self._source.truth())
             self._moving, self._chosen = with_odometry(self._source, opened.odometry)

@@ -19,7 +19,6 @@ import msgspec
 
 from app.common.text import COMPILING
 from app.explain.recent_scans import Recent
-from app.sources.opening import options_of
 from app.worker.internal_protocol import (
     Begin,
     FromWorker,
@@ -254,7 +253,7 @@ class Driver:
             command.seed,
             command.record,
             publish=command.publish,
-            options=options_of(command),
+            options=command.options(),
         )
         if opened is not None:
             self._tell_opened(opened)

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from app.sources.request import SourceRequest
+
 # Beyond any run, and well inside of an int64 of nanoseconds.
 LONGEST_S = 1e9
 MOST_SCANS = 10**9
@@ -122,25 +124,16 @@ class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
     step: int | None = None
 
 
-class Open(msgspec.Struct, frozen=True, tag="open"):
-    """Leave the present run and open another source.
+class Open(SourceRequest, frozen=True, tag="open"):
+    """Leave the current run and open this source. Its parameters arrive with `Begin`.
 
     Attributes:
-        uri, odometry, seed: What is mapped, and how.
-        record: Path of the file that a live run is recorded to; empty for none. No browser may say it.
-        publish: Whether a live run's results go back to the robot's network.
-        topics: Topic by role where somebody chose it.
-        mount: Where the LiDAR stands on the robot: x, y, z [m], roll, pitch, yaw [rad]; None: as the source
-            says.
+        record: Path of the file to which a live run is recorded; empty for none. No browser can set it.
+        publish: Whether the results of a live run are published to the robot's network.
     """
 
-    uri: str
-    odometry: str = "auto"
-    seed: int = 0
     record: str = ""
     publish: bool = False
-    topics: dict[str, str] = {}
-    mount: tuple[float, ...] | None = None
 
 
 Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from app.sources.request import SourceRequest
 from app.tuning.sweep.jobs import RunAsked, TruthTable
 from app.tuning.sweep.sensitivity import Question
-from app.worker.protocol import Open, Status
+from app.worker.protocol import Status
 from pipeline.config import Parameters
 from pipeline.config.model import Value
 from pipeline.errors import StemmapError
@@ -12,7 +13,7 @@ from pipeline.types.records import TruthTrees
 
 
 def question_of(
-    source: Open,
+    source: SourceRequest,
     digest: str,
     status: Status,
     truth: TruthTrees | None,
@@ -40,5 +41,7 @@ def question_of(
             "there are no true trees to score by",
             remedy="Judge some trees in the tab Annotate, or import a table",
         )
-    run = RunAsked(source.uri, digest, source.seed, source.odometry or "auto", {}, [], TruthTable.of(truth))
+    mount = source.for_page()["mount"] or []
+    table = TruthTable.of(truth)
+    run = RunAsked(source.uri, digest, source.seed, source.odometry, dict(source.topics), mount, table)
     return Question(run, parameters, name, tuple(values))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Sequence
-from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl, urlencode
@@ -16,18 +15,16 @@ from msgspec import Meta
 from starlette.responses import Response
 
 from app.common.settings import Settings
+from app.sources.request import LONGEST_URI, Role, Seed, SourceRequest, TopicName, mount_of_degrees
 from app.sources.sandbox import ask
-from app.sources.source_options import Role, TopicName
 from app.web.responses import BadRequestError, body_of, error_reply, json_reply
 from app.web.routes.access import Dash
-from app.worker.protocol import LONGEST_S, Advance, Open, Pause, Play, Seek, SetSpeed
+from app.worker.protocol import LONGEST_S, Advance, Pause, Play, Seek, SetSpeed
 from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api")
 
 _MOST_RECORDINGS = 500
-# A path or address; far longer ones are no mistake of typing.
-_LONGEST_URI = 4096
 SHORTEST_LOOP_S = 0.5
 NOT_FROM_AFAR = "from another machine only scenarios and the recordings of the folder can be opened"
 
@@ -36,15 +33,18 @@ _Command = Play | Pause | Advance | Seek | SetSpeed
 
 _Length = Annotated[float, Meta(ge=-100.0, le=100.0)]
 _Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
+_Word = Annotated[str, Meta(max_length=100)]
 
 
 class OpenRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a browser may ask to have opened."""
 
-    uri: Annotated[str, Meta(min_length=1, max_length=_LONGEST_URI)]
+    uri: Annotated[str, Meta(min_length=1, max_length=LONGEST_URI)]
     odometry: Literal["auto", "wheels", "kiss-icp", "static"] = "auto"
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
+    seed: Seed = 0
     topics: dict[Role, TopicName] = {}
+    preset: Annotated[str, Meta(max_length=100)] = ""
+    parameters: Annotated[dict[_Word, bool | int | float | _Word], Meta(max_length=500)] = {}
     #: x, y, z [m], roll, pitch, yaw [degrees] of the LiDAR on the robot.
     mount: tuple[_Length, _Length, _Length, _Angle, _Angle, _Angle] | None = None
 
@@ -52,7 +52,7 @@ class OpenRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class _Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is to be looked into."""
 
-    uri: Annotated[str, Meta(min_length=1, max_length=_LONGEST_URI)]
+    uri: Annotated[str, Meta(min_length=1, max_length=LONGEST_URI)]
 
 
 @router.get("/status")
@@ -97,9 +97,12 @@ async def open_source(request: Request, dashboard: Dash) -> Response:
     uri = what_may_be_opened(wanted.uri, settings)
     if uri is None:
         return _not_from_afar(wanted.uri)
-    mount = None if wanted.mount is None else (*wanted.mount[:3], *map(radians, wanted.mount[3:]))
     topics = {str(role): name for role, name in wanted.topics.items()}
-    await dashboard.open(Open(uri, wanted.odometry, wanted.seed, topics=topics, mount=mount))
+    mount = mount_of_degrees(wanted.mount)
+    request_ = SourceRequest(
+        uri, wanted.odometry, wanted.seed, topics, mount, wanted.preset, wanted.parameters
+    )
+    await dashboard.open(request_)
     return json_reply({}, 202)
 
 

@@ -18,13 +18,12 @@ from app.batch.partial_outputs import unfinished
 from app.batch.run_folders import finished_folders, read_folder
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
-from app.sources.source_options import chosen_again
+from app.sources.request import request_of_kept
 from app.store.book import RunBook
 from app.store.records import UnknownError
 from app.web.responses import BadRequestError, body_of, error_reply, failure_reply, json_reply
 from app.web.routes.access import Dash
 from app.web.routes.run import NOT_FROM_AFAR, what_may_be_opened
-from app.worker.protocol import Open
 
 router = APIRouter(prefix="/api/runs")
 
@@ -126,9 +125,16 @@ async def replay(key: _Key, request: Request, dashboard: Dash) -> Response:
     uri = what_may_be_opened(run["uri"], settings)
     if uri is None:
         return error_reply(403, NOT_FROM_AFAR, where=run["uri"])
-    # Odometry stands in records only; a finished folder was mapped with it or without, as run.json says.
-    wanted = chosen_again(Open(uri, run.get("odometry", "auto"), run["seed"]), run.get("chosen"))
-    await dashboard.replay(wanted, run["preset"], run["parameters"])
+    await dashboard.open(
+        request_of_kept(
+            uri,
+            odometry=run.get("odometry") or "auto",
+            seed=run["seed"],
+            choices=run.get("chosen"),
+            preset=run["preset"],
+            parameters=run["parameters"],
+        )
+    )
     return json_reply({}, 202)
 
 

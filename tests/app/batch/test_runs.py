@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import msgspec
 import numpy as np
 import pytest
 
@@ -16,8 +17,9 @@ from app.dashboard import run_recorder
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.run_recorder import MOST_PATH_POINTS, thinned
 from app.sources import sandbox
-from app.sources.opening import options_of
-from app.sources.source_options import chosen_again, plain_of_options
+from app.sources.request import SourceRequest, request_of_kept, request_of_options
+from app.store.records import Author, Content
+from app.training.annotated_runs import annotated_run
 from app.worker.internal_protocol import Begin, Shown
 from app.worker.protocol import Open
 from pipeline.errors import SourceError, StemmapError
@@ -191,16 +193,45 @@ async def test_a_run_is_played_again_with_its_topics_and_mounting(both: Running)
 
 
 @pytest.mark.parametrize("kept", [None, 7, {"topics": {"lidar": "/x"}}, {"mount": [1]}, {"mount": ["a"] * 6}])
-def test_a_damaged_choice_was_none(kept: object):
-    assert chosen_again(Open("fake:", seed=3), kept) == Open("fake:", seed=3)
+def test_damaged_choices_are_left_out(kept: object):
+    request = request_of_kept("fake:", odometry="auto", seed=3, choices=kept)
+    assert request == SourceRequest("fake:", seed=3)
 
 
-def test_the_choice_of_a_run_without_a_browser_is_kept_as_well():
-    wanted = Open("", topics={"imu": "/imu"}, mount=(1.0, 2.0, 3.0, 0.1, -0.2, 0.3))
-    again = chosen_again(Open(""), plain_of_options(options_of(wanted)))
+def test_the_choices_of_a_run_without_a_browser_are_kept_as_well():
+    wanted = SourceRequest("", topics={"imu": "/imu"}, mount=(1.0, 2.0, 3.0, 0.1, -0.2, 0.3))
+    kept = request_of_options("", wanted.options()).kept_choices()
+    again = request_of_kept("", odometry="auto", seed=0, choices=kept)
     assert again.topics == wanted.topics
     np.testing.assert_allclose(again.mount or (), wanted.mount or ())
-    assert plain_of_options(SourceOptions(seed=5)) is None
+    assert request_of_options("", SourceOptions(seed=5)).kept_choices() is None
+
+
+async def test_learning_uses_topics_mounting_seed_and_odometry_of_the_mapped_run(both: Running) -> None:
+    _, dashboard = both
+    wanted = Open("fake:", "static", 7, {"scan": "/other"}, (0.0, 0.1, 2.0, 0.0, 0.0, 0.5))
+    await play(dashboard, wanted=wanted)
+    run, author = dashboard.annotating.run, Author("b" * 16, "Ann")
+    assert run is not None
+    await dashboard.keeper.ask(lambda store: store.add(run, author, [Content(1.0, 2.0)]))
+    (source,) = await dashboard.keeper.ask(lambda store: store.annotated_sources())
+    state = dashboard.parameters
+    expected = msgspec.structs.replace(
+        wanted.request(), preset=state.preset, parameters=state.parameters.flat()
+    )
+    assert source.request == expected
+    assert annotated_run(source).request == source.request
+
+
+async def test_a_shared_run_is_opened_with_its_parameters(both: Running) -> None:
+    client, dashboard = both
+    body = {"uri": "run.mcap", "seed": 3, "preset": "paper", "parameters": {"clustering.eps": 0.3}}
+    assert (await client.post("/api/open", json=body)).status_code == 202
+    assert dashboard.request == SourceRequest(
+        "run.mcap", seed=3, preset="paper", parameters={"clustering.eps": 0.3}
+    )
+    wrong = {**body, "parameters": {"clustering.eps": -1.0}}
+    assert (await client.post("/api/open", json=wrong)).status_code == 422
 
 
 async def test_from_afar_a_run_of_a_hidden_file_is_not_opened() -> None:

@@ -23,6 +23,7 @@ from app.fleet.frames import Frames
 from app.fleet.names import named
 from app.fleet.server import build_fleet
 from app.fleet.warming import warmed
+from app.sources.request import SourceRequest
 from app.store.book import Beginning
 from app.web.auth import viewer_token
 from app.web.serving import bind
@@ -245,7 +246,9 @@ async def test_a_task_that_had_failed_hinders_no_end(caplog: pytest.LogCaptureFi
 async def test_a_run_that_is_open_in_any_dashboard_is_not_deleted():
     async with served("red", "blue") as (_, fleet), httpx.AsyncClient() as client:
         red, blue = fleet.members.values()
-        blue.dashboard.logbook._page = _Page(Beginning(0, "run", "fake:blue", "fake", "auto", 0), 3, record=7)
+        blue.dashboard.logbook._page = _Page(
+            Beginning(0, "run", "fake", SourceRequest("fake:blue")), 3, record=7
+        )
         for member, words in ((red, "of another robot"), (blue, "is open")):
             place = f"http://127.0.0.1:{member.port}/api/runs/7"
             refused = await client.delete(place, headers={"Authorization": f"Bearer {TOKEN}"})

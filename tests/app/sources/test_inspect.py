@@ -14,7 +14,8 @@ from app.common.settings import Settings
 from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
 from app.sources import inspect
-from app.sources.opening import open_any, options_of
+from app.sources.opening import open_any
+from app.sources.request import SourceRequest
 from app.worker.protocol import Open
 from app.worker.session import Session
 from pipeline.config import Parameters
@@ -117,7 +118,7 @@ async def test_the_choice_goes_to_the_worker(both: Running) -> None:
     assert isinstance(wanted, Open)
     assert wanted.topics == {"scan": "/other", "imu": "/imu"}
     assert wanted.mount == (*MOUNT[:3], *map(radians, MOUNT[3:]))
-    assert dashboard.source == wanted  # a worker that is started again opens the same
+    assert dashboard.source == wanted.request()  # a worker that is started again opens the same
 
 
 @pytest.mark.parametrize(
@@ -146,12 +147,12 @@ async def test_from_afar_nobody_looks_into_the_disk(tmp_path: Path) -> None:
 
 def test_the_choice_decides_what_is_read(run: Path):
     mount = (0.0, 0.0, 2.0, 0.0, 0.0, radians(45.0))
-    source = open_any(str(run), options_of(Open(str(run), mount=mount)))
+    source = open_any(str(run), SourceRequest(str(run), mount=mount).options())
     np.testing.assert_allclose(source.description.T_base_lidar.t, mount[:3])
     assert source.description.T_base_lidar.euler()[2] == pytest.approx(mount[5])
     source.close()
     with pytest.raises(SourceError, match="no topic /other"):
-        open_any(str(run), options_of(Open(str(run), topics={"scan": "/other"})))
+        open_any(str(run), SourceRequest(str(run), topics={"scan": "/other"}).options())
 
 
 def test_a_run_that_failed_is_opened_again_with_the_same_choice():

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from app.sources.request import SourceRequest
 from app.store.book import Beginning, Change, Standing
 from app.store.records import Author, Content, StaleError
 from app.store.store import Store
@@ -52,7 +53,9 @@ def test_annotations_are_kept_and_stale_edits_refused(store: Store, server: str)
 
 def test_runs_are_written_renamed_deleted_and_brought_back(store: Store):
     run = store.open_run("d", "u", "n")
-    record = store.book.begin(Beginning(run, "north", "run.mcap", "rosbag2", "auto", 2**63 - 1), STANDING)
+    record = store.book.begin(
+        Beginning(run, "north", "rosbag2", SourceRequest("run.mcap", "auto", 2**63 - 1)), STANDING
+    )
     store.book.revise(record, Change(1, 0.2, "Ann", "forest", {"clustering.eps": [0.15, 0.2]}))
     store.book.revise(record, Change(2, 0.2, "Ann", "forest", {"clustering.eps": [0.2, 0.3]}))
     store.book.rename(record, "north stand")

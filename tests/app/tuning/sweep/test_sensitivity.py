@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -14,10 +15,11 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
+from app.sources.request import SourceRequest
 from app.tuning.sweep.asking_page import question_of
 from app.tuning.sweep.sensitivity import Question, Sensitivity
 from app.web.auth import viewer_token
-from app.worker.protocol import Open, Status
+from app.worker.protocol import Status
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.types.records import TruthTrees
@@ -182,11 +184,13 @@ TRUTH = TruthTrees(np.zeros(1), np.zeros(1), np.full(1, np.nan), ("tree",))
 def test_a_run_that_cannot_be_scored_says_what_to_do(digest, live, truth, says):
     status = Status(state="playing", live=live)
     with pytest.raises(StemmapError, match=says):
-        question_of(Open("sim:stand"), digest, status, truth, preset("forest"), NAME, [0.1])
+        question_of(SourceRequest("sim:stand"), digest, status, truth, preset("forest"), NAME, [0.1])
 
 
 def test_the_run_that_is_asked_of_is_the_one_that_is_shown():
-    source = Open("sim:stand", "static", 7)
+    source = SourceRequest(
+        "sim:stand", "static", 7, {"scan": "/other"}, (0.1, 0.2, 0.9, 0.0, 0.0, math.pi / 2)
+    )
     made = question_of(source, "d", Status(state="playing"), TRUTH, preset("paper"), NAME, [0.1])
     assert (made.run.uri, made.run.odometry, made.run.seed, made.run.digest) == (
         "sim:stand",
@@ -194,6 +198,7 @@ def test_the_run_that_is_asked_of_is_the_one_that_is_shown():
         7,
         "d",
     )
+    assert (made.run.topics, made.run.mount) == ({"scan": "/other"}, [0.1, 0.2, 0.9, 0.0, 0.0, 90.0])
     assert (
         msgspec.json.decode(msgspec.json.encode(made.run.truth), type=type(made.run.truth)) == made.run.truth
     )
