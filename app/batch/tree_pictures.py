@@ -10,9 +10,8 @@ import numpy as np
 from app.common.draw_picture import drawn
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.readers.base import Source
-from pipeline.io.readers.camera import Camera, nearest
-from pipeline.io.readers.odometry_override import WithMotion
-from pipeline.io.readers.pictures import WithPictures
+from pipeline.io.readers.camera import Camera, WithPictures, nearest
+from pipeline.odometry.odometry_override import WithMotion
 from pipeline.types.records import Bool, Int, Path, Trees
 
 FOLDER = "pictures"

@@ -10,7 +10,7 @@ from app.robot.ros_graph import Publisher
 from pipeline.errors import SourceError
 from pipeline.io.readers.camera import shared_parts
 from pipeline.io.readers.container import Channel
-from pipeline.io.readers.rostypes import (
+from pipeline.io.readers.ros_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMU,

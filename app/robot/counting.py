@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.rostypes import READ_TYPES
+from pipeline.io.readers.ros_messages import READ_TYPES
 
 
 @dataclass(slots=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
-from pipeline.io.readers.rostypes import standard_types
+from pipeline.io.readers.ros_messages import standard_types
 
 _STRING = "string"
 

@@ -22,9 +22,7 @@ from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
-from pipeline.io.readers.live_camera import LiveCamera
-from pipeline.io.readers.live_reader import ArrivalReader
-from pipeline.io.readers.live_recording import camera_topics
+from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
 from pipeline.types.records import Frame, Path, Record, Truth
 
 #: A robot's nodes come up one after another: so long after its LiDAR its topics are counted.

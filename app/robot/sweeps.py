@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.io.readers.rostypes import VELODYNE_SCAN, standard_types
+from pipeline.io.readers.ros_messages import VELODYNE_SCAN, standard_types
 from pipeline.io.readers.velodyne import PACKET_BYTES
 
 #: A longer silence between packets ends a sweep.

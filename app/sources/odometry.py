@@ -8,7 +8,7 @@ from typing import Literal
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source, SourceDescription
-from pipeline.io.readers.odometry_override import Motion, WithMotion
+from pipeline.odometry.odometry_override import Motion, WithMotion
 from pipeline.odometry.synchroniser import OdometryChoice
 
 FILE = "file:"
@@ -88,11 +88,11 @@ def motion_of(known: SourceDescription, choice: str, chosen: Chosen) -> Motion |
         SourceError: A file of poses cannot be read.
     """
     if chosen.method == "kiss-icp":
-        from pipeline.io.readers.lidar_odometry import LidarOdometry
+        from pipeline.odometry.lidar_odometry import LidarOdometry
 
         return LidarOdometry(known.T_base_lidar)
     if chosen.method == "file":
-        from pipeline.io.readers.pose_table import PoseTable
+        from pipeline.odometry.odometry_override import PoseTable
 
         return PoseTable(Path(choice.removeprefix(FILE)).expanduser(), known.T_base_lidar)
     return None
@@ -104,7 +104,7 @@ def with_odometry(source: Source, choice: str) -> tuple[Source, Chosen]:
     Raises:
         SourceError: What is asked for cannot be had of this source.
     """
-    from pipeline.io.readers.digest import digest_of
+    from pipeline.io.readers.base import digest_of
 
     known = source.description
     chosen = choose_odometry(known, choice)

@@ -7,10 +7,9 @@ import msgspec
 from app.robot.source import LiveSource
 from pipeline.errors import StemmapError
 from pipeline.io.readers.base import Source, SourceDescription
-from pipeline.io.readers.camera import SHOWN_NS, Camera, Picture
-from pipeline.io.readers.odometry_override import WithMotion
-from pipeline.io.readers.pictures import WithPictures
-from pipeline.io.readers.rostypes import COMPRESSED_IMAGE, IMAGE
+from pipeline.io.readers.camera import SHOWN_NS, Camera, Picture, WithPictures
+from pipeline.io.readers.ros_messages import COMPRESSED_IMAGE, IMAGE
+from pipeline.odometry.odometry_override import WithMotion
 
 
 class CameraPicture(msgspec.Struct, frozen=True):

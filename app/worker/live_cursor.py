@@ -9,7 +9,7 @@ from app.robot.source import LiveSource
 from app.sources.odometry import Chosen
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
-from pipeline.io.readers.odometry_override import WithMotion
+from pipeline.odometry.odometry_override import WithMotion
 from pipeline.odometry.synchroniser import Joiner
 from pipeline.types.records import Step
 

@@ -10,9 +10,8 @@ from typing import Literal
 import numpy as np
 
 from pipeline.geometry.poses import Pose2, Pose3, wrap_angle
+from pipeline.odometry.buffers import KEEP_NS, STILL, Jump, MeasuredInTime, OdometryInTime, Tilt
 from pipeline.odometry.gyro import Gyro
-from pipeline.odometry.odometry_buffer import KEEP_NS, STILL, Jump, OdometryInTime, Tilt
-from pipeline.odometry.pose_buffer import MeasuredInTime
 from pipeline.types.records import Imu, Learnt, Notice, Odometry, PoseMeasurement, Record, Scan, Step, Turn
 
 OdometryChoice = Literal["auto", "wheels", "static"]

@@ -20,7 +20,7 @@ from zenoh import ext
 from app.robot.ros_graph import ADMIN, PUBLISHER, data_key
 from app.robot.zenoh_link import configuration
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.rostypes import POINT_CLOUD
+from pipeline.io.readers.ros_messages import POINT_CLOUD
 
 _HASH = "RIHS01_0"
 

@@ -12,7 +12,7 @@ Opener = Callable[[str, Path, SourceOptions], Source]
 
 
 def _mcap(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.live_recording import open_live_recording
+    from pipeline.io.readers.live import open_live_recording
     from pipeline.io.readers.mcap_file import open_mcap
     from pipeline.io.readers.ros import open_ros
 
@@ -21,22 +21,22 @@ def _mcap(uri: str, path: Path, options: SourceOptions) -> Source:
 
 
 def _db3(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.db3_file import open_db3
     from pipeline.io.readers.ros import open_ros
+    from pipeline.io.readers.rosbag2 import open_db3
 
     return open_ros(uri, lambda: open_db3(path), [path], options)
 
 
 def _bag(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.bag_file import open_bag
     from pipeline.io.readers.ros import open_ros
+    from pipeline.io.readers.rosbag1 import open_bag
 
     return open_ros(uri, lambda: open_bag(path), [path], options)
 
 
 def _bag_folder(uri: str, folder: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.bag_folder import BagFolder, bag_files
     from pipeline.io.readers.ros import open_ros
+    from pipeline.io.readers.rosbag2 import BagFolder, bag_files
 
     files = bag_files(folder)
     return open_ros(uri, lambda: BagFolder(files), files, options)

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import Container, Message
 from pipeline.io.readers.gnss import LONGEST, Alignment, Fix, align
-from pipeline.io.readers.ordering import Stamped
+from pipeline.io.readers.message_time import Stamped
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.types.records import Odometry
 

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.io.readers.base import SourceOptions
-from pipeline.io.readers.cleaning import POINT_LIMIT, RANGE_LIMIT, clean_scan
 from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT, clean_scan, sensor_of
 from pipeline.io.readers.scan_folder import ScanFileError, ScanFolder, ScanFormat
-from pipeline.io.readers.sensor_inference import sensor_of
 from pipeline.types.records import Scan, Sensor
 
 _ROW = 16

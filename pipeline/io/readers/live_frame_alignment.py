@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.frame_alignment import lever_of
-from pipeline.io.readers.ordering import Stamped
+from pipeline.io.readers.message_time import Stamped
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.types.records import Odometry
 

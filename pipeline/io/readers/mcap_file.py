@@ -13,9 +13,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.chunk_index import BrokenChunkError, Chunk, LastChunk, in_order, tail_ns
-from pipeline.io.readers.container import Channel, Message, count_loss, damaged, ros2_type_name
-from pipeline.io.readers.decompression import UnpackError
+from pipeline.io.readers.container import (
+    BrokenChunkError,
+    Channel,
+    Chunk,
+    LastChunk,
+    Message,
+    UnpackError,
+    count_loss,
+    damaged,
+    in_order,
+    ros2_type_name,
+    tail_ns,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT = 0x03, 0x04, 0x05, 0x06, 0x07, 0x09

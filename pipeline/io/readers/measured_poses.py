@@ -12,7 +12,7 @@ from pipeline.io.readers.base import SourceDescription
 from pipeline.io.readers.container import Container, Message
 from pipeline.io.readers.frame_alignment import MOST_MESSAGES, TimesOf, align_fixes
 from pipeline.io.readers.live_frame_alignment import Kind, LiveStretch
-from pipeline.io.readers.ordering import Stamped
+from pipeline.io.readers.message_time import Stamped
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.topics import Topics
 from pipeline.types.records import Odometry

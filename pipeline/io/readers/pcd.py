@@ -7,12 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.io.readers.base import SourceOptions
-from pipeline.io.readers.cleaning import clean_scan
 from pipeline.io.readers.pcd_file import read_pcd
-from pipeline.io.readers.point_fields import REFLECTANCE, RING, TIME, first_of, is_ring, point_offsets
 from pipeline.io.readers.point_files import Columns
+from pipeline.io.readers.scan_columns import (
+    REFLECTANCE,
+    RING,
+    TIME,
+    clean_scan,
+    first_of,
+    is_ring,
+    point_offsets,
+    sensor_of,
+)
 from pipeline.io.readers.scan_folder import ScanFolder, ScanFormat
-from pipeline.io.readers.sensor_inference import sensor_of
 from pipeline.types.records import Scan
 
 

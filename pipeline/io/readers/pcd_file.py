@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.readers.cleaning import POINT_LIMIT
 from pipeline.io.readers.container import count_loss
 from pipeline.io.readers.lzf import LzfError, lzf_decompress
 from pipeline.io.readers.number_text import parse_numbers
+from pipeline.io.readers.scan_columns import POINT_LIMIT
 from pipeline.io.readers.scan_folder import ScanFileError
 
 FILE_LIMIT = 1 << 30

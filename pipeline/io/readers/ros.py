@@ -13,21 +13,16 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import ros_messages
-from pipeline.io.readers.base import SourceDescription, SourceOptions
-from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture, find_camera
-from pipeline.io.readers.container import Channel, Container, Message, count_loss
-from pipeline.io.readers.decompression import plain_message
-from pipeline.io.readers.digest import digest_of
-from pipeline.io.readers.extrinsics import Mounting
+from pipeline.io.readers.base import SourceDescription, SourceOptions, digest_of
+from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture, RecordedPictures, find_camera
+from pipeline.io.readers.container import Channel, Container, Message, count_loss, plain_message
 from pipeline.io.readers.measured_poses import MeasuredPoses
-from pipeline.io.readers.message_time import Clock, header_stamp
-from pipeline.io.readers.ordering import WINDOW_NS, Stamped, by_stamp
-from pipeline.io.readers.pictures import RecordedPictures
+from pipeline.io.readers.message_time import WINDOW_NS, Clock, Stamped, by_stamp, header_stamp
+from pipeline.io.readers.ros_messages import LASER_SCAN, MessageDecoder
 from pipeline.io.readers.ros_records import RecordDecoder
-from pipeline.io.readers.rostypes import LASER_SCAN, MessageDecoder
-from pipeline.io.readers.sensor_inference import rings_descend, sensor_of
-from pipeline.io.readers.tf_tree import frame_name
+from pipeline.io.readers.scan_columns import rings_descend, sensor_of
 from pipeline.io.readers.topics import Topic, choose_topics
+from pipeline.io.readers.transforms import Mounting, frame_name
 from pipeline.io.readers.truth_file import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.velodyne import SENSORS
 from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth

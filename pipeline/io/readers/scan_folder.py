@@ -11,12 +11,10 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import SourceDescription, SourceOptions
+from pipeline.io.readers.base import SourceDescription, SourceOptions, digest_of
 from pipeline.io.readers.container import count_loss
-from pipeline.io.readers.digest import digest_of
 from pipeline.io.readers.format_detection import named, recordings_in
-from pipeline.io.readers.pose_table import pose_at
-from pipeline.io.readers.poses_file import TextError, read_any_poses, read_times, seconds_ns
+from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns
 from pipeline.types.records import Int, Odometry, Record, Scan, Sensor, Truth
 
 #: Scans of a folder without times are taken to follow each other at 10 Hz.

@@ -8,12 +8,11 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceOptions
-from pipeline.io.readers.cleaning import POINT_LIMIT, clean_scan
 from pipeline.io.readers.container import count_loss
 from pipeline.io.readers.pcd import scan_of
 from pipeline.io.readers.point_files import read_columns
+from pipeline.io.readers.scan_columns import POINT_LIMIT, clean_scan, sensor_of
 from pipeline.io.readers.scan_folder import ScanFileError, ScanFolder, ScanFormat
-from pipeline.io.readers.sensor_inference import sensor_of
 from pipeline.types.records import Scan
 
 _KINDS = {".ply": "PLY", ".npy": "NumPy", ".npz": "NumPy", ".las": "LAS", ".laz": "LAS"}

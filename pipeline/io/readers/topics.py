@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import RecordedTopic
 from pipeline.io.readers.container import Channel
-from pipeline.io.readers.rostypes import (
+from pipeline.io.readers.ros_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,

@@ -12,11 +12,10 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import SourceDescription, SourceOptions
+from pipeline.io.readers.base import SourceDescription, SourceOptions, digest_of
 from pipeline.io.readers.container import count_loss
-from pipeline.io.readers.digest import digest_of
 from pipeline.io.readers.number_text import parse_numbers
-from pipeline.io.readers.poses_file import TextError, read_table
+from pipeline.io.readers.pose_files import TextError, read_table
 from pipeline.io.tree_manager_writer import AXIS, DBH, PLACE, TRAJECTORY
 from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Stems, Truth
 

@@ -8,7 +8,7 @@ import numpy as np
 import velodyne_decoder
 from numpy.typing import NDArray
 
-from pipeline.io.readers.cleaning import clean_scan
+from pipeline.io.readers.scan_columns import clean_scan
 from pipeline.types.records import Scan, Sensor
 
 PACKET_BYTES = 1206

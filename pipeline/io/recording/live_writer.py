@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from mcap.writer import CompressionType, Writer
 
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.live_recording import NAME, PARAMETERS, VERSION
+from pipeline.io.readers.live import NAME, PARAMETERS, VERSION
 from pipeline.io.recording import messages, outputs
 from pipeline.io.recording.quality_of_service import BAG_METADATA, offered_qos_profiles
 

@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 
 from pipeline.errors import SourceError
 from pipeline.io.atomic_files import write_beside
-from pipeline.io.readers.decompression import BLOCK_LIMIT, UnpackError, unpack
+from pipeline.io.readers.container import BLOCK_LIMIT, UnpackError, unpack
 
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")

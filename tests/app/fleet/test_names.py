@@ -10,7 +10,7 @@ from app.robot.address import ROOT, ZenohAddress, parse_address
 from app.robot.choosing import choose
 from app.robot.ros_graph import Publisher
 from app.worker.protocol import Open
-from pipeline.io.readers.rostypes import POINT_CLOUD
+from pipeline.io.readers.ros_messages import POINT_CLOUD
 from tests.app.fleet.test_fleet import make
 from tests.app.robot.conftest import free_port
 

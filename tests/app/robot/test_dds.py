@@ -16,7 +16,7 @@ from app.robot.dds_discovery import DdsGraph, Offer
 from app.robot.ros_graph import Publisher
 from app.robot.source import LiveSource, open_live
 from pipeline.errors import SourceError
-from pipeline.io.readers.rostypes import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
+from pipeline.io.readers.ros_messages import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
 from pipeline.types.records import Odometry, Record, Scan
 from tests.app.robot.conftest import POINTS, SCANS, until
 from tests.app.robot.fast_dds import Peer, messages_of

@@ -30,10 +30,10 @@ from pipeline.errors import StemmapError
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.camera import SHOWN_NS, Picture
 from pipeline.io.readers.container import Message
-from pipeline.io.readers.live_recording import LiveRecording
+from pipeline.io.readers.live import LiveRecording
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.ros import RosSource
-from pipeline.io.readers.rostypes import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.io.recording import write_recording
 from pipeline.io.recording.rendering import CAMERA, with_pictures

@@ -23,7 +23,7 @@ from pipeline.config import Parameters
 from pipeline.io.readers import SourceOptions
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.rostypes import POINT_CLOUD
+from pipeline.io.readers.ros_messages import POINT_CLOUD
 from pipeline.odometry.synchroniser import steps
 from tests.app.fakes import FakeMapper
 from tests.app.robot.conftest import SCANS, until

@@ -15,7 +15,7 @@ from app.robot.ros_graph import Publisher, RosGraph, data_key, publisher_of
 from app.robot.zenoh_link import ZenohLink
 from pipeline.errors import SourceError
 from pipeline.io.readers.container import Message
-from pipeline.io.readers.rostypes import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, TRANSFORMS
+from pipeline.io.readers.ros_messages import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, TRANSFORMS
 
 NAMES = st.from_regex(r"\A[a-z][a-z0-9_]{0,8}\Z")
 

@@ -21,9 +21,9 @@ from app.robot.sweeps import Sweeps
 from app.robot.velodyne_link import NO_DATA, OTHERS
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.live_reader import ArrivalReader
+from pipeline.io.readers.live import ArrivalReader
 from pipeline.io.readers.pcap_packets import find_packets
-from pipeline.io.readers.rostypes import VELODYNE_SCAN, standard_types
+from pipeline.io.readers.ros_messages import VELODYNE_SCAN, standard_types
 from pipeline.io.readers.velodyne import PACKET_BYTES, is_data_packet
 from pipeline.types.records import Record, Scan
 from tests.app.robot.conftest import free_port, until

@@ -23,7 +23,7 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.base import Source, SourceOptions
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.rostypes import IMAGE, NAV_SAT_FIX, POINT_CLOUD
+from pipeline.io.readers.ros_messages import IMAGE, NAV_SAT_FIX, POINT_CLOUD
 from pipeline.io.recording import write_recording
 from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Sensor

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
-from pipeline.io.readers.digest import digest_of
+from pipeline.io.readers.base import digest_of
 
 
 def mcap_bomb() -> bytes:

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import SourceOptions
-from pipeline.io.readers.poses_file import R_LIDAR_CAMERA, read_poses
+from pipeline.io.readers.pose_files import R_LIDAR_CAMERA, read_poses
 from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 

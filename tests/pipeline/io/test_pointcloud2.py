@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipeline.io.readers.pointcloud2 import LayoutError, decode_cloud
 from pipeline.io.readers.ros_messages import PointCloud2
+from pipeline.io.readers.ros_records import LayoutError, decode_cloud
 
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 STAMP_NS = 1_700_000_000_123_456_789

@@ -16,11 +16,10 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.container import Channel
-from pipeline.io.readers.decompression import UnpackError, unpack
-from pipeline.io.readers.ordering import WINDOW_NS, Stamped, by_stamp
-from pipeline.io.readers.rostypes import POINT_CLOUD, MessageDecoder
-from pipeline.io.readers.tf_tree import TransformTree
+from pipeline.io.readers.container import Channel, UnpackError, unpack
+from pipeline.io.readers.message_time import WINDOW_NS, Stamped, by_stamp
+from pipeline.io.readers.ros_messages import POINT_CLOUD, MessageDecoder
+from pipeline.io.readers.transforms import TransformTree
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, STEP_NS, Author, drive, points_of, write_recording

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.vehicle import Car, dead_reckoning
+from pipeline.io.readers.victoria_park import Car, dead_reckoning
 from pipeline.types.records import Float, Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.inventory.cloud import CloudDescription
+from pipeline.io.readers.base import digest_of
 from pipeline.io.readers.clouds.coordinate_offset import is_place, offset_for
-from pipeline.io.readers.digest import digest_of
 from pipeline.types.records import Float32
 
 if TYPE_CHECKING:

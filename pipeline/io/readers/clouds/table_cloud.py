@@ -9,9 +9,9 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.inventory.cloud import CloudDescription
+from pipeline.io.readers.base import digest_of
 from pipeline.io.readers.clouds.coordinate_offset import is_place, offset_for
 from pipeline.io.readers.container import count_loss
-from pipeline.io.readers.digest import digest_of
 from pipeline.io.readers.point_files import Columns, open_table
 from pipeline.io.readers.point_files.table import MISSING
 from pipeline.io.readers.scan_folder import ScanFileError

@@ -9,8 +9,8 @@ from typing import IO, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.readers.cleaning import POINT_LIMIT
 from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.scan_columns import POINT_LIMIT
 from pipeline.io.readers.scan_folder import ScanFileError
 
 Columns = dict[str, NDArray[np.generic]]

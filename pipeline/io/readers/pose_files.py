@@ -175,3 +175,39 @@ def _nearest_rotation(matrix: Float) -> Float:
     U, _, Vt = np.linalg.svd(matrix)
     R: Float = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     return R
+
+
+#: No pose is told for a time that lies farther from the rows [ns].
+_FAR_NS = 1_000_000_000
+
+
+def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
+    """The pose at a time between two rows, that of the nearest row at the ends; None far from any.
+
+    Args:
+        times: Ascending [ns], shape (N,), N >= 1.
+    """
+    after = int(np.searchsorted(times, stamp_ns))
+    before = max(after - 1, 0)
+    after = min(after, len(poses) - 1)
+    if min(abs(int(times[before]) - stamp_ns), abs(int(times[after]) - stamp_ns)) > _FAR_NS:
+        return None
+    span = int(times[after]) - int(times[before])
+    if span <= 0 or not int(times[before]) <= stamp_ns <= int(times[after]):
+        near = before if abs(int(times[before]) - stamp_ns) <= abs(int(times[after]) - stamp_ns) else after
+        return poses[near]
+    return between(poses[before], poses[after], (stamp_ns - int(times[before])) / span)
+
+
+def between(first: Pose3, second: Pose3, fraction: float) -> Pose3:
+    """From one pose to another: the position on a line, the attitude on the great arc (slerp)."""
+    q, p = first.quaternion(), second.quaternion()
+    dot = float(q @ p)
+    if dot < 0.0:
+        p, dot = -p, -dot
+    if dot > 0.9995:
+        mixed = (1.0 - fraction) * q + fraction * p
+    else:
+        angle = np.arccos(min(dot, 1.0))
+        mixed = (np.sin((1.0 - fraction) * angle) * q + np.sin(fraction * angle) * p) / np.sin(angle)
+    return Pose3.from_quaternion((1.0 - fraction) * first.t + fraction * second.t, mixed)

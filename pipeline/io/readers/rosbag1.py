@@ -14,9 +14,19 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.chunk_index import BrokenChunkError, Chunk, LastChunk, in_order, tail_ns
-from pipeline.io.readers.container import Channel, Message, count_loss, damaged, ros2_type_name
-from pipeline.io.readers.decompression import UnpackError
+from pipeline.io.readers.container import (
+    BrokenChunkError,
+    Channel,
+    Chunk,
+    LastChunk,
+    Message,
+    UnpackError,
+    count_loss,
+    damaged,
+    in_order,
+    ros2_type_name,
+    tail_ns,
+)
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_ENTRY, CONNECTION = 2, 3, 4, 5, 6, 7

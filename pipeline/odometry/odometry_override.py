@@ -1,16 +1,86 @@
-"""Poses that stand in a text file as the odometry of a source: TUM rows with times, KITTI rows a scan."""
+"""Odometry that replaces that of a source: poses from a text file, or another estimator."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
+from typing import Protocol
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.poses_file import TextError, read_any_poses
-from pipeline.types.records import Int, Odometry, Record, Scan
+from pipeline.io.readers.base import Source, SourceDescription
+from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses
+from pipeline.types.records import Odometry, Record, Scan, Truth
+
+
+class Motion(Protocol):
+    """Tells the motion of a source whose records it is given one by one.
+
+    Attributes:
+        losses: What got no pose, by reason.
+    """
+
+    losses: dict[str, int]
+
+    def add(self, record: Record) -> Iterator[Record]:
+        """The records that stand for one."""
+
+    def end(self) -> None:
+        """Every record from the first to the last was given."""
+
+
+class WithMotion:
+    """A source (see `Source`) through which the records of another go on their way.
+
+    Args:
+        source: Closed with this one.
+        motion: Tells the odometry.
+        digest: Of what else is read; "" for nothing.
+
+    Attributes:
+        source: As given.
+    """
+
+    def __init__(self, source: Source, motion: Motion, digest: str = "") -> None:
+        self.source, self._motion = source, motion
+        self._digest = digest
+
+    @property
+    def description(self) -> SourceDescription:
+        """As the source's own, with odometry."""
+        known = self.source.description
+        digest = f"{known.digest}+{self._digest}" if self._digest else known.digest
+        return replace(known, has_odometry=True, digest=digest)
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was left out, by reason."""
+        total = dict(self.source.losses)
+        for reason, count in self._motion.losses.items():
+            count_loss(total, reason, count)
+        return total
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """Yield records in the order of time."""
+        for record in self.source.records(start_ns):
+            yield from self._motion.add(record)
+        if start_ns is None:
+            self._motion.end()
+
+    def pass_on(self, record: Record) -> Iterator[Record]:
+        """The records that stand for one of the source, where somebody else reads it (live)."""
+        return self._motion.add(record)
+
+    def truth(self) -> Truth | None:
+        """That of the source."""
+        return self.source.truth()
+
+    def close(self) -> None:
+        """Close the source."""
+        self.source.close()
+
 
 #: Rows without times, counted against the scans that could be read.
 TOO_MANY = "rows of poses without a scan; if scans are missing between others, later ones have wrong poses"
@@ -70,39 +140,3 @@ class PoseTable:
             return pose_at(self._times, self._poses, stamp_ns)
         row = self._row_of.setdefault(stamp_ns, len(self._row_of))
         return self._poses[row] if row < len(self._poses) else None
-
-
-#: No pose is told for a time that lies farther from the rows [ns].
-_FAR_NS = 1_000_000_000
-
-
-def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
-    """The pose at a time between two rows, that of the nearest row at the ends; None far from any.
-
-    Args:
-        times: Ascending [ns], shape (N,), N >= 1.
-    """
-    after = int(np.searchsorted(times, stamp_ns))
-    before = max(after - 1, 0)
-    after = min(after, len(poses) - 1)
-    if min(abs(int(times[before]) - stamp_ns), abs(int(times[after]) - stamp_ns)) > _FAR_NS:
-        return None
-    span = int(times[after]) - int(times[before])
-    if span <= 0 or not int(times[before]) <= stamp_ns <= int(times[after]):
-        near = before if abs(int(times[before]) - stamp_ns) <= abs(int(times[after]) - stamp_ns) else after
-        return poses[near]
-    return between(poses[before], poses[after], (stamp_ns - int(times[before])) / span)
-
-
-def between(first: Pose3, second: Pose3, fraction: float) -> Pose3:
-    """From one pose to another: the position on a line, the attitude on the great arc (slerp)."""
-    q, p = first.quaternion(), second.quaternion()
-    dot = float(q @ p)
-    if dot < 0.0:
-        p, dot = -p, -dot
-    if dot > 0.9995:
-        mixed = (1.0 - fraction) * q + fraction * p
-    else:
-        angle = np.arccos(min(dot, 1.0))
-        mixed = (np.sin((1.0 - fraction) * angle) * q + np.sin(fraction * angle) * p) / np.sin(angle)
-    return Pose3.from_quaternion((1.0 - fraction) * first.t + fraction * second.t, mixed)

@@ -1,0 +1,487 @@
+"""Live runs: messages in the order of arrival, their camera, and their recording read again."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from pipeline.errors import SourceError
+from pipeline.io.readers.base import RecordedTopic, Revision, SourceDescription, SourceOptions, digest_of
+from pipeline.io.readers.camera import (
+    SAME_TIME_NS,
+    Camera,
+    Picture,
+    RecordedPictures,
+    find_camera,
+    picture_of,
+    time_beside,
+)
+from pipeline.io.readers.container import Channel, Container, Message, count_loss
+from pipeline.io.readers.mcap_file import McapFile, open_mcap
+from pipeline.io.readers.message_time import SECOND_NS, SteppingClock, header_stamp
+from pipeline.io.readers.ros import RosSource
+from pipeline.io.readers.ros_messages import CAMERA_INFO, MessageDecoder, standard_types
+from pipeline.io.readers.topics import TYPES_BY_ROLE, Topic
+from pipeline.io.readers.transforms import Mounting
+from pipeline.types.records import Notice, Record, Truth
+
+#: So long after the first scan, or after so many, it is clear which topics speak and where the LiDAR stands.
+OPENING_NS = SECOND_NS
+OPENING_SCANS = 10
+#: So many messages are kept while no scan comes.
+OPENING_LIMIT = 4000
+_TRIES = 5
+
+
+class Heard:
+    """Some messages that came as a container."""
+
+    damage: dict[str, int]
+
+    def __init__(self, kind: str, channels: Sequence[Channel], messages: Sequence[Message]) -> None:
+        self.kind, self.damage = kind, {}
+        self._messages = messages
+        counts = {channel.number: 0 for channel in channels}
+        for message in messages:
+            counts[message.channel] += 1
+        self.channels = [replace(channel, count=counts[channel.number]) for channel in channels]
+
+    def tail_ns(self, numbers: Collection[int]) -> int:
+        """See Container."""
+        return max((m.log_ns for m in self._messages if m.channel in numbers), default=0)
+
+    def messages(
+        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
+    ) -> Iterator[Message]:
+        """See Container."""
+        del losses
+        for message in self._messages:
+            if message.channel in numbers and (start_ns is None or message.log_ns >= start_ns):
+                yield message
+
+    def attachment(self, name: str, limit: int) -> bytes | None:
+        """There is none."""
+        del name, limit
+        return None
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+class ArrivalReader:
+    """Turns messages into records, one by one.
+
+    Args:
+        uri, kind: Of the source, for people.
+        channels: That may come.
+        options: What the user knows better.
+
+    Attributes:
+        description: None until a second after the first scan, or ten scans.
+        losses: What was left out so far, by reason.
+        from_ns: What lies before this time is not decoded; None decodes all.
+    """
+
+    def __init__(self, uri: str, kind: str, channels: Sequence[Channel], options: SourceOptions) -> None:
+        self._uri, self._kind, self._channels, self._options = uri, kind, channels, options
+        self._scans = {c.number for c in channels if c.msgtype in TYPES_BY_ROLE["scan"]}
+        self._fixed = {c.number for c in channels if c.topic.endswith("tf_static")}
+        self._opening: list[Message] = []
+        self._first_ns: int | None = None
+        self._scan_ns = 0
+        self._heard = 0
+        self._failures = 0
+        self._source: RosSource | None = None
+        self._clock: SteppingClock | None = None
+        self.description: SourceDescription | None = None
+        self.losses: dict[str, int] = {}
+        self.from_ns: int | None = None
+
+    @property
+    def offset_ns(self) -> int:
+        """Stamp minus arrival of the first scan [ns]; 0 before the description is known."""
+        known = self.description
+        return 0 if known is None or known.start_ns is None else known.start_ns - self._scan_ns
+
+    @property
+    def base(self) -> str:
+        """The name of the base frame, "" where nobody says it."""
+        return "" if self._source is None else self._source.base
+
+    def add(self, message: Message) -> list[Record]:
+        """Take the next message; the records that are known by it.
+
+        Raises:
+            SourceError: There are scans and none can be read.
+        """
+        if self._source is not None:
+            return self._records_of(message)
+        self._opening.append(message)
+        if message.channel in self._scans:
+            self._scan_ns = self._scan_ns or message.log_ns
+            self._heard += 1
+            self._first_ns = message.log_ns if self._first_ns is None else self._first_ns
+        if len(self._opening) > OPENING_LIMIT:
+            self._forget_oldest()
+        if self._first_ns is None:
+            return []
+        if self._heard < OPENING_SCANS and message.log_ns < self._first_ns + OPENING_NS:
+            return []
+        return self._open(message.log_ns)
+
+    def finish(self) -> list[Record]:
+        """No more messages will come: what the opening held, where it was not over.
+
+        Raises:
+            SourceError: As `add`.
+        """
+        if self._source is not None or self._first_ns is None:
+            return []
+        self._failures = _TRIES
+        return self._open(self._first_ns)
+
+    def _forget_oldest(self) -> None:
+        """Of the oldest half only the fixed transforms stay, which are said once, and the scans."""
+        half, kept = len(self._opening) // 2, self._fixed | self._scans
+        old = [message for message in self._opening[:half] if message.channel in kept]
+        self._opening[:half] = old[-half // 2 :]
+
+    def _open(self, now_ns: int) -> list[Record]:
+        clocks: list[SteppingClock] = []
+
+        def make_clock(offsets_ns: list[int | None]) -> SteppingClock:
+            clocks.append(SteppingClock(offsets_ns))
+            return clocks[-1]
+
+        heard = Heard(self._kind, self._channels, self._opening)
+        try:
+            source = RosSource(self._uri, heard, [], self._options, make_clock, live=True)
+        except SourceError:
+            self._failures += 1
+            if self._failures >= _TRIES:
+                raise
+            self._first_ns, self._heard = now_ns, 0  # a second more
+            return []
+        self._source = source
+        # What the opening looked at must not count for the run, which begins anew with its first message.
+        self._clock = SteppingClock(clocks[-1].offsets_ns)
+        source.use_clock(self._clock)
+        known = source.description
+        self.description = replace(known, scans=None, end_ns=None, digest="", in_order_of_arrival=True)
+        opening, self._opening = self._opening, []
+        return [record for message in opening for record in self._records_of(message)]
+
+    def _records_of(self, message: Message) -> list[Record]:
+        assert self._source is not None  # noqa: S101 - the two callers have looked
+        assert self._clock is not None  # noqa: S101 - set with it
+        records = list(self._source.records_of(message, self.losses, self.from_ns))
+        told = [*self._clock.notices, *self._source.notices]
+        if told:
+            stamp_ns = records[0].stamp_ns if records else 0
+            records = [*(Notice(stamp_ns, text) for text in told), *records]
+            self._clock.notices.clear()
+            self._source.notices.clear()
+        return records
+
+
+#: So many pictures are held, and no more bytes of them: a paused run can still show its scan.
+MOST_PICTURES, MOST_BYTES = 60, 64 << 20
+_MOST_FIXED, _LARGEST_TOLD = 200, 64 << 10
+
+
+class LiveCamera:
+    """Takes the messages of a camera one by one, see `app.robot.source`.
+
+    Args:
+        channels: Of the pictures first, then of their CameraInfo, if there is one.
+        fixed: Of fixed transforms.
+    """
+
+    def __init__(self, channels: Sequence[Channel], fixed: Sequence[Channel]) -> None:
+        self._pictures_of, self._infos = channels[0], [c for c in channels if c.msgtype == CAMERA_INFO]
+        self._channels = {channel.number: channel for channel in (*channels, *fixed)}
+        self._numbers = {channel.number for channel in channels}
+        self._decoder = MessageDecoder(self._channels.values())
+        self._held: deque[tuple[int | None, Message]] = deque()
+        self._bytes = 0
+        self._fixed: list[Message] = []
+        self._info: Message | None = None
+        self._found: tuple[str, Camera | None, str] | None = None
+
+    def add(self, message: Message) -> bool:
+        """Take a message, whatever it is of; whether it is of the camera alone."""
+        number = message.channel
+        if number not in self._numbers:
+            if number in self._channels and len(self._fixed) < _MOST_FIXED:
+                self._keep_fixed(message)
+            return False
+        if number == self._pictures_of.number:
+            self._held.append((header_stamp(self._pictures_of, message.payload), message))
+            self._bytes += len(message.payload)
+            while len(self._held) > MOST_PICTURES or self._bytes > MOST_BYTES:
+                self._bytes -= len(self._held.popleft()[1].payload)
+        elif len(message.payload) <= _LARGEST_TOLD and (self._info is None or self._is_other(message)):
+            self._info, self._found = message, None
+        return True
+
+    def camera(self, base: str) -> tuple[Camera | None, str]:
+        """How it stands on the robot; None and why where nobody tells.
+
+        Args:
+            base: The name of the base frame.
+        """
+        if self._found is None or self._found[0] != base:
+            told = [*self._fixed, *([] if self._info is None else [self._info])]
+            heard = Heard("", list(self._channels.values()), told)
+            self._found = (base, *placed(heard, self._decoder, self._pictures_of.number, base))
+        return self._found[1:]
+
+    def near(self, stamp_ns: int, offset_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The held picture that was taken nearest to a time, None where that is farther from it.
+
+        Args:
+            stamp_ns: The time.
+            offset_ns: Stamp minus arrival of the run's first scan.
+            within_ns: So far from it at most.
+        """
+        times = [(time_beside(stamp, m.log_ns, offset_ns), k) for k, (stamp, m) in enumerate(self._held)]
+        taken_ns, k = min(times, key=lambda each: abs(each[0] - stamp_ns), default=(0, -1))
+        if k < 0 or abs(taken_ns - stamp_ns) > within_ns:
+            return None
+        return picture_of(self._held[k][1], self._channels, self._decoder, taken_ns)
+
+    def _is_other(self, info: Message) -> bool:
+        """Whether it tells another thing than the one that is known, but for its time."""
+        head = 12  # of CDR: what the bytes mean, and the stamp
+        return self._info is None or info.payload[head:] != self._info.payload[head:]
+
+    def _keep_fixed(self, message: Message) -> None:
+        known = {each.payload for each in self._fixed}
+        if len(message.payload) <= _LARGEST_TOLD and message.payload not in known:
+            self._fixed.append(message)
+            self._found = None
+
+
+def placed(
+    container: Container, decoder: MessageDecoder, pictures: int, base: str
+) -> tuple[Camera | None, str]:
+    """How the camera of a channel stands, from the fixed transforms and CameraInfo beside it; None and why.
+
+    Args:
+        pictures: The channel's number.
+    """
+    mounting = Mounting(container, decoder)
+    fixed = [c for c in container.channels if c.topic.endswith("tf_static")]
+    mounting.read([Topic(c.topic, c.msgtype, frozenset((c.number,)), c.count) for c in fixed], ())
+    return find_camera(container, decoder, mounting.tree, base, frozenset((pictures,)))
+
+
+NAME, PARAMETERS, VERSION = "stemmap_live.json", "/stemmap/parameters", 1
+KIND = "recording of a live run"
+_LIMIT = 1 << 20
+_MOST_TOPICS = 100
+_MOST_REVISIONS = 10_000
+
+
+class Told(msgspec.Struct, frozen=True):
+    """What the recorder said of the run.
+
+    Attributes:
+        version: Of this form.
+        uri: The robot's address.
+        topics: That were read, in the order of their numbers; the first one is of the scans.
+        seed, odometry, preset: As the run had them.
+        camera: Topics of pictures and of what tells of them, of which no map is made.
+    """
+
+    version: int
+    uri: str
+    topics: list[str]
+    seed: int = 0
+    odometry: str = "auto"
+    preset: str = "forest"
+    camera: list[str] = []
+
+
+def told_of(container: McapFile, where: str) -> Told | None:
+    """What the recorder said; None where the file is another recording.
+
+    Raises:
+        SourceError: It is damaged or of a newer form.
+    """
+    content = container.attachment(NAME, _LIMIT)
+    if content is None:
+        return None
+    try:
+        told = msgspec.json.decode(content, type=Told)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise SourceError(f"what the recorder said cannot be read: {error}", where=where) from error
+    if told.version != VERSION or not 0 < len(told.topics) + len(told.camera) <= _MOST_TOPICS:
+        raise SourceError("the recording is of a newer version of stemmap", where=where)
+    return told
+
+
+class LiveRecording:
+    """A live run, read again.
+
+    Args:
+        uri: As the user wrote it.
+        container: The file; the source closes it.
+        told: What the recorder said.
+        path: Of the file, for the digest.
+        options: Mounting, where the user knows better.
+
+    Raises:
+        SourceError: There is no scan in it that can be read.
+    """
+
+    def __init__(self, uri: str, container: McapFile, told: Told, path: Path, options: SourceOptions) -> None:
+        self._uri, self._container, self._told = uri, container, told
+        self._options = replace(options, topics={"scan": told.topics[0], **options.topics})
+        self._channels = _channels(container, told, uri)
+        self._losses: dict[str, int] = {}
+        self._base, self._offset_ns = "", 0
+        self._placed: tuple[Camera | None, str] | None = None
+        camera = [c for c in container.channels if c.topic in told.camera]
+        self._camera = tuple(replace(c, definition="", definition_format="") for c in camera)
+        self.description = self._describe(path)
+        self._recorded = RecordedPictures(
+            container,
+            MessageDecoder(self._camera),
+            {channel.number: channel for channel in self._camera},
+            frozenset(c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]),
+            lambda stamp_ns, message: time_beside(stamp_ns, message.log_ns, self._offset_ns),
+            self._offset_ns,
+        )
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was left out when opening and in the latest reading, by reason."""
+        return {**self._container.damage, **self._losses}
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """Yield records in the order in which they came; what lies before `start_ns` is not decoded."""
+        reader = self._reader()
+        self._losses = reader.losses
+        reader.from_ns = start_ns
+        numbers = [channel.number for channel in self._channels]
+        for message in self._container.messages(numbers, None, reader.losses):
+            yield from reader.add(message)
+        yield from reader.finish()
+
+    def truth(self) -> Truth | None:
+        """Nobody knows."""
+        return None
+
+    def camera(self) -> tuple[Camera | None, str]:
+        """How the camera stands; None and why where nobody tells, or there is none ("")."""
+        if self._placed is None:  # it is asked for with each picture
+            pictures = [c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
+            self._placed = None, ""
+            if pictures:
+                self._placed = placed(self._container, MessageDecoder(()), pictures[0], self._base)
+        return self._placed
+
+    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """The picture that was taken nearest to a time, None where none is within `within_ns` of it."""
+        return self._recorded.near(stamp_ns, within_ns)
+
+    def picture_stamps(self) -> list[int]:
+        """When the pictures were taken, ascending [ns]."""
+        return self._recorded.stamps()
+
+    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
+        """The pictures that were taken at some of `picture_stamps`, each once."""
+        return self._recorded.at(wanted_ns)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
+
+    def _reader(self) -> ArrivalReader:
+        return ArrivalReader(self._uri, KIND, self._channels, self._options)
+
+    def _describe(self, path: Path) -> SourceDescription:
+        reader = self._reader()
+        numbers = [channel.number for channel in self._channels]
+        for message in self._container.messages(numbers, None, {}):
+            reader.add(message)
+            if reader.description is not None:
+                break
+        else:
+            reader.finish()
+        known = reader.description
+        self._base, self._offset_ns = reader.base, reader.offset_ns
+        if known is None:
+            raise SourceError("there is no scan in it", where=self._uri, remedy="Record the LiDAR's topic.")
+        scans = {c.number: c.count for c in self._container.channels if c.topic == self._told.topics[0]}
+        first_ns = next((m.log_ns for m in self._container.messages(scans, None, {})), 0)
+        tail_ns = self._container.tail_ns(scans)
+        last_ns = max((m.log_ns for m in self._container.messages(scans, tail_ns, {})), default=first_ns)
+        cut = (
+            ("the recording is cut or damaged: only what is whole is read",) if self._container.damage else ()
+        )
+        return replace(
+            known,
+            scans=sum(scans.values()),
+            end_ns=(known.start_ns or 0) + last_ns - first_ns,
+            digest=digest_of([path]),
+            preset=self._told.preset,
+            warnings=(*known.warnings, *cut),
+            revisions=tuple(self._revisions()),
+            topics=(*known.topics, *camera_topics(self._camera)),
+        )
+
+    def _revisions(self) -> Iterator[Revision]:
+        """The parameters that the run was mapped with; what is damaged is passed over."""
+        numbers = [c.number for c in self._container.channels if c.topic == PARAMETERS]
+        types: Any = standard_types("cdr")
+        for count, message in enumerate(self._container.messages(numbers, None, {})):
+            if count >= _MOST_REVISIONS or len(message.payload) > _LIMIT:
+                break
+            try:
+                text = types.deserialize_cdr(message.payload, "std_msgs/msg/String").data
+                yield msgspec.json.decode(text, type=Revision)
+            except Exception:  # whatever the generated decoders of rosbags raise
+                count_loss(self._losses, "revisions of the parameters that cannot be read")
+
+
+def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
+    """The topics of a live run's camera, for people."""
+    return tuple(RecordedTopic(c.topic, c.msgtype, c.count, "camera", "") for c in channels)
+
+
+def _channels(container: McapFile, told: Told, where: str) -> list[Channel]:
+    """The robot's channels as the live run had them: numbered in the order of their choice."""
+    by_topic = {channel.topic: channel for channel in container.channels}
+    missing = [topic for topic in told.topics if topic not in by_topic]
+    if missing:
+        raise SourceError(f"the recording lacks the topic {missing[0][:100]}", where=where)
+    channels = [by_topic[topic] for topic in told.topics]
+    if channels[0].msgtype not in TYPES_BY_ROLE["scan"]:
+        raise SourceError("the recording's first topic is of no scans", where=where)
+    # The live run had no definitions but the standard ones.
+    return [replace(channel, definition="", definition_format="", count=0) for channel in channels]
+
+
+def open_live_recording(uri: str, path: Path, options: SourceOptions) -> LiveRecording | None:
+    """Open an MCAP as the recording of a live run; None where it is another one.
+
+    Raises:
+        SourceError: It is one and cannot be read.
+    """
+    container = open_mcap(path)
+    try:
+        told = told_of(container, uri)
+        if told is not None:
+            return LiveRecording(uri, container, told, path, options)
+    except BaseException:
+        container.close()
+        raise
+    container.close()
+    return None

@@ -1,0 +1,200 @@
+"""From decoded columns to a Scan: units of columns, invalid returns, the sensor by its first scan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.types.records import Float, Float32, Int, Int32, Scan, Sensor
+
+#: Most points that one scan may have; a 128-ring sensor at 5 Hz gives 480,000.
+POINT_LIMIT = 16_000_000
+#: No LiDAR sees farther; such a number is a damaged one, and it would overflow in the stages.
+RANGE_LIMIT = 10_000.0
+#: Drivers write (0, 0, 0) for a beam without a return; nothing real is seen at 1 mm.
+NEAR_LIMIT = 1e-3
+
+
+def clean_scan(
+    stamp_ns: int,
+    points: NDArray[np.floating],
+    *,
+    reflectance: NDArray[np.generic] | None = None,
+    ring: NDArray[np.generic] | None = None,
+    offset_ns: NDArray[np.generic] | None = None,
+    dropped: int = 0,
+) -> Scan:
+    """Make a Scan of points of shape (N, 3) [m] and their columns of shape (N,).
+
+    Rows that are not finite, beyond 10 km, or at the origin are no returns: they are left out and
+    added to `dropped`.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        xyz = np.ascontiguousarray(points, dtype=np.float32)
+        # Column by column: reducing rows of three is ten times slower.
+        x, y, z = np.abs(xyz.T)
+        reach = np.maximum(np.maximum(x, y), z)
+        keep = (reach > NEAR_LIMIT) & (reach < RANGE_LIMIT)
+    refused = int(len(keep) - np.count_nonzero(keep))
+    if refused:
+        xyz = xyz[keep]
+
+    def column(values: NDArray[np.generic] | None) -> NDArray[np.generic] | None:
+        return values if values is None or not refused else values[keep]
+
+    return Scan(
+        stamp_ns,
+        xyz,
+        _as_float(column(reflectance)),
+        _as_int(column(ring)),
+        _as_int(column(offset_ns)),
+        dropped + refused,
+    )
+
+
+def _as_float(values: NDArray[np.generic] | None) -> Float32 | None:
+    if values is None:
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):
+        column = np.ascontiguousarray(values, dtype=np.float32)
+    return np.nan_to_num(column, copy=False) if not np.isfinite(column).all() else column
+
+
+def _as_int(values: NDArray[np.generic] | None) -> Int32 | None:
+    return None if values is None else np.ascontiguousarray(values, dtype=np.int32)
+
+
+REFLECTANCE = ("intensity", "intensities", "reflectivity", "reflectance", "i")
+RING = ("ring", "channel", "laser_id", "line")
+TIME = ("t", "time", "timestamp", "time_offset", "offset_time")
+RING_LIMIT = 1024
+OFFSET_LIMIT_NS = 2_000_000_000
+
+
+def first_of(
+    columns: Mapping[str, NDArray[np.generic]], names: tuple[str, ...]
+) -> NDArray[np.generic] | None:
+    """The column with the first of these names that is there, None when none is."""
+    return next((columns[name] for name in names if name in columns), None)
+
+
+def is_ring(ring: NDArray[np.generic]) -> bool:
+    """Whether a column numbers lasers: whole numbers from 0 to less than RING_LIMIT."""
+    if ring.dtype.kind not in "iu" or not len(ring):
+        return False
+    return int(ring.min()) >= 0 and int(ring.max()) < RING_LIMIT
+
+
+def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | None:
+    """Times of points relative to the stamp [ns], shape (N,), or None when they make no sense.
+
+    Integers are nanoseconds; floating numbers are seconds after the stamp, or since 1970 in the unit
+    that their size tells. Times that do not lie within 2 s of the stamp make no sense.
+    """
+    if not len(time):
+        return None
+    if time.dtype.kind in "iu":
+        ns = time.astype(np.int64)
+        ns = ns - stamp_ns if abs(int(ns[0])) > 10**15 else ns
+    else:
+        with np.errstate(invalid="ignore"):
+            seconds = time.astype(np.float64)
+        finite = np.isfinite(seconds)
+        if not finite.all():
+            seconds[~finite] = 0.0
+        unit = _unit(float(np.abs(seconds).max()))
+        since = stamp_ns if unit is not None else 0
+        # Subtract the whole second first: a double cannot hold nanoseconds since 1970.
+        whole = since // 1_000_000_000
+        scale = unit or 1.0
+        with np.errstate(over="ignore"):
+            seconds = (seconds - whole / scale) * scale
+            ns = np.clip(seconds * 1e9, -1e18, 1e18).astype(np.int64) - (since - whole * 10**9)
+    return ns if int(np.abs(ns).max()) <= OFFSET_LIMIT_NS else None
+
+
+def _unit(largest: float) -> float | None:
+    """Seconds in one unit of times since 1970, None when they are relative."""
+    for limit, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
+        if largest > limit:
+            return unit
+    return None
+
+
+#: Fewer points than this in a ring say nothing about its elevation.
+_RING_POINTS = 8
+VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.03, 100.0)
+
+
+def sensor_of(scan: Scan) -> Sensor:
+    """Rings, their step and the step of the azimuth as the scan shows them.
+
+    Without a ring column only a VLP-16 is recognised, by its elevations; else `rings` is 0.
+    """
+    if len(scan.points) < 100:
+        return Sensor(range_sigma=0.03)
+    if scan.ring is None:
+        return VLP_16 if _in_steps_of_vlp_16(scan) else Sensor(range_sigma=0.03)
+    rings = int(scan.ring.max()) + 1
+    elevation = _elevations(scan)
+    steps = np.abs(np.diff(elevation[np.isfinite(elevation)]))
+    ring_step = float(np.median(steps)) if len(steps) else 0.0
+    azimuth_step = _azimuth_step(scan)
+    name = {
+        1: "planar laser",
+        16: "16-ring LiDAR",
+        32: "32-ring LiDAR",
+        64: "64-ring LiDAR",
+        128: "128-ring LiDAR",
+    }
+    return Sensor(
+        name.get(rings, "LiDAR"), rings, ring_step, azimuth_step or Sensor().azimuth_step, range_sigma=0.03
+    )
+
+
+def _in_steps_of_vlp_16(scan: Scan) -> bool:
+    """Whether nearly all returns lie at odd degrees of elevation from -15 to 15, in four rings or more."""
+    points = scan.points.astype(np.float64)
+    reach = np.hypot(points[:, 0], points[:, 1])
+    # The lasers stand up to 11 mm above and below the centre, which blurs the angles near by.
+    degrees = np.degrees(np.arctan2(points[:, 2], reach))[reach > 3.0]
+    if len(degrees) < 100:
+        return False
+    nearest = 2.0 * np.floor(degrees / 2.0) + 1.0
+    fitting = (np.abs(degrees - nearest) < 0.2) & (np.abs(nearest) <= 15.0)
+    return float(np.mean(fitting)) > 0.95 and len(np.unique(nearest[fitting])) >= 4
+
+
+def rings_descend(scan: Scan) -> bool:
+    """Whether ring 0 looks highest, as some drivers number them."""
+    elevation = _elevations(scan) if scan.ring is not None and len(scan.points) else np.zeros(0)
+    elevation = elevation[np.isfinite(elevation)]
+    return len(elevation) >= 2 and float(np.median(np.diff(elevation))) < 0.0
+
+
+def _elevations(scan: Scan) -> Float:
+    """Median elevation [rad] by ring, NaN for rings with few points, shape (rings,)."""
+    ring = np.asarray(scan.ring, dtype=np.int64)
+    points = scan.points.astype(np.float64)
+    angle = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    found = np.full(int(ring.max()) + 1, np.nan)
+    for number in np.unique(ring):
+        members: Int = np.flatnonzero(ring == number)
+        if len(members) >= _RING_POINTS:
+            found[number] = np.median(angle[members])
+    return found
+
+
+def _azimuth_step(scan: Scan) -> float:
+    """Median angle between neighbouring returns of a ring [rad], 0 when it cannot be told."""
+    steps = []
+    ring = np.asarray(scan.ring)
+    azimuth = np.arctan2(scan.points[:, 1].astype(np.float64), scan.points[:, 0].astype(np.float64))
+    for number in np.unique(ring):
+        gaps = np.diff(np.sort(azimuth[ring == number]))
+        # Two returns of one shot share their azimuth; gaps of 2 degrees are holes.
+        steps.append(gaps[(gaps > 2e-4) & (gaps < 0.035)])
+    gaps = np.concatenate(steps) if steps else np.zeros(0)
+    return float(np.median(gaps)) if len(gaps) >= _RING_POINTS else 0.0
