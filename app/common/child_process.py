@@ -1,0 +1,325 @@
+"""Child processes that exchange lines of JSON with the process that started them.
+
+The parent starts `python -m MODULE` without a shell, writes one JSON value per line to the child's standard
+input and reads one JSON value per line from its standard output. A child ends when its standard input does,
+so that it never outlives its parent. The parent limits the length of a line and the time that it waits; a
+child that reads files from outside limits its own memory.
+
+The parent uses `ChildProcess` on an event loop and `BlockingChildProcess` in a thread; the child's program is
+a function that is passed to `run_child`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from typing import BinaryIO, NoReturn, TypeVar
+
+import msgspec
+
+from pipeline.errors import StemmapError
+
+T = TypeVar("T")
+
+#: Default limit of a line [bytes].
+LINE_LIMIT = 16 << 20
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class ProtocolError(StemmapError):
+    """A child process sent a line that is too long or is not the expected JSON."""
+
+
+def python_module(name: str, *arguments: str) -> tuple[str, ...]:
+    """The command that runs a module of this program in another Python process."""
+    # -P: a file `app.py` in the working directory must not replace this package.
+    return (sys.executable, "-P", "-m", name, *arguments)
+
+
+def exit_reason(returncode: int) -> str:
+    """How a process ended: "ended by signal 9" or "exit code 1"."""
+    return f"ended by signal {-returncode}" if returncode < 0 else f"exit code {returncode}"
+
+
+class ChildProcess:
+    """A child process, used from an event loop. `start` makes one.
+
+    Attributes:
+        pid: Its process number.
+    """
+
+    def __init__(self, process: asyncio.subprocess.Process) -> None:
+        assert process.stdin is not None  # noqa: S101 - `start` opens both
+        assert process.stdout is not None  # noqa: S101
+        self._process, self._stdin, self._stdout = process, process.stdin, process.stdout
+        self.pid = process.pid
+
+    @classmethod
+    async def start(
+        cls, command: Sequence[str], *, line_limit: int = LINE_LIMIT, one_thread: bool = False
+    ) -> ChildProcess:
+        """Start a process.
+
+        Args:
+            command: Program and arguments, see `python_module`.
+            line_limit: Longest line that is accepted [bytes].
+            one_thread: Whether its numerical libraries use one thread each.
+
+        Raises:
+            StemmapError: The system cannot start it.
+        """
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *command,
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                limit=line_limit,
+                start_new_session=True,  # Ctrl-C in the terminal is for the parent, which ends its children
+                env=_environment(one_thread),
+            )
+        except OSError as error:
+            raise _cannot_start(error) from None
+        return cls(process)
+
+    async def send(self, message: object) -> None:
+        """Send a message. A child that has ended is not an error here; `receive` reports it."""
+        with contextlib.suppress(ConnectionError):
+            self._stdin.write(msgspec.json.encode(message) + b"\n")
+            await self._stdin.drain()
+
+    async def receive(self, kind: type[T], timeout_s: float | None = None) -> T | None:
+        """Wait for the next message; None when the child has ended.
+
+        Args:
+            kind: Type that the message must have.
+            timeout_s: Longest wait; None for no limit.
+
+        Raises:
+            ProtocolError: The line is too long or is not of this type; the child is to be ended.
+            TimeoutError: No line came in time.
+        """
+        try:
+            async with asyncio.timeout(timeout_s):
+                line = await self._stdout.readline()
+        except ValueError:
+            raise ProtocolError("protocol error: a line is too long") from None
+        return _decoded(line, kind)
+
+    async def end(self, grace_s: float = 0.0) -> int:
+        """Close the child's standard input, wait for `grace_s` and kill the child if it still runs.
+
+        Returns:
+            Its return code.
+        """
+        self._stdin.close()
+        try:
+            if grace_s > 0.0:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._wait(), grace_s)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.kill()
+            await self._wait()
+        return self._process.returncode or 0
+
+    async def _wait(self) -> None:
+        """Wait for the end. Output that fills the buffer is read, because it would keep the pipe open."""
+        with contextlib.suppress(RuntimeError):  # another task waits in `receive`, which reads it
+            while await self._stdout.read(1 << 16):
+                pass
+        await self._process.wait()
+
+
+class BlockingChildProcess:
+    """A child process, used from a thread that may wait.
+
+    Args:
+        command: Program and arguments, see `python_module`.
+        line_limit: Longest line that is accepted [bytes].
+        one_thread: Whether its numerical libraries use one thread each.
+
+    Raises:
+        StemmapError: The system cannot start it.
+    """
+
+    def __init__(
+        self, command: Sequence[str], *, line_limit: int = LINE_LIMIT, one_thread: bool = False
+    ) -> None:
+        self._line_limit = line_limit
+        try:
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C in the terminal is for the parent, which ends its children
+                env=_environment(one_thread),
+            )
+        except OSError as error:
+            raise _cannot_start(error) from None
+        assert self._process.stdin is not None  # noqa: S101 - opened above
+        assert self._process.stdout is not None  # noqa: S101
+        self._stdin, self._stdout = self._process.stdin, self._process.stdout
+        self.pid = self._process.pid
+
+    @property
+    def returncode(self) -> int | None:
+        """The return code; None while the child runs."""
+        return self._process.poll()
+
+    def send(self, message: object) -> None:
+        """Send a message. A child that has ended is not an error here; `receive` reports it."""
+        with contextlib.suppress(ConnectionError):
+            self._stdin.write(msgspec.json.encode(message) + b"\n")
+            self._stdin.flush()
+
+    def receive(self, kind: type[T], timeout_s: float | None = None) -> T | None:
+        """Wait for the next message; None when the child has ended, also because it took too long.
+
+        Args:
+            kind: Type that the message must have.
+            timeout_s: After this time the child is killed; None for no limit.
+
+        Raises:
+            ProtocolError: The line is too long or is not of this type.
+        """
+        timer = None if timeout_s is None else threading.Timer(timeout_s, self._process.kill)
+        if timer is not None:
+            timer.start()
+        try:
+            line = self._stdout.readline(self._line_limit + 1)
+        finally:
+            if timer is not None:
+                timer.cancel()
+        if len(line) > self._line_limit:
+            raise ProtocolError("protocol error: a line is too long")
+        return _decoded(line, kind)
+
+    def end(self, grace_s: float = 0.0) -> int:
+        """Close the child's standard input, wait for `grace_s` and kill the child if it still runs. A thread
+        that waits in `receive` gets None.
+
+        Returns:
+            Its return code.
+        """
+        with contextlib.suppress(ConnectionError):
+            self._stdin.close()
+        try:
+            self._process.wait(grace_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        returncode = self._process.wait()
+        self._stdout.close()
+        return returncode
+
+
+class ParentConnection:
+    """The child's end: messages from and to the parent.
+
+    Args:
+        incoming, outgoing: Streams of lines from and to the parent.
+        on_close: Called in a thread of its own when the parent closes the connection or ends.
+    """
+
+    def __init__(self, incoming: BinaryIO, outgoing: BinaryIO, on_close: Callable[[], None]) -> None:
+        self._incoming, self._outgoing, self._on_close = incoming, outgoing, on_close
+        self._lines: queue.Queue[bytes] = queue.Queue()
+        threading.Thread(target=self._read, name="parent", daemon=True).start()
+
+    @property
+    def has_message(self) -> bool:
+        """Whether a message waits to be received."""
+        return not self._lines.empty()
+
+    def receive(self, kind: type[T]) -> T:
+        """Wait for the next message.
+
+        Raises:
+            ProtocolError: It is not of this type.
+        """
+        message = _decoded(self._lines.get(), kind)
+        assert message is not None  # noqa: S101 - only whole lines are queued
+        return message
+
+    def send(self, message: object) -> None:
+        """Send a message."""
+        self._outgoing.write(msgspec.json.encode(message) + b"\n")
+        self._outgoing.flush()
+
+    def _read(self) -> None:
+        for line in self._incoming:
+            if line.endswith(b"\n"):
+                self._lines.put(line)
+        self._on_close()
+
+
+def run_child(
+    main: Callable[[ParentConnection], None],
+    *,
+    memory_limit: int | None = None,
+    low_priority: bool = False,
+    on_close: Callable[[], None] | None = None,
+) -> NoReturn:
+    """Run the program of a child process, then end the process.
+
+    What libraries print goes to standard error. Ctrl-C is ignored: the parent ends its children.
+
+    Args:
+        main: The program.
+        memory_limit: Memory that the process may allocate [bytes]; more raises MemoryError. File mappings do
+            not count. Not available on Windows.
+        low_priority: Whether all other processes come first.
+        on_close: Called when the parent closes the connection or ends; ends this process by default.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if low_priority and hasattr(os, "nice"):
+        os.nice(10)
+    if memory_limit is not None:
+        _limit_memory(memory_limit)
+    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    code = 0
+    try:
+        main(ParentConnection(incoming, outgoing, on_close or (lambda: os._exit(1))))
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    sys.stderr.flush()
+    os._exit(code)  # the thread that reads from the parent still waits
+
+
+def _limit_memory(limit: int) -> None:
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+
+
+def _environment(one_thread: bool) -> dict[str, str]:
+    """The parent's environment; a thread number that is set there stays."""
+    return {**(dict.fromkeys(_THREAD_VARIABLES, "1") if one_thread else {}), **os.environ}
+
+
+def _decoded(line: bytes, kind: type[T]) -> T | None:
+    if not line.endswith(b"\n"):  # the sender ended, possibly in the middle of a line
+        return None
+    try:
+        return msgspec.json.decode(line, type=kind)
+    except msgspec.MsgspecError as error:
+        raise ProtocolError(f"protocol error: {error}") from None
+
+
+def _cannot_start(error: OSError) -> StemmapError:
+    return StemmapError(
+        f"no process can be started: {error.strerror}", remedy="Close other programs and try again"
+    )

@@ -1,0 +1,47 @@
+"""A child process of the tests: answers each number with its double, and misbehaves when asked to."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+from app.common.child_process import ParentConnection, run_child
+
+
+def serve(parent: ParentConnection) -> None:
+    """Answer messages until the parent ends."""
+    while True:
+        message = parent.receive(str)
+        if message.isdigit():
+            print("printed by a library")
+            parent.send(2 * int(message))
+        elif message == "die":
+            os.kill(os.getpid(), signal.SIGKILL)
+        elif message == "sleep":
+            time.sleep(60.0)
+        elif message == "long":
+            parent.send("x" * 100_000)
+        elif message == "pid":
+            parent.send(os.getpid())
+        elif message == "allocate":
+            try:
+                parent.send(len(bytearray(1 << 30)))
+            except MemoryError:
+                parent.send("MemoryError")
+        else:
+            raise ValueError(message)
+
+
+if __name__ == "__main__":
+    mark = Path(sys.argv[1]) if len(sys.argv) > 1 else None
+
+    def close() -> None:
+        """Write the mark before the process ends."""
+        if mark is not None:
+            mark.touch()
+        os._exit(0)
+
+    run_child(serve, memory_limit=512 << 20, on_close=close)
