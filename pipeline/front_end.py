@@ -172,10 +172,10 @@ def _at_points(step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, w
         free=free,
         sensor_offset=sensor_offset,
         overview=_overview(raw, boxed, height, terrain, sensor_offset, sensor)
-        if p.gathering.method == "columns" and is_gathered(step.index, p.gathering.every)
+        if p.classification.method == "columns" and is_gathered(step.index, p.classification.every)
         else None,
         terrain=replace(terrain, height=rounded(terrain.height, GROUND))
-        if terrain is not None and is_fused(step.index, p.gathering.every)
+        if terrain is not None and is_fused(step.index, p.classification.every)
         else None,
         warnings=(NO_GROUND,) if terrain is not None and len(raw) and not grounded else (),
         counts={

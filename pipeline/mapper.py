@@ -62,7 +62,7 @@ class Mapper:
         self._T_base_lidar = T_base_lidar
         self._watch = watch
         self._slam = BackEnd(parameters.slam, seed)
-        self._gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forests=forests)
+        self._gathering = Gathering(parameters.classification, all_around=sensor.rings > 0, forests=forests)
         self._ground = HeightMapper()
         self._tracker = Tracker(parameters.tracking)
         self._odometry: Pose2 | None = None
@@ -80,7 +80,7 @@ class Mapper:
 
     @parameters.setter
     def parameters(self, parameters: Parameters) -> None:
-        self._gathering.parameters = parameters.gathering  # first: it may not find its forest
+        self._gathering.parameters = parameters.classification  # first: it may not find its forest
         self._parameters = parameters
         self._slam.parameters = parameters.slam
         self._tracker.parameters = parameters.tracking
@@ -204,7 +204,7 @@ class Mapper:
             trees=trees,
             counts=looked.counts,
             warnings=(*step.warnings, *looked.warnings, *told),
-            columns=self._gathering.columns if p.gathering.method == "columns" else None,
+            columns=self._gathering.columns if p.classification.method == "columns" else None,
             ground=None if p.ground.method == "none" else self._ground.state.record,
             base_z=(self._ground.state.sensor_z or 0.0) - float(looked.sensor_offset[2])
             if self._ground.state.scans
@@ -264,7 +264,7 @@ class Mapper:
             )
             tracker.anchor(*located.landmarks, estimate.T_map_base, view_range)
             # Of a scan that is gathered the columns are judged anew, and all tracks by them.
-            if seen.looked.overview is None and self._parameters.gathering.method == "columns":
+            if seen.looked.overview is None and self._parameters.classification.method == "columns":
                 tracker.learn_between(self._gathering.columns)
 
     def _map(self, step: Step, looked: Looked, estimate: PoseEstimate) -> None:
@@ -281,7 +281,7 @@ class Mapper:
                     over.terrain,
                 )
                 self._gathering.add(over.points, over.height, step.index, view)
-                p = self._parameters.gathering
+                p = self._parameters.classification
                 columns = self._tracker.judge(step.scan.stamp_ns, self._gathering.columns, p)
                 self._gathering.columns = columns
         elif self._gathering.is_unsettled:

@@ -157,7 +157,7 @@ def _map(
     losses = {reason: n for reason, n in counted.items() if n}
     state = _saved(plan, begun, mapper, start_ns, losses).as_bytes()
     tally.tell_of_far_truth(evaluation)
-    if plan.parameters.gathering.method == "none":  # else a track is judged by more than its hits
+    if plan.parameters.classification.method == "none":  # else a track is judged by more than its hits
         tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)

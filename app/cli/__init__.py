@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from typing import NoReturn
 
@@ -53,8 +54,12 @@ class _Parser(argparse.ArgumentParser):
         self.exit(WRONG_USAGE, f"{self.prog}: {message}. Help: {self.prog} --help\n")
 
 
+_PYTHON_FORMAT = warnings.formatwarning
+
+
 def command() -> NoReturn:
     """The program `stemmap`: `main` with the words of this process, whose code the process ends with."""
+    warnings.formatwarning = _format_warning
     code = main()
     if "zenoh" in sys.modules:
         # All is written and closed. Its threads outlive a session and now and then abort a process that is
@@ -64,6 +69,15 @@ def command() -> NoReturn:
             sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
+
+
+def _format_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    """Return a FutureWarning, which is meant for people, as one line; other warnings keep Python's format."""
+    if issubclass(category, FutureWarning):
+        return f"stemmap: {message}\n"
+    return _PYTHON_FORMAT(message, category, filename, lineno, line)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -231,7 +231,7 @@ def chosen_parameters(
             ) from None
         parameters = from_toml(text, parameters, str(arguments.config))
     parameters = assign(parameters, arguments.assignments)
-    if parameters.gathering.forest != "package":
+    if parameters.classification.forest != "package":
         from app.training.learned_forests import kept_forests
 
         kept_forests().check(parameters)

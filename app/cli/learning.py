@@ -42,7 +42,7 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
         runs = _chosen(store, names)
     forests = Forests(settings.folder)
     asked = Asked(
-        in_force=preset("forest").gathering,
+        in_force=preset("forest").classification,
         forests=forests,
         seen=(),
         seed=seed,

@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not examples:
         raise StemmapError("there is nothing to learn from", remedy="Name scenes, or folders with labels")
     pasted = _pasted(arguments)
-    for line in leave_one_out(examples, pasted, preset("forest").gathering.tree_share):
+    for line in leave_one_out(examples, pasted, preset("forest").classification.tree_share):
         print(line)
     scenes = _scenes(arguments)
     write_forest(as_json(grow_all(examples, pasted, seed=arguments.seed), scenes), arguments.out)

@@ -110,7 +110,7 @@ class Learning:
     async def _learn(self, sources: list[AnnotatedSource], parameters: Parameters, folder: Path) -> None:
         question = {
             "sources": sources,
-            "gathering": parameters.gathering.model_dump(),
+            "gathering": parameters.classification.model_dump(),
             "folder": str(folder),
             "parent": os.getpid(),
             "date": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),

@@ -142,7 +142,7 @@ def gathered(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor)
     if distance[row] > _COLUMN_REACH:
         return None
     share, verdict = columns.share[row], Verdict(int(columns.verdict[row]))
-    forest = kept_forests()(parameters.gathering.forest, sensor.rings > 0)
+    forest = kept_forests()(parameters.classification.forest, sensor.rings > 0)
     figures = columns.figures[row]
     in_free_air = float(tree_in_free_air(figures[None], forest)[0])
     refused = forest.free_end if in_free_air < TREE_IN_FREE_AIR else None
@@ -152,9 +152,9 @@ def gathered(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor)
         verdict=verdict.label,
         distance=float(distance[row]),
         votes={kind.label: float(share[k]) for k, kind in enumerate(CLASSES)},
-        tree_share=parameters.gathering.tree_share,
+        tree_share=parameters.classification.tree_share,
         tree_in_free_air=None if np.isnan(in_free_air) else in_free_air,
-        by_votes=verdict in _decided_by(share, parameters.gathering.tree_share),
+        by_votes=verdict in _decided_by(share, parameters.classification.tree_share),
         present=int(columns.present[row]),
         absent=int(columns.absent[row]),
         viewed=float(columns.viewed[row]),

@@ -102,7 +102,9 @@ def _looked_through(run: AnnotatedRun, progress: Progress) -> list[Examples]:
             raise SourceError("it is another recording than the one that was annotated", where=request.uri)
         moving, chosen = with_odometry(source, request.odometry)
         # Columns and their figures are the same whoever votes on them.
-        parameters = run.parameters.replace({"gathering.method": "columns", "gathering.forest": PACKAGE})
+        parameters = run.parameters.replace(
+            {"classification.method": "columns", "classification.forest": PACKAGE}
+        )
         mapper = Mapper(
             parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=run.request.seed
         )

@@ -20,7 +20,7 @@ from app.training.annotated_runs import annotated_run
 from app.training.learned_forests import Forests
 from app.training.learning import Asked, Learned, learn, seen_by
 from pipeline.classification.forest import PACKAGE
-from pipeline.config.stages import Gathering
+from pipeline.config.stages import Classification
 from pipeline.errors import StemmapError
 
 
@@ -39,7 +39,7 @@ class Question(msgspec.Struct, frozen=True):
 def answer(question: Question, say: Any) -> dict[str, Any]:  # noqa: ANN401 - a function of one dict
     """Learn, and keep the new forest under its name; nothing uses it yet."""
     folder = Path(question.folder)
-    forests, gathering = Forests(folder), Gathering.model_validate(question.gathering)
+    forests, gathering = Forests(folder), Classification.model_validate(question.gathering)
     old = gathering.forest
     asked = Asked(
         in_force=gathering,

@@ -72,7 +72,7 @@ class Forests:
         Raises:
             StemmapError: See `__call__`.
         """
-        self(parameters.gathering.forest, True)
+        self(parameters.classification.forest, True)
 
     def read(self, name: str) -> dict[str, Any]:
         """The JSON of a learned forest, with where it came from.

@@ -26,7 +26,7 @@ from pipeline.classification.forest import (
     ForestOf,
     read_forests,
 )
-from pipeline.config.stages import Gathering as GatheringParameters
+from pipeline.config.stages import Classification as GatheringParameters
 from pipeline.errors import SourceError, StemmapError
 
 LEAST_TREES, LEAST_OTHERS = 10, 5

@@ -49,7 +49,7 @@ def gathered(
 ) -> Iterator[Columns]:
     """The columns of a run mapped with the poses it tells, after each of MARKS scans and at the end."""
     taken = 0
-    gathering = Gathering(parameters.gathering, all_around=sensor.rings > 0, forests=_no_forest)
+    gathering = Gathering(parameters.classification, all_around=sensor.rings > 0, forests=_no_forest)
     before = b""
     for step in run:
         repeated = step.scan.points.tobytes()

@@ -20,7 +20,7 @@ SENSIBLE = (
     "detection.radius_min=0..0.1",
     "detection.height_extent_min=0.1..1.2",
     "detection.arc_min=0..120",
-    "gathering.tree_share=0.1..0.8",
+    "classification.tree_share=0.1..0.8",
     "tracking.hits_to_confirm=1..10",
     "tracking.proximity_radius=0.2..1",
 )

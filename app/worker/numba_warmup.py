@@ -58,7 +58,9 @@ def warm_eyes() -> None:
 
     source = open_source(_SCENE)
     known, parameters = source.description, Parameters()
-    gathering = Gathering(parameters.gathering, all_around=known.sensor.rings > 0, forests=kept_forests())
+    gathering = Gathering(
+        parameters.classification, all_around=known.sensor.rings > 0, forests=kept_forests()
+    )
     heights = HeightMapper()
     with closing(KeptScans()) as kept:
         for step in steps(source.records()):
@@ -111,7 +113,7 @@ def warm_map() -> None:
         rough_trees(basis, kept.clusters, again.parameters)
         for _ in Rerun(again, kept, None, basis).frames(scans):
             pass
-    tree_columns(Tracker(stems.tracking).judge(0, no_columns(), stems.gathering))
+    tree_columns(Tracker(stems.tracking).judge(0, no_columns(), stems.classification))
 
 
 def _stems() -> Iterator[Step]:

@@ -16,7 +16,7 @@ from pipeline.classification.packed_voxel_map import PackedMemory
 from pipeline.classification.ray_statistics import View, look, look_through
 from pipeline.classification.stale_tiles import seen_higher
 from pipeline.classification.voxel_map import SLICE, SLICES, TILE, Memory
-from pipeline.config.stages import Gathering as GatheringParameters
+from pipeline.config.stages import Classification as GatheringParameters
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.loop_closure.map_correction import Bend

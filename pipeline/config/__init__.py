@@ -1,11 +1,10 @@
-"""Every tunable value, declared once: bounds, unit, title, step and one sentence.
+"""Parameter declarations: each tunable value is declared once with bounds, unit, title, step and a sentence.
 
-From this declaration come the sliders, the REST schema, `--set stage.name=value`, the TOML file and
-the table in README.
+The sliders, the REST schema, `--set stage.name=value`, the TOML file and docs/parameters.md derive from it.
 """
 
-from pipeline.config.declare import Stage
-from pipeline.config.model import FieldSpec, Parameters, field_specs
+from pipeline.config.declaration import Stage
+from pipeline.config.model import FieldSpec, Parameters, RenamedParameterWarning, current_names, field_specs
 from pipeline.config.presets import PRESETS, preset
 from pipeline.config.text import assign, from_toml, markdown_table, to_toml
 
@@ -13,8 +12,10 @@ __all__ = [
     "PRESETS",
     "FieldSpec",
     "Parameters",
+    "RenamedParameterWarning",
     "Stage",
     "assign",
+    "current_names",
     "field_specs",
     "from_toml",
     "markdown_table",

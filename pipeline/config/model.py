@@ -1,21 +1,37 @@
-"""How a parameter is declared, and the whole set of them."""
+"""The set of all parameters, its validation, and a description of each field."""
 
 from __future__ import annotations
 
+import difflib
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.config import stages
-from pipeline.config.declare import Stage
+from pipeline.config.declaration import Stage
 from pipeline.errors import ParameterError
 
 Value = float | int | bool | str
 
+# Names of earlier versions, which files, saved sets and the command line may still use.
+RENAMED_STAGES = {"gathering": "classification"}
+RENAMED = {
+    "slam.looks": "slam.independent_views_max",
+    "shape.slices": "shape.split_slices",
+}
+# Parameters of earlier versions that no longer exist; their values are ignored.
+REMOVED: frozenset[str] = frozenset()
+
+
+class RenamedParameterWarning(FutureWarning):
+    """A parameter is given under the name of an earlier version."""
+
 
 class Parameters(BaseModel):
-    """All stages' parameters, in the order in which the data passes them."""
+    """The parameters of all stages, in the order in which a scan passes the stages."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
@@ -27,19 +43,21 @@ class Parameters(BaseModel):
     detection: stages.Detection = Field(default_factory=stages.Detection)
     slam: stages.Slam = Field(default_factory=stages.Slam)
     relocalisation: stages.Relocalisation = Field(default_factory=stages.Relocalisation)
-    gathering: stages.Gathering = Field(default_factory=stages.Gathering)
+    classification: stages.Classification = Field(default_factory=stages.Classification)
     tracking: stages.Tracking = Field(default_factory=stages.Tracking)
     obstacles: stages.Obstacles = Field(default_factory=stages.Obstacles)
     evaluation: stages.Evaluation = Field(default_factory=stages.Evaluation)
 
-    def replace(self, changes: dict[str, Any]) -> Parameters:
-        """A new set with values changed by their dotted names, validated as a whole.
+    def replace(self, changes: Mapping[str, Any]) -> Parameters:
+        """Return a copy with values changed by their dotted names, validated as a whole.
+
+        Names of earlier versions are accepted with a RenamedParameterWarning.
 
         Raises:
-            ParameterError: A name is unknown, a value is out of bounds, or two values contradict.
+            ParameterError: A name is unknown, a value is out of bounds, or two values contradict each other.
         """
         tree = self.model_dump()
-        for name, value in changes.items():
+        for name, value in current_names(changes).items():
             stage, _, field_name = name.partition(".")
             if stage not in tree or field_name not in tree[stage]:
                 raise ParameterError(
@@ -50,7 +68,7 @@ class Parameters(BaseModel):
         return validated(tree)
 
     def flat(self) -> dict[str, Value]:
-        """Every value by its dotted name, in the order of the stages."""
+        """Return every value by its dotted name, in the order of the stages."""
         return {
             f"{stage}.{name}": value
             for stage, values in self.model_dump().items()
@@ -58,53 +76,105 @@ class Parameters(BaseModel):
         }
 
     def changes_from(self, other: Parameters) -> dict[str, Value]:
-        """The values, by dotted name, that differ from another set."""
-        theirs = other.flat()
-        return {name: value for name, value in self.flat().items() if theirs[name] != value}
+        """Return the values, by dotted name, that differ from another set."""
+        others = other.flat()
+        return {name: value for name, value in self.flat().items() if others[name] != value}
 
 
-def validated(tree: dict[str, Any]) -> Parameters:
-    """Parameters from nested dicts.
+def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by dotted name with the names of earlier versions replaced by the current names.
+
+    Each renamed or removed parameter gives one RenamedParameterWarning. A value under the current name takes
+    precedence over one under an earlier name.
+    """
+    result: dict[str, Any] = {}
+    for name, value in values.items():
+        current = _current_name(name)
+        if current is None:
+            _warn(f"the parameter {name} no longer exists and is ignored")
+        elif current == name:
+            result[name] = value
+        else:
+            _warn(f"the parameter {name} is now called {current}")
+            if current not in values:
+                result[current] = value
+    return result
+
+
+def _current_name(name: str) -> str | None:
+    """Return the current dotted name of a parameter, or None if the parameter was removed."""
+    stage, dot, field_name = RENAMED.get(name, name).partition(".")
+    name = f"{RENAMED_STAGES.get(stage, stage)}{dot}{field_name}"
+    return None if name in REMOVED else name
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, RenamedParameterWarning, stacklevel=2)
+
+
+def validated(tree: Mapping[str, Any]) -> Parameters:
+    """Return parameters from nested mappings (stage, parameter).
+
+    Names of earlier versions are accepted with a RenamedParameterWarning.
 
     Raises:
         ParameterError: One line that names the parameter, its bound and the value given.
     """
     try:
-        return Parameters.model_validate(tree)
+        return Parameters.model_validate(_current_tree(tree))
     except ValidationError as error:
         raise ParameterError(_first_message(error)) from None
+
+
+def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested mappings with the names of earlier versions replaced by the current names."""
+    known = Parameters.model_fields
+    nested = {stage: values for stage, values in tree.items() if isinstance(values, Mapping)}
+    result = {stage: values for stage, values in tree.items() if stage not in nested}
+    old = any(
+        stage not in known or _current_name(f"{stage}.{name}") != f"{stage}.{name}"
+        for stage, values in nested.items()
+        for name in values
+    )
+    if not old:
+        return result | {stage: dict(values) for stage, values in nested.items()}
+    flat = {f"{stage}.{name}": value for stage, values in nested.items() for name, value in values.items()}
+    for dotted, value in current_names(flat).items():
+        stage, _, name = dotted.partition(".")
+        result.setdefault(stage, {})[name] = value
+    return result
 
 
 def _first_message(error: ValidationError) -> str:
     first = error.errors()[0]
     name = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "value_error":  # a rule across fields, which names them itself
+    if first["type"] == "value_error":  # a rule across fields, whose message names them
         return str(first["ctx"]["error"])
     if first["type"] == "extra_forbidden":
         return f"there is no parameter {name!r}{_nearest(name)}"
-    what = first["msg"].removeprefix("Input ")
-    return f"{name} = {first['input']!r}: {what[0].lower()}{what[1:]}"
+    message = first["msg"].removeprefix("Input ")
+    return f"{name} = {first['input']!r}: {message[0].lower()}{message[1:]}"
 
 
 def _nearest(name: str) -> str:
-    import difflib
-
     close = difflib.get_close_matches(name, [spec.name for spec in field_specs()], n=1)
     return f"; the nearest is {close[0]!r}" if close else ""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldSpec:
-    """One parameter as a slider, a schema or a table row needs it.
+    """Description of one parameter, from which sliders, schemas and tables are made.
 
     Attributes:
-        name: Dotted, e.g. "clustering.eps".
-        stage: The stage's title.
-        title, unit, doc: For people.
-        kind: "float", "int", "bool", "choice" or "name".
-        minimum, maximum, step: Of numbers, else None.
-        choices: Of a choice, else empty.
-        default: Of the preset `forest`.
+        name: Dotted name, for example "clustering.eps".
+        stage: Title of the stage.
+        title: Short label.
+        unit: Unit symbol, empty if dimensionless.
+        doc: One sentence of explanation.
+        kind: Type of the value.
+        minimum, maximum, step: Bounds and slider increment of a number, else None.
+        choices: Valid words of a choice, else empty.
+        default: Value in the preset `forest`.
     """
 
     name: str
@@ -121,7 +191,7 @@ class FieldSpec:
 
 
 def field_specs() -> tuple[FieldSpec, ...]:
-    """Every parameter, in the order of the stages."""
+    """Return the description of every parameter, in the order of the stages."""
     return tuple(
         _spec(stage_name, stage_model, name)
         for stage_name, stage_field in Parameters.model_fields.items()

@@ -1,4 +1,4 @@
-"""Named sets of parameters, each with where its numbers come from."""
+"""Presets: named sets of parameters, each with the source of its values."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 from pipeline.config.model import Parameters
 from pipeline.errors import ParameterError
 
-# Table 1 of the paper; what it does not say is set so that it changes nothing.
+# Table 1 of the paper. Stages that the paper does not have are turned off.
 _PAPER: dict[str, object] = {
     "acquisition.level": "none",
     "acquisition.deskew": False,
@@ -27,7 +27,7 @@ _PAPER: dict[str, object] = {
     "clustering.stem_area": 0.0,
     "shape.plane": 2,
     "shape.centre": "centroid",
-    "shape.slices": 0,
+    "shape.split_slices": 0,
     "detection.whole": False,
     "detection.e_min": 1.0,
     "detection.e_max": 20.0,
@@ -40,15 +40,15 @@ _PAPER: dict[str, object] = {
     "slam.method": "fastslam1",
     "slam.particles": 100,
     "slam.view_range": 0.0,
-    "slam.looks": 10000.0,
+    "slam.independent_views_max": 10000.0,
     "slam.weight_power": 1.0,
     "slam.merge_gate": 0.0,
-    # The centroid's error is the same in each scan from one side; only a step aside brings news.
+    # The error of the centroid is the same in successive scans; only a changed viewpoint is independent.
     "slam.update_distance": 1.0,
     "detection.sigma_range": 0.1,
     "detection.sigma_bearing": 1.0,
     "relocalisation.method": "none",
-    "gathering.method": "none",
+    "classification.method": "none",
     "tracking.dbh_arc_min": 0.0,
     "tracking.velocity_sigma": 0.1,
     "tracking.acceleration_sigma": 0.001,
@@ -56,8 +56,9 @@ _PAPER: dict[str, object] = {
     "tracking.distance_max": 1.0,
 }
 
-# A planar laser on a car among park trees: trunks of one to ten beams, far apart, seen to 40 m. The
-# car itself is seen at 0.7 m. Its encoders turn truer than those of a robot that skids.
+# A planar laser on a car in a park: trunks have one to ten beams, large distances between each other and a
+# range of up to 40 m. The laser sees the car itself at 0.7 m. The heading of the encoders is more accurate
+# than that of a skid-steered robot.
 _LASER2D: dict[str, object] = {
     "acquisition.level": "none",
     "acquisition.range_min": 1.5,
@@ -66,8 +67,8 @@ _LASER2D: dict[str, object] = {
     "clustering.method": "range_jump",
     "clustering.eps": 1.0,
     "clustering.min_points": 1,
-    "shape.slices": 0,  # one ring has no height
-    # One ring meets no ground: where returns end says little of where the laser looks.
+    "shape.split_slices": 0,  # a single ring has no height
+    # A single ring shows no ground, so the field of view cannot be estimated from the returns.
     "detection.whole": False,
     "detection.e_max": 1000.0,
     "detection.cylindrical_stddev_thresh": 0.3,
@@ -88,8 +89,8 @@ _LASER2D: dict[str, object] = {
     "slam.update_distance": 0.5,
     "relocalisation.method": "none",
     "relocalisation.slack": 0.3,
-    "gathering.method": "none",
-    # The laser looks level, so nothing says how high a return stands.
+    "classification.method": "none",
+    # The laser is horizontal: the height of a return above the ground is unknown.
     "obstacles.height_min": -10.0,
     "obstacles.height_max": 10.0,
     "obstacles.width": 2.0,
@@ -98,8 +99,8 @@ _LASER2D: dict[str, object] = {
     "tracking.proximity_radius": 1.5,
 }
 
-# Stems that another program found, about a scan every half metre: their places err by a decimetre whatever
-# their distance. In a dense forest those beyond 15 m double the time and better the path by a centimetre.
+# Stems detected by another program, about one scan per half metre. Their position error is about 0.1 m at any
+# range. In a dense forest, stems beyond 15 m double the computing time and improve the path by 1 cm.
 _STEMS: dict[str, object] = {
     "acquisition.range_min": 0.0,
     "acquisition.range_max": 15.0,
@@ -109,25 +110,25 @@ _STEMS: dict[str, object] = {
     "slam.noise_distance": 0.05,
     "slam.noise_turn_distance": 0.6,
     "slam.weight_power": 0.3,
-    "gathering.method": "none",
+    "classification.method": "none",
     "tracking.dbh_arc_min": 0.0,
 }
 
 PRESETS: dict[str, tuple[str, dict[str, object]]] = {
-    "forest": ("The best that we know for trunks seen by a 3D LiDAR; the default", {}),
+    "forest": ("Default for trunks seen by a 3D LiDAR", {}),
     "paper": ("Table 1 of the paper: eccentricity below 20", _PAPER),
     "paper-text": (
         "The paper's text: eccentricity between 10 and 20",
         {**_PAPER, "detection.e_min": 10.0},
     ),
-    "stems": ("Ready stems of another program, as in a folder of TreeManagerState files", _STEMS),
+    "stems": ("Stems detected by another program, as in a folder of TreeManagerState files", _STEMS),
     "laser2d": ("A planar laser, as on the car of Victoria Park", _LASER2D),
 }
 
 
 @cache
 def preset(name: str) -> Parameters:
-    """The parameters of a preset.
+    """Return the parameters of a preset.
 
     Raises:
         ParameterError: There is no preset of this name.

@@ -1,4 +1,4 @@
-"""Parameters as text: `stage.name=value`, TOML, and the table in README."""
+"""Parameters as text: `stage.name=value`, TOML, and the table in docs/parameters.md."""
 
 from __future__ import annotations
 
@@ -6,31 +6,36 @@ import math
 import tomllib
 from typing import Any
 
-from pipeline.config.model import FieldSpec, Parameters, Value, field_specs, validated
+from pipeline.config.model import FieldSpec, Parameters, Value, current_names, field_specs, validated
 from pipeline.errors import ParameterError
 
 
 def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
-    """Apply `stage.name=value` texts as they come from the command line.
+    """Return parameters changed by `stage.name=value` texts of the command line.
 
     Raises:
-        ParameterError: A text has no "=", a name is unknown, or a value does not fit.
+        ParameterError: A text has no "=", a name is unknown, or a value is not valid.
     """
     specs = {spec.name: spec for spec in field_specs()}
-    changes: dict[str, Any] = {}
+    changes: dict[str, str] = {}
     for text in assignments:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
             raise ParameterError(f"{text!r} is not stage.name=value", remedy="E.g. --set clustering.eps=0.3")
-        changes[name] = parsed(specs[name], value) if name in specs else value
-    return parameters.replace(changes)
+        changes[name] = value
+    return parameters.replace(
+        {
+            name: parsed(specs[name], value) if name in specs else value
+            for name, value in current_names(changes).items()
+        }
+    )
 
 
 def parsed(spec: FieldSpec, text: str) -> Value:
-    """A value of a parameter from the command line; its bounds are looked at with the whole set.
+    """Return the value of a parameter from its text; bounds are checked later, with the whole set.
 
     Raises:
-        ParameterError: It is to be a number and is none.
+        ParameterError: The text of a numeric parameter is not a number.
     """
     try:
         if spec.kind == "int":
@@ -46,42 +51,40 @@ def parsed(spec: FieldSpec, text: str) -> Value:
 
 
 def to_toml(parameters: Parameters) -> str:
-    """All values as TOML, one table a stage."""
+    """Return all values as TOML with one table per stage."""
     import tomli_w
 
     return tomli_w.dumps(parameters.model_dump())
 
 
 def from_toml(text: str, base: Parameters, where: str) -> Parameters:
-    """Values from TOML laid over a base set; stages and values may be missing.
+    """Return the base set with the values of a TOML text; the text may omit stages and values.
 
     Args:
-        text: The file's text.
-        base: What holds where the text says nothing.
-        where: The file's name, for the error.
+        text: Content of the file.
+        base: Values of the parameters that the text omits.
+        where: Name of the file, for error messages.
 
     Raises:
-        ParameterError: The text is not TOML, or a value does not fit.
+        ParameterError: The text is not TOML, or a value is not valid.
     """
     try:
         given = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError
         raise ParameterError(f"not a TOML file: {error}", where=where) from None
-    tree: dict[str, Any] = base.model_dump()
     for stage, values in given.items():
         if not isinstance(values, dict):
             raise ParameterError(
-                f"{stage} stands outside of a stage", where=where, remedy="Write it below a line [stage]"
+                f"{stage} is not inside a stage", where=where, remedy="Write it below a line [stage]"
             )
-        floats = {
-            s.name.partition(".")[2]
-            for s in field_specs()
-            if s.name.startswith(f"{stage}.") and s.kind == "float"
-        }
-        # TOML tells 1 from 1.0; a person who writes 1 for a length means 1.0.
-        tree.setdefault(stage, {}).update(
-            {k: _as_float(v) if k in floats and type(v) is int else v for k, v in values.items()}
-        )
+    floats = {spec.name for spec in field_specs() if spec.kind == "float"}
+    values = current_names({f"{stage}.{name}": v for stage, vs in given.items() for name, v in vs.items()})
+    tree: dict[str, Any] = base.model_dump()
+    for dotted, value in values.items():
+        stage, _, name = dotted.partition(".")
+        # TOML distinguishes 1 from 1.0; a person who writes 1 for a length means 1.0.
+        integral = dotted in floats and type(value) is int
+        tree.setdefault(stage, {})[name] = _as_float(value) if integral else value
     try:
         return validated(tree)
     except ParameterError as error:
@@ -92,11 +95,11 @@ def _as_float(value: int) -> float:
     try:
         return float(value)
     except OverflowError:
-        return math.inf  # which every bound refuses
+        return math.inf  # rejected by every bound
 
 
 def markdown_table(presets: dict[str, Parameters]) -> str:
-    """A table of every parameter with its bounds and its value in each preset."""
+    """Return a Markdown table of every parameter with its bounds and its value in each preset."""
     values = {name: parameters.flat() for name, parameters in presets.items()}
     head = ["parameter", "unit", "bounds", *(f"`{name}`" for name in presets), "meaning"]
     rows = [

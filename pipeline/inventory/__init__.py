@@ -116,7 +116,7 @@ def map_plot(cloud: Cloud, parameters: Parameters, forests: ForestOf = package_a
     verdict = judge(figures, r_min, r_max)
     kept = ~same(figures, verdict)
     fits, figures, verdict = fits[kept], figures[kept], verdict[kept]
-    places, share = find_upright(near.points, forests(parameters.gathering.forest, True))
+    places, share = find_upright(near.points, forests(parameters.classification.forest, True))
     _refuse_what_is_known(figures, verdict, places, share)
     tree = verdict == Verdict.TREE
     # From west to east, so that numbers can be found again.

@@ -8,13 +8,13 @@ import json
 from pipeline.config import Parameters
 
 STAGES = ("acquisition", "filters", "ground", "clustering", "shape")
-GATHERING = ("method", "every")  # which scans an overview is made of
+CLASSIFICATION = ("method", "every")  # which scans an overview is made of
 
 
 def look_key(parameters: Parameters) -> bytes:
     """Sixteen bytes that differ where `pipeline.front_end.look` may give something else."""
     values = {
         **{stage: getattr(parameters, stage).model_dump() for stage in STAGES},
-        "gathering": parameters.gathering.model_dump(include=set(GATHERING)),
+        "classification": parameters.classification.model_dump(include=set(CLASSIFICATION)),
     }
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).digest()[:16]

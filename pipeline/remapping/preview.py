@@ -104,7 +104,9 @@ def _judged(place: Float, hits: Int, confirmed: Bool, notes: Notes, p: Parameter
 def _columns(notes: Notes, p: Parameters) -> Columns | None:
     known = notes.newest_columns()
     return (
-        None if known is None or p.gathering.method == "none" else columns_of(known, p.gathering.tree_share)
+        None
+        if known is None or p.classification.method == "none"
+        else columns_of(known, p.classification.tree_share)
     )
 
 

@@ -65,7 +65,7 @@ class Basis:
 
     def gathers_as(self, parameters: Parameters) -> bool:
         """Whether other parameters gather what a scan shows in the same way."""
-        before, now = self.parameters.gathering, parameters.gathering
+        before, now = self.parameters.classification, parameters.classification
         return before.model_dump(exclude=LATE) == now.model_dump(exclude=LATE)
 
     def gathers_the_same(self, parameters: Parameters) -> bool:
@@ -99,7 +99,7 @@ class Basis:
         same = min(len(self.notes), len(clusters))
         if before.detection != now.detection:
             same = clusters.first_judged_otherwise(before.detection, now.detection, same)
-        late = before.tracking != now.tracking or before.gathering != now.gathering
+        late = before.tracking != now.tracking or before.classification != now.classification
         if late and now.tracking.engine != COMPILED:
             return 0, False
         if late:

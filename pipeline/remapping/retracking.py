@@ -59,7 +59,7 @@ class Tail:
     """
 
     def __init__(self, parameters: Parameters, notes: Notes, states: Mapping[int, MapperState]) -> None:
-        self._tree_share = parameters.gathering.tree_share
+        self._tree_share = parameters.classification.tree_share
         self._notes = notes
         self._starts = np.cumsum([0, *map(len, notes.stretches)]).tolist()
         self._states = states

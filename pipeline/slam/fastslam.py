@@ -279,7 +279,7 @@ def rules_of(p: Slam) -> Rules:
         miss=1.0 / p.misses_per_hit,
         miss_weight=p.miss_weight,
         weight_power=p.weight_power,
-        looks=p.looks,
+        looks=p.independent_views_max,
         merge_gate=p.merge_gate,
     )
 

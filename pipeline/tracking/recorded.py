@@ -105,7 +105,7 @@ class Tracking:
         self._parameters = p.tracking
         self._rules = _Rules(
             limits_of(p.tracking), telling_of(p.tracking), p.slam.view_range, p.tracking.breast_height,
-            p.gathering.tree_share, p.gathering.range_max,
+            p.classification.tree_share, p.classification.range_max,
         )  # fmt: skip
         self._rows, self._count, self.next_number = TrackTable.empty().with_room(_ROOM), 0, 1
         self._since: Int = np.full(_ROOM, -1, np.int64)  # scan at which a tree was first confirmed, by number

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.config.stages import Gathering, Tracking
+from pipeline.config.stages import Classification, Tracking
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.loop_closure.map_correction import Bend
 from pipeline.tracking.kalman import ENGINES
@@ -110,7 +110,7 @@ class Tracker:
         t.hits[rows] = known.hits[left]
         t.score[rows] = np.minimum(known.hits[left], SCORE_STANDING)
 
-    def judge(self, stamp_ns: int, columns: Columns, parameters: Gathering) -> Columns:
+    def judge(self, stamp_ns: int, columns: Columns, parameters: Classification) -> Columns:
         """Take the verdicts of what was gathered (see `pipeline.tracking.track_classification`).
 
         Args:

@@ -20,7 +20,7 @@ const ASK_AGAIN = 300; // [ms] after an edit until what there is to learn from i
 let known = null, asked = 0, error = "";
 
 const inWords = (things) => Object.entries(things).map(([kind, n]) => counted(n, kind === "other" ? "other thing" : kind)).join(", ");
-const inForce = () => state.parameters?.values["gathering.forest"] ?? PACKAGE;
+const inForce = () => state.parameters?.values["classification.forest"] ?? PACKAGE;
 const button = (id, text, title, onclick) => el("button", { id, class: "small", type: "button", text, title, onclick });
 
 async function doing(work) {
@@ -36,7 +36,7 @@ async function doing(work) {
 const grow = () => doing(() => post("/api/learning", {}));
 const forget = () => doing(() => request("/api/learning", { method: "DELETE" }));
 const use = () => doing(() => post("/api/learning/use", {}));
-const backToPackage = () => doing(() => post("/api/parameters/reset", { names: ["gathering.forest"] }));
+const backToPackage = () => doing(() => post("/api/parameters/reset", { names: ["classification.forest"] }));
 
 export function learnSection() {
   return el("section", { class: "learn", "aria-label": "Learn" },
@@ -94,7 +94,7 @@ function nowUsed() {
 function inUse(name) {
   const from = known?.in_use?.name === name ? known.in_use : null;
   const words = from ? `In use: grown ${from.date.replace(/:\d\d UTC$/, " UTC")} from ${inWords(from.things)} in ${count(from.runs, "run")}` : "In use: learned decision trees";
-  return el("p", { id: "learn-used", class: "learn-used" }, words, el("small", { class: "dim", text: name, title: "Name of these decision trees (gathering.forest)" }));
+  return el("p", { id: "learn-used", class: "learn-used" }, words, el("small", { class: "dim", text: name, title: "Name of these decision trees (classification.forest)" }));
 }
 
 function choices(learned) {

@@ -29,7 +29,9 @@ def main() -> None:
     p, kind = preset("forest"), ONE_WAY if asked.one_way else ALL_AROUND
     scenes = [_annotated(k, asked.first + k, asked.one_way, p) for k in range(asked.scenes)]
     base, (old,) = read_forests(FILE, kind)
-    told = validate(scenes, base, kind, standard_forest(not asked.one_way), p.gathering.tree_share, seed=0)
+    told = validate(
+        scenes, base, kind, standard_forest(not asked.one_way), p.classification.tree_share, seed=0
+    )
     print(f"{told.folds} parts, no {told.by} in two of them; {len(old.root)} decision trees")
     print(f"old: {_words(told.old)}\nnew: {_words(told.new)}")
 

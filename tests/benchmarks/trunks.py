@@ -89,7 +89,9 @@ def mapped(
     with closing(open_source(uri)) as source:
         about = source.description
         if isinstance(source, SimulatedSource):  # as many scans are gathered as in a whole run
-            parameters = parameters.replace({"gathering.every": max(parameters.gathering.every // every, 1)})
+            parameters = parameters.replace(
+                {"classification.every": max(parameters.classification.every // every, 1)}
+            )
         mapper = Mapper(
             parameters,
             sensor=about.sensor,

@@ -137,7 +137,7 @@ POINTS = """() => import('/static/js/state.js').then(({ state, changed }) => {
   const point = (value, f1) => ({
     value, f1, TA: 10 * f1, TA_of: 10, false: 1, position_rmse_m: 0.02, mean_pair_error_percent: null });
   const points = [point(0.4, 0.8), point(0, 0.5), point(1, 0), { value: 0.9, error: "it cannot be" }];
-  state.sensitivity = { name: "gathering.tree_share", of: 4, error: "", asked_with: {}, points };
+  state.sensitivity = { name: "classification.tree_share", of: 4, error: "", asked_with: {}, points };
   changed("sensitivity");
 })"""
 

@@ -17,7 +17,7 @@ router = APIRouter(prefix="/api")
 @router.get("/doubts")
 async def doubts(dashboard: Dash) -> Response:
     """The found trees, the most doubted first, with the votes on each and how many are needed."""
-    share = dashboard.parameters.parameters.gathering.tree_share
+    share = dashboard.parameters.parameters.classification.tree_share
     shown = dashboard.shown
     return json_reply({"needed": share, "trees": [] if shown is None else doubts_of(shown.frame, share)})
 
@@ -25,7 +25,7 @@ async def doubts(dashboard: Dash) -> Response:
 @router.get("/learning")
 async def read(request: Request, dashboard: Dash) -> Response:
     """What there is to learn from, and how far it is."""
-    return json_reply(await _learning(request).known(dashboard.parameters.parameters.gathering.forest))
+    return json_reply(await _learning(request).known(dashboard.parameters.parameters.classification.forest))
 
 
 @router.post("/learning")
@@ -48,7 +48,7 @@ async def use(request: Request, dashboard: Dash) -> Response:
     learned = _learning(request).learned
     if learned is None:
         raise StemmapError("no decision trees were grown", remedy="Grow them first")
-    await dashboard.change_parameters({"gathering.forest": learned["name"]})
+    await dashboard.change_parameters({"classification.forest": learned["name"]})
     return json_reply(_learning(request).as_plain())
 
 

@@ -24,9 +24,9 @@ def describe_stems(
     """The figures of each cluster, as `describe`, after a trunk was taken out of those in which something
     else is joined to it; and the labels, in which that is a cluster of its own."""
     whole = describe(points, labels, sensor, parameters)
-    if parameters.slices == 0 or parameters.centre != "circle":
+    if parameters.split_slices == 0 or parameters.centre != "circle":
         return labels, whole
-    parted, changed = take_apart(points, labels, whole, sensor, parameters.slices)
+    parted, changed = take_apart(points, labels, whole, sensor, parameters.split_slices)
     if not len(changed):
         return labels, whole
     number = np.full(parted.clusters + 1, -1, np.int32)  # the last entry serves noise, -1

@@ -78,7 +78,7 @@ def merge_maps(
     merged = replace(
         a,
         slam=_slam(a.slam, b.slam, T_a_b, covariance, path, parameters.tracking.distance_max),
-        memory=_memory(a.memory, b.memory, T_a_b, len(path), 1 << parameters.gathering.voxels_log2),
+        memory=_memory(a.memory, b.memory, T_a_b, len(path), 1 << parameters.classification.voxels_log2),
         columns=_columns(a.columns, b.columns, T_a_b),
         tracks=tracks,
         next_number=a.next_number + int(np.count_nonzero(fresh)),

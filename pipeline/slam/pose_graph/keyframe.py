@@ -190,7 +190,9 @@ def _count(
     mean, covariance, local, anchor = (
         known.mean.copy(), known.covariance.copy(), known.local.copy(), known.anchor.copy(),
     )  # fmt: skip
-    mean[rows], covariance[rows] = sharpened(mean[rows], covariance[rows], at[old], C[old], p.looks)
+    mean[rows], covariance[rows] = sharpened(
+        mean[rows], covariance[rows], at[old], C[old], p.independent_views_max
+    )
     local[rows], anchor[rows] = Pose2(*pose).inverse().apply(mean[rows]), k
     n = int((~old).sum())
     birth = s.detections + np.flatnonzero(~old)

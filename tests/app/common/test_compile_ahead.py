@@ -41,7 +41,7 @@ session.set_parameters(Parameters(), 0)
 session.advance(10)
 while session.pace == "hurry":
     session.work()
-for revision, change in enumerate([{"gathering.tree_share": 0.7}, {"detection.e_max": 20.0}]):
+for revision, change in enumerate([{"classification.tree_share": 0.7}, {"detection.e_max": 20.0}]):
     session.set_parameters(Parameters().replace(change), revision + 1, whole=True)
     assert session.is_remapping
     while session.is_remapping:

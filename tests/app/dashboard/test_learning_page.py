@@ -63,7 +63,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 def force(dashboard: Dashboard) -> str:
-    return dashboard.parameters.parameters.gathering.forest
+    return dashboard.parameters.parameters.classification.forest
 
 
 async def test_new_trees_are_used_when_somebody_says_so_and_not_before(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ async def test_new_trees_are_used_when_somebody_says_so_and_not_before(tmp_path:
         await client.delete("/api/learning")
         assert (learning.state, force(dashboard)) == ("idle", name)
         answer = await client.post("/api/parameters/undo")
-        assert answer.json()["values"]["gathering.forest"] == "package"
+        assert answer.json()["values"]["classification.forest"] == "package"
 
 
 async def test_a_file_that_was_damaged_meanwhile_is_refused_and_the_old_trees_stay(tmp_path: Path) -> None:

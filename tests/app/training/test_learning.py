@@ -246,7 +246,7 @@ def test_a_damaged_forest_is_refused_and_the_one_in_force_stays(tmp_path, text):
     state = ParameterState()
     state.check = Forests(tmp_path).check
     with pytest.raises(StemmapError, match=r"decision trees (are damaged|cannot be read)"):
-        state.change({"gathering.forest": name})
+        state.change({"classification.forest": name})
     assert (state.parameters, state.revision) == (preset("forest"), 0)
 
 
@@ -257,7 +257,7 @@ def test_an_unknown_forest_and_a_name_that_is_a_path_are_refused(tmp_path):
         Forests(tmp_path)("../../etc/passwd", True)
     for name in ("../../etc/passwd", "0123456789ABCDEF", "", "package\n"):
         with pytest.raises(ParameterError, match=r"gathering\.forest"):
-            assign(Parameters(), [f"gathering.forest={name}"]).replace({"gathering.forest": name})
+            assign(Parameters(), [f"classification.forest={name}"]).replace({"classification.forest": name})
 
 
 # --- the command ----------------------------------------------------------------------------------
@@ -292,7 +292,7 @@ def test_a_run_that_was_annotated_is_learned_from(tmp_path, monkeypatch, capsys)
     assert sum(learned["things"].values()) >= LEAST_TREES + LEAST_OTHERS
     assert learned["runs"] == [{"name": uri, "source": digest}]
     # Nothing uses it before somebody says so.
-    assert preset("forest").gathering.forest == "package"
+    assert preset("forest").classification.forest == "package"
     assert Forests(tmp_path)(kept.stem, True) is not None
     # The same again, now from kept examples.
     assert main(["train", "--annotations", "--out", str(tmp_path / "again.json")]) == 0

@@ -102,7 +102,7 @@ def test_a_search_begins_with_decision_trees_that_were_learned(tmp_path, monkeyp
     data = json.loads(FILE.read_text(encoding="utf-8"))
     name = Forests(tmp_path).keep({**data, ALL_AROUND: data[ALL_AROUND][:20]})
     monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path))
-    start = preset("forest").replace({"gathering.forest": name})
+    start = preset("forest").replace({"classification.forest": name})
     search = Search(plan(tmp_path, start=start.model_dump()))
     try:
         assert search.begin().loss is not None

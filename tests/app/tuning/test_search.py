@@ -26,7 +26,7 @@ from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
 
 RUN, OTHER = "sim:stand?duration=1", "sim:stand?duration=1&seed=3"
-OVER = ["detection.e_max=5..200", "gathering.tree_share=0.1..1"]
+OVER = ["detection.e_max=5..200", "classification.tree_share=0.1..1"]
 
 
 def plan(folder: Path, name: str = "a", **changes: object) -> Plan:
@@ -67,7 +67,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> list[Trial]:
 
 def test_the_start_is_tried_first_and_is_never_better_than_the_best(whole):
     assert len(whole) == 9
-    assert whole[0].values == {"detection.e_max": 60.0, "gathering.tree_share": 0.4}
+    assert whole[0].values == {"detection.e_max": 60.0, "classification.tree_share": 0.4}
     assert min(trial.loss for trial in whole) <= whole[0].loss
     assert len({trial.loss for trial in whole}) > 1
 
@@ -187,7 +187,7 @@ def test_the_command_writes_a_set_with_its_provenance(tmp_path, capsys):
     told = provenance_in(text)
     assert [run["uri"] for run in told["run"]] == [RUN, OTHER]
     changed = values.changes_from(preset("forest"))
-    assert set(changed) <= {"detection.e_max", "gathering.tree_share"}
+    assert set(changed) <= {"detection.e_max", "classification.tree_share"}
     # The same command goes on with its journal, and another one with more trials makes them.
     assert main([*words, "--trials", "4"]) == 0
     said = capsys.readouterr()

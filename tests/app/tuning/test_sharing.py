@@ -101,7 +101,7 @@ def test_two_machines_share_the_trials(told: Plan):
     assert len(made) == TRIALS
     assert set(who.values()) == {"red", "blue"}
     assert len({tuple(trial.values.items()) for trial in made}) == TRIALS
-    assert made[0].values == {"detection.e_max": 60.0, "gathering.tree_share": 0.4}
+    assert made[0].values == {"detection.e_max": 60.0, "classification.tree_share": 0.4}
 
 
 def test_the_last_trial_is_begun_by_one_of_two_that_ask_at_once(told: Plan):

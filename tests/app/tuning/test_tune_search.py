@@ -30,7 +30,7 @@ from tests.app.server_for_tests import BEARER, Running, running
 
 PLAN = Plan(
     runs=(PlannedRun("sim:stand?duration=1"),),
-    axes=axes_of(["gathering.tree_share=0.1..0.9"]),
+    axes=axes_of(["classification.tree_share=0.1..0.9"]),
     start=preset("forest").model_dump(),
     storage="",
     trials=3,
@@ -38,10 +38,10 @@ PLAN = Plan(
 POOR, GOOD = (
     RunScore(TA=ta, FR=10 - ta, FA=0, TR=0, spurious=0, position_rmse=0.1, pair_error=1.0) for ta in (5, 9)
 )
-START = Trial(-1, {"gathering.tree_share": 0.4}, 1 / 3, (POOR,))
-BEST = Trial(1, {"gathering.tree_share": 0.7}, 1 / 19, (GOOD,))
+START = Trial(-1, {"classification.tree_share": 0.4}, 1 / 3, (POOR,))
+BEST = Trial(1, {"classification.tree_share": 0.7}, 1 / 19, (GOOD,))
 RESULT = Result(
-    START, BEST, True, 2, 0, {"gathering.tree_share": 1.0}, (("sim:stand?duration=1", "ab", False),)
+    START, BEST, True, 2, 0, {"classification.tree_share": 1.0}, (("sim:stand?duration=1", "ab", False),)
 )
 SAID = (Said(start=START), Said(trials=(msgspec.structs.replace(START, number=0), BEST)), Said(result=RESULT))
 
@@ -74,9 +74,9 @@ async def test_what_a_search_says_is_told_and_its_set_is_a_file_with_its_provena
     assert last["start"]["shown"] == "F1 0.667"
     assert last["best"]["number"] == 1
     assert last["points"] == [(0, pytest.approx(2 / 3)), (1, pytest.approx(18 / 19))]
-    assert last["changes"] == [["gathering.tree_share", 0.4, 0.7]]
+    assert last["changes"] == [["classification.tree_share", 0.4, 0.7]]
     name, values, text = search.found()
-    assert (name, values) == ("forest", preset("forest").replace({"gathering.tree_share": 0.7}))
+    assert (name, values) == ("forest", preset("forest").replace({"classification.tree_share": 0.7}))
     assert provenance_in(text)["run"][0]["sha256"] == "ab"
     await search.leave()
     assert told[-1] == {"state": "none"}
@@ -217,7 +217,7 @@ async def test_a_real_search_is_stopped_and_keeps_what_it_found():
 
 # --- the routes -----------------------------------------------------------------------------------
 
-BODY = {"over": ["gathering.tree_share=0.1..0.9"], "trials": 3}
+BODY = {"over": ["classification.tree_share=0.1..0.9"], "trials": 3}
 
 
 @pytest_asyncio.fixture
@@ -235,22 +235,22 @@ async def test_the_set_that_was_found_is_used_undone_and_saved(both: Running):
     assert (await client.post("/api/search", json=BODY)).status_code == 202
     await until(lambda: not dashboard.search.is_under_way)
     assert (await client.post("/api/search/use", json={})).status_code == 200
-    assert dashboard.parameters.parameters.gathering.tree_share == 0.7
+    assert dashboard.parameters.parameters.classification.tree_share == 0.7
     await client.post("/api/parameters/undo", json={})
-    assert dashboard.parameters.parameters.gathering.tree_share == 0.4
+    assert dashboard.parameters.parameters.classification.tree_share == 0.4
     saved = await client.post("/api/search/save", json={"name": "found", "who": "Ann"})
     assert [row["name"] for row in saved.json()["sets"]] == ["found"]
     text = (await client.get("/api/sets/found.toml")).text
     assert provenance_in(text)["tuned"]["goal"] == "f1"
     await client.post("/api/sets/use", json={"name": "found"})
-    assert dashboard.parameters.parameters.gathering.tree_share == 0.7
+    assert dashboard.parameters.parameters.classification.tree_share == 0.7
 
 
 @pytest.mark.parametrize(
     ("body", "words"),
     [
         ({"over": []}, "does not fit"),
-        ({"over": ["gathering.tree_share=0.9..0.1"]}, "must be less"),
+        ({"over": ["classification.tree_share=0.9..0.1"]}, "must be less"),
         ({**BODY, "goal": "best"}, "does not fit"),
         ({**BODY, "trials": 10**9}, "does not fit"),
         ({**BODY, "storage": "/etc/passwd"}, "does not fit"),
@@ -319,6 +319,6 @@ async def test_runs_of_the_list_are_searched_over_or_held_out_where_they_can_be_
     assert told["held_out"] == [(1, pytest.approx(2 / 3))]
     assert "on held-out runs F1 fell" in told["warning"]
     await client.post("/api/parameters/undo", json={})
-    await dashboard.change_parameters({"gathering.tree_share": 0.5})
+    await dashboard.change_parameters({"classification.tree_share": 0.5})
     answer = await client.post("/api/search/go-on", json={})
-    assert (answer.status_code, answer.json()["error"]["where"]) == (409, "gathering.tree_share")
+    assert (answer.status_code, answer.json()["error"]["where"]) == (409, "classification.tree_share")

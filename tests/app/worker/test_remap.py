@@ -23,7 +23,7 @@ URI = "sim:paper?duration=4&odometry=poor"
 LAST = 39
 BASE = Parameters()
 FEWER = BASE.replace({"detection.e_max": 12.0, "slam.particles": 60})  # judged anew
-LATER = BASE.replace({"tracking.gate": 2.0, "gathering.tree_share": 0.3})  # tracked anew alone
+LATER = BASE.replace({"tracking.gate": 2.0, "classification.tree_share": 0.3})  # tracked anew alone
 JUDGED = BASE.replace({"detection.radius_max": 0.2})  # from the first scan on that it touches
 WIDER = BASE.replace({"clustering.eps": 0.25})  # looked at anew
 
@@ -209,7 +209,7 @@ def test_what_a_held_slider_changes_is_told_against_the_map_before_it_was_taken(
     def named(renamed: list[tuple[int, int]], side: int) -> set[int]:
         return {pair[side] for pair in renamed}
 
-    none = BASE.replace({"gathering.tree_share": 1.0, "tracking.hits_to_confirm": 30})
+    none = BASE.replace({"classification.tree_share": 1.0, "tracking.hits_to_confirm": 30})
     first = told_after(FEWER, 1, 1)
     assert first.followed == first.renamed
     second = told_after(none, 2, 1)
@@ -293,7 +293,7 @@ def test_it_tells_which_trees_came_and_went_and_why():
         assert session.run is not None
         marked = dict(session.run._told.confirmed_s)
         # No column is ever a tree now; then all are back.
-        session.set_parameters(BASE.replace({"gathering.tree_share": 1.0}), 1, whole=True)
+        session.set_parameters(BASE.replace({"classification.tree_share": 1.0}), 1, whole=True)
         _, none = remapped(session)
         session.set_parameters(BASE, 2, whole=True)
         again, back = remapped(session)

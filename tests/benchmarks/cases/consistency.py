@@ -105,7 +105,7 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
     from pipeline.tracking import Tracker
     from tests.benchmarks.stands import RING
 
-    parameters = Parameters().replace({"slam.particles": particles, "gathering.method": "none"})
+    parameters = Parameters().replace({"slam.particles": particles, "classification.method": "none"})
     random = np.random.default_rng([7, seed])
     drive = stand or RING
     trees_there = drive.trees(random)

@@ -31,7 +31,7 @@ COPIED = 1 << 28  # bytes
 # What is changed, to what, and how long the whole run may take [s].
 JUDGED = (
     ("detection.e_max", 40.0, 0.5),
-    ("gathering.tree_share", 0.7, 0.5),
+    ("classification.tree_share", 0.7, 0.5),
     ("tracking.gate", 2.5, 0.5),
     ("detection.radius_max", 0.5, 0.5),
     ("slam.particles", 50, 0.5),

@@ -34,7 +34,7 @@ def view(free=NOWHERE_FREE, pose=None):
 
 
 def gathered(*clouds: Float32, free=NOWHERE_FREE, scans=1):
-    gathering = Gathering(FOREST.gathering, all_around=True)
+    gathering = Gathering(FOREST.classification, all_around=True)
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3), np.float32)
     for k in range(scans):
         gathering.add(points, points[:, 2].copy(), k, view(free))
@@ -82,13 +82,13 @@ def test_another_forest_votes_on_all_columns_from_the_next_scan_on():
         kind = 0 if name == "package" else 1
         return Forest(one, none, np.zeros(1), one, one, np.eye(len(CLASSES))[kind : kind + 1])
 
-    gathering = Gathering(FOREST.gathering, all_around=True, forests=sure)
+    gathering = Gathering(FOREST.classification, all_around=True, forests=sure)
     points = trunk(5.0, 1.0, 0.15, top=5.9)
     gathering.add(points, points[:, 2].copy(), 0, view())
     tree = at(gathering.columns, 5.0, 1.0)
     assert gathering.columns.verdict[tree] == Verdict.TREE
     before = gathering.snapshot()
-    other = FOREST.replace({"gathering.forest": "0" * 16}).gathering
+    other = FOREST.replace({"classification.forest": "0" * 16}).classification
     nothing, none = np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
     for restored in (False, True):
         gathering.parameters = other
@@ -102,7 +102,7 @@ def test_another_forest_votes_on_all_columns_from_the_next_scan_on():
 
 def test_going_back_gives_the_same_again():
     clouds = [trunk(4.0 + 0.001 * k, 1.0, 0.1, points=300, seed=k) for k in range(FOLD + 20)]
-    gathering = Gathering(FOREST.gathering, all_around=True)
+    gathering = Gathering(FOREST.classification, all_around=True)
     states, seen = {}, {}
     for k, cloud in enumerate(clouds):
         if k in (0, 5, FOLD - 1, FOLD, FOLD + 7):
@@ -125,7 +125,7 @@ def test_a_tree_that_no_scan_showed_begins_a_track_and_keeps_its_number():
     columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
     tracker = Tracker(FOREST.tracking)
     for _ in range(3):
-        tracker.judge(1, columns, FOREST.gathering)
+        tracker.judge(1, columns, FOREST.classification)
     trees = tracker.trees()
     assert trees.number.tolist() == [1]
     assert trees.confirmed.tolist() == [True]
@@ -145,19 +145,19 @@ def test_hits_make_no_tree_where_a_column_is_overdue(x, stays):
         found = detections([[5.0, 1.0], [x, -3.0]])
         tracker.process(k * second, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
         if k >= 4:
-            tracker.judge(k * second, columns, FOREST.gathering)
+            tracker.judge(k * second, columns, FOREST.classification)
             shown.append(tracker.trees().confirmed.tolist())
     assert 5 * second == DUE_NS
     assert shown == [[True, True], [True, stays]]
     late = gathered(trunk(x, -3.0, 0.15, top=5.9), scans=3).columns
-    tracker.judge(2 * DUE_NS, late, FOREST.gathering)
+    tracker.judge(2 * DUE_NS, late, FOREST.classification)
     assert tracker.trees().confirmed.tolist() == [True, True], "a column that comes late counts"
 
 
 def test_hits_count_where_returns_are_gathered_only_from_nearer():
     """Nobody can miss a column at 6 m who remembers no return from farther than 5 m."""
-    nothing, near = no_columns(), FOREST.gathering.model_copy(update={"range_max": 5.0})
-    for parameters, stays in ((FOREST.gathering, False), (near, True)):
+    nothing, near = no_columns(), FOREST.classification.model_copy(update={"range_max": 5.0})
+    for parameters, stays in ((FOREST.classification, False), (near, True)):
         tracker = Tracker(FOREST.tracking)
         for stamp_ns in (0, DUE_NS // 2, DUE_NS):
             far = detections([[6.0, -3.0]])
@@ -186,7 +186,7 @@ def test_hits_make_no_tree_of_who_walked_on(seen_s, unseen_s, stays):
         found = detections([[20.0, -3.0]])
         tracker.process(stamp_ns, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
     assert tracker.trees().confirmed.tolist() == [True]
-    tracker.judge(round(1e9 * (seen_s + unseen_s)), no_columns(), FOREST.gathering)
+    tracker.judge(round(1e9 * (seen_s + unseen_s)), no_columns(), FOREST.classification)
     assert tracker.trees().confirmed.tolist() == [stays]
 
 
@@ -199,12 +199,12 @@ def test_a_tree_does_not_outlive_its_column_beside_something_else():
         (Verdict.BUSH, 0.75, True),
     ):
         tracker = Tracker(FOREST.tracking)
-        tracker.judge(0, columns, FOREST.gathering)
+        tracker.judge(0, columns, FOREST.classification)
         assert tracker.trees().confirmed.tolist() == [True]
         place = tracker.trees().position[0]
         moved = replace(columns, axis=columns.axis.copy(), verdict=np.full_like(columns.verdict, kind))
         moved.axis[:, :2] = place + np.array([0.0, off])
-        tracker.judge(1, moved, FOREST.gathering)
+        tracker.judge(1, moved, FOREST.classification)
         assert tracker.trees().confirmed.tolist() == [stays], kind.label
 
 
@@ -217,7 +217,7 @@ def test_a_piece_that_is_joined_does_not_take_the_verdict_away():
         found = detections([[5.0, 1.0]] if k < 4 else [[5.0, 1.0], [5.0, 1.3]])
         tracker.process(k, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
         if k == 3:
-            tracker.judge(k, columns, FOREST.gathering)
+            tracker.judge(k, columns, FOREST.classification)
             assert tracker.trees().confirmed.tolist() == [False]
     assert tracker.trees().confirmed.tolist() == [False]
 

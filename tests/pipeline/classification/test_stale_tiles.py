@@ -27,7 +27,7 @@ def view(behind, steepest, x=0.0):
 def person_then_from_afar(steepest):
     """Somebody 1.7 m tall at (3, 0), seen ten times from 3 m and then with few returns from 15 m, with what
     stands 20 m behind them as high as that."""
-    gathering = Gathering(preset("forest").gathering, all_around=True)
+    gathering = Gathering(preset("forest").classification, all_around=True)
     body = trunk(3.0, 0.0, 0.15, top=1.7)
     nothing = depth_image(np.zeros((0, 3), np.float32))
     for k in range(10):
@@ -51,7 +51,7 @@ def test_few_returns_from_afar_tell_that_a_person_ends():
 
 
 def test_a_column_asks_once_and_few_at_a_time():
-    gathering = Gathering(preset("forest").gathering, all_around=True)
+    gathering = Gathering(preset("forest").classification, all_around=True)
     nothing = depth_image(np.zeros((0, 3), np.float32))
     places = [(-6.0, 2.0), (2.0, 2.0), (6.0, -6.0), (10.0, 2.0)]
     points = np.concatenate([trunk(x, y, 0.15, top=1.7) for x, y in places])

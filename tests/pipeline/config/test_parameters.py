@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pipeline.config import (
     PRESETS,
     Parameters,
+    RenamedParameterWarning,
     assign,
     field_specs,
     from_toml,
@@ -298,3 +299,21 @@ def test_the_table_has_a_row_a_parameter_and_a_column_a_preset():
 def test_values_are_plain_python_numbers():
     for value in preset("forest").replace({"clustering.eps": np.float64(0.3)}).flat().values():
         assert type(value) in (int, float, bool, str)
+
+
+def test_names_of_earlier_versions_are_accepted_with_one_warning_each():
+    with pytest.warns(RenamedParameterWarning, match=r"slam.looks is now called slam.independent_views_max"):
+        by_name = Parameters().replace({"slam.looks": 50.0})
+    with pytest.warns(RenamedParameterWarning, match=r"gathering.every is now called classification.every"):
+        from_file = from_toml("[gathering]\nevery = 2\n", Parameters(), "old.toml")
+    with pytest.warns(RenamedParameterWarning, match=r"shape.slices"):
+        assigned = assign(Parameters(), ["shape.slices=6"])
+    assert by_name.slam.independent_views_max == 50.0
+    assert from_file.classification.every == 2
+    assert assigned.shape.split_slices == 6
+
+
+def test_a_current_name_takes_precedence_over_an_earlier_name():
+    with pytest.warns(RenamedParameterWarning):
+        p = from_toml("[slam]\nlooks = 50.0\nindependent_views_max = 20.0\n", Parameters(), "both.toml")
+    assert p.slam.independent_views_max == 20.0

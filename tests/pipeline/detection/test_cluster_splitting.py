@@ -15,7 +15,7 @@ from pipeline.detection.verdicts import judge
 from pipeline.types.records import Clusters, Labels, Verdict
 from tests.pipeline.strategies import LAW, SENSOR, one_cluster
 
-FOREST = preset("forest").shape.model_copy(update={"slices": 4})
+FOREST = preset("forest").shape.model_copy(update={"split_slices": 4})
 DETECTION = preset("forest").detection
 SHARP = replace(SENSOR, range_sigma=0.01)
 HEIGHTS = np.arange(-1.3, 0.4, 0.05)  # of rings at a trunk, below a sensor that stands 1.6 m high
@@ -57,7 +57,7 @@ def rays(rng, turn, reach, heights, sigma):
 
 
 def parts_of(points, slices=4):
-    shape = FOREST.model_copy(update={"slices": slices})
+    shape = FOREST.model_copy(update={"split_slices": slices})
     return describe_stems(points.astype(np.float32), one_cluster(points), SHARP, shape)
 
 
@@ -117,7 +117,9 @@ def test_no_return_is_lost_whatever_the_points(seed, slices, spread):
     points = (rng.normal(0.0, spread, (120, 3)) + np.array([3.0, 0.0, 0.0])).astype(np.float32)
     label = rng.integers(-1, 3, 120).astype(np.int32)
     before = Labels(label, 3, np.zeros(3, np.bool_))
-    labels, clusters = describe_stems(points, before, SENSOR, FOREST.model_copy(update={"slices": slices}))
+    labels, clusters = describe_stems(
+        points, before, SENSOR, FOREST.model_copy(update={"split_slices": slices})
+    )
     assert ((labels.label >= 0) == (label >= 0)).all()
     assert (np.bincount(labels.label[label >= 0], minlength=labels.clusters) == clusters.size).all()
     assert len(clusters.size) == labels.clusters == len(labels.hidden)

@@ -24,7 +24,7 @@ def share_within(place: np.ndarray, other: np.ndarray, distance: float) -> float
 
 
 @pytest.mark.parametrize(
-    "change", [{}, {"gathering.tree_share": 0.6}, {"detection.e_max": 5.0}, {"slam.particles": 40}]
+    "change", [{}, {"classification.tree_share": 0.6}, {"detection.e_max": 5.0}, {"slam.particles": 40}]
 )
 def test_it_is_near_to_the_map_that_comes(change, known):
     kept, basis = known
@@ -43,7 +43,7 @@ def test_without_votes_enough_nothing_that_was_gathered_is_a_tree(known):
     columns = basis.notes.newest_columns()
     assert columns is not None
     assert (columns.verdict(0.4) == Verdict.TREE).any()
-    rough = rough_trees(basis, kept.clusters, BASE.replace({"gathering.tree_share": 1.0}))
+    rough = rough_trees(basis, kept.clusters, BASE.replace({"classification.tree_share": 1.0}))
     assert rough is not None
     trees = columns.place[columns.verdict(0.4) == Verdict.TREE]
     assert share_within(trees, rough.position, 0.1) < 0.5
@@ -93,7 +93,7 @@ def test_clusters_join_the_nearest_of_all_places(seed, reach, most):
     assert found == pytest.approx(np.array(place), abs=1e-9)
 
 
-@pytest.mark.parametrize("change", [{"clustering.eps": 0.2}, {"gathering.every": 2}])
+@pytest.mark.parametrize("change", [{"clustering.eps": 0.2}, {"classification.every": 2}])
 def test_nothing_is_told_of_clusters_that_nobody_knows(change, known):
     kept, basis = known
     assert rough_trees(basis, kept.clusters, BASE.replace(change)) is None

@@ -23,7 +23,7 @@ from pipeline.io.readers import open_source
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import KeptScans, Recalled, Rerun, look_key
-from pipeline.remapping.cache_key import GATHERING, STAGES
+from pipeline.remapping.cache_key import CLASSIFICATION, STAGES
 from pipeline.remapping.packing import HIGHEST
 from pipeline.remapping.rerun import one_by_one
 from pipeline.types.records import Frame, PoseMeasurement, Scan, Step, Turn
@@ -76,7 +76,7 @@ def told(frame: Frame | Recalled) -> object:
 def is_later(name: str) -> bool:
     """Whether a parameter says nothing of what a scan shows."""
     stage, _, field = name.partition(".")
-    return field not in GATHERING if stage == "gathering" else stage not in STAGES
+    return field not in CLASSIFICATION if stage == "classification" else stage not in STAGES
 
 
 def another(spec: FieldSpec, share: float) -> Value:

@@ -19,7 +19,7 @@ from tests.pipeline.remapping.mapped import BASE, mapper, run, with_odd
 from tests.pipeline.remapping.test_rerun import another
 
 SETS = 8
-LATE = ("detection.", "tracking.", "gathering.tree_share", "evaluation.", "obstacles.")
+LATE = ("detection.", "tracking.", "classification.tree_share", "evaluation.", "obstacles.")
 
 
 def told(known: object) -> object:
@@ -80,7 +80,7 @@ def test_what_goes_on_is_what_begins_anew(seed, known):
 
 
 @pytest.mark.parametrize("most", [1, 7, 1000])
-@pytest.mark.parametrize("change", [{"tracking.hits_to_confirm": 9}, {"gathering.tree_share": 0.7}])
+@pytest.mark.parametrize("change", [{"tracking.hits_to_confirm": 9}, {"classification.tree_share": 0.7}])
 def test_the_same_is_remembered_of_scans_that_are_told_many_at_a_time(change, most, known, monkeypatch):
     monkeypatch.setattr("app.explain.estimate_history._MOST_ROWS", 150)
     kept, basis = known
@@ -100,9 +100,9 @@ def test_the_same_is_remembered_of_scans_that_are_told_many_at_a_time(change, mo
     [
         ("tracking.gate", 2.5, True),
         ("tracking.hits_to_confirm", 9, True),
-        ("gathering.tree_share", 0.7, True),
+        ("classification.tree_share", 0.7, True),
         ("slam.gate", 3.0, False),
-        ("gathering.every", 2, False),
+        ("classification.every", 2, False),
         ("clustering.eps", 0.2, False),
         ("tracking.engine", "filterpy", False),
     ],
@@ -116,7 +116,7 @@ def test_trees_alone_are_tracked_where_nothing_before_them_changes(name, value, 
 def test_a_journal_of_a_rerun_is_one_of_its_parameters(known):
     """One change after another, each from the run before."""
     kept, basis = known
-    first, second = BASE.replace({"tracking.gate": 2.5}), BASE.replace({"gathering.tree_share": 0.7})
+    first, second = BASE.replace({"tracking.gate": 2.5}), BASE.replace({"classification.tree_share": 0.7})
     again, _, _ = finished(first, kept, basis)
     last = again.state()
     assert last is not None

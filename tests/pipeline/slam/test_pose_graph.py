@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from pipeline.config import Parameters, optional_packages, preset
+from pipeline.config import Parameters, preset, stages
 from pipeline.errors import ParameterError
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.io.checkpoints.saved_map import SavedMap
@@ -190,7 +190,7 @@ def test_particles_and_graph_take_over_from_one_another():
 
 
 def test_without_gtsam_the_choice_names_the_extra(monkeypatch):
-    monkeypatch.setattr(optional_packages, "find_spec", lambda _name: None)
+    monkeypatch.setattr(stages, "find_spec", lambda _name: None)
     with pytest.raises(ParameterError, match=r"stemmap\[graph\]"):
         Parameters().replace({"slam.method": "graph"})
     assert Parameters().replace({"slam.method": "fastslam1"}).slam.method == "fastslam1"

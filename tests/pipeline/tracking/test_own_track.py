@@ -26,7 +26,7 @@ def told(*tracks: tuple[float, int]):
         table.x[k, :2] = PLACE + away * np.array([np.cos(2.0 * k), np.sin(2.0 * k)])
         table.number[k], table.hits[k], table.score[k] = k + 1, hits, 5.0
     tracker.tracks, tracker.next_number = table, len(tracks) + 1
-    tracker.judge(1, column(Verdict.TREE, tree=0.8), FOREST.gathering)
+    tracker.judge(1, column(Verdict.TREE, tree=0.8), FOREST.classification)
     return [Verdict(int(v)) if v >= 0 else None for v in tracker.tracks.verdict]
 
 

@@ -49,7 +49,7 @@ def track(*, sides=SIDES, fits=FITS, off=0.0):
 def verdict(columns, tracks, share=0.4):
     tracker = Tracker(FOREST.tracking)
     tracker.tracks = tracks
-    judged = tracker.judge(1, columns, FOREST.gathering.model_copy(update={"tree_share": share}))
+    judged = tracker.judge(1, columns, FOREST.classification.model_copy(update={"tree_share": share}))
     return Verdict(int(judged.verdict[0]))
 
 
@@ -115,6 +115,6 @@ def test_no_tree_is_lost_and_more_votes_for_a_tree_never_harm(tree, more, needed
 def test_the_tracker_shows_the_tree_and_says_so_of_the_column():
     tracker = Tracker(FOREST.tracking)
     tracker.tracks = track()
-    columns = tracker.judge(1, column(tree=0.3), FOREST.gathering)
+    columns = tracker.judge(1, column(tree=0.3), FOREST.classification)
     assert columns.verdict.tolist() == [Verdict.TREE]
     assert tracker.trees().confirmed.tolist() == [True]

@@ -25,7 +25,7 @@ SETS: tuple[tuple[dict[str, float], bool], ...] = (
     ({"detection.radius_max": 0.1, "tracking.gate": 2.0}, False),
     ({"slam.particles": 7}, False),
     ({"clustering.eps": 0.3}, True),
-    ({"clustering.eps": 0.3, "gathering.tree_share": 0.9}, False),
+    ({"clustering.eps": 0.3, "classification.tree_share": 0.9}, False),
 )
 
 

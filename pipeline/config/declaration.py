@@ -1,4 +1,4 @@
-"""The words in which a stage declares its parameters."""
+"""Helpers with which a stage declares its parameters."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Stage(BaseModel):
-    """The parameters of one stage: frozen, strict, nothing unknown, no NaN and no infinity."""
+    """Parameters of one stage: immutable, strictly typed, without unknown names, NaN or infinity."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
     @classmethod
     def title(cls) -> str:
-        """The stage's name for people: the first line of its docstring up to the colon."""
+        """Return the name of the stage for people: its docstring up to the first colon."""
         return (cls.__doc__ or cls.__name__).partition(":")[0].strip()
 
 
 def number(default: float, title: str, unit: str, low: float, high: float, step: float, doc: str) -> Any:  # noqa: ANN401 - pydantic's Field is the default of a field of any type
-    """A number in [low, high]; `step` is what a slider moves by."""
+    """Declare a floating-point parameter in [low, high]; `step` is the increment of its slider."""
     return Field(
         default=default,
         title=title,
@@ -31,7 +31,7 @@ def number(default: float, title: str, unit: str, low: float, high: float, step:
 
 
 def count(default: int, title: str, unit: str, low: int, high: int, doc: str) -> Any:  # noqa: ANN401
-    """A whole number in [low, high]."""
+    """Declare an integer parameter in [low, high]."""
     return Field(
         default=default,
         title=title,
@@ -43,10 +43,10 @@ def count(default: int, title: str, unit: str, low: int, high: int, doc: str) ->
 
 
 def name(default: str, title: str, pattern: str, doc: str) -> Any:  # noqa: ANN401
-    """A word that names something; what names look like is a regular expression."""
+    """Declare a parameter that holds a name; the regular expression `pattern` defines valid names."""
     return Field(default=default, title=title, description=doc, pattern=pattern)
 
 
 def choice(default: str | bool, title: str, doc: str) -> Any:  # noqa: ANN401
-    """One of the words of a Literal, or a switch."""
+    """Declare a parameter whose type is a Literal of words, or bool."""
     return Field(default=default, title=title, description=doc)
