@@ -189,7 +189,7 @@ def test_a_parameter_file_sets_all_its_values(file: Path, changes: dict[str, Any
     saved = flat(tomllib.loads(file.read_text(encoding="utf-8")))
     assert saved.items() >= as_saved(changes).items()
     now = flat(tomllib.loads(stemmap("params", "--format", "toml", "--config", file)))
-    assert now.items() >= saved.items()
+    assert as_saved(now).items() >= saved.items()
 
 
 def test_a_learned_forest_is_used(tmp_path: Path):
