@@ -18,11 +18,10 @@ from app.batch.saved_run import FORMAT, SavedRun
 from app.batch.summary import start_lines, summary_lines
 from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
-from app.common.preset_text import changed_values, preset_words
-from app.common.stage_timer import Stopwatch
-from app.common.text import count
+from app.common.text import changed_values, count, preset_words
+from app.common.timers import Stopwatch
 from app.common.version import version
-from app.sources.odometry import Chosen, with_odometry
+from app.sources.opening import Chosen, with_odometry
 from app.training.learned_forests import kept_forests
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
@@ -52,7 +51,7 @@ class OfflineRun:
     """What to map, and how.
 
     Attributes:
-        odometry: Where the motion comes from, as asked, see `app.sources.odometry`.
+        odometry: Where the motion comes from, as asked, see `app.sources.opening`.
         stop_after: So many scans.
         revisions: Other parameters, each from a scan on, in their order.
         on_frame: Told of each scan's results.

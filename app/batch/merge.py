@@ -18,7 +18,7 @@ from app.batch.output_folder import check_folder
 from app.batch.run_folder import read_run_record
 from app.batch.run_totals import Tally
 from app.batch.saved_run import SavedRun, read_saved_run
-from app.common.preset_text import changed_values
+from app.common.text import changed_values
 from app.common.version import version
 from app.worker.run_health import RunHealth
 from pipeline.config import Parameters

@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print_table(name: str, parameters: Parameters) -> None:
-    from app.common.preset_text import preset_words
+    from app.common.text import preset_words
     from pipeline.config import field_specs
 
     words = preset_words(name, parameters)

@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     record = recording_place(arguments, *uris)
     chosen_parameters(arguments, "forest")  # a mistyped flag is said now, not on the page
 
-    from app.dashboard.parameter_state import ParameterState
+    from app.dashboard.parameters import ParameterState
     from app.web.serving import serve
     from app.worker.protocol import Open
 

@@ -1,4 +1,4 @@
-"""The dashboard's state: what the worker said last, and what people asked for.
+"""The dashboard's state: the last results of the worker and the choices of the users.
 
 Joins the worker, the parameters, the 3D scene and the browsers. Everything runs on the event loop.
 """
@@ -8,25 +8,24 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from app.common.throttle import Throttle
+from app.common.timers import Throttle
 from app.dashboard.annotations import Annotating
 from app.dashboard.broadcast import Live
 from app.dashboard.camera_view import CameraDesk
 from app.dashboard.events import Events
-from app.dashboard.interfaces import SceneLike, WorkerLike
 from app.dashboard.map_changes import MapChanges
-from app.dashboard.parameter_sets import ParameterSets
-from app.dashboard.parameter_state import ParameterState
-from app.dashboard.payload import map_payload, truth_payload
+from app.dashboard.parameters import ParameterSets, ParameterState
+from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
 from app.dashboard.run_recorder import Glance, Logbook
 from app.dashboard.scores import Scores, score_payload
-from app.dashboard.selecting import Selecting
-from app.dashboard.verdict_counts import BeforeAfter, counts_of
+from app.dashboard.selection import Selecting
+from app.dashboard.user import SOMEBODY, hand
 from app.explain.client import Asking
 from app.sources.request import SourceRequest
 from app.store.async_store import Keeper
@@ -34,7 +33,6 @@ from app.tuning.job import TuneSearch
 from app.tuning.sweep.asking_page import question_of
 from app.tuning.sweep.sensitivity import Sensitivity
 from app.web.connection_limits import Places, Turns
-from app.web.user import SOMEBODY, hand
 from app.worker.internal_protocol import (
     Answer,
     Begin,
@@ -49,9 +47,44 @@ from app.worker.internal_protocol import (
 from app.worker.loop_playback import Loop
 from app.worker.outbox import joined
 from app.worker.protocol import Open, Play, SetParameters, Status
-from pipeline.config import preset
+from pipeline.config import Parameters, preset
 from pipeline.config.model import Value
-from pipeline.types.records import Path, Trees, TruthTrees
+from pipeline.types.records import Frame, Path, Trees, TruthTrees
+
+
+class SceneLike(Protocol):
+    """What the dashboard needs of `app.scene.Scene`."""
+
+    @property
+    def port(self) -> int: ...
+
+    secret: str
+
+    def show(self, frame: Frame, path: NDArray[np.float64], /) -> None: ...
+    def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None: ...
+    def show_truth(self, trees: TruthTrees | None, /) -> None: ...
+    def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None: ...
+    def choose(self, name: str, value: str | bool, /) -> None: ...
+    @property
+    def view(self) -> dict[str, Any]: ...
+    @property
+    def counts(self) -> dict[str, int]: ...
+    def clear(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class WorkerLike(Protocol):
+    """What the dashboard needs of `app.worker.supervisor.WorkerProcess`."""
+
+    restarts: int
+
+    @property
+    def pid(self) -> int | None: ...
+
+    async def start(self) -> None: ...
+    async def send(self, command: ToWorker, /) -> None: ...
+    async def close(self) -> None: ...
+
 
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 _SCENE_PAUSE_S = 0.09

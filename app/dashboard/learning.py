@@ -15,8 +15,8 @@ from typing import Any
 
 import msgspec
 
-from app.store.annotated import AnnotatedSource
 from app.store.async_store import Keeper
+from app.store.store import AnnotatedSource
 from app.training.learned_forests import Forests
 from pipeline.classification.forest import PACKAGE
 from pipeline.config import Parameters

@@ -1,16 +1,20 @@
-"""A frame as the page needs it: the map without the points."""
+"""Frames as the page receives them: the map without its points, verdict counts, uncertain trees, and the
+points of one scan as a binary block."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from app.explain.estimate_history import half_axes
 from app.worker.internal_protocol import Shown
+from pipeline.classification.forest import CLASSES
 from pipeline.types.clearance import Clearance
 from pipeline.types.pose_health import Health
 from pipeline.types.records import Frame, Trees, TruthTrees, Verdict
@@ -181,3 +185,156 @@ def _known(value: float) -> float | None:
 
 def _finite(values: Float) -> list[float | None]:
     return [round(v, 2) if math.isfinite(v) else None for v in values.tolist()]
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """How many clusters of a scan ended with each verdict.
+
+    Attributes:
+        index: Of the scan.
+        verdicts: In words.
+        right, wrong: Of those taken for trees, how many stand at a true tree and how many do not; None
+            without truth.
+    """
+
+    index: int
+    verdicts: dict[str, int]
+    right: int | None
+    wrong: int | None
+
+    def as_plain(self) -> dict[str, Any]:
+        """For the browsers."""
+        return {"verdicts": self.verdicts, "right": self.right, "wrong": self.wrong}
+
+
+def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> Counts:
+    """The counts of a scan; `match_distance` [m] is how far a detection may lie from its tree."""
+    verdicts = verdict_counts(frame.clusters.verdict)
+    if truth is None:
+        return Counts(frame.index, verdicts, None, None)
+    from pipeline.evaluation import match
+
+    found = frame.estimate.T_map_base.apply(frame.detections.centre)
+    truth_of = match(found, np.column_stack([truth.x, truth.y]), match_distance)
+    right = sum(row >= 0 and truth.kind[row] == "tree" for row in truth_of.tolist())
+    return Counts(frame.index, verdicts, right, len(found) - right)
+
+
+class BeforeAfter:
+    """Remembers how the standing scan looked before the last change."""
+
+    def __init__(self) -> None:
+        self._now: Counts | None = None
+        self._before: Counts | None = None
+
+    def forget(self) -> None:
+        """Another run begins."""
+        self._now = self._before = None
+
+    def step(self) -> None:
+        """A change begins that is a step of its own."""
+        self._before = self._now
+
+    def shown(self, counts: Counts) -> dict[str, Any]:
+        """Take the counts of what is shown now; gives what the page needs of them."""
+        self._now = counts
+        if self._before is not None and self._before.index != counts.index:
+            self._before = None  # of another scan
+        before = None if self._before is None else self._before.as_plain()
+        return {"right": counts.right, "wrong": counts.wrong, "before": before}
+
+
+REACH = 0.45  # m; a column farther from a tree is another thing
+
+
+def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
+    """The confirmed trees with the votes on what was gathered there, the closest to the limit first.
+
+    Trees where nothing upright was gathered have no votes and come last.
+
+    Args:
+        frame: With its columns.
+        tree_share: Share of the votes that makes a tree.
+    """
+    from scipy.spatial import cKDTree
+
+    # As the page sorts them: of equal doubt the one that was seen least often.
+    rows = np.flatnonzero(frame.trees.confirmed)
+    rows = rows[np.lexsort((frame.trees.number[rows], frame.trees.observations[rows]))]
+    number = frame.trees.number[rows].tolist()
+    columns = frame.columns
+    if columns is None or not len(columns.share):
+        return [{"tree": each, "votes": None, "next": "", "next_votes": 0.0} for each in number]
+    distance, column = cKDTree(columns.axis[:, :2]).query(frame.trees.position[rows])
+    told = []
+    for tree, far, row in zip(number, distance.tolist(), column.tolist(), strict=True):
+        share = columns.share[row]
+        other = 1 + int(share[1:].argmax())
+        votes, following = (None if far > REACH else round(float(share[k]), 3) for k in (0, other))
+        told.append({"tree": tree, "votes": votes, "next": CLASSES[other].label, "next_votes": following})
+    return sorted(told, key=lambda each: _margin(each["votes"], tree_share))
+
+
+def _margin(votes: float | None, tree_share: float) -> float:
+    return float("inf") if votes is None else abs(votes - tree_share)
+
+
+_ALIGNED = 4
+_FARTHEST_CM = 32_767
+
+
+def packed(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
+    """The block; see above."""
+    table, parts, place = [], [], 0
+    for name, array in arrays.items():
+        content = np.ascontiguousarray(array).tobytes()
+        table.append({"name": name, "type": array.dtype.str, "shape": array.shape, "at": place})
+        padded = content + bytes(-len(content) % _ALIGNED)
+        parts.append(padded)
+        place += len(padded)
+    text = msgspec.json.encode({**header, "arrays": table})
+    text += b" " * (-len(text) % _ALIGNED)
+    return b"".join([len(text).to_bytes(4, "little"), text, *parts])
+
+
+def in_centimetres(points: NDArray[np.float32]) -> NDArray[np.int16]:
+    """Points of shape (N, 3) [m] in whole centimetres; what lies beyond 327 m stands at its edge."""
+    return np.clip(np.round(100.0 * points), -_FARTHEST_CM, _FARTHEST_CM).astype(np.int16)
+
+
+def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
+    """What the header says of a frame's clusters."""
+    counts = counts_of(frame, truth, match_distance)
+    return {
+        "index": frame.index,
+        "clusters": clusters_payload(frame),
+        **counts.as_plain(),
+        "counts": dict(frame.counts),
+    }
+
+
+def stages_payload(frame: Frame) -> bytes:
+    """The four stages of Fig. 3: the raw scan, what passed the filters, the clusters and the trunks."""
+    arrays = {"raw": in_centimetres(frame.raw), **_clustered(frame)}
+    return packed(described(frame, None, 0.0), arrays)
+
+
+def comparison_payload(
+    frames: list[Frame], header: dict[str, Any], truth: TruthTrees | None, match_distance: float
+) -> bytes:
+    """The same scan under several sets; the arrays of the k-th have its number in their names."""
+    arrays = {
+        f"{name}{k}": array for k, frame in enumerate(frames) for name, array in _clustered(frame).items()
+    }
+    pictures = [described(frame, truth, match_distance) for frame in frames]
+    return packed({**header, "pictures": pictures}, arrays)
+
+
+def _clustered(frame: Frame) -> dict[str, NDArray[Any]]:
+    circles = np.column_stack([frame.clusters.centre, frame.clusters.radius, frame.clusters.centroid[:, 2]])
+    return {
+        "points": in_centimetres(frame.filtered),
+        "labels": frame.labels.astype(np.int32),
+        "circles": circles.astype(np.float32),
+    }

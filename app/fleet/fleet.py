@@ -10,7 +10,7 @@ from typing import Any
 
 from app.common.settings import Settings
 from app.dashboard.broadcast import Live
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState
 from app.fleet.frames import Frames
 from app.fleet.member import Member, next_port
 from app.fleet.payload import card, drawn, shown_map

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from app.common.settings import Settings
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState
 from app.fleet.fleet import Fleet
 from app.fleet.remote import RemoteRobots
 from app.fleet.server import build_fleet

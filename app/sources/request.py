@@ -30,7 +30,7 @@ class SourceRequest(msgspec.Struct, frozen=True):
 
     Attributes:
         uri: Path or address of the source, as the user wrote it.
-        odometry: "auto", "wheels", "kiss-icp", "static", or "file:" and a path (see `app.sources.odometry`).
+        odometry: "auto", "wheels", "kiss-icp", "static", or "file:" and a path (see `app.sources.opening`).
         seed: Random seed of the mapping and of a simulated source.
         topics: Topic name by role, where the user chose one; other topics are found by type.
         mount: Pose of the LiDAR on the robot: x, y, z [m], roll, pitch, yaw [rad]. None uses the pose that

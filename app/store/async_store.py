@@ -47,7 +47,7 @@ class Keeper:
     def _work(self, function: Callable[[Store], T]) -> T:
         from sqlalchemy.exc import SQLAlchemyError
 
-        from app.store.opening import reason_of
+        from app.store.database import reason_of
         from app.store.store import Store
 
         if self._store is None:

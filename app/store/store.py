@@ -1,35 +1,138 @@
-"""Reads and edits annotations; each edit can be undone by the browser that made it.
+"""Reads and edits annotations and saved parameter sets. The browser that made an edit of an annotation can
+undo it.
 
-Every change remembers what stood before and after, and an annotation remembers which change led to what
-stands. A change can be undone as long as it is that one: then nobody has touched the annotation since.
+Every change stores the content before and after it, and an annotation stores which change led to its current
+content. A change can be undone while it is still the last one of its annotation.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from sqlalchemy import Connection, Insert, Row, func, insert, select, update
+from sqlalchemy import Connection, Engine, Insert, Row, delete, func, insert, select, update
 
+from app.sources.request import SourceRequest, request_of_kept
 from app.store import tables
-from app.store.annotated import AnnotatedSource, annotated_sources
 from app.store.book import RunBook
-from app.store.opening import open_engine
+from app.store.database import open_engine
 from app.store.records import (
     MOST_ANNOTATIONS,
+    MOST_SETS,
     Annotation,
     Author,
     Content,
+    SavedSet,
     StaleError,
     UnknownError,
     moment,
 )
-from app.store.sets import Sets
+from app.store.tables import parameter_sets as table
 from pipeline.errors import StemmapError
+
+_runs, _annotations, _records = tables.runs, tables.annotated, tables.records
+
+
+@dataclass(frozen=True, slots=True)
+class AnnotatedSource:
+    """A source with its annotations.
+
+    Attributes:
+        source: Digest of the recording, or its URI where it has no digest.
+        name: Name under which it was opened last.
+        request: How it was mapped last, with its parameters; the defaults where it was never mapped.
+        annotations: The annotations that are not deleted.
+    """
+
+    source: str
+    name: str
+    request: SourceRequest
+    annotations: tuple[Content, ...]
+
+
+def annotated_sources(engine: Engine) -> list[AnnotatedSource]:
+    """All sources with annotations, in the order in which they were first opened."""
+    a = _annotations.c
+    query = select(a.run, a.x, a.y, a.kind, a.dbh).where(a.deleted.is_(False)).order_by(a.id)
+    with engine.begin() as connection:
+        contents: dict[int, list[Content]] = {}
+        for row in connection.execute(query):
+            contents.setdefault(row.run, []).append(Content(row.x, row.y, row.kind, row.dbh))
+        found = []
+        for run in connection.execute(select(_runs).where(_runs.c.id.in_(contents)).order_by(_runs.c.id)):
+            newest = connection.execute(
+                select(_records)
+                .where(_records.c.run == run.id, _records.c.deleted_ns.is_(None), _records.c.scans > 0)
+                .order_by(_records.c.changed_ns.desc(), _records.c.id.desc())
+                .limit(1)
+            ).one_or_none()
+            found.append(
+                AnnotatedSource(
+                    run.source,
+                    run.name,
+                    SourceRequest(run.uri) if newest is None else request_of_record(newest, run.uri),
+                    tuple(contents[run.id]),
+                )
+            )
+    return found
+
+
+def request_of_record(row: Row[Any], uri: str) -> SourceRequest:
+    """Return how a recorded run was mapped, with the path at which its source was opened last."""
+    return request_of_kept(
+        uri,
+        odometry=row.odometry,
+        seed=row.seed,
+        choices=row.chosen,
+        preset=row.preset,
+        parameters=row.parameters,
+    )
+
+
+class Sets:
+    """Reads and writes the saved sets.
+
+    Args:
+        engine: On the database.
+        clock: Nanoseconds since 1970.
+    """
+
+    def __init__(self, engine: Engine, clock: Callable[[], int]) -> None:
+        self._engine, self._clock = engine, clock
+
+    def all(self) -> list[SavedSet]:
+        """Every set, by name."""
+        with self._engine.begin() as connection:
+            rows = connection.execute(select(table).order_by(table.c.name)).all()
+        return [SavedSet(row.name, row.toml, row.who, row.at_ns) for row in rows]
+
+    def save(self, name: str, toml: str, who: str) -> None:
+        """Keep a set under a name; one that has the name already makes room for it.
+
+        Raises:
+            StemmapError: There would be too many.
+        """
+        with self._engine.begin() as connection:
+            connection.execute(delete(table).where(table.c.name == name))
+            if connection.execute(select(func.count()).select_from(table)).scalar_one() >= MOST_SETS:
+                raise StemmapError(f"there are {MOST_SETS} saved sets already", remedy="Delete some first")
+            values = {"name": name, "toml": toml, "who": who, "at_ns": self._clock()}
+            connection.execute(insert(table).values(**values))
+
+    def delete(self, name: str) -> None:
+        """Forget a set.
+
+        Raises:
+            UnknownError: There is none of this name.
+        """
+        with self._engine.begin() as connection:
+            if connection.execute(delete(table).where(table.c.name == name)).rowcount == 0:
+                raise UnknownError("there is no saved set of this name", where=name)
+
 
 # Longer ones were never the digests that all recordings have.
 _LONGEST_KEY = 600

@@ -13,11 +13,10 @@ from pathlib import Path
 
 from app.common.version import version
 from app.robot.source import LiveSource
-from app.sources.odometry import with_odometry
-from app.sources.opening import open_any
+from app.sources.opening import open_any, with_odometry
 from app.sources.request import SourceRequest
-from app.store.annotated import AnnotatedSource
 from app.store.records import Content
+from app.store.store import AnnotatedSource
 from app.training.annotated import REACH, SEEN, Judged
 from app.training.fit_forest import Examples
 from app.training.keeping import kept_or_made

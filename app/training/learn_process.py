@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from app.common.parent_watch import end_with
-from app.store.annotated import AnnotatedSource
+from app.store.store import AnnotatedSource
 from app.training.annotated_runs import annotated_run
 from app.training.learned_forests import Forests
 from app.training.learning import Asked, Learned, learn, seen_by

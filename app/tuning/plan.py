@@ -70,7 +70,7 @@ class Plan(msgspec.Struct, frozen=True):
         preset: Name of that from which the parameters come.
         start: All parameters with which the search begins, by stage; those of the axes are tried first.
         seed: Of the mapping and of the sampler.
-        odometry: Where the motion of each run comes from, see `app.sources.odometry`.
+        odometry: Where the motion of each run comes from, see `app.sources.opening`.
         trials: So many in all, those of earlier times counted.
         seconds: Stop after this time; 0 for none.
         storage: Path of a journal, or address of a PostgreSQL database.

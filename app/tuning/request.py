@@ -14,7 +14,7 @@ from msgspec import Meta
 from app.common.text import count
 from app.robot.address import is_live
 from app.sources.request import SourceRequest, request_of_kept
-from app.store.annotated import AnnotatedSource
+from app.store.store import AnnotatedSource
 from app.tuning.goal import goal_of
 from app.tuning.plan import Plan, PlannedRun, TruthColumns
 from app.tuning.space import axes_of, check

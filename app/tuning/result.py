@@ -12,7 +12,7 @@ import tomli_w
 
 from app.common.text import count
 from app.common.version import version
-from app.dashboard.parameter_sets import file_of
+from app.dashboard.parameters import file_of
 from app.tuning.goal import RunScore, pool
 from app.tuning.plan import Plan
 from app.tuning.trial import Trial

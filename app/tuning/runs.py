@@ -12,8 +12,8 @@ import numpy as np
 from app.batch.run_folder import as_written
 from app.batch.run_totals import far_truth
 from app.common.text import count
-from app.dashboard.ground_truth import contents_of, laid_over
-from app.sources.odometry import with_odometry
+from app.dashboard.annotations import contents_of, laid_over
+from app.sources.opening import with_odometry
 from app.sources.request import SourceRequest
 from app.store.records import Annotation
 from app.training.learned_forests import kept_forests

@@ -18,10 +18,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.common.settings import Settings
 from app.dashboard.broadcast import Live
-from app.dashboard.dashboard import Dashboard
-from app.dashboard.interfaces import SceneLike, WorkerLike
+from app.dashboard.dashboard import Dashboard, SceneLike, WorkerLike
 from app.dashboard.learning import Learning
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState
 from app.store.async_store import Keeper
 from app.store.records import UnknownError
 from app.training.learned_forests import Forests

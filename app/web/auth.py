@@ -23,8 +23,8 @@ from starlette.datastructures import Headers
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from app.dashboard.user import hand, name_in
 from app.web.responses import error_reply
-from app.web.user import hand, name_in
 from pipeline.errors import StemmapError
 
 # Where bodies may be as long as a recording.

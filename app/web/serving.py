@@ -1,27 +1,57 @@
-"""Runs the web server in this process: the socket, the printed link, the browser, the signals."""
+"""Runs the web server in this process: socket, printed link, browser and signals."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import errno
+import html
 import os
 import signal
 import socket
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import uvicorn
 from starlette.types import ASGIApp
 
 from app.common.settings import DEFAULT_PORT, Settings
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState
 from app.web.app import build
 from app.web.auth import new_token, viewer_token
-from app.web.browser_launch import page_that_leads_to, show_in_browser
 from app.worker.protocol import Open
 from pipeline.errors import StemmapError
+
+_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="referrer" content="no-referrer">
+<meta http-equiv="refresh" content="0;url={link}"><title>stemmap</title>
+<p><a href="{link}">Open the dashboard</a></p></html>
+"""
+
+
+@contextlib.contextmanager
+def page_that_leads_to(link: str) -> Iterator[Path]:
+    """A file that only its owner can read and that leads a browser on to a link: what a program is
+    called with, everybody on the machine can read. It is removed at the end."""
+    number, name = tempfile.mkstemp(prefix="stemmap-", suffix=".html")  # readable by its owner only
+    page = Path(name)
+    try:
+        with os.fdopen(number, "w", encoding="utf-8") as file:
+            file.write(_PAGE.format(link=html.escape(link)))
+        yield page
+    finally:
+        page.unlink(missing_ok=True)
+
+
+def show_in_browser(page: Path) -> None:
+    """Have the person's browser open a file; where there is none, nothing happens."""
+    import webbrowser
+
+    with contextlib.suppress(webbrowser.Error):
+        webbrowser.open(page.as_uri())
+
 
 _PORTS_TRIED = 10
 # Less waits in the kernel for a browser behind a slow radio link; what waits is old when it arrives.

@@ -6,7 +6,7 @@ from array import array
 from collections import Counter, deque
 
 from app.robot.source import LiveSource
-from app.sources.odometry import Chosen
+from app.sources.opening import Chosen
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
 from pipeline.odometry.odometry_override import WithMotion

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from app.common.compile_ahead import compile_ahead
-from app.common.stage_timer import Stopwatch
+from app.common.timers import Stopwatch
 from app.training.learned_forests import kept_forests
 from pipeline.config import Parameters
 

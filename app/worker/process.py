@@ -18,8 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from app.common.stage_timer import Stopwatch
 from app.common.text import COMPILING
+from app.common.timers import Stopwatch
 from app.explain.recent_scans import Recent
 from app.worker.codec import WireError, to_worker
 from app.worker.internal_protocol import ToWorker

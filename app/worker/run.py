@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from app.common.stage_timer import Stopwatch
+from app.common.timers import Stopwatch
 from app.explain.estimate_history import TreeHistory
 from app.worker.abreast import abreast
 from app.worker.cursor import Cursor

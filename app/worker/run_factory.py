@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from app.common.stage_timer import Stopwatch
+from app.common.timers import Stopwatch
 from app.robot.source import LiveSource
-from app.sources.odometry import with_odometry
+from app.sources.opening import with_odometry
 from app.worker.cursor import Cursor, Synchroniser
 from app.worker.live_cursor import LiveCursor
 from app.worker.run import MakeMapper, Run

@@ -13,7 +13,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState
 from app.web.app import ROUTERS, build
 from app.web.auth import session_value
 from app.web.serving import bind, uvicorn_config

@@ -16,7 +16,7 @@ from typing import Any
 
 from app.robot.recording import Recording
 from app.robot.source import LiveSource, open_live
-from app.sources.odometry import with_odometry
+from app.sources.opening import with_odometry
 from app.worker.live_cursor import LiveCursor
 from app.worker.numba_warmup import warm_up
 from pipeline.config import preset

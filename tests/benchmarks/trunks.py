@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.common.stage_timer import Stopwatch
+from app.common.timers import Stopwatch
 from app.training.augmentation import FOLDER, copies, is_of
 from app.training.fit_forest import Examples, as_json, can_grow, grow_all
 from app.training.keeping import read_examples

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from playwright.sync_api import Browser, expect
 
-from app.web.browser_launch import page_that_leads_to
+from app.web.serving import page_that_leads_to
 from tests.browser.conftest import PATIENCE_MS
 from tests.browser.serving import Server
 

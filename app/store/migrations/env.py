@@ -1,4 +1,4 @@
-"""What alembic runs: the migrations, on the connection that `app.store.migrating` hands over."""
+"""What alembic runs: the migrations, on the connection that `app.store.database` hands over."""
 
 from __future__ import annotations
 

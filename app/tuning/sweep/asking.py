@@ -9,7 +9,7 @@ from pathlib import Path
 
 from app.batch.run_folder import read_run, read_run_record
 from app.common.text import count
-from app.sources.odometry import with_odometry
+from app.sources.opening import with_odometry
 from app.tuning.sweep.grid import laid_over, words_of
 from app.tuning.sweep.jobs import Job, RunAsked, TruthTable, code_digest
 from pipeline.config import Parameters

@@ -53,7 +53,7 @@ class RunAsked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         uri: Of the source; a path is absolute, and leads to the same recording for every worker.
         digest: SHA-256 of what is read, so that a worker with another recording says so.
         seed: Of every random number.
-        odometry: As asked, see `app.sources.odometry`.
+        odometry: As asked, see `app.sources.opening`.
         topics: Chosen topic by role.
         mount: x, y, z [m], roll, pitch, yaw [deg] of the LiDAR on the robot; empty for what the source says.
         truth: The true trees in the frame of the map.

@@ -15,7 +15,7 @@ import numpy as np
 
 from app.batch.run_folder import as_written
 from app.batch.run_totals import far_truth
-from app.sources.odometry import Chosen, with_odometry
+from app.sources.opening import Chosen, with_odometry
 from app.training.learned_forests import kept_forests
 from app.tuning.sweep.compiling import one_at_a_time
 from app.tuning.sweep.jobs import Answer, Fault, Job, RunAsked, code_digest

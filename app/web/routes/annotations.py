@@ -11,13 +11,12 @@ from fastapi import APIRouter, Path, Request
 from msgspec import Meta
 from starlette.responses import Response
 
-from app.dashboard.annotations import row_payload
+from app.dashboard.annotations import Against, contents_of, row_payload
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.ground_truth import Against, contents_of
+from app.dashboard.user import NAME
 from app.store.records import MOST_ANNOTATIONS, Author, Content, UnknownError, moment
 from app.web.responses import BadRequestError, body_of, failure_reply, json_reply, table_reply
 from app.web.routes.access import Dash
-from app.web.user import NAME
 from pipeline.errors import SourceError
 
 router = APIRouter(prefix="/api")

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from app.dashboard.learning import Learning
-from app.dashboard.uncertain_trees import doubts_of
+from app.dashboard.payload import doubts_of
 from app.web.responses import json_reply
 from app.web.routes.access import Dash
 from pipeline.errors import StemmapError

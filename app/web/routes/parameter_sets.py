@@ -9,10 +9,10 @@ from fastapi import APIRouter, Request
 from msgspec import Meta
 from starlette.responses import Response
 
-from app.dashboard.parameter_sets import read_file
+from app.dashboard.parameters import read_file
+from app.dashboard.user import NAME
 from app.web.responses import body_of, json_reply, table_reply
 from app.web.routes.access import Dash
-from app.web.user import NAME
 
 router = APIRouter(prefix="/api/sets")
 

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Request
 from msgspec import Meta
 from starlette.responses import Response
 
-from app.dashboard.parameter_sets import file_of
+from app.dashboard.parameters import file_of
 from app.web.responses import body_of, json_reply, table_reply
 from app.web.routes.access import Dash
 

@@ -12,7 +12,7 @@ from msgspec import Meta
 from starlette.responses import Response
 
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.picture_payload import comparison_payload, stages_payload
+from app.dashboard.payload import comparison_payload, stages_payload
 from app.web.auth import role_of
 from app.web.responses import body_of, error_reply
 from app.web.routes.access import Dash

@@ -10,9 +10,9 @@ from msgspec import Meta
 from starlette.websockets import WebSocket
 
 from app.dashboard.dashboard import Dashboard
+from app.dashboard.user import hand
 from app.web.auth import role_of
 from app.web.routes.access import Dash
-from app.web.user import hand
 from app.web.viser_proxy import bridge
 from app.web.websocket_feed import telling
 

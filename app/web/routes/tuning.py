@@ -12,6 +12,7 @@ from starlette.responses import Response
 
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
+from app.dashboard.user import NAME
 from app.tuning.goal import GOALS
 from app.tuning.plan import Plan
 from app.tuning.request import MOST_OTHERS, OtherRun, SearchAsked, other_runs, plan_of
@@ -20,7 +21,6 @@ from app.web.responses import body_of, json_reply
 from app.web.routes.access import Dash
 from app.web.routes.parameter_sets import SET_NAME
 from app.web.routes.run import what_may_be_opened
-from app.web.user import NAME
 from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api/search")

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from app.batch.tree_pictures import best_views, keep_pictures
-from app.common.draw_picture_process import draw
+from app.common.draw_picture import draw
 from pipeline.io.readers import open_source
 from pipeline.io.readers.camera import nearest
 from pipeline.io.readers.ros import RosSource

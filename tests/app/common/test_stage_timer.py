@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from app.common.stage_timer import Stopwatch
+from app.common.timers import Stopwatch
 
 
 def test_medians_of_the_last_scans() -> None:

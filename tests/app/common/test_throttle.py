@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from app.common.throttle import Throttle
+from app.common.timers import Throttle
 
 
 async def test_the_first_call_is_at_once_and_of_many_the_last_follows() -> None:

@@ -17,9 +17,8 @@ from websockets.asyncio.client import connect
 from websockets.typing import Origin
 
 from app.common.settings import Settings
-from app.dashboard.annotations import Annotating
+from app.dashboard.annotations import Annotating, contents_of, counted, laid_over, truth_of
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.ground_truth import contents_of, counted, laid_over, truth_of
 from app.store.async_store import Keeper
 from app.store.records import Annotation, Content
 from app.web.auth import session_value

@@ -15,7 +15,7 @@ import pytest_asyncio
 
 from app.dashboard.broadcast import Live
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState
 from app.worker.internal_protocol import Answer, AskCluster, Begin, Report, Shown
 from app.worker.protocol import Open, Play, Seek, SetParameters, Status
 from pipeline.config import preset

@@ -17,7 +17,7 @@ import pytest
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import LEAST_OTHERS, LEAST_TREES, Learning
-from app.dashboard.uncertain_trees import doubts_of
+from app.dashboard.payload import doubts_of
 from app.training import learning as training
 from app.training.learned_forests import Forests
 from app.web.auth import viewer_token

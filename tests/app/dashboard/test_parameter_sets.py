@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.cli.choices import chosen_parameters
-from app.dashboard.verdict_counts import BeforeAfter, Counts, counts_of
+from app.dashboard.payload import BeforeAfter, Counts, counts_of
 from app.worker.internal_protocol import Shown
 from pipeline.config import preset
 from tests.app.fakes import frame, opened, path, truth_trees

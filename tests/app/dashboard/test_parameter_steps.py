@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.dashboard.parameter_sets import file_of, read_file
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState, file_of, read_file
 from pipeline.config import Parameters, preset
 from pipeline.errors import ParameterError, StemmapError
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.dashboard.picture_payload import in_centimetres, packed, stages_payload
+from app.dashboard.payload import in_centimetres, packed, stages_payload
 from app.worker.internal_protocol import Answer, AskCompare, FromWorker, Shown, ToWorker
 from app.worker.loop import Driver
 from app.worker.process import new_session

@@ -14,8 +14,9 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import String, create_engine, insert
 
-from app.store import migrating, tables
-from app.store.opening import FILE_NAME
+from app.store import database as migrating
+from app.store import tables
+from app.store.database import FILE_NAME
 from app.store.records import Author, Content
 from app.store.store import Store
 from pipeline.errors import StemmapError

@@ -16,7 +16,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from app.store.opening import FILE_NAME
+from app.store.database import FILE_NAME
 from app.store.records import MOST_ANNOTATIONS, Author, Content, StaleError, UnknownError
 from app.store.store import Store
 from pipeline.errors import StemmapError

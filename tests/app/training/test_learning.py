@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.cli import main
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState
 from app.store.records import Author, Content
 from app.store.store import Store
 from app.training.annotated import CLASS_OF_KIND, SEEN, Judged, things_of

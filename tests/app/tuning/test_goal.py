@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.dashboard.parameter_sets import read_file
+from app.dashboard.parameters import read_file
 from app.tuning.goal import Goal, RunScore, goal_of, pool
 from app.tuning.plan import Plan, PlannedRun
 from app.tuning.result import Result, best_parameters, provenance_in, toml_of, warning_of

@@ -15,7 +15,7 @@ import pytest
 from app.batch.run_folder import read_run_record
 from app.cli import main
 from app.cli.tune import files_of
-from app.dashboard.parameter_sets import read_file
+from app.dashboard.parameters import read_file
 from app.tuning.plan import Plan, PlannedRun, TruthColumns
 from app.tuning.processes import Helpers
 from app.tuning.result import provenance_in, result_of

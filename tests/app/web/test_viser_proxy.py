@@ -18,7 +18,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from app.web.auth import viewer_token
-from app.web.viser_messages import LARGEST, is_allowed
+from app.web.viser_proxy import LARGEST, is_allowed
 from tests.app.fakes import FakeScene
 from tests.app.server_for_tests import BEARER, TOKEN, served
 
@@ -265,7 +265,7 @@ async def test_a_wrong_secret_or_no_viser_is_a_refusal() -> None:
 
 
 async def test_the_real_scene_is_reached() -> None:
-    from app.dashboard.parameter_state import ParameterState
+    from app.dashboard.parameters import ParameterState
     from app.scene import Scene
 
     class Commands:

@@ -44,7 +44,7 @@ class Measured:
 
 def run() -> list[Table]:
     """The simulated stand and the constructed lane, preset forest."""
-    from app.common.stage_timer import Stopwatch
+    from app.common.timers import Stopwatch
     from pipeline.config import preset
     from pipeline.io.readers import open_source
     from pipeline.mapper import Mapper

@@ -17,7 +17,7 @@ import uvicorn
 
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.parameter_state import ParameterState
+from app.dashboard.parameters import ParameterState
 from app.scene.scene import RENEW_AFTER, Scene
 from app.web.app import build
 from app.web.auth import new_token
