@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from app.robot.ros_graph import MOST_ENDPOINTS, NAME, TYPE, Publisher
 from app.robot.zenoh_link import TOO_MANY
-from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.base import count_loss
 
 _PREFIX, _LONGEST = "rt/", 256
 

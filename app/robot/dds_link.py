@@ -16,7 +16,8 @@ from app.robot.dds_types import idl_type
 from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
 from app.robot.zenoh_link import LOST_SCANS, MESSAGE_LIMIT
-from pipeline.io.readers.container import Channel, Message, count_loss
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.container import Channel, Message
 
 _RETRY_S = 1.0
 _WAIT_NS = 50_000_000

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from pipeline.io.readers.container import Message, count_loss
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.container import Message
 
 #: Two seconds of a usual LiDAR: what is older no picture needs any more.
 MOST_SCANS = 20

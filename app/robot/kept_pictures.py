@@ -8,8 +8,8 @@ from collections.abc import Collection, Iterator
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
+from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.camera import Picture
-from pipeline.io.readers.container import count_loss
 from pipeline.remapping.scan_cache import SPARE_BYTES, room
 from pipeline.types.records import Path
 

@@ -12,7 +12,8 @@ from app.robot.arrival_times import ArrivalTimes
 from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
 from app.robot.sweeps import Sweeps
-from pipeline.io.readers.container import Channel, Message, count_loss
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.ros_messages import VELODYNE_SCAN
 from pipeline.io.readers.velodyne import PACKET_BYTES, PRODUCT, is_data_packet
 

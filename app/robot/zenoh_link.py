@@ -15,7 +15,8 @@ from app.robot.arrival_times import ArrivalTimes
 from app.robot.choosing import PICTURE_TYPES, SCAN_TYPES
 from app.robot.inbox import Inbox
 from app.robot.ros_graph import ADMIN, MOST_ENDPOINTS, Publisher, RosGraph, data_key
-from pipeline.io.readers.container import Channel, Message, count_loss
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.container import Channel, Message
 
 #: Largest message that is put together from its parts; a cloud of 2 million points is smaller.
 MESSAGE_LIMIT = 64 << 20

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
+from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.types.records import TruthTrees
 
 KINDS = ("tree", "pole", "person", "bush", "other")
@@ -89,6 +90,12 @@ class _Table:
             value = math.nan
         if not math.isfinite(value) and (required or text.lower() not in ("nan", "na")):
             raise SourceError(f"line {self.lines[row]}: {name} = {text!r} is not a number", where=self.where)
+        if abs(value) >= COORDINATE_LIMIT:
+            raise SourceError(
+                f"line {self.lines[row]}: {name} = {text!r} is out of range",
+                where=self.where,
+                remedy=f"Numbers must be below {COORDINATE_LIMIT:.0e}.",
+            )
         return value
 
 

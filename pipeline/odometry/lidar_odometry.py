@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose3
-from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.base import count_loss
 from pipeline.types.records import Odometry, Record, Scan
 
 #: What is farther is thin, and one scan in ten would be spent on it [m].

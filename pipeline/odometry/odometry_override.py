@@ -9,8 +9,7 @@ from typing import Protocol
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import Source, SourceDescription
-from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.base import Source, SourceDescription, count_loss
 from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses
 from pipeline.types.records import Odometry, Record, Scan, Truth
 

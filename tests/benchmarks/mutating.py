@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.clouds import open_cloud
-from pipeline.io.readers.clouds.e57_pages import PAGE, checksums
 from pipeline.types.records import Scan
+
+PAGE = 1024  # bytes of a page of an E57 file; the last four are its CRC-32C
+_POLYNOMIAL = 0x82F63B78  # CRC-32C (Castagnoli), reflected
 
 
 def mutation(original: bytes, seed: int, number: int) -> bytes:
@@ -48,6 +52,27 @@ def with_sums(damaged: bytes) -> bytes:
         pages[0, 16:24] = np.frombuffer(pages.size.to_bytes(8, "little"), np.uint8)
         pages[:, -4:] = checksums(pages[:, :-4]).astype(">u4")[:, None].view(np.uint8)
     return pages.tobytes()
+
+
+def checksums(rows: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """CRC-32C of each row, shape (N, length >= 4): it is linear, so each byte adds a term of its position."""
+    begun = rows.copy()
+    begun[:, :4] ^= 0xFF  # the same as an initial value of ones
+    terms = _crc_terms(rows.shape[1])[np.arange(rows.shape[1]), begun]
+    total: NDArray[np.uint32] = np.bitwise_xor.reduce(terms, axis=1)
+    return ~total
+
+
+@cache
+def _crc_terms(length: int) -> NDArray[np.uint32]:
+    """Term of each of 256 bytes at each position, shape (length, 256)."""
+    table = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        table = np.where(table & 1, (table >> 1) ^ np.uint32(_POLYNOMIAL), table >> 1).astype(np.uint32)
+    terms = [table]
+    for _ in range(length - 1):
+        terms.append(table[terms[-1] & 0xFF] ^ (terms[-1] >> np.uint32(8)))
+    return np.stack(terms[::-1])
 
 
 def read_all(path: Path) -> str:

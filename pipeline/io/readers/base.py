@@ -1,4 +1,4 @@
-"""Sources of records: the interface, what is known of a source, and its digest."""
+"""Sources of records: the interface, the description of a source, and its digest."""
 
 from __future__ import annotations
 
@@ -11,17 +11,23 @@ from typing import Protocol
 from pipeline.geometry.poses import Pose3
 from pipeline.types.records import Record, Sensor, Truth
 
+#: Coordinates in metres are smaller than this in every reference system; larger ones are damaged.
+COORDINATE_LIMIT = 1e8
+#: Above this many bytes (about 1 s of hashing) only the ends of each file are hashed.
+WHOLE_LIMIT = 1 << 30
+_BLOCK = 1 << 20
+_PARTIAL_ENDS = 16 << 20
+
 
 @dataclass(frozen=True, slots=True)
 class RecordedTopic:
-    """A topic that a recording holds, whether it is read or not.
+    """A topic of a recording, whether it is read or not.
 
     Attributes:
         name, type: e.g. "/velodyne_points" and "sensor_msgs/msg/PointCloud2".
-        messages: How many.
-        read_as: What it is read as ("scan", "odometry", "imu", "gnss", "pose", "transforms"), "" when it
-            is not read.
-        fits: The role that it could be given with `--topic`, "" when none.
+        messages: Number of messages.
+        read_as: Role in which it is read ("scan", "odometry", "imu", "gnss", "pose", "transforms"), or "".
+        fits: Role that `--topic` can give it, "" when there is none.
         why_not: Why it is not read, "" when it is.
     """
 
@@ -35,12 +41,12 @@ class RecordedTopic:
 
 @dataclass(frozen=True, slots=True)
 class Revision:
-    """Parameters that were in force from a scan on.
+    """Parameters that apply from a scan onwards.
 
     Attributes:
-        revision: Its number in the run.
-        from_scan: The first scan that was mapped with them.
-        values: Values by stage and name; checked by whoever uses them.
+        revision: Number of the revision in the run.
+        from_scan: First scan that is mapped with them.
+        values: Values by stage and name; not checked here.
     """
 
     revision: int
@@ -54,20 +60,20 @@ class SourceDescription:
 
     Attributes:
         uri: As the user wrote it.
-        kind: The format in words, e.g. "ROS 2 MCAP".
+        kind: Name of the format, e.g. "ROS 2 MCAP".
         sensor: The LiDAR.
-        T_base_lidar: Where the LiDAR stands on the robot.
-        has_odometry, has_imu: Whether such records will come.
+        T_base_lidar: Extrinsics of the LiDAR.
+        has_odometry, has_imu: Whether the source yields such records.
         scans: Number of scans, None when it is not known before the end.
         start_ns, end_ns: Time of the first and last scan, None when not known.
-        digest: SHA-256 (hex) of what is read: file contents, or the scenario's definition.
-        preset: The preset that suits this kind of source.
-        topics: What a recording of messages holds; () where there are no topics.
-        warnings: What a person should know, e.g. that there is no odometry.
-        in_order_of_arrival: Whether records come as they came to a live run, not sorted by their time.
-        revisions: The parameters that a recorded run was mapped with, in the order of their scans.
-        gnss: How GNSS fixes are used, in words, "" when none are.
-        other_slam: Likewise of the poses of another SLAM.
+        digest: SHA-256 (hex) of the file contents, or of the definition of a simulated scenario.
+        preset: Parameter preset for this kind of source.
+        topics: Topics of a recording of messages; () for other sources.
+        warnings: Messages for the user, e.g. that there is no odometry.
+        in_order_of_arrival: Whether records come in the order of arrival (live run), not sorted by time.
+        revisions: Parameters of a recorded run, in the order of their scans.
+        gnss: How GNSS fixes are used, as text; "" when they are not used.
+        other_slam: How the poses of another SLAM are used, as text; "" when they are not used.
     """
 
     uri: str
@@ -91,12 +97,12 @@ class SourceDescription:
 
 @dataclass(frozen=True, slots=True)
 class SourceOptions:
-    """What the user may say about a source.
+    """Choices of the user for a source.
 
     Attributes:
-        topics: Chosen topic by role ("scan", "odometry", "imu", "gnss", "pose"); empty means found by type.
-        T_base_lidar: Mounting of the LiDAR; None means what the source says, else identity.
-        seed: Of simulated runs.
+        topics: Topic by role ("scan", "odometry", "imu", "gnss", "pose"); other roles are found by type.
+        T_base_lidar: Extrinsics of the LiDAR; None means those of the source, else identity.
+        seed: Random seed of simulated runs.
     """
 
     topics: dict[str, str] = field(default_factory=dict)
@@ -105,43 +111,42 @@ class SourceOptions:
 
 
 class Source(Protocol):
-    """A run that can be read from the start or from any time.
+    """A run that can be read from its start or from any time.
 
-    Reading never raises for a single bad record: it is left out and counted in `losses`. A
-    `SourceError` is raised when opening, or while reading when nothing more can be read; what was
-    yielded before stays valid.
+    A single bad record never raises: it is left out and counted in `losses`. `SourceError` is raised when the
+    source is opened, or during reading when nothing more can be read; records that were yielded before it
+    stay valid.
     """
 
     @property
     def description(self) -> SourceDescription:
-        """What is known before reading."""
+        """Description that is known before reading."""
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out so far, by reason in words, e.g. {"scans without points": 3}."""
+        """Number of records left out so far, by reason, e.g. {"scans without points": 3}."""
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield records in the order of time, from `start_ns` on (None: all)."""
 
     def truth(self) -> Truth | None:
-        """What is known for certain about this run, if anything."""
+        """Ground truth that comes with the run, None when there is none."""
 
     def close(self) -> None:
-        """Let go of files and sockets; safe to call twice."""
+        """Close files and sockets; safe to call twice."""
 
 
-#: Above this many bytes (about 1 s of work) only the ends of each file are hashed, and the digest says so.
-WHOLE_LIMIT = 1 << 30
-_BLOCK = 1 << 20
-_PARTIAL_ENDS = 16 << 20
+def count_loss(losses: dict[str, int], reason: str, number: int = 1) -> None:
+    """Add a number of left-out records to the losses of one reason."""
+    losses[reason] = losses.get(reason, 0) + number
 
 
 def digest_of(paths: Sequence[Path], *, whole_limit: int = WHOLE_LIMIT) -> str:
-    """SHA-256 (hex) of one file's contents, or of the names and contents of several.
+    """Return the SHA-256 (hex) of one file's contents, or of the names and contents of several files.
 
     Args:
         paths: One file, or the files of a folder in the order in which they are read.
-        whole_limit: Above this many bytes in all, only sizes and the first and last 16 MB of each
+        whole_limit: Above this many bytes in total, only the sizes and the first and last 16 MB of each
             file are hashed, and the digest begins with "partial:".
 
     Raises:

@@ -15,6 +15,7 @@ import lz4.frame
 import zstandard
 
 from pipeline.errors import SourceError
+from pipeline.io.readers.base import count_loss
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,11 +85,6 @@ class Container(Protocol):
 
     def close(self) -> None:
         """Close the file; safe to call twice."""
-
-
-def count_loss(losses: dict[str, int], reason: str, number: int = 1) -> None:
-    """Add to the losses of one reason."""
-    losses[reason] = losses.get(reason, 0) + number
 
 
 def ros2_type_name(name: str) -> str:

@@ -55,7 +55,7 @@ def _victoria(uri: str, path: Path, options: SourceOptions) -> Source:
 
 
 def _kitti(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.kitti import open_kitti
+    from pipeline.io.readers.scan_folder import open_kitti
 
     return open_kitti(uri, path, options)
 
@@ -67,13 +67,13 @@ def _tree_manager(uri: str, folder: Path, options: SourceOptions) -> Source:
 
 
 def _pcd(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.pcd import open_pcd
+    from pipeline.io.readers.scan_folder import open_pcd
 
     return open_pcd(uri, path, options)
 
 
 def _scan_tables(uri: str, folder: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.table_scans import open_table_scans
+    from pipeline.io.readers.scan_folder import open_table_scans
 
     return open_table_scans(uri, folder, options)
 

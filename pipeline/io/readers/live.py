@@ -11,7 +11,14 @@ from typing import Any
 import msgspec
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.base import RecordedTopic, Revision, SourceDescription, SourceOptions, digest_of
+from pipeline.io.readers.base import (
+    RecordedTopic,
+    Revision,
+    SourceDescription,
+    SourceOptions,
+    count_loss,
+    digest_of,
+)
 from pipeline.io.readers.camera import (
     SAME_TIME_NS,
     Camera,
@@ -21,7 +28,7 @@ from pipeline.io.readers.camera import (
     picture_of,
     time_beside,
 )
-from pipeline.io.readers.container import Channel, Container, Message, count_loss
+from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.mcap_file import McapFile, open_mcap
 from pipeline.io.readers.message_time import SECOND_NS, SteppingClock, header_stamp
 from pipeline.io.readers.ros import RosSource

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import SourceError
+from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import (
     BrokenChunkError,
     Channel,
@@ -20,7 +21,6 @@ from pipeline.io.readers.container import (
     LastChunk,
     Message,
     UnpackError,
-    count_loss,
     damaged,
     in_order,
     ros2_type_name,

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from pipeline.io.readers.container import Channel, Message, count_loss
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.container import Channel, Message
 
 #: Stamps farther than this from the time of writing, once the clocks are compared, are damaged.
 STAMP_LIMIT_NS = 60_000_000_000

@@ -1,137 +1,91 @@
-"""Numbers written as text, read in one compiled pass; nothing in the text is believed."""
+"""Numbers in text files: tables with one row per line, and plain sequences."""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import io
+import re
+import warnings
+from collections.abc import Iterator
+from itertools import islice, takewhile
+from typing import IO
 
-from pipeline.jit import compiled
+import numpy as np
+
 from pipeline.types.records import Float
 
-_POWERS: Float = 10.0 ** np.arange(23, dtype=np.float64)
+_BLOCK = 4 << 20  # bytes of text that are split into words at once, which takes ten times as much memory
+_GAP = re.compile(rb"\s")
+_LINES = 1 << 18  # read at once
+_LINE_LIMIT = 1 << 16  # bytes; a longer line is cut, and its parts are damaged lines
 
 
-def parse_numbers(text: bytes | memoryview, limit: int | None = None) -> Float:
-    """Decimal numbers separated by blanks, commas, tabs or line ends, float64 of shape (N,).
+def parse_numbers(text: bytes) -> Float:
+    """Parse numbers between blanks or line ends up to the first word that is not a number; shape (N,)."""
+    parts, at = [np.zeros(0)], 0
+    while at < len(text):
+        gap = _GAP.search(text, at + _BLOCK)
+        end = len(text) if gap is None else gap.end()
+        words = text[at:end].split()
+        try:
+            parts.append(np.array(words, np.float64))
+        except ValueError:
+            whole = list(takewhile(lambda numbers: numbers is not None, (_numbers([word]) for word in words)))
+            parts.append(np.array(whole, np.float64).ravel())
+            break
+        at = end
+    return np.concatenate(parts)
 
-    "nan" gives NaN. Reading stops at the first word that is no number, so a cut or damaged text
-    gives the numbers before the damage.
+
+def parse_table(text: bytes, columns: int) -> tuple[Float, int]:
+    """Parse lines of numbers separated by blanks.
+
+    Empty lines are skipped. A line with another number of words, or with a word that is not a number, is
+    damaged and left out; "nan" is a number.
 
     Args:
         text: ASCII.
-        limit: Read at most so many numbers.
-    """
-    buffer = np.frombuffer(text, dtype=np.uint8)
-    most = len(buffer) // 2 + 1
-    numbers = np.empty(most if limit is None else min(most, limit), dtype=np.float64)
-    return numbers[: _parse(buffer, numbers, _POWERS)]
-
-
-def rows_of(text: bytes | memoryview, width: int, limit: int) -> tuple[int, int]:
-    """How many lines of `width` words a text begins with, empty ones aside, and the words of the line after.
-
-    Args:
-        text: ASCII; width: of a row; limit: count at most so many rows.
+        columns: Numbers per line.
 
     Returns:
-        The rows, and how many words stand in the first line that is none; 0 where there is no such line.
+        The numbers, float64 of shape (rows, columns), and how many lines are damaged.
     """
-    rows, words = _rows(np.frombuffer(text, dtype=np.uint8), width, limit)
-    return int(rows), int(words)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")
+            table = np.loadtxt(io.BytesIO(text), comments=None, ndmin=2, encoding="latin1")
+        if table.shape[1] == columns and table.size:
+            return table, 0
+    except ValueError:
+        pass  # at least one line is damaged: find out which
+    lines = [words for line in text.split(b"\n") if (words := line.split())]
+    rows = [row for words in lines if len(words) == columns and (row := _numbers(words)) is not None]
+    return np.array(rows, np.float64).reshape(-1, columns), len(lines) - len(rows)
 
 
-@compiled
-def _rows(buffer: NDArray[np.uint8], width: int, limit: int) -> tuple[int, int]:
-    rows, words, at, size = 0, 0, 0, len(buffer)
-    before = True  # whether a gap stands before this letter
-    while at <= size and rows < limit:
-        if at == size or buffer[at] == 10:
-            if words != 0 and words != width:
-                return rows, words
-            rows += words != 0
-            words = 0
-            before = True
-        else:
-            gap = _is_gap(buffer[at])
-            words += before and not gap
-            before = gap
-        at += 1
-    return rows, 0
+def read_rows(file: IO[bytes], columns: int, lines: int) -> Iterator[Float]:
+    """Yield the numbers of the next lines of a file part by part, each of shape (N, columns), N >= 1.
+
+    Empty lines are skipped, and damaged lines are left out.
+
+    Args:
+        file: Open at the beginning of the first line.
+        columns: Numbers per line.
+        lines: How many lines are read, including damaged ones.
+    """
+    left = lines
+    while left > 0:
+        found = (line for line in iter(lambda: file.readline(_LINE_LIMIT), b"") if not line.isspace())
+        block = list(islice(found, min(left, _LINES)))
+        if not block:
+            return
+        left -= len(block)
+        rows, _ = parse_table(b"".join(block), columns)
+        if len(rows):
+            yield rows
 
 
-@compiled
-def _is_gap(letter: int) -> bool:
-    return letter == 32 or letter == 44 or 9 <= letter <= 13
-
-
-@compiled
-def _parse(buffer: NDArray[np.uint8], numbers: Float, powers: Float) -> int:
-    at, found, size = 0, 0, len(buffer)
-    while found < len(numbers):
-        while at < size and _is_gap(buffer[at]):
-            at += 1
-        if at >= size:
-            break
-        end = at
-        while end < size and not _is_gap(buffer[end]):
-            end += 1
-        number, sound = _word(buffer, at, end, powers)
-        if not sound:
-            break
-        numbers[found] = number
-        found += 1
-        at = end
-    return found
-
-
-@compiled
-def _word(buffer: NDArray[np.uint8], at: int, end: int, powers: Float) -> tuple[float, bool]:
-    """One number and whether the word is one."""
-    negative = buffer[at] == 45
-    if negative or buffer[at] == 43:
-        at += 1
-    if (
-        end - at == 3
-        and (buffer[at] | 32) == 110
-        and (buffer[at + 1] | 32) == 97
-        and (buffer[at + 2] | 32) == 110
-    ):
-        return np.nan, True
-    mantissa, digits, shift = 0.0, 0, 0
-    point = False
-    while at < end and (48 <= buffer[at] <= 57 or (buffer[at] == 46 and not point)):
-        if buffer[at] == 46:
-            point = True
-        else:
-            digits += 1
-            # Sixteen digits fill a double; what comes after them only moves the point.
-            if mantissa < 1e15:
-                mantissa = mantissa * 10.0 + (buffer[at] - 48)
-                shift -= 1 if point else 0
-            else:
-                shift += 0 if point else 1
-        at += 1
-    if digits == 0:
-        return 0.0, False
-    if at < end and (buffer[at] | 32) == 101:
-        at += 1
-        down = at < end and buffer[at] == 45
-        if at < end and (buffer[at] == 45 or buffer[at] == 43):
-            at += 1
-        exponent, digits = np.int64(0), 0
-        while at < end and 48 <= buffer[at] <= 57 and digits < 6:
-            exponent = exponent * 10 + np.int64(buffer[at] - 48)
-            digits += 1
-            at += 1
-        if digits == 0:
-            return 0.0, False
-        shift += int(-exponent if down else exponent)
-    if at < end:
-        return 0.0, False
-    if 0 <= shift <= 22:
-        mantissa *= powers[shift]
-    elif -22 <= shift < 0:
-        mantissa /= powers[-shift]
-    else:
-        mantissa *= 10.0 ** np.float64(shift)
-    return (-mantissa if negative else mantissa), True
+def _numbers(words: list[bytes]) -> list[float] | None:
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return None

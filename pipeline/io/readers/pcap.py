@@ -9,8 +9,7 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import SourceDescription, SourceOptions, digest_of
-from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.pcap_packets import DATA_PORT, Packets, find_packets
 from pipeline.io.readers.velodyne import PACKET_BYTES, SENSORS, PacketDecoder, PacketError
 from pipeline.jit import compiled

@@ -13,9 +13,9 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import ros_messages
-from pipeline.io.readers.base import SourceDescription, SourceOptions, digest_of
+from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture, RecordedPictures, find_camera
-from pipeline.io.readers.container import Channel, Container, Message, count_loss, plain_message
+from pipeline.io.readers.container import Channel, Container, Message, plain_message
 from pipeline.io.readers.measured_poses import MeasuredPoses
 from pipeline.io.readers.message_time import WINDOW_NS, Clock, Stamped, by_stamp, header_stamp
 from pipeline.io.readers.ros_messages import LASER_SCAN, MessageDecoder

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import ros_messages
-from pipeline.io.readers.container import Channel, Message, count_loss
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.gnss import Alignment, Fix
 from pipeline.io.readers.message_time import SECOND_NS
 from pipeline.io.readers.other_slam import NoPoseError, Placed, Relation

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import SourceError
+from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import (
     BrokenChunkError,
     Channel,
@@ -21,7 +22,6 @@ from pipeline.io.readers.container import (
     LastChunk,
     Message,
     UnpackError,
-    count_loss,
     damaged,
     in_order,
     ros2_type_name,

@@ -13,7 +13,8 @@ from urllib.parse import quote
 import numpy as np
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.container import Channel, Container, Message, count_loss, damaged, ros2_type_name
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.container import Channel, Container, Message, damaged, ros2_type_name
 from pipeline.io.readers.mcap_file import open_mcap
 from pipeline.types.records import Int
 

@@ -1,4 +1,4 @@
-"""A folder with one file a scan as a source, whatever the format of the files."""
+"""Folders with one file per scan: KITTI .bin, PCD, PLY, NumPy and LAS, with poses and times beside them."""
 
 from __future__ import annotations
 
@@ -11,23 +11,31 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import SourceDescription, SourceOptions, digest_of
-from pipeline.io.readers.container import count_loss
+from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.format_detection import named, recordings_in
+from pipeline.io.readers.point_files import Columns, ScanFileError, read_columns
 from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns
+from pipeline.io.readers.scan_columns import (
+    POINT_LIMIT,
+    RANGE_LIMIT,
+    REFLECTANCE,
+    RING,
+    TIME,
+    clean_scan,
+    first_of,
+    is_ring,
+    point_offsets,
+    sensor_of,
+)
 from pipeline.types.records import Int, Odometry, Record, Scan, Sensor, Truth
 
-#: Scans of a folder without times are taken to follow each other at 10 Hz.
+#: Period of scans without times: 10 Hz.
 STEP_NS = 100_000_000
-#: Names that poses beside scans usually have.
+#: Usual names of files with poses.
 POSES = ("poses.txt", "poses.tum", "trajectory.txt", "trajectory.tum", "groundtruth.txt")
 _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[0-9]{19})", re.ASCII)
-#: How many files may be unreadable at the start before the folder is refused.
+#: Number of unreadable files at the start after which the folder is refused.
 _TRIES = 20
-
-
-class ScanFileError(Exception):
-    """A file that holds no scan; the text says why."""
 
 
 #: Reads one file: (path, stamp_ns, losses) -> scan. Raises ScanFileError or OSError.
@@ -36,13 +44,13 @@ Loader = Callable[[Path, int, dict[str, int]], Scan]
 
 @dataclass(frozen=True, slots=True)
 class ScanFormat:
-    """One format of scan files.
+    """A format of scan files.
 
     Attributes:
-        kind: In words.
-        suffix: In lower case, with the dot.
+        kind: Name of the format.
+        suffix: Suffix in lower case, with the dot.
         load: Reads one file.
-        sensor: What the first scan tells about the LiDAR.
+        sensor: Infers the LiDAR from the first scan.
     """
 
     kind: str
@@ -52,19 +60,19 @@ class ScanFormat:
 
 
 class ScanFolder:
-    """Scan files in the order of the numbers in their names.
+    """Source of scans from files, in the order of the numbers in their names.
 
-    Poses (odometry; `poses.txt` and the other names of POSES, in KITTI's form or TUM's) and `times.txt` or
-    `timestamps.txt` are taken from the folder or its parent. The number in a file's name is its row in
-    them, or else its place in the folder when they have as many rows as there are files; if neither fits
-    they are left aside with a warning. Without a file of times a name that is a time (1645000000.25.pcd)
-    tells it, or else TUM's rows. TUM's rows belong to the scans by their times where both have some.
+    Poses (odometry; `poses.txt` and the other names of POSES, in KITTI or TUM format) and `times.txt` or
+    `timestamps.txt` are read from the folder or its parent. The number in the name of a scan file is its row
+    in them, or its index in the folder when there are as many rows as files; if neither fits, a warning is
+    given and they are not used. Without a file of times, the times are those in the names of the scans
+    (1645000000.25.pcd), else those of TUM rows. TUM rows are matched to scans by time where both have times.
 
     Args:
         uri: As the user wrote it.
         path: One file, the folder with the files, or a folder with a folder `velodyne`.
-        form: Their format.
-        options: The mounting.
+        form: Format of the files.
+        options: Extrinsics.
 
     Raises:
         SourceError: None of the first files holds a scan.
@@ -86,7 +94,7 @@ class ScanFolder:
         folder = self._files[0].parent
         others = [name for name in recordings_in(folder) if Path(name).suffix.lower() != form.suffix]
         if others and not path.is_file():
-            self._warnings.append(f"not part of this run are {named(others)}: open each by its name")
+            self._warnings.append(f"not part of this run are {named(others)}: open each of them by its name")
         places = [] if path.is_file() else [folder, folder.parent]
         self._timed = False
         self._stamp = self._read_stamps(places, numbers)
@@ -109,12 +117,12 @@ class ScanFolder:
 
     @property
     def description(self) -> SourceDescription:
-        """What is known before reading."""
+        """Description that is known before reading."""
         return self._description
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out in the latest reading, by reason."""
+        """Records left out in the latest reading, by reason."""
         return dict(self._losses)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
@@ -193,7 +201,7 @@ class ScanFolder:
     def _fitting(
         self, name: str, times: Int | None, poses: list[Pose3], numbers: Int
     ) -> list[Pose3 | None] | None:
-        """The pose of each scan, None where a file's rows do not belong to the scans."""
+        """Return the pose of each scan, or None when the rows of the file do not belong to the scans."""
         if times is not None and self._timed:
             found = [pose_at(times, poses, int(stamp_ns)) for stamp_ns in self._stamp]
             if any(pose is not None for pose in found):
@@ -208,7 +216,7 @@ class ScanFolder:
         return [poses[row] for row in rows.tolist()]
 
     def _rows(self, name: str, count: int, numbers: Int) -> Int | None:
-        """The row of each file in a text file with `count` rows, None when they do not fit."""
+        """Return the row of each scan in a text file with `count` rows, None when they do not fit."""
         if count > int(numbers[-1]):
             return numbers
         if count == len(numbers):
@@ -227,13 +235,13 @@ def _scan_files(path: Path, suffix: str) -> list[Path]:
         folder = path / "velodyne"
     files = (file for file in folder.iterdir() if file.suffix.lower() == suffix and file.is_file())
     found = sorted(files, key=lambda file: (_number(file), file.name))
-    if all(_TIME_NAME.fullmatch(file.stem) for file in found):  # their last digits alone say nothing
+    if all(_TIME_NAME.fullmatch(file.stem) for file in found):  # not sorted by their last digits
         found.sort(key=lambda file: (_name_ns(file.stem), file.name))
     return found
 
 
 def _times_in_names(files: list[Path]) -> Int | None:
-    """The times that files are named by [ns], None where they are named otherwise."""
+    """Return the times in the names of the files [ns], None when the names are no ascending times."""
     if not all(_TIME_NAME.fullmatch(file.stem) for file in files):
         return None
     stamps = [_name_ns(file.stem) for file in files]
@@ -241,7 +249,7 @@ def _times_in_names(files: list[Path]) -> Int | None:
 
 
 def _name_ns(stem: str) -> int:
-    """A name that is a time, in seconds with decimals, microseconds or nanoseconds since 1970 [ns]."""
+    """Parse a name that is a time since 1970 in seconds with decimals, microseconds or nanoseconds; in ns."""
     match = _TIME_NAME.fullmatch(stem)
     word = match.group(1) if match else "0"
     if "." in word or "_" in word:
@@ -250,10 +258,133 @@ def _name_ns(stem: str) -> int:
 
 
 def _number(file: Path) -> int:
-    """The number at the end of a file's name, -1 when there is none."""
+    """Return the number at the end of the name of a file, -1 when there is none."""
     digits = ""
     for letter in reversed(file.stem):
         if not letter.isdecimal() or not letter.isascii():
             break
         digits = letter + digits
     return int(digits) if 0 < len(digits) <= 9 else int(digits[-9:]) if digits else -1
+
+
+# --- formats ---------------------------------------------------------------------------------------
+
+_KITTI_ROW = 16  # bytes: four little-endian float32, x, y, z [m] and reflectance
+HDL_64 = Sensor("HDL-64", 64, float(np.radians(0.4)), float(np.radians(0.17)), 0.03, 120.0)
+_TABLES = {".ply": "PLY", ".npy": "NumPy", ".npz": "NumPy", ".las": "LAS", ".laz": "LAS"}
+
+
+def open_kitti(uri: str, path: Path, options: SourceOptions) -> ScanFolder:
+    """Open a .bin file, a folder of .bin files, or a folder with a folder `velodyne` of .bin files.
+
+    Raises:
+        SourceError: None of the first files holds a scan.
+        OSError: The folder cannot be read.
+    """
+    return ScanFolder(uri, path, ScanFormat("KITTI .bin", ".bin", load_bin, _kitti_sensor), options)
+
+
+def open_pcd(uri: str, path: Path, options: SourceOptions) -> ScanFolder:
+    """Open a .pcd file or a folder of .pcd files.
+
+    Raises:
+        SourceError: None of the first files holds a scan.
+        OSError: The folder cannot be read.
+    """
+    return ScanFolder(uri, path, ScanFormat("PCD", ".pcd", load_table, sensor_of), options)
+
+
+def open_table_scans(uri: str, folder: Path, options: SourceOptions) -> ScanFolder:
+    """Open a folder of PLY, NumPy or LAS files; of several formats the one with the most files is read.
+
+    Raises:
+        SourceError: None of the first files holds a scan.
+        OSError: The folder cannot be read.
+    """
+    counts = dict.fromkeys(_TABLES, 0)
+    for file in folder.iterdir():
+        if file.suffix.lower() in counts:
+            counts[file.suffix.lower()] += 1
+    suffix = max(counts, key=lambda each: counts[each])
+    load = load_las if suffix in (".las", ".laz") else load_table
+    return ScanFolder(uri, folder, ScanFormat(_TABLES[suffix], suffix, load, sensor_of), options)
+
+
+def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
+    """Read a KITTI .bin file; a last row that is cut is left out and counted.
+
+    Raises:
+        ScanFileError: It is too large, or most of its rows are no positions.
+        OSError: It cannot be read.
+    """
+    size = path.stat().st_size
+    if size > POINT_LIMIT * _KITTI_ROW:
+        raise ScanFileError(f"{size} bytes are too many for one scan")
+    rows = np.fromfile(path, dtype="<f4", count=size // _KITTI_ROW * 4).reshape(-1, 4)
+    with np.errstate(invalid="ignore"):
+        sound = (np.abs(rows[:, :3]) < RANGE_LIMIT).all(axis=1)
+    if 2 * int(np.count_nonzero(sound)) < len(rows):
+        raise ScanFileError("most of its rows are no positions")
+    scan = clean_scan(stamp_ns, rows[:, :3], reflectance=rows[:, 3])
+    if size % _KITTI_ROW:
+        count_loss(losses, "scan files that end within a point")
+    return scan
+
+
+def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
+    """Read a PCD, PLY or NumPy file as a scan; rows of NaN in organised clouds are no returns.
+
+    Raises:
+        ScanFileError: See `read_columns`.
+        OSError: It cannot be read.
+    """
+    return scan_of(read_columns(path, losses), stamp_ns)
+
+
+def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
+    """Read a LAS or LAZ file as a scan; its coordinates are in the sensor frame.
+
+    Raises:
+        ScanFileError: It is damaged or too large.
+        OSError: It cannot be read.
+    """
+    from pipeline.io.readers.clouds import LasCloud
+
+    try:
+        cloud = LasCloud(str(path), path)
+        if cloud.description.points > POINT_LIMIT:
+            raise ScanFileError(
+                f"its header promises {cloud.description.points} points, too many for one scan"
+            )
+        parts = list(cloud.parts())
+    except SourceError as error:
+        raise ScanFileError(error.what) from None
+    for reason, number in cloud.losses.items():
+        count_loss(losses, reason, number)
+    points = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
+    return clean_scan(stamp_ns, points + cloud.description.offset)
+
+
+def scan_of(columns: Columns, stamp_ns: int) -> Scan:
+    """Make a scan of the columns of a table; x, y and z [m] are among them."""
+    kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
+    with np.errstate(invalid="ignore", over="ignore"):
+        points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)
+    ring, time = first_of(columns, RING), first_of(columns, TIME)
+    return clean_scan(
+        stamp_ns,
+        points,
+        reflectance=first_of(columns, REFLECTANCE),
+        ring=ring if ring is not None and is_ring(ring) else None,
+        offset_ns=None if time is None else point_offsets(time, stamp_ns),
+    )
+
+
+def _kitti_sensor(scan: Scan) -> Sensor:
+    """Return an HDL-64 when the scan looks like one: all around, dense, and from -25 to +3 degrees."""
+    points = scan.points.astype(np.float64)
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    low, high = np.percentile(elevation, [0.5, 99.5])
+    sectors = len(np.unique(np.floor(np.arctan2(points[:, 1], points[:, 0]) / np.radians(10.0))))
+    dense = len(points) > 50_000 and sectors >= 30
+    return HDL_64 if dense and -27.0 < low < -20.0 and 1.0 < high < 6.0 else sensor_of(scan)

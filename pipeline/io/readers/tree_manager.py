@@ -12,9 +12,8 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import SourceDescription, SourceOptions, digest_of
-from pipeline.io.readers.container import count_loss
-from pipeline.io.readers.number_text import parse_numbers
+from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
+from pipeline.io.readers.number_text import parse_table
 from pipeline.io.readers.pose_files import TextError, read_table
 from pipeline.io.tree_manager_writer import AXIS, DBH, PLACE, TRAJECTORY
 from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Stems, Truth
@@ -168,19 +167,11 @@ def _dbh(table: Float, at: dict[str, int]) -> Float:
 
 
 def _numbers(body: bytes, columns: int) -> tuple[Float, int]:
-    """Rows of numbers, NaN for an empty field, and how many rows have another form."""
-    text = (b"\n" + body).replace(b"\r", b"").replace(b"True", b"1").replace(b"False", b"0")
+    """Return the rows of numbers, NaN for an empty field, and the number of damaged rows."""
+    text = (b"\n" + body + b"\n").replace(b"\r", b"").replace(b"True", b"1").replace(b"False", b"0")
     for gap, filled in ((b",,", b",nan,"), (b",,", b",nan,"), (b",\n", b",nan\n"), (b"\n,", b"\nnan,")):
         text = text.replace(gap, filled)
-    lines = [line for line in text.split(b"\n") if line.strip()]
-    even = all(line.count(b",") == columns - 1 for line in lines)
-    whole = parse_numbers(text) if even else np.zeros(0)
-    if even and len(whole) == columns * len(lines):
-        return whole.reshape(-1, columns), 0
-    # A row alone, so that damage ends with the row that has it.
-    rows = [parse_numbers(line) for line in lines if line.count(b",") == columns - 1]
-    sound = [row for row in rows if len(row) == columns]
-    return np.array(sound).reshape(-1, columns), len(lines) - len(sound)
+    return parse_table(text.replace(b",", b" "), columns)
 
 
 def _names(head: bytes) -> list[str]:

@@ -1,4 +1,4 @@
-"""The truth that a simulated recording carries with it, as an attachment in JSON."""
+"""Ground truth of a simulated recording, attached to it as JSON."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ import msgspec
 import numpy as np
 
 from pipeline.errors import SourceError
+from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.types.records import Sensor, Truth, TruthPath, TruthTrees
 
 ATTACHMENT = "stemmap_truth.json"
 SIZE_LIMIT = 64 << 20
-Rows = Annotated[list[float], msgspec.Meta(max_length=2_000_000)]
+_LIMIT = COORDINATE_LIMIT
+Rows = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=-_LIMIT, le=_LIMIT)]], msgspec.Meta(max_length=2_000_000)
+]
 
 
 _UNKNOWN = Sensor()
@@ -53,10 +57,10 @@ class _File(msgspec.Struct, frozen=True):
 
 
 def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
-    """Decode the attachment: the truth, in the frame of the map, and the sensor if it is named.
+    """Decode the attachment into the ground truth, in the map frame, and the sensor (None if not named).
 
     Raises:
-        SourceError: It is no JSON of this form, or its columns differ in length.
+        SourceError: It is not JSON of this form, a number is beyond 1e8, or columns differ in length.
     """
     try:
         file = msgspec.json.decode(content, type=_File)

@@ -1,7 +1,7 @@
 """The Victoria Park recording: a zip with LASER.txt, DRS.txt (encoders) and GPS.txt.
 
 The base frame is the laser's: x ahead, y left. Dead reckoning starts at the origin with heading 0;
-GPS (x east, y north) is the truth in a frame of its own.
+GPS (x east, y north) is the ground truth, in a different frame.
 """
 
 from __future__ import annotations
@@ -19,22 +19,21 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import SourceDescription, SourceOptions, digest_of
-from pipeline.io.readers.container import count_loss
-from pipeline.io.readers.number_text import parse_numbers
+from pipeline.io.readers.base import COORDINATE_LIMIT, SourceDescription, SourceOptions, count_loss, digest_of
+from pipeline.io.readers.number_text import parse_numbers, parse_table
 from pipeline.io.readers.scan_columns import clean_scan
 from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Truth, TruthPath
 
 
 @dataclass(frozen=True, slots=True)
 class Car:
-    """Measures of a car with steered front wheels [m].
+    """Dimensions of a car with steered front wheels [m].
 
     Attributes:
         L: Wheelbase.
-        H: From the left rear wheel, where the speed is measured, to the centre line.
-        a: The laser stands so far ahead of the rear axle.
-        b: The laser stands so far to the left of the centre line.
+        H: Distance from the left rear wheel, where the speed is measured, to the centre line.
+        a: Distance of the laser ahead of the rear axle.
+        b: Distance of the laser to the left of the centre line.
     """
 
     L: float = 2.83
@@ -44,17 +43,17 @@ class Car:
 
 
 def dead_reckoning(time: Float, speed: Float, steering: Float, car: Car) -> Float:
-    """Pose of the laser at each encoder time, from (0, 0, 0) at the first; shape (N, 3): x, y, yaw.
+    """Return the pose of the laser at each encoder time, shape (N, 3): x, y [m], yaw [rad].
 
-    Speed and steering hold until the next reading, over which the motion is an arc and is
-    integrated exactly. With v_c = v / (1 - tan(s) H / L) the laser moves in its own axes with
+    The first pose is (0, 0, 0). Speed and steering are constant between two readings, so the motion is an
+    arc, which is integrated exactly. With v_c = v / (1 - tan(s) H / L) the laser moves in its own axes with
     v_c - b w ahead and a w to the left, and turns with w = v_c tan(s) / L.
 
     Args:
         time: [s], ascending, shape (N,).
-        speed: Of the left rear wheel [m/s].
+        speed: Speed of the left rear wheel [m/s].
         steering: [rad], positive to the left, well below a right angle.
-        car: Its measures.
+        car: Dimensions of the car.
     """
     dt = np.diff(time)
     tangent = np.tan(steering[:-1])
@@ -72,24 +71,24 @@ def dead_reckoning(time: Float, speed: Float, steering: Float, car: Car) -> Floa
 
 
 BEAMS = 361
-#: 81.91 m is the laser's word for no return.
+#: The laser writes 81.91 m for a beam without a return.
 RANGE_MAX = 80.0
-MEMBER_LIMIT = 128 << 20
+MEMBER_LIMIT = 64 << 20  # bytes; four times the real LASER.txt
 LASER = Sensor("SICK LMS 221", 1, 0.0, float(np.radians(0.5)), 0.05, RANGE_MAX)
 _STEEPEST, _FASTEST, _LONGEST_S = 1.0, 50.0, 10_000_000.0
 
 
 class VictoriaParkSource:
-    """The zip as a source of planar scans (z = 0) and of odometry.
+    """Source of planar scans (z = 0) and odometry from the Victoria Park zip.
 
     Args:
         uri: As the user wrote it.
         path: The zip.
-        options: The mounting; dead reckoning gives the laser's own path, so identity suits.
+        options: Extrinsics; dead reckoning gives the path of the laser, so the default is identity.
 
     Raises:
-        SourceError: It is another zip, damaged, or too large when unpacked.
-        OSError: It cannot be read.
+        SourceError: It is a different zip, damaged, or too large when unpacked.
+        OSError: The file cannot be read.
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
@@ -117,12 +116,12 @@ class VictoriaParkSource:
 
     @property
     def description(self) -> SourceDescription:
-        """What is known before reading."""
+        """Description that is known before reading."""
         return self._description
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out when opening and in the latest reading, by reason."""
+        """Records left out on opening and in the latest reading, by reason."""
         return {**self._damage, **self._losses}
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
@@ -132,7 +131,7 @@ class VictoriaParkSource:
         return heapq.merge(*streams, key=attrgetter("stamp_ns"))
 
     def truth(self) -> Truth | None:
-        """The path by GPS, None when the zip has none."""
+        """Path by GPS, None when the zip has none."""
         return None if self._gps is None else Truth(path=self._gps)
 
     def close(self) -> None:
@@ -161,26 +160,29 @@ class VictoriaParkSource:
         return clean_scan(int(self._scan_ns[index]), points, dropped=int(BEAMS - np.count_nonzero(seen)))
 
     def _read_laser(self, text: bytes, uri: str) -> tuple[Int, NDArray[np.float32]]:
-        table, rest = _table(text, BEAMS + 1)
-        if rest:
-            count_loss(self._damage, "numbers at the end of LASER.txt that are no whole scan", rest)
+        numbers = parse_numbers(text)  # the real file has all scans in one line
+        whole = len(numbers) // (BEAMS + 1) * (BEAMS + 1)
+        if whole < len(numbers):
+            count_loss(
+                self._damage, "numbers at the end of LASER.txt that are no whole scan", len(numbers) - whole
+            )
+        table = numbers[:whole].reshape(-1, BEAMS + 1)
         table = self._ascending(table, "laser scans with impossible times")
         if not len(table):
-            raise SourceError("LASER.txt holds no scan", where=uri, remedy="Get the file again.")
-        return _nanoseconds(table[:, 0]), table[:, 1:].astype(np.float32)
+            raise SourceError("LASER.txt holds no scan", where=uri, remedy="Download the file again.")
+        with np.errstate(over="ignore"):  # a number that is too large becomes inf: no return
+            return _nanoseconds(table[:, 0]), table[:, 1:].astype(np.float32)
 
     def _read_encoders(self, text: bytes, uri: str) -> tuple[Int, Float]:
-        """Times and poses; a pose at rest before the first reading reaches back to the first scan."""
-        table, rest = _table(text, 3)
-        if rest:
-            count_loss(self._damage, "numbers at the end of DRS.txt that are no whole row", rest)
+        """Return times and poses; scans before the first encoder reading get its pose."""
+        table = self._rows(text, "DRS.txt")
         table = self._ascending(table, "encoder readings with impossible times")
         sound = (np.abs(table[:, 1]) < _FASTEST) & (np.abs(table[:, 2]) < _STEEPEST)
         if not sound.all():
             count_loss(self._damage, "encoder readings out of bounds", int(np.count_nonzero(~sound)))
         table = table[sound]
         if not len(table):
-            raise SourceError("DRS.txt holds no reading", where=uri, remedy="Get the file again.")
+            raise SourceError("DRS.txt holds no reading", where=uri, remedy="Download the file again.")
         poses = dead_reckoning(table[:, 0], table[:, 1], table[:, 2], Car())
         stamp_ns = _nanoseconds(table[:, 0])
         if self._scan_ns[0] < stamp_ns[0]:
@@ -188,8 +190,11 @@ class VictoriaParkSource:
         return stamp_ns, poses
 
     def _read_gps(self, text: bytes) -> TruthPath | None:
-        table, _ = _table(text, 3)
-        table = self._ascending(table, "GPS rows with impossible times")
+        table = self._ascending(self._rows(text, "GPS.txt"), "GPS rows with impossible times")
+        near = (np.abs(table[:, 1:]) < COORDINATE_LIMIT).all(axis=1)
+        if not near.all():
+            count_loss(self._damage, "GPS rows with impossible positions", int(np.count_nonzero(~near)))
+        table = table[near]
         if not len(table):
             return None
         north, east = table[:, 1].copy(), table[:, 2].copy()
@@ -197,8 +202,15 @@ class VictoriaParkSource:
             _nanoseconds(table[:, 0]), east, north, np.full(len(table), np.nan), same_frame=False
         )
 
+    def _rows(self, text: bytes, name: str) -> Float:
+        """Return the rows of three numbers of a text file, shape (N, 3), and count its damaged lines."""
+        table, damaged = parse_table(text, 3)
+        if damaged:
+            count_loss(self._damage, f"damaged rows of {name}", damaged)
+        return table
+
     def _ascending(self, table: Float, reason: str) -> Float:
-        """Rows whose time is sound and not before the one above."""
+        """Return the rows with finite numbers whose times do not go back; count the others."""
         time = table[:, 0]
         with np.errstate(invalid="ignore"):
             sound = (time >= 0.0) & (time < _LONGEST_S) & np.isfinite(table).all(axis=1)
@@ -209,17 +221,17 @@ class VictoriaParkSource:
 
 
 def _unpack(path: Path, uri: str) -> dict[str, bytes]:
-    """The text files of the zip by name in lower case; sizes are checked before unpacking."""
+    """Return the text files of the zip by lower-case name; sizes are checked before unpacking."""
     wanted = {"laser.txt", "drs.txt", "gps.txt"}
     try:
-        # A damaged zip may lead before the start of the file, which is an OSError like any other.
+        # A damaged zip may point before the start of the file, which raises an OSError.
         with path.open("rb") as file, zipfile.ZipFile(file) as archive:
             found = {Path(entry.filename).name.lower(): entry for entry in archive.infolist()}
             if not {"laser.txt", "drs.txt"} <= found.keys():
                 raise SourceError(
                     "the zip holds no LASER.txt and DRS.txt",
                     where=uri,
-                    remedy="Of zips only Victoria Park's can be read; unpack others first.",
+                    remedy="Only the zip of Victoria Park can be read; unpack other zips first.",
                 )
             chosen = {name: entry for name, entry in found.items() if name in wanted}
             large = [name for name, entry in chosen.items() if entry.file_size > MEMBER_LIMIT]
@@ -235,14 +247,9 @@ def _unpack(path: Path, uri: str) -> dict[str, bytes]:
         ValueError,
         UnicodeDecodeError,
     ) as error:
-        raise SourceError(f"the zip is damaged: {error}", where=uri, remedy="Get the file again.") from error
-
-
-def _table(text: bytes, columns: int) -> tuple[Float, int]:
-    """Whole rows of the numbers of a text, and how many numbers are left over at its end."""
-    numbers = parse_numbers(text)
-    whole = len(numbers) // columns * columns
-    return numbers[:whole].reshape(-1, columns), len(numbers) - whole
+        raise SourceError(
+            f"the zip is damaged: {error}", where=uri, remedy="Download the file again."
+        ) from error
 
 
 def _nanoseconds(seconds: Float) -> Int:

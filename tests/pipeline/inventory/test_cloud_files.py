@@ -16,8 +16,7 @@ from app.cli import main
 from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.clouds import is_cloud, open_cloud
-from pipeline.io.readers.point_files import open_table, read_columns
-from pipeline.io.readers.scan_folder import ScanFileError
+from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
 from tests.pipeline.inventory.plots import plot
 
 UTM = np.array([470600.0, 3810200.0, 2278.0])
@@ -126,13 +125,22 @@ def test_a_ply_text_is_read_to_its_last_line(tmp_path, end):
     assert not losses
 
 
-@pytest.mark.parametrize("body", ["1 2 3\n4 5 x\n7 8 9\n", "1 2 3\n4 5\n", "1 2 3\n"])
-def test_what_a_text_promises_and_does_not_hold_is_counted(tmp_path, body):
+@pytest.mark.parametrize(
+    ("body", "x"),
+    [
+        ("1 2 3\n4 5 x\n7 8 9\n", [1.0, 7.0]),
+        ("1 2 3\n4 5 6 7\n7 8 9\n", [1.0, 7.0]),
+        ("1 2 3\n4 5\n6 7 8 9\n", [1.0]),
+        ("1 2 3\n4 5\n", [1.0]),
+        ("1 2 3\n", [1.0]),
+    ],
+)
+def test_damaged_and_missing_rows_of_a_text_are_counted(tmp_path, body, x):
     (tmp_path / "c.ply").write_text(TEXT.format(n=3) + body)
     losses: dict[str, int] = {}
     columns = read_columns(tmp_path / "c.ply", losses)
-    np.testing.assert_array_equal(columns["x"], [1.0])
-    assert losses == {"points that the files promise but do not hold": 2}
+    np.testing.assert_array_equal(columns["x"], x)
+    assert losses == {"points that the files promise but do not hold": 3 - len(x)}
 
 
 def test_what_stands_before_the_points_of_a_text_is_passed_over_once(tmp_path):
@@ -148,14 +156,6 @@ def test_rows_longer_than_the_header_says_are_refused(tmp_path, body):
     (tmp_path / "c.ply").write_text(TEXT.format(n=2) + body)
     with pytest.raises(ScanFileError, match=r"have [46] numbers, its header names 3"):
         read_columns(tmp_path / "c.ply", {})
-
-
-@pytest.mark.parametrize("body", ["1 2 3\n4 5 6 7\n7 8 9\n", "1 2 3\n4 5\n6 7 8 9\n"])
-def test_no_point_is_made_of_two_rows(tmp_path, body):
-    (tmp_path / "c.ply").write_text(TEXT.format(n=3) + body)
-    losses: dict[str, int] = {}
-    np.testing.assert_array_equal(read_columns(tmp_path / "c.ply", losses)["x"], [1.0])
-    assert losses == {"points that the files promise but do not hold": 2}
 
 
 def test_points_that_are_none_are_counted(tmp_path, points):

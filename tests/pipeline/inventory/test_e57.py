@@ -9,7 +9,6 @@ import pytest
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.clouds import is_cloud, open_cloud
-from pipeline.io.readers.clouds.e57_pages import _HEADER, PAGE, Pages, checksums
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
 
@@ -50,31 +49,16 @@ def test_a_cut_file_is_one_clear_error(keep: float, tmp_path: Path):
         list(open_cloud(str(tmp_path / "plot.e57")).parts())
 
 
-def test_the_sums_are_those_that_the_library_writes_and_name_the_station_that_is_damaged(tmp_path: Path):
+def test_a_damaged_page_is_one_clear_error_or_a_counted_loss(tmp_path: Path):
     path = tmp_path / "plot.e57"
     write(path, stations=3)
-    pages, whole = Pages(path), path.read_bytes()
-    assert (pages.damage, len(pages.sections)) == ("", 3)
-    assert [pages.are_sound(station) for station in range(3)] == [True, True, True]
-    second = pages.sections[1] + 3000
-    path.write_bytes(whole[:second] + bytes([whole[second] ^ 1]) + whole[second + 1 :])
-    assert not Pages(path).are_sound(1)
-    assert Pages(path).are_sound(2)
-    cloud = open_cloud(str(path))
-    assert 0 < sum(len(part) for part in cloud.parts()) + sum(cloud.losses.values()) == 900
+    whole = path.read_bytes()
     path.write_bytes(whole[:-5] + b"\0" + whole[-4:])
-    with pytest.raises(SourceError, match="E57 file is damaged: a checksum"):
+    with pytest.raises(SourceError, match=r"E57 file is damaged: .*(?i:checksum)"):
         open_cloud(str(path))
-    assert checksums(np.frombuffer(b"123456789", np.uint8)[None])[0] == 0xE3069283  # the sum of RFC 3720
-
-
-def test_an_element_of_points_that_never_ends_is_passed_over_at_once(tmp_path: Path):
-    """Going through it once an attribute would take hours."""
-    xml = b"<points " + 100_000 * b'type="CompressedVector" '
-    pages = -(-(_HEADER.size + len(xml)) // (PAGE - 4))
-    head = _HEADER.pack(b"ASTM-E57", 1, 0, pages * PAGE, _HEADER.size, len(xml), PAGE)
-    rows = np.frombuffer((head + xml).ljust(pages * (PAGE - 4), b"\0"), np.uint8).reshape(pages, -1)
-    sums = checksums(rows).astype(">u4")[:, None].view(np.uint8)
-    (tmp_path / "endless.e57").write_bytes(np.hstack([rows, sums]).tobytes())
-    looked_at = Pages(tmp_path / "endless.e57")
-    assert (looked_at.damage, looked_at.sections) == ("", ())
+    middle = len(whole) // 2
+    path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+    cloud = open_cloud(str(path))
+    read = sum(len(part) for part in cloud.parts())
+    assert 0 < read < 900
+    assert cloud.losses == {"points after the damage in the file": 900 - read}

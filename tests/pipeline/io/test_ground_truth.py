@@ -149,3 +149,10 @@ def test_the_stems_of_the_pine_plot(shared_data):
     told = read_truth_trees(shared_data / "forest" / "pine_plot_stems.csv")
     assert len(told.x) == 16
     assert 0.1 < np.nanmedian(told.dbh) < 0.4
+
+
+@pytest.mark.parametrize("header", ["x_m,y_m", "azimuth_deg,distance_m"])
+@pytest.mark.parametrize("number", ["1e200", "-1e8", "inf"])
+def test_coordinates_out_of_range_are_refused_in_one_line(tmp_path, header, number):
+    with pytest.raises(SourceError, match=r"line 3: .* is (out of range|not a number)"):
+        read(tmp_path, f"{header}\n1,2\n1,{number}\n")

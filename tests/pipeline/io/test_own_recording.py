@@ -106,6 +106,7 @@ def test_an_attachment_is_read_with_its_size_and_checksum(tmp_path: Path):
         ({"trees": {"x": [1.0], "y": [], "dbh": [None], "kind": ["tree"]}}, "differ in length"),
         ({"trees": {"x": [1.0], "y": [1.0], "dbh": [None], "kind": ["dragon"]}}, "dragon"),
         ({"trees": {"x": ["1"], "y": [1.0], "dbh": [None], "kind": ["tree"]}}, "float"),
+        ({"trees": {"x": [1e200], "y": [1.0], "dbh": [None], "kind": ["tree"]}}, "1e8|100000000"),
         ({"path": {"stamp_ns": [-1], "x": [0.0], "y": [0.0], "yaw": [0.0]}}, "stamp_ns"),
         ({"sensor": {"azimuth_step": 0.0}}, "azimuth_step"),
     ],

@@ -111,10 +111,20 @@ def test_bad_rows_are_counted(tmp_path: Path, opened: Opened):
     assert source.losses == {
         "numbers at the end of LASER.txt that are no whole scan": 2,
         "laser scans with impossible times": 1,
-        "numbers at the end of DRS.txt that are no whole row": 1,
+        "damaged rows of DRS.txt": 1,
         "encoder readings with impossible times": 2,
         "encoder readings out of bounds": 1,
     }
+
+
+def test_a_gps_row_that_is_no_position_is_counted(tmp_path: Path, opened: Opened):
+    gps = "0.1 1e200 0\n0.2 5 7\n0.3 0 -1e9\n0.4 6\n"
+    source = opened(write_zip(tmp_path, np.full(362, 5.0), **{"GPS.txt": gps}))
+    truth = source.truth()
+    assert truth is not None
+    assert truth.path is not None
+    np.testing.assert_array_equal([truth.path.x, truth.path.y], [[7.0], [5.0]])
+    assert source.losses == {"GPS rows with impossible positions": 2, "damaged rows of GPS.txt": 1}
 
 
 def test_other_zips_and_empty_texts_are_refused(tmp_path: Path, opened: Opened):
@@ -133,8 +143,8 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, opened: Ope
     path = tmp_path / "bomb.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         with archive.open("LASER.txt", "w", force_zip64=True) as member:
-            for _ in range(129):
+            for _ in range(65):
                 member.write(bytes(1 << 20))
         archive.writestr("DRS.txt", "0 0 0")
-    with pytest.raises(SourceError, match="unpacks to more than 128 MB"):
+    with pytest.raises(SourceError, match="unpacks to more than 64 MB"):
         opened(path)

@@ -1,0 +1,633 @@
+"""Point files as tables with one column per value: PCD, PLY, and NumPy's .npy and .npz.
+
+A table is read part by part (a whole cloud) or at once (a scan). Headers are compared with the size of the
+file before memory is taken, and pickles are never read. The readers are our own: Open3D ends the process on
+some damaged PCD files and returns an empty cloud for others.
+"""
+
+from __future__ import annotations
+
+import io
+import lzma
+import struct
+import tokenize
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.number_text import read_rows
+from pipeline.io.readers.scan_columns import POINT_LIMIT
+from pipeline.jit import compiled
+
+Columns = dict[str, NDArray[np.generic]]
+
+#: First bytes of the files by their usual suffix; .npz files are zips.
+MAGIC = {
+    ".ply": (b"ply\n", b"ply\r"),
+    ".npy": (b"\x93NUMPY",),
+    ".npz": (b"PK\x03\x04", b"PK\x05\x06"),
+    ".pcd": (b"# .PCD", b"VERSION", b"FIELDS"),
+}
+PART = 1 << 18  # points
+MOST_POINTS = 2_000_000_000
+STEP_LIMIT = 64 << 10  # bytes per point
+#: Largest data that is held in memory as a whole, where a format cannot be read in parts.
+WHOLE_LIMIT = 1 << 30  # bytes
+MISSING = "points that the files promise but do not hold"
+_HEADER_LIMIT = 64 << 10  # bytes
+_NPY_HEADER_LIMIT = 16 << 10  # bytes; NumPy itself refuses headers of more than 10,000
+_MOST_FIELDS = 1000
+
+
+class ScanFileError(Exception):
+    """A file does not hold a scan or a cloud; the message gives the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointTable:
+    """A point file with a valid header.
+
+    Attributes:
+        kind: Name of the format, e.g. "PLY binary".
+        points: Number of points by the header.
+        names: Names of the columns with one number per point, in lower case; x, y and z are among them.
+        parts: Yields all points in parts, each with columns of equal length. Numbers need not be finite. A
+            file that is cut or damaged yields the points before the damage. Raises ScanFileError when nothing
+            can be read, and OSError.
+    """
+
+    kind: str
+    points: int
+    names: tuple[str, ...]
+    parts: Callable[[], Iterator[Columns]]
+
+
+def open_table(path: Path) -> PointTable:
+    """Open a file by its contents and read its header.
+
+    Raises:
+        ScanFileError: It has none of these formats, contradicts itself, or has no x, y and z.
+        OSError: It cannot be read.
+    """
+    openers = {".ply": _open_ply, ".npy": _open_npy, ".npz": _open_npz, ".pcd": _open_pcd}
+    with path.open("rb") as file:
+        head = file.read(16)
+    for suffix, magic in MAGIC.items():
+        if head.startswith(magic):
+            return openers[suffix](path)
+    raise ScanFileError("its contents are not those of a PLY, NumPy or PCD file")
+
+
+def read_columns(path: Path, losses: dict[str, int], *, limit: int = POINT_LIMIT) -> Columns:
+    """Read a file as a whole; columns of shape (N,).
+
+    Args:
+        path: A PLY, NumPy or PCD file.
+        losses: Counts the points that the header promises and the file does not hold.
+        limit: A file that promises more points is refused before they are read.
+
+    Raises:
+        ScanFileError: It cannot be read, or is too large.
+        OSError: It cannot be read.
+    """
+    table = open_table(path)
+    if table.points > limit:
+        raise ScanFileError(f"its header promises {table.points} points, too many for one scan")
+    parts = list(table.parts())
+    columns = {
+        name: np.concatenate([part[name] for part in parts]) if parts else np.zeros(0) for name in table.names
+    }
+    read = len(columns["x"])
+    if read < table.points:
+        count_loss(losses, MISSING, table.points - read)
+    return columns
+
+
+def _column_names(fields: list[str]) -> list[str]:
+    """Return names in lower case without the prefix of CloudCompare; unusable ones begin with "*"."""
+    names: list[str] = []
+    for k, field in enumerate(fields):
+        name = field.lower().removeprefix("scalar_")
+        names.append(f"*{k}" if name in ("", "_", *names) else name)
+    return names
+
+
+def _usable(names: list[str]) -> tuple[str, ...]:
+    """Return the names of the columns that can be used.
+
+    Raises:
+        ScanFileError: x, y or z is missing.
+    """
+    missing = [axis for axis in "xyz" if axis not in names]
+    if missing:
+        raise ScanFileError(f"its points have no {' and no '.join(missing)}")
+    return tuple(name for name in names if not name.startswith("*"))
+
+
+def _check_size(points: int, step: int, *, whole: bool = False) -> None:
+    """Check the number of points and the bytes of one point.
+
+    Args:
+        points, step: As the header says.
+        whole: Whether all points are read at once.
+
+    Raises:
+        ScanFileError: They are too large.
+    """
+    too_large = points > MOST_POINTS or (whole and points * step > WHOLE_LIMIT)
+    if points < 0 or too_large or not 0 < step <= STEP_LIMIT:
+        raise ScanFileError(f"its header promises {points} points of {step} bytes, too many to be read")
+
+
+def _read_records(file: IO[bytes], dtype: np.dtype[Any], points: int) -> Iterator[NDArray[Any]]:
+    """Yield records of fixed length from the position of the file, without the last one if it is cut."""
+    rows = max(1, min(PART, (16 << 20) // dtype.itemsize))
+    while points > 0:
+        block = file.read(min(rows, points) * dtype.itemsize)
+        whole = len(block) // dtype.itemsize
+        if whole:
+            yield np.frombuffer(block, dtype, whole)
+        if whole * dtype.itemsize < len(block) or not whole:
+            return
+        points -= whole
+
+
+# --- PCD (Point Cloud Library), version 0.7 --------------------------------------------------------
+
+_PCD_TYPES = {("F", 4): "<f4", ("F", 8): "<f8"}
+_PCD_TYPES |= {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
+
+
+@dataclass(frozen=True, slots=True)
+class _PcdHeader:
+    """Header of a PCD file.
+
+    Attributes:
+        dtype: One point; a field has its count as shape.
+        points: Number of points.
+        data: "ascii", "binary" or "binary_compressed".
+        length: Bytes of the header.
+    """
+
+    dtype: np.dtype[np.void]
+    points: int
+    data: str
+    length: int
+
+
+def _open_pcd(path: Path) -> PointTable:
+    with path.open("rb") as file:
+        header = _pcd_header(file.read(_HEADER_LIMIT))
+    size, step = path.stat().st_size, header.dtype.itemsize
+    _check_size(header.points, step, whole=header.data != "binary")
+    if header.data == "binary" and header.points and size < header.length + step:
+        raise ScanFileError("the PCD file ends before its first point")
+    if header.data != "binary" and size > WHOLE_LIMIT:
+        raise ScanFileError("the PCD file is too large; write it as binary")
+    names = [
+        name if header.dtype[name].shape == () else f"*{name}"  # a field of several values is no column
+        for name in header.dtype.names or ()
+    ]
+    read = {"ascii": _pcd_ascii, "binary": _pcd_binary, "binary_compressed": _pcd_compressed}[header.data]
+    usable = _usable(names)
+
+    def parts() -> Iterator[Columns]:
+        with path.open("rb") as file:
+            file.seek(header.length)
+            for columns in read(file, header):
+                yield {name: columns[name] for name in usable}
+
+    return PointTable(f"PCD {header.data}", header.points, usable, parts)
+
+
+def _pcd_header(head: bytes) -> _PcdHeader:
+    """Parse and check the header of a PCD file.
+
+    Raises:
+        ScanFileError: It is not a header of a PCD file, or contradicts itself.
+    """
+    entries: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in entries:
+        end = head.find(b"\n", at)
+        if end < 0:
+            raise ScanFileError("it has no header of a PCD file")
+        words = head[at:end].decode("ascii", "replace").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+    try:
+        fields, data = entries["FIELDS"], entries["DATA"][0].lower()
+        sizes = [_whole_number(word) for word in entries["SIZE"]]
+        counts = [_whole_number(word) for word in entries.get("COUNT", ["1"] * len(fields))]
+        if not len(fields) == len(sizes) == len(entries["TYPE"]) == len(counts) <= _MOST_FIELDS:
+            raise ScanFileError("its header names another number of fields than of sizes, types or counts")
+        types = [_PCD_TYPES[kind, size] for kind, size in zip(entries["TYPE"], sizes, strict=True)]
+        width, height = _whole_number(entries["WIDTH"][0]), _whole_number(entries.get("HEIGHT", ["1"])[0])
+        points = _whole_number(entries["POINTS"][0]) if "POINTS" in entries else width * height
+    except (KeyError, IndexError, ValueError) as error:
+        raise ScanFileError(f"its header is damaged at {error}") from error
+    if points != width * height:
+        raise ScanFileError(f"its header promises {points} points and {width} x {height}")
+    if data not in ("ascii", "binary", "binary_compressed"):
+        raise ScanFileError(f"its data is of the unknown kind {data[:20]!r}")
+    _check_size(points, sum(size * count for size, count in zip(sizes, counts, strict=True)))
+    names = _column_names(fields)
+    for axis in "xyz":
+        column = names.index(axis) if axis in names else -1
+        if column < 0 or not types[column].startswith("<f") or counts[column] != 1:
+            raise ScanFileError(f"it has no field {axis} of floating numbers")
+    shapes = [() if count == 1 else (count,) for count in counts]
+    return _PcdHeader(np.dtype(list(zip(names, types, shapes, strict=True))), points, data, at)
+
+
+def _whole_number(word: str) -> int:
+    if not word.isdecimal() or len(word) > 18:
+        raise ValueError(word[:20])
+    return int(word)
+
+
+def _pcd_binary(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
+    for records in _read_records(file, header.dtype, header.points):
+        yield {name: records[name] for name in header.dtype.names or ()}
+
+
+def _pcd_ascii(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
+    fields = [(name, header.dtype[name]) for name in header.dtype.names or ()]
+    for rows in read_rows(file, sum(max(1, *dtype.shape, 1) for _, dtype in fields), header.points):
+        columns: Columns = {}
+        at = 0
+        for name, dtype in fields:
+            columns[name] = _as_type(rows[:, at], dtype.base)
+            at += dtype.shape[0] if dtype.shape else 1
+        yield columns
+
+
+def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.generic]:
+    """Convert numbers of a text to the type of the header; integers are clipped to its range."""
+    if dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            return numbers.astype(dtype)
+    bounds = np.iinfo(dtype)
+    high = bounds.max / 2 if dtype.itemsize == 8 else bounds.max
+    return np.clip(np.nan_to_num(numbers), bounds.min, high).astype(dtype)
+
+
+def _pcd_compressed(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
+    """Compressed data holds one field after the other, each with all its points."""
+    body = file.read(WHOLE_LIMIT)
+    if len(body) < 8:
+        raise ScanFileError("its packed data is missing")
+    packed, size = struct.unpack_from("<II", body)
+    if size != header.points * header.dtype.itemsize or packed > len(body) - 8:
+        raise ScanFileError("its packed data is cut or has another size than the header promises")
+    raw = lzf_decompress(memoryview(body)[8 : 8 + packed], size)
+    columns: Columns = {}
+    at = 0
+    for name in header.dtype.names or ():
+        length = header.dtype[name].itemsize * header.points
+        columns[name] = raw[at : at + length].view(header.dtype[name].base)
+        at += length
+    yield columns
+
+
+def lzf_decompress(block: bytes | memoryview, size: int) -> NDArray[np.uint8]:
+    """Decompress an LZF block to exactly `size` bytes; uint8 of shape (size,).
+
+    Raises:
+        ScanFileError: The block is damaged or has another size.
+    """
+    if size > 88 * (len(block) + 1):  # three bytes of LZF give at most 264 bytes
+        raise ScanFileError("the packed data cannot grow to the size in its header")
+    unpacked = np.empty(size, dtype=np.uint8)
+    if _unpack_lzf(np.frombuffer(block, dtype=np.uint8), unpacked) != size:
+        raise ScanFileError("the packed data is damaged")
+    return unpacked
+
+
+@compiled
+def _unpack_lzf(block: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
+    """Return the number of bytes written, -1 when the block points outside of either array."""
+    at, out = 0, 0
+    while at < len(block):
+        control = int(block[at])
+        at += 1
+        if control < 32:
+            run = control + 1
+            if at + run > len(block) or out + run > len(unpacked):
+                return -1
+            for k in range(run):
+                unpacked[out + k] = block[at + k]
+            at += run
+        else:
+            run = control >> 5
+            if run == 7:
+                if at >= len(block):
+                    return -1
+                run += int(block[at])
+                at += 1
+            if at >= len(block):
+                return -1
+            source = out - ((control & 31) << 8) - int(block[at]) - 1
+            at += 1
+            run += 2
+            if source < 0 or out + run > len(unpacked):
+                return -1
+            # Source and target may overlap, which repeats bytes, so they are copied one by one.
+            for k in range(run):
+                unpacked[out + k] = unpacked[source + k]
+        out += run
+    return out
+
+
+# --- PLY -------------------------------------------------------------------------------------------
+
+_PLY_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_PLY_ORDER = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(slots=True)
+class _PlyElement:
+    """An element of the header: its name, count, and properties (name, type); a list has the type ""."""
+
+    name: str
+    count: int
+    fields: list[tuple[str, str]]
+
+    def dtype(self, order: str) -> np.dtype[np.void]:
+        """Return the record of one element."""
+        names = _column_names([name for name, _ in self.fields])
+        return np.dtype(
+            [(name, (order or "<") + kind) for name, (_, kind) in zip(names, self.fields, strict=True)]
+        )
+
+
+def _open_ply(path: Path) -> PointTable:
+    with path.open("rb") as file:
+        order, elements, start = _ply_header(file.read(_HEADER_LIMIT))
+    place = next((k for k, e in enumerate(elements) if e.name in ("vertex", "point", "points")), None)
+    if place is None:
+        raise ScanFileError("the PLY file has no vertices")
+    vertex, earlier = elements[place], elements[:place]
+    with_lists = [vertex, *earlier] if order else [vertex]
+    if not all(kind for element in with_lists for _, kind in element.fields):
+        raise ScanFileError("the PLY file has lists of varying length before its last vertex")
+    dtype = vertex.dtype(order)
+    names = list(dtype.names or ())
+    usable = _usable(names)
+    _check_size(vertex.count, dtype.itemsize)
+    # Lines of text, or bytes of binary data, before the vertices.
+    before = sum(e.count * (e.dtype(order).itemsize if order else 1) for e in earlier)
+    # A vertex in text needs a digit and a separator per number.
+    if (
+        vertex.count
+        and start + before + (dtype.itemsize if order else 2 * len(names)) > path.stat().st_size + 1
+    ):
+        raise ScanFileError("the PLY file ends before its first vertex")
+
+    def parts() -> Iterator[Columns]:
+        with path.open("rb") as file:
+            file.seek(start + before if order else start)
+            if order:
+                for records in _read_records(file, dtype, vertex.count):
+                    yield {name: records[name] for name in usable}
+                return
+            for _ in range(before):
+                file.readline()
+            _check_ply_row(file, len(names))
+            for rows in read_rows(file, len(names), vertex.count):
+                yield {name: rows[:, k] for k, name in enumerate(names) if name in usable}
+
+    return PointTable("PLY binary" if order else "PLY text", vertex.count, usable, parts)
+
+
+def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
+    """Return the byte order ("" for text), the elements, and the length of the header.
+
+    Raises:
+        ScanFileError: It is not a header of a PLY file.
+    """
+    order: str | None = None
+    elements: list[_PlyElement] = []
+    at = 0
+    while (end := head.find(b"\n", at)) >= 0:
+        words = head[at:end].decode("ascii", "replace").split()
+        at = end + 1
+        try:
+            match words:
+                case ["end_header"]:
+                    if order is None:
+                        raise ScanFileError("the header of the PLY file does not say how its data is written")
+                    return order, elements, at
+                case ["format", form, *_]:
+                    order = _PLY_ORDER[form]
+                case ["element", name, number]:
+                    elements.append(_PlyElement(name.lower(), _whole_number(number), []))
+                case ["property", "list", _, _, name]:
+                    elements[-1].fields.append((name, ""))
+                case ["property", kind, name]:
+                    elements[-1].fields.append((name, _PLY_TYPES[kind]))
+                case ["property" | "element", *_]:
+                    raise ScanFileError("the header of the PLY file is damaged")
+        except (KeyError, IndexError, ValueError):
+            raise ScanFileError("the header of the PLY file is damaged") from None
+    raise ScanFileError("it has no header of a PLY file")
+
+
+def _check_ply_row(file: IO[bytes], columns: int) -> None:
+    """Check that the first row does not have more numbers than the header names."""
+    start = file.tell()
+    words: list[bytes] = []
+    while not words and (line := file.readline(WHOLE_LIMIT)):
+        words = line.split()
+    file.seek(start)
+    if len(words) > columns:
+        raise ScanFileError(f"the rows of the PLY file have {len(words)} numbers, its header names {columns}")
+
+
+# --- NumPy -----------------------------------------------------------------------------------------
+
+_MOST_MEMBERS = 1000
+_BEST_NAMES = ("points", "xyz", "cloud", "point_cloud", "pointcloud", "pts", "data", "arr_0")
+_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError, struct.error)
+_HEADER_DAMAGE = (
+    *_DAMAGE, KeyError, TypeError, SyntaxError, tokenize.TokenError, MemoryError, OverflowError
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Array:
+    """An array of an .npy file or of a member of an .npz file.
+
+    Attributes:
+        member: Name in the .npz, None for an .npy.
+        start: Bytes of its header.
+        size: Bytes of the file, or of the unpacked member by the directory of the zip.
+        shape, dtype, fortran: As its header says.
+    """
+
+    member: str | None
+    start: int
+    size: int
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fortran: bool
+
+    @property
+    def name(self) -> str:
+        """Name of the array."""
+        return (self.member or "").removesuffix(".npy").lower()
+
+    def records(self) -> np.dtype[Any]:
+        """Return the record of one row, with a name for each column.
+
+        Raises:
+            ScanFileError: The array is not a table of numbers.
+        """
+        form = f"an array of shape {self.shape} and type {self.dtype}"[:120]
+        if len(self.shape) == 1 and self.dtype.names:
+            fields = dict(self.dtype.fields or {})
+            kinds = [fields[name][0] for name in self.dtype.names]
+            if not all(_is_number(kind) or kind.kind in "VSU" for kind in kinds):
+                raise ScanFileError(f"it holds {form}; it must be numbers")
+            names = _column_names(
+                [n if _is_number(k) else "" for n, k in zip(self.dtype.names, kinds, strict=True)]
+            )
+            offsets = [fields[name][1] for name in self.dtype.names]
+            return np.dtype(
+                {"names": names, "formats": kinds, "offsets": offsets, "itemsize": self.dtype.itemsize}
+            )
+        if len(self.shape) != 2 or not _is_number(self.dtype) or not 3 <= self.shape[1] <= _MOST_FIELDS:
+            raise ScanFileError(
+                f"it holds {form}; it must be (N, 3) numbers or more columns, or have fields x, y and z"
+            )
+        # Four or five columns are those of KITTI and similar sets; six are x, y, z and a colour.
+        known = ["x", "y", "z", *(["intensity"] if self.shape[1] in (4, 5) else [])]
+        names = [*known, *(f"*{k}" for k in range(len(known), self.shape[1]))]
+        return np.dtype([(name, self.dtype) for name in names])
+
+    def parts(self, path: Path, dtype: np.dtype[Any], stack: ExitStack) -> Iterator[NDArray[Any]]:
+        """Yield the rows as records part by part; the stack closes the file."""
+        file: IO[bytes]
+        if self.member is None:
+            file = stack.enter_context(path.open("rb"))
+        else:
+            file = stack.enter_context(stack.enter_context(zipfile.ZipFile(path)).open(self.member))
+        file.seek(self.start)
+        if not (self.fortran and len(self.shape) == 2):
+            yield from _read_records(file, dtype, self.shape[0])
+            return
+        block = file.read(self.shape[0] * dtype.itemsize)
+        if len(block) < self.shape[0] * dtype.itemsize:
+            raise EOFError("it is cut off")
+        table = np.frombuffer(block, self.dtype).reshape(self.shape, order="F")
+        yield np.ascontiguousarray(table).view(dtype)[:, 0]
+
+
+def _open_npy(path: Path) -> PointTable:
+    with path.open("rb") as file:
+        array = _npy_header(file, None, path.stat().st_size)
+    return _numpy_table(path, "NumPy .npy", {array: array.records()})
+
+
+def _open_npz(path: Path) -> PointTable:
+    """Open the array with a usual name, else the first table, else arrays x, y and z."""
+    arrays: dict[str, _Array] = {}
+    reason = "it holds no arrays"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist()[:_MOST_MEMBERS]:
+                if info.filename.endswith(".npy"):
+                    try:
+                        with archive.open(info) as file:
+                            array = _npy_header(file, info.filename, info.file_size)
+                            arrays[array.name] = array
+                    except ScanFileError as error:
+                        reason = f"{info.filename[:40]}: {error}"
+    except _DAMAGE as error:
+        raise ScanFileError(f"the .npz file is damaged: {error}"[:200]) from None
+    for name in sorted(arrays, key=lambda name: _BEST_NAMES.index(name) if name in _BEST_NAMES else 99):
+        try:
+            return _numpy_table(
+                path, f"NumPy .npz, its array {name[:40]}", {arrays[name]: arrays[name].records()}
+            )
+        except ScanFileError as error:
+            reason = f"{name[:40]}: {error}"
+    columns = {
+        arrays[name]: np.dtype([(name, arrays[name].dtype)])
+        for name in ("x", "y", "z", "intensity")
+        if name in arrays and len(arrays[name].shape) == 1 and _is_number(arrays[name].dtype)
+    }
+    if len(columns) >= 3 and len({array.shape for array in columns}) == 1:
+        return _numpy_table(path, "NumPy .npz, its arrays x, y and z", columns)
+    raise ScanFileError(f"no array of it holds points; {reason}")
+
+
+def _numpy_table(path: Path, kind: str, arrays: dict[_Array, np.dtype[Any]]) -> PointTable:
+    """Return the table of arrays that are read side by side, each with its record type."""
+    usable = _usable([name for dtype in arrays.values() for name in dtype.names or ()])
+    points = next(iter(arrays)).shape[0]
+    for array, dtype in arrays.items():
+        whole = array.fortran and len(array.shape) == 2
+        _check_size(points, dtype.itemsize, whole=whole)
+        if points and array.start + dtype.itemsize * (points if whole else 1) > array.size:
+            raise ScanFileError("it ends before its first point" if not whole else "it is cut off")
+
+    def parts() -> Iterator[Columns]:
+        read = 0
+        try:
+            with ExitStack() as stack:
+                streams = [array.parts(path, dtype, stack) for array, dtype in arrays.items()]
+                for records in zip(*streams, strict=False):
+                    n = min(map(len, records))
+                    read += n
+                    columns = {name: part[name][:n] for part in records for name in part.dtype.names or ()}
+                    yield {name: columns[name] for name in usable}
+        except _DAMAGE as error:
+            if read == 0:
+                raise ScanFileError(f"the NumPy file is damaged: {error}"[:200]) from None
+
+    return PointTable(kind, points, usable, parts)
+
+
+def _npy_header(file: IO[bytes], member: str | None, size: int) -> _Array:
+    """Parse the header of an array.
+
+    Raises:
+        ScanFileError: It is damaged, or the array holds Python objects (pickles) or is too large.
+    """
+    head = io.BytesIO(file.read(_NPY_HEADER_LIMIT))  # no header decides how much is read
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # headers that Python 2 wrote
+            shape, fortran, dtype = read[np.lib.format.read_magic(head)](head)
+    except (*_HEADER_DAMAGE, RecursionError) as error:
+        raise ScanFileError(f"the header of the array is damaged: {error}"[:160]) from None
+    if dtype.hasobject:
+        raise ScanFileError("an array of Python objects is not read, because it could run code")
+    if not shape or not all(0 <= n <= MOST_POINTS for n in shape) or dtype.subdtype:
+        raise ScanFileError(f"the header of the array promises the shape {shape}"[:120])
+    return _Array(member, head.tell(), size, tuple(shape), dtype, fortran)
+
+
+def _is_number(dtype: np.dtype[Any]) -> bool:
+    return dtype.kind in "fiu" and dtype.itemsize <= 8 and not dtype.shape
