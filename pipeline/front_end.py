@@ -10,19 +10,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline import ground
 from pipeline.classification import depth_image, steepest_by_direction
 from pipeline.config import Parameters
 from pipeline.config.stages import Detection
+from pipeline.detection.cluster_shape import describe_stems
 from pipeline.detection.clustering import cluster
 from pipeline.detection.external_stems import take_stems
 from pipeline.detection.free_space import clear_range
 from pipeline.detection.obstacles import find_clearance
-from pipeline.detection.stem_fit import describe_stems
-from pipeline.detection.stem_fit.truncation import is_cut
+from pipeline.detection.truncation import is_cut
 from pipeline.detection.verdicts import detections, judge
 from pipeline.geometry.poses import Float, Pose3
 from pipeline.geometry.quantisation import GROUND, POINT, rounded
+from pipeline.ground import scan_ground
 from pipeline.ground.terrain import NO_GROUND, Terrain, height_above, heights_of_places, shows_ground
 from pipeline.preprocessing import filters
 from pipeline.preprocessing.acquisition import acquire, acquire_near, driven_with
@@ -136,9 +136,9 @@ def _at_points(step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, w
         boxed = filters.pass_through(raw, p.filters)
 
     with watch("ground"):
-        terrain = None if p.ground.method == "none" else ground.find_terrain(raw, p.ground)
+        terrain = None if p.ground.method == "none" else scan_ground.find_terrain(raw, p.ground)
         height = height_above(boxed, terrain) if terrain else None
-        band = boxed if height is None else ground.in_band(boxed, height, p.ground)
+        band = boxed if height is None else scan_ground.in_band(boxed, height, p.ground)
 
     with watch("voxel grid"):
         filtered = filters.voxel_grid(band, p.filters)

@@ -12,7 +12,7 @@ from pipeline.classification.feature_attribution import what_told
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES, TREE_IN_FREE_AIR, standard_forest, tree_in_free_air
 from pipeline.config import Parameters, field_specs
-from pipeline.detection.stem_fit.fit_residuals import StemFit, fit_one
+from pipeline.detection.cylinder_fit import StemFit, fit_one
 from pipeline.detection.verdicts import checks
 from pipeline.types.records import Clusters, Frame, Sensor, Verdict
 

@@ -11,12 +11,12 @@ import numpy as np
 from app.training.fit_forest import DOUBTFUL, Examples
 from app.training.stands import furnished_stand
 from app.training.streets import simulate_street
-from pipeline import ground
 from pipeline.classification import Gathering, View, depth_image, steepest_by_direction
 from pipeline.classification.forest import CLASSES, Forest
 from pipeline.config import Parameters
 from pipeline.detection.free_space import clear_range
 from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.ground import scan_ground
 from pipeline.ground.terrain import height_above
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import SimulatedSource
@@ -57,9 +57,9 @@ def gathered(
             continue
         before = repeated
         raw, offset = acquire(step, T_base_lidar, parameters.acquisition)
-        terrain = ground.find_terrain(raw, parameters.ground)
+        terrain = scan_ground.find_terrain(raw, parameters.ground)
         height = height_above(raw, terrain)
-        free = clear_range(raw, ground.in_band(raw, height, parameters.ground), offset)
+        free = clear_range(raw, scan_ground.in_band(raw, height, parameters.ground), offset)
         steepest = steepest_by_direction(raw, offset, sensor.rings > 0)
         pose = step.T_odom_base or Pose2()
         view = View(pose, offset, free, steepest, depth_image(raw), terrain.height)

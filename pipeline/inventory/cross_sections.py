@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.detection.clustering.grid import dbscan_grid
+from pipeline.detection.clustering import dbscan_grid
 from pipeline.geometry.poses import Float
 from pipeline.inventory.circle import FIGURES, best_circle, fit_circle, on_circle, share_inside
 from pipeline.jit import compiled

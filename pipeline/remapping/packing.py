@@ -15,8 +15,8 @@ import zstandard
 
 from pipeline.classification.ray_statistics import ELEVATIONS
 from pipeline.classification.voxel_map import SLICE, SLICES
+from pipeline.detection.cluster_shape import eccentricity
 from pipeline.detection.free_space import BINS
-from pipeline.detection.stem_fit import eccentricity
 from pipeline.front_end import Looked, Overview
 from pipeline.geometry.poses import Pose2
 from pipeline.geometry.quantisation import GROUND, POINT

@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.config import Parameters
 from pipeline.detection.obstacles import find_clearance
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.ground import find_terrain
+from pipeline.ground.scan_ground import find_terrain
 from pipeline.ground.terrain import shows_ground
 from pipeline.preprocessing.acquisition import acquire, acquire_near
 from pipeline.simulation.lidar import SpinningLidar, sweep_scene

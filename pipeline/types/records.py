@@ -137,7 +137,7 @@ class Clusters:
         arc: Visible part of the circle [rad].
         extent: shape (K, 3) [m], size of the bounding box along the ray, across it and up.
         hidden: Whether something nearer hides an edge of the cluster.
-        cut: Whether it goes on where nobody looked (see `pipeline.detection.stem_fit.truncation`).
+        cut: Whether it goes on where nobody looked (see `pipeline.detection.truncation`).
         verdict: int32, see Verdict.
     """
 

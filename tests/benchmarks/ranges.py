@@ -15,12 +15,12 @@ from itertools import pairwise
 import numpy as np
 
 from app.training.streets import simulate_street
-from pipeline import ground
 from pipeline.config import Parameters, preset
+from pipeline.detection.cluster_shape import describe_stems
 from pipeline.detection.clustering import cluster
-from pipeline.detection.stem_fit import describe_stems
 from pipeline.detection.verdicts import detections, judge
 from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.ground import scan_ground
 from pipeline.ground.terrain import height_above
 from pipeline.io.readers import open_source
 from pipeline.odometry.synchroniser import steps
@@ -83,8 +83,8 @@ def _count(place: Place, parameters: Parameters) -> np.ndarray[tuple[int, int], 
     p = parameters
     raw, offset = acquire(step, T_base_lidar, p.acquisition)
     boxed = filters.pass_through(raw, p.filters)
-    height = height_above(boxed, ground.find_terrain(raw, p.ground))
-    points = filters.voxel_grid(ground.in_band(boxed, height, p.ground), p.filters)
+    height = height_above(boxed, scan_ground.find_terrain(raw, p.ground))
+    points = filters.voxel_grid(scan_ground.in_band(boxed, height, p.ground), p.filters)
     _, described = describe_stems(points, cluster(points, sensor, p.clustering), sensor, p.shape)
     found = detections(judge(described, p.detection), offset, p.detection).centre
     here = _in_base_frame(trees, step.T_odom_base or Pose2())

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import ground
 from pipeline.config import Parameters, preset
+from pipeline.detection.cluster_shape import describe_stems
 from pipeline.detection.clustering import cluster
 from pipeline.detection.free_space import clear_range
-from pipeline.detection.stem_fit import describe_stems
 from pipeline.detection.verdicts import detections, judge
 from pipeline.evaluation import path_error
 from pipeline.geometry.poses import Pose2
+from pipeline.ground import scan_ground
+from pipeline.ground.terrain import height_above
 from pipeline.io.readers import open_source
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing import filters
@@ -71,8 +72,8 @@ def seen_in(uri: str, parameters: Parameters | None = None) -> tuple[list[Seen],
         raw, offset = acquire(step, known.T_base_lidar, p.acquisition)
         band = filters.pass_through(raw, p.filters)
         if p.ground.method != "none":
-            height = ground.height_above(band, ground.find_terrain(raw, p.ground))
-            band = ground.in_band(band, height, p.ground)
+            height = height_above(band, scan_ground.find_terrain(raw, p.ground))
+            band = scan_ground.in_band(band, height, p.ground)
         filtered = filters.voxel_grid(band, p.filters)
         labels = cluster(filtered, known.sensor, p.clustering)
         _, described = describe_stems(filtered, labels, known.sensor, p.shape)

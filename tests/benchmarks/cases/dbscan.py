@@ -10,7 +10,7 @@ from tests.benchmarks.table import Cell, Table, ratio
 from tests.benchmarks.timing import in_turns, middle
 
 if TYPE_CHECKING:
-    from pipeline.detection.clustering.engines import Dbscan
+    from pipeline.detection.clustering import Dbscan
     from pipeline.types.records import Float32
 
 NAME = "dbscan"

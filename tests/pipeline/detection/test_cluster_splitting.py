@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import preset
-from pipeline.detection.stem_fit import describe, describe_stems
+from pipeline.detection.cluster_shape import describe, describe_stems
 from pipeline.detection.verdicts import judge
 from pipeline.types.records import Clusters, Labels, Verdict
 from tests.pipeline.strategies import LAW, SENSOR, one_cluster

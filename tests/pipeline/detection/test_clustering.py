@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
-from pipeline.detection.clustering import cluster, weigh
-from pipeline.detection.clustering.engines import ENGINES, in_order_of_first_point
-from pipeline.detection.clustering.grid import dbscan_grid
+from pipeline.detection.clustering import ENGINES, cluster, dbscan_grid, in_order_of_first_point, weigh
 from tests.pipeline.strategies import FEW, LAW, SENSOR, simulated_cloud
 
 FOREST = preset("forest").clustering

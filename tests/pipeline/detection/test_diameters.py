@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import preset
-from pipeline.detection.stem_fit.cylinder_fit import fit_stems
-from pipeline.detection.stem_fit.residuals import BEAM
+from pipeline.detection.cylinder_fit import BEAM, fit_stems
 from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
 from pipeline.tracking.merge import join

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.detection.stem_fit.fit_residuals import arc_start, fit_one
+from pipeline.detection.cylinder_fit import arc_start, fit_one
 from pipeline.types.records import Sensor
 
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
-from pipeline.detection.stem_fit import describe, eccentricity
-from pipeline.detection.stem_fit.moments import gather, moments
+from pipeline.detection.cluster_shape import describe, eccentricity, gather, moments
 from pipeline.types.records import Labels
 from tests.pipeline.strategies import LAW, SENSOR, arc, one_cluster
 

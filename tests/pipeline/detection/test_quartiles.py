@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from pipeline.detection.stem_fit.angular_width import quantile
+from pipeline.detection.cylinder_fit import quantile
 from tests.pipeline.strategies import LAW
 
 

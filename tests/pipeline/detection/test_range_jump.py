@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.detection.clustering.range_jump import range_jump
+from pipeline.detection.clustering import range_jump
 from tests.pipeline.strategies import LAW
 
 STEP = np.radians(0.5)

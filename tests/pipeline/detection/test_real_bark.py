@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.detection.stem_fit.cylinder_fit import fit_stems
+from pipeline.detection.cylinder_fit import fit_stems
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import SimulatedSource
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.detection.stem_fit.residuals import (
+from pipeline.detection.cylinder_fit import (
     BEAM,
     PRIOR_RADIUS,
     PRIOR_RADIUS_SIGMA,

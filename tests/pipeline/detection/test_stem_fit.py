@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
-from pipeline.detection.stem_fit import describe
-from pipeline.detection.stem_fit.cylinder_fit import fit_stems
-from pipeline.detection.stem_fit.residuals import BEAM
+from pipeline.detection.cluster_shape import describe
+from pipeline.detection.cylinder_fit import BEAM, fit_stems
 from pipeline.types.records import Labels, Sensor
 from tests.pipeline.strategies import FEW, LAW, SENSOR, arc, one_cluster
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
-from pipeline.detection.stem_fit.truncation import view_of
+from pipeline.detection.truncation import view_of
 from pipeline.front_end import perceive
 from pipeline.geometry.azimuth_bins import bin_direction, direction_bin
 from pipeline.geometry.poses import Pose3

@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
-from pipeline.ground import find_terrain
+from pipeline.ground import terrain_map
+from pipeline.ground.scan_ground import find_terrain
 from pipeline.ground.terrain_map import HeightMapper, PackedHeightMap
-from pipeline.ground.terrain_map import fusion as fusion_module
 from pipeline.io.checkpoints.codec import decode, encode
 from tests.pipeline.ground.test_ground import SENSOR_HEIGHT, _rings
 
@@ -79,11 +79,11 @@ def test_a_saved_map_is_the_same_to_the_bit():
 
 
 def test_memory_is_bounded(monkeypatch):
-    monkeypatch.setattr(fusion_module, "MOST_TILES", 40)
+    monkeypatch.setattr(terrain_map, "MOST_TILES", 40)
     far = [Pose2(30.0 * k, 0.0, 0.0) for k in range(6)]
     state = _driven(0.0, 0.0, far).state
     assert len(state.tiles) == 40
-    assert max(i for i, _ in state.tiles) * fusion_module.TILE > 130.0  # what was seen last is kept
+    assert max(i for i, _ in state.tiles) * terrain_map.TILE > 130.0  # what was seen last is kept
 
 
 def test_a_sensor_that_comes_back_higher_by_mistake_finds_its_height_again():

@@ -16,9 +16,9 @@ from pipeline.classification.map_correction import bent_columns
 from pipeline.classification.voxel_map import SIDE, Memory
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.ground.terrain_map.cell_update import CELL, COLUMNS, VIEWS, WEIGHT
-from pipeline.ground.terrain_map.cell_update import SIDE as CELLS
-from pipeline.ground.terrain_map.map_correction import bent as bent_tiles
+from pipeline.ground.terrain_map import CELL, COLUMNS, VIEWS, WEIGHT
+from pipeline.ground.terrain_map import SIDE as CELLS
+from pipeline.ground.terrain_map import bent as bent_tiles
 from pipeline.loop_closure.map_correction import TILE, Bend
 from pipeline.mapper import Mapper
 from pipeline.slam import BackEnd, Loop

@@ -1,7 +1,8 @@
-"""Which clusters go on where nobody looked: cut off by the box, by the least or greatest range, or at the
-side of the field of view. What is seen of them is a part, and no circle of a part tells the trunk.
+"""Detection of truncated clusters: clusters cut off by the box, the range limits or the sides of the field of
+view.
 
-Trunks leave the field of view above and below, which takes nothing from their circle and is no border.
+The circle of a truncated cluster does not describe the trunk. Trunks also leave the field of view at the top
+and at the bottom, which does not affect their circle; these sides do not count.
 """
 
 from __future__ import annotations

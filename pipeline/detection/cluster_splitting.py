@@ -1,9 +1,9 @@
-"""Parts: a trunk is taken out of a cluster in which shrubs or low branches are joined to it.
+"""Separation of a trunk from a cluster that also contains shrubs or low branches.
 
-The cluster is cut into slices of height. In each the returns that lie side by side and lead from one to the
-next without a jump are a run; one that is bent as the front of a trunk of its width would be is the sight of
-a circle. Where the circles of enough slices stand above one another a trunk stands, and their returns
-are it. What grows beside a trunk hides some of the slices, seldom all of them.
+The cluster is cut into height slices. In each slice, adjacent returns without a range jump form a run. A run
+whose returns follow the front of a circle as wide as the run is a section of a stem. Where the circles of
+enough slices are above each other, their returns are the trunk. Vegetation beside a trunk hides some of the
+slices, rarely all.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.detection.stem_fit.moments import gather
-from pipeline.detection.stem_fit.residuals import BARK
+from pipeline.detection.cluster_shape import gather
+from pipeline.detection.cylinder_fit import BARK
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Clusters, Float32, Int, Int32, Labels, Sensor

@@ -1,0 +1,532 @@
+"""Clustering of the points of one scan (section 3.2 of the paper): DBSCAN, or range jumps of a planar laser.
+
+DBSCAN (Ester et al. 1996) runs on one of three engines, which agree on core points, noise and core clusters.
+A border point within reach of two clusters is assigned to the nearest core point by the compiled grid; in
+scikit-learn and Open3D its cluster depends on the order of the points.
+
+The compiled grid (Gunawan 2013) has cells with a diagonal of eps. Two points of one cell are always
+neighbours, so all points of a cell with `min_points` points are core points, all core points of a cell form
+one cluster, and clusters grow by joining cells. Most distances between points of dense trunks are therefore
+never computed. The points are sorted by cell with the last axis fastest, so that the neighbourhood of a cell
+consists of few rows of cells and each row is one contiguous range of memory.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from pipeline.config.stages import Clustering
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing
+from pipeline.types.records import Bool, Float32, Int, Int32, Labels, Sensor
+
+_AXIS_BITS = 21
+_FARTHEST = float(1 << _AXIS_BITS)
+_DIGIT_BITS = 10  # of the counting sort: the table fits the first-level cache
+_DIGIT = 1 << _DIGIT_BITS
+_ROUNDING = 1.0 - 1e-9  # keeps the diagonal of a cell below eps in floating point
+_REACH = 2  # cells along each axis
+_AXES = 3
+
+
+class Cores(NamedTuple):
+    """Core points sorted by cell.
+
+    Attributes:
+        place: Coordinates [m], shape (_AXES, cores).
+        bounds: Index of the first core point of each cell, shape (cells + 1,).
+        box: Minimum and maximum coordinates of the core points of each cell [m], shape (cells, 2 * _AXES).
+    """
+
+    place: Float
+    bounds: Int
+    box: Float
+
+
+def dbscan_grid(
+    points: Float, eps: float, min_points: int, weight: Int32 | None = None
+) -> tuple[Int32, Bool]:
+    """Cluster points with DBSCAN on the compiled grid.
+
+    Args:
+        points: Shape (N, 2) or (N, 3) [m].
+        eps: Maximum distance between neighbours [m].
+        min_points: Neighbours, including the point itself, that make a core point.
+        weight: Number of neighbours that each point counts for, at least 1, int32, shape (N,); None means 1.
+            The result equals that of a cloud in which each point is repeated this many times.
+
+    Returns:
+        Cluster labels, int32, shape (N,), numbered in the order of their first point, -1 for noise; and a
+        mask of the core points, shape (N,).
+
+    Raises:
+        ValueError: The cloud is wider than 2^21 cells.
+    """
+    n, dimensions = points.shape
+    if n == 0:
+        return np.zeros(0, np.int32), np.zeros(0, np.bool_)
+    side = eps / np.sqrt(dimensions) * _ROUNDING
+    cells = _cells(points, side)
+    if int(cells.max()) + 2 >= 1 << _AXIS_BITS:
+        raise ValueError("the cloud is too wide for cells of this eps")
+    rows, offsets = _offsets(dimensions)
+    weight = np.ones(n, np.int32) if weight is None else weight
+    return _cluster(points, cells, rows, offsets, eps * eps, min_points, weight)
+
+
+@cache
+def _offsets(dimensions: int) -> tuple[Int, Int]:
+    """Return the key differences between a cell and the cells that can contain a neighbour.
+
+    Returns:
+        The differences to the middle cell of each row along the last axis, the row of the cell itself first;
+        and the differences to all cells without the cell itself, nearest cell first.
+    """
+    reach = np.arange(-_REACH, _REACH + 1)
+    grid = np.stack(np.meshgrid(*([reach] * dimensions), indexing="ij"), axis=-1).reshape(-1, dimensions)
+    grid = grid[np.argsort((grid**2).sum(axis=1), kind="stable")]
+    weights = np.array([1 << (_AXIS_BITS * (dimensions - 1 - axis)) for axis in range(dimensions)], np.int64)
+    keys: Int = grid @ weights
+    return keys[grid[:, -1] == 0], keys[1:]
+
+
+@compiled
+def _cells(points: Float, side: float) -> Int32:
+    """Return the cell index of each point along each axis, int32, shape (N, dimensions).
+
+    A margin of two cells on every side prevents that the key of a neighbour wraps into another row. Indices
+    above the maximum are clipped to one value beyond it.
+    """
+    cells = np.empty(points.shape, np.int32)
+    for a in range(points.shape[1]):
+        low = points[0, a]
+        for i in range(points.shape[0]):
+            low = min(low, points[i, a])
+        for i in range(points.shape[0]):
+            cells[i, a] = np.int32(min((points[i, a] - low) / side, _FARTHEST)) + 2
+    return cells
+
+
+@compiled
+def _by_key(cells: Int32) -> Int:
+    """Return the order of the points sorted by cell, first axis first; the sort is stable.
+
+    The sort is a counting (radix) sort from the least significant digit; an axis with few cells has one
+    digit.
+    """
+    n = cells.shape[0]
+    order, other = np.arange(n), np.empty(n, np.int64)
+    place = np.empty(_DIGIT + 1, np.int64)
+    for a in range(cells.shape[1] - 1, -1, -1):
+        most = 0
+        for i in range(n):
+            most = max(most, cells[i, a])
+        shift = 0
+        while most >> shift > 0:
+            place[:] = 0
+            for i in range(n):
+                place[((cells[i, a] >> shift) & (_DIGIT - 1)) + 1] += 1
+            for d in range(_DIGIT):
+                place[d + 1] += place[d]
+            for k in range(n):
+                d = (cells[order[k], a] >> shift) & (_DIGIT - 1)
+                other[place[d]] = order[k]
+                place[d] += 1
+            order, other = other, order
+            shift += _DIGIT_BITS
+    return order
+
+
+@compiled
+def _cluster(
+    points: Float, cells: Int32, rows: Int, offsets: Int, eps2: float, min_points: int, weight: Int32
+) -> tuple[Int32, Bool]:
+    """Sort the points by cell and label them; see `dbscan_grid`."""
+    n = points.shape[0]
+    order = _by_key(cells)
+    keys, bounds = np.empty(n, np.int64), np.empty(n + 1, np.int64)
+    # A third axis of zeros does not change distances in the plane.
+    laid, weight_laid = np.zeros((_AXES, n)), np.empty_like(weight)
+    last, filled = np.int64(-1), 0
+    for k in range(n):
+        i = order[k]
+        key = np.int64(0)
+        for a in range(points.shape[1]):
+            key = (key << _AXIS_BITS) | np.int64(cells[i, a])
+            laid[a, k] = points[i, a]
+        weight_laid[k] = weight[i]
+        if key != last:
+            keys[filled], bounds[filled], last = key, k, key
+            filled += 1
+    bounds[filled] = n
+    keys, bounds = keys[:filled], bounds[: filled + 1]
+    reach = _in_reach(keys, rows)
+    core = _find_cores(laid, bounds, reach, eps2, min_points, weight_laid)
+    cores = _lay_cores(laid, bounds, core)
+    parent = _join(cores, rows, reach, eps2)
+    label, core_out = np.full(n, -1, np.int32), np.empty(n, np.bool_)
+    for c in range(filled):
+        root = _root(parent, c)
+        for i in range(bounds[c], bounds[c + 1]):
+            core_out[order[i]] = core[i]
+            if core[i]:
+                label[order[i]] = root
+                continue
+            d = _cell_of_nearest_core(laid, i, cores, keys, c, reach, offsets, eps2)
+            if d >= 0:
+                label[order[i]] = _root(parent, d)
+    _number(label, filled)
+    return label, core_out
+
+
+@compiled
+def _number(label: Int32, most: int) -> None:
+    """Renumber the labels, which are less than `most`, in the order of their first point, in place."""
+    number, clusters = np.full(most, -1, np.int32), 0
+    for k in range(label.shape[0]):
+        root = label[k]
+        if root >= 0:
+            if number[root] < 0:
+                number[root] = clusters
+                clusters += 1
+            label[k] = number[root]
+
+
+@compiled
+def _in_reach(keys: Int, rows: Int) -> Int32:
+    """Return, for each cell and row, the range of cells that can contain a neighbour.
+
+    Returns:
+        First cell and one past the last cell, int32, shape (cells, rows, 2).
+    """
+    cells = keys.shape[0]
+    reach = np.empty((cells, rows.shape[0], 2), np.int32)
+    for r in range(rows.shape[0]):
+        first = after = 0
+        for c in range(cells):  # keys ascend, and so do the searched keys: one pass
+            least = keys[c] + rows[r] - _REACH
+            while first < cells and keys[first] < least:
+                first += 1
+            while after < cells and keys[after] <= least + 2 * _REACH:
+                after += 1
+            reach[c, r, 0], reach[c, r, 1] = first, after
+    return reach
+
+
+@compiled
+def _find_cores(laid: Float, bounds: Int, reach: Int32, eps2: float, min_points: int, weight: Int32) -> Bool:
+    core = np.zeros(laid.shape[1], np.bool_)
+    x, y, z = laid[0], laid[1], laid[2]
+    for c in range(reach.shape[0]):
+        begin, end = bounds[c], bounds[c + 1]
+        here = 0
+        for i in range(begin, end):
+            here += weight[i]
+        for i in range(begin, end):
+            count = here
+            for r in range(reach.shape[1]):
+                if count >= min_points:
+                    break
+                first, after = bounds[reach[c, r, 0]], bounds[reach[c, r, 1]]
+                if r > 0:
+                    count += _weight_within(x, y, z, weight, first, after, i, eps2)
+                else:  # the cell itself is in the middle of its row and already counted
+                    count += _weight_within(x, y, z, weight, first, begin, i, eps2)
+                    count += _weight_within(x, y, z, weight, end, after, i, eps2)
+            core[i] = count >= min_points
+    return core
+
+
+@compiled_borrowing
+def _weight_within(
+    x: Float, y: Float, z: Float, weight: Int32, first: int, after: int, i: int, eps2: float
+) -> int:
+    """Return the total weight of the points first..after-1 within eps of point i."""
+    count = 0
+    # An unsigned index avoids the check for negative (wrap-around) indexing.
+    for j in range(np.uint64(first), np.uint64(after)):
+        dx, dy, dz = x[i] - x[j], y[i] - y[j], z[i] - z[j]
+        if dx * dx + dy * dy + dz * dz <= eps2:
+            count += weight[j]
+    return count
+
+
+@compiled
+def _lay_cores(laid: Float, bounds: Int, core: Bool) -> Cores:
+    cells = bounds.shape[0] - 1
+    place, first = np.empty((_AXES, core.sum())), np.empty(cells + 1, np.int64)
+    box = np.empty((cells, 2 * _AXES))
+    n = 0
+    for c in range(cells):
+        first[c] = n
+        for a in range(_AXES):
+            box[c, a], box[c, _AXES + a] = np.inf, -np.inf
+        for i in range(bounds[c], bounds[c + 1]):
+            if core[i]:
+                for a in range(_AXES):
+                    at = laid[a, i]
+                    place[a, n] = at
+                    box[c, a], box[c, _AXES + a] = min(box[c, a], at), max(box[c, _AXES + a], at)
+                n += 1
+    first[cells] = n
+    return Cores(place, first, box)
+
+
+@compiled
+def _join(cores: Cores, rows: Int, reach: Int32, eps2: float) -> Int:
+    """Return the parent of each cell in a union-find forest with one tree per cluster of cells.
+
+    The cell with the smallest index of a cluster is its root. Near rows are joined first, since most cells of
+    one cluster are then already joined and need no distance computation.
+    """
+    cells = cores.box.shape[0]
+    parent = np.arange(cells)
+    for r in range(rows.shape[0]):
+        if rows[r] < 0:
+            continue  # joined when the other cell is visited
+        for c in range(cells):
+            if cores.bounds[c] == cores.bounds[c + 1]:
+                continue
+            for d in range(max(reach[c, r, 0], c + 1), reach[c, r, 1]):
+                if cores.bounds[d] == cores.bounds[d + 1]:
+                    continue
+                a, b = _root(parent, c), _root(parent, d)
+                if a != b and _touch(cores, c, d, eps2):
+                    parent[max(a, b)] = min(a, b)
+    return parent
+
+
+@compiled
+def _root(parent: Int, c: int) -> int:
+    while parent[c] != c:
+        parent[c] = parent[parent[c]]
+        c = parent[c]
+    return c
+
+
+@compiled_borrowing
+def _touch(cores: Cores, c: int, d: int, eps2: float) -> bool:
+    """Return whether a core point of cell c is within eps of a core point of cell d."""
+    place, box = cores.place, cores.box
+    for i in range(cores.bounds[c], cores.bounds[c + 1]):
+        x, y, z = place[0, i], place[1, i], place[2, i]
+        # Rounding is monotonic: no point in the box is closer than the box.
+        dx = max(max(box[d, 0] - x, x - box[d, 3]), 0.0)
+        dy = max(max(box[d, 1] - y, y - box[d, 4]), 0.0)
+        dz = max(max(box[d, 2] - z, z - box[d, 5]), 0.0)
+        if dx * dx + dy * dy + dz * dz > eps2:
+            continue
+        for j in range(cores.bounds[d], cores.bounds[d + 1]):
+            dx, dy, dz = x - place[0, j], y - place[1, j], z - place[2, j]
+            if dx * dx + dy * dy + dz * dz <= eps2:
+                return True
+    return False
+
+
+@compiled_borrowing
+def _cell_of_nearest_core(
+    laid: Float, i: int, cores: Cores, keys: Int, c: int, reach: Int32, offsets: Int, eps2: float
+) -> int:
+    """Return the cell of the core point nearest to point i of cell c, or -1 if none is within eps.
+
+    Of several cells at the same distance, the first in the order of `offsets` is returned.
+    """
+    best, best2 = -1, eps2
+    x, y, z = laid[0, i], laid[1, i], laid[2, i]
+    for r in range(reach.shape[1]):
+        for d in range(reach[c, r, 0], reach[c, r, 1]):
+            for j in range(cores.bounds[d], cores.bounds[d + 1]):
+                dx, dy, dz = x - cores.place[0, j], y - cores.place[1, j], z - cores.place[2, j]
+                d2 = dx * dx + dy * dy + dz * dz
+                if d2 < best2 or (
+                    d2 == best2
+                    and d != best
+                    and (best < 0 or _turn(offsets, keys[d] - keys[c]) < _turn(offsets, keys[best] - keys[c]))
+                ):
+                    best, best2 = d, d2
+    return best
+
+
+@compiled_borrowing
+def _turn(offsets: Int, offset: int) -> int:
+    """Return the rank of a cell in the search order; the cell itself has rank 0."""
+    for k in range(offsets.shape[0]):
+        if offsets[k] == offset:
+            return k + 1
+    return 0
+
+
+# Ring spacing [rad] of a solid-state sensor with 24,000 returns in a cone of 70 degrees, used for sensors
+# without rings.
+UNKNOWN_RING_STEP = float(np.radians(0.8))
+
+
+def weigh(points: Float32, sensor: Sensor, parameters: Clustering) -> Int32:
+    """Return the number of neighbours that each point counts for, int32, shape (N,), 1 to `weight_max`.
+
+    A visible stem area A gives n(r) = A / (r^2 da de) returns at range r, where da and de are the angles
+    between successive shots and between rings. Where n(r) is below `min_points`, a return has the weight
+    min_points / n(r), rounded down. DBSCAN then finds stems over the whole range.
+
+    Args:
+        points: float32, shape (N, 3) [m], level sensor frame.
+        sensor: Angles between shots and between rings.
+        parameters: `stem_area` is A [m^2].
+    """
+    rings = sensor.ring_step if sensor.ring_step > 0.0 else UNKNOWN_RING_STEP
+    scale = parameters.min_points * sensor.azimuth_step * rings / parameters.stem_area
+    return _weigh(points, scale, parameters.weight_max)
+
+
+@compiled
+def _weigh(points: Float32, scale: float, most: int) -> Int32:
+    weight = np.empty(points.shape[0], np.int32)
+    for i in range(points.shape[0]):
+        x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
+        weight[i] = int(min(max(scale * (x * x + y * y), 1.0), float(most)))
+    return weight
+
+
+def range_jump(points: Float32, jump: float, min_points: int, azimuth_step: float) -> tuple[Int32, Bool]:
+    """Cluster the beams of a planar laser: a cluster ends where the range jumps or a beam is missing.
+
+    Args:
+        points: float32, shape (N, 3) [m], sensor frame.
+        jump: Maximum difference in range between neighbouring beams of one cluster [m].
+        min_points: Smaller clusters are noise.
+        azimuth_step: Angle between neighbouring beams [rad].
+
+    Returns:
+        Labels, int32, shape (N,), -1 for noise; and for each cluster whether the return of a neighbouring
+        beam is closer and hides one of its edges.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.int32), np.zeros(0, np.bool_)
+    x, y = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
+    azimuth = np.arctan2(y, x)
+    order = np.argsort(azimuth, kind="stable")
+    return _cut(azimuth[order], np.hypot(x, y)[order], order, jump, min_points, 2.5 * azimuth_step)
+
+
+@compiled
+def _cut(
+    azimuth: Float, distance: Float, order: Int, jump: float, min_points: int, gap: float
+) -> tuple[Int32, Bool]:
+    n = azimuth.shape[0]
+    # neighbours[i], begins[i]: relation of beam i to beam i - 1. The circle is closed: the first beam follows
+    # the last one.
+    neighbours = np.zeros(n, np.bool_)
+    begins = np.zeros(n, np.bool_)
+    for i in range(n):
+        turn = azimuth[i] - azimuth[i - 1] + (2.0 * np.pi if i == 0 else 0.0)
+        neighbours[i] = n > 1 and turn <= gap
+        begins[i] = not (neighbours[i] and abs(distance[i] - distance[i - 1]) <= jump)
+    first = 0
+    while first < n - 1 and not begins[first]:
+        first += 1
+    label = np.full(n, -1, np.int32)
+    hidden = np.zeros(n, np.bool_)
+    clusters = 0
+    start = first
+    for k in range(first + 1, first + n + 1):
+        if k < first + n and not begins[k % n]:
+            continue
+        if k - start >= min_points:
+            for i in range(start, k):
+                label[order[i % n]] = clusters
+            a, b = start % n, (k - 1) % n
+            before = neighbours[a] and distance[a - 1] < distance[a]
+            after = neighbours[k % n] and distance[k % n] < distance[b]
+            hidden[clusters] = before or after
+            clusters += 1
+        start = k
+    return label, hidden[:clusters].copy()
+
+
+class Dbscan(NamedTuple):
+    """Labels, int32, shape (N,), -1 for noise; and the mask of core points, None if the engine gives none."""
+
+    label: Int32
+    core: Bool | None
+
+
+class Engine(Protocol):
+    """DBSCAN on points of shape (N, 2 or 3) [m] with weights, int32, shape (N,), None for 1 each."""
+
+    def __call__(
+        self, points: Float32, eps: float, min_points: int, weight: Int32 | None = None
+    ) -> Dbscan: ...
+
+
+def _grid(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
+    return Dbscan(*dbscan_grid(points.astype(np.float64), eps, min_points, weight))
+
+
+def _sklearn(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
+    from sklearn.cluster import DBSCAN
+
+    if len(points) == 0:
+        return Dbscan(np.zeros(0, np.int32), np.zeros(0, np.bool_))
+    fitted = DBSCAN(eps=eps, min_samples=min_points).fit(points.astype(np.float64), sample_weight=weight)
+    core = np.zeros(len(points), np.bool_)
+    core[fitted.core_sample_indices_] = True
+    return Dbscan(in_order_of_first_point(fitted.labels_.astype(np.int32)), core)
+
+
+def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
+    import open3d
+
+    if len(points) == 0:
+        return Dbscan(np.zeros(0, np.int32), None)
+    space = np.zeros((len(points), 3))
+    space[:, : points.shape[1]] = points
+    # Open3D has no weights; repeated points have the same effect.
+    times = np.ones(len(points), np.int32) if weight is None else weight
+    space, first = np.repeat(space, times, axis=0), np.cumsum(times) - times
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(space))
+    # Open3D uses distance < radius, the other engines distance <= radius.
+    radius = float(np.nextafter(eps, np.inf))
+    label = np.asarray(cloud.cluster_dbscan(radius, min_points), np.int32)[first]
+    return Dbscan(in_order_of_first_point(label), None)
+
+
+ENGINES: dict[str, Engine] = {
+    "grid": _grid,
+    "sklearn": _sklearn,
+    "open3d": _open3d,
+}
+
+
+def in_order_of_first_point(label: Int32) -> Int32:
+    """Return the labels renumbered in the order of the first point of each cluster."""
+    found, first = np.unique(label, return_index=True)
+    number = np.full(int(label.max(initial=-1)) + 2, -1, np.int32)  # the last entry is for noise, -1
+    by_first = found[np.argsort(first)]
+    by_first = by_first[by_first >= 0]
+    number[by_first] = np.arange(len(by_first), dtype=np.int32)
+    ordered: Int32 = number[label]
+    return ordered
+
+
+def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
+    """Cluster the points of a scan.
+
+    Args:
+        points: float32, shape (N, 3) [m], level sensor frame.
+        sensor: The LiDAR, whose angular resolution sets weights and beam gaps.
+        parameters: Method and thresholds.
+
+    Returns:
+        Cluster label of each point, and for each cluster whether one of its edges is hidden.
+    """
+    if parameters.method == "range_jump":
+        label, hidden = range_jump(points, parameters.eps, parameters.min_points, sensor.azimuth_step)
+        return Labels(label, len(hidden), hidden)
+    plane = np.ascontiguousarray(points[:, : parameters.dimensions])
+    weight = weigh(points, sensor, parameters) if parameters.stem_area > 0.0 else None
+    label = ENGINES[parameters.engine](plane, parameters.eps, parameters.min_points, weight).label
+    clusters = int(label.max(initial=-1)) + 1
+    return Labels(label, clusters, np.zeros(clusters, np.bool_))

@@ -1,0 +1,319 @@
+"""Terrain map: the ground height of all scans in the map frame, in tiles of cells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.geometry.azimuth_bins import direction_bin
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.ground.terrain import Terrain, ground_at, ring_at
+from pipeline.jit import compiled
+from pipeline.loop_closure.map_correction import Bend
+from pipeline.types.records import Bool, Float32, HeightMap, Int
+
+CELL = 0.5  # m
+SIDE = 16  # cells of a tile
+WEIGHT, MEAN, VARIANCE, VIEWS = range(4)
+COLUMNS = 4
+SIGMA, SIGMA_A_METRE = 0.03, 0.005  # of one view: grass, and the tilt that is left
+MOST = 50.0  # views at 5 m that a cell counts at the most
+
+
+@compiled
+def look(
+    corner: Float, at: Float, yaw: float, height: Float, seen: Bool, reach: float
+) -> tuple[Float, Float]:
+    """What a scan saw of the cells of some tiles.
+
+    Args:
+        corner: Of the tiles, shape (T, 2) [m]; at: the sensor, shape (2,) [m], both in the map.
+        yaw: Of the sensor [rad].
+        height, seen: Of its Terrain.
+        reach: Cells farther away are left out [m].
+
+    Returns:
+        Height of the ground in the sensor's frame [m], NaN where it was not seen, and the weight of that
+        view [1/m^2], 0 likewise; both of shape (T, SIDE, SIDE).
+    """
+    tiles = corner.shape[0]
+    below, weight = np.full((tiles, SIDE, SIDE), np.nan), np.zeros((tiles, SIDE, SIDE))
+    c, s = np.cos(yaw), np.sin(yaw)
+    for t in range(tiles):
+        for i in range(SIDE):
+            dx = corner[t, 0] + (i + 0.5) * CELL - at[0]
+            for j in range(SIDE):
+                dy = corner[t, 1] + (j + 0.5) * CELL - at[1]
+                distance = np.sqrt(dx * dx + dy * dy)
+                if distance > reach:
+                    continue
+                x, y = c * dx + s * dy, c * dy - s * dx
+                ring = int(ring_at(distance))
+                if ring < seen.shape[1] and seen[direction_bin(x, y, seen.shape[0]), ring]:
+                    below[t, i, j] = ground_at(height, x, y)
+                    weight[t, i, j] = 1.0 / (SIGMA**2 + (SIGMA_A_METRE * distance) ** 2)
+    return below, weight
+
+
+@compiled
+def fuse(block: Float32, below: Float, weight: Float, sensor_z: float) -> None:
+    """Average one view into the cells, in place.
+
+    Args:
+        block: shape (T, SIDE, SIDE, COLUMNS); below, weight: from `look`; sensor_z: see HeightMapState.
+    """
+    most = MOST / (SIGMA**2 + (5.0 * SIGMA_A_METRE) ** 2)
+    for t in range(block.shape[0]):
+        for i in range(SIDE):
+            for j in range(SIDE):
+                w = weight[t, i, j]
+                if w > 0.0:
+                    cell = block[t, i, j]
+                    total = min(cell[WEIGHT] + w, most)
+                    a, d = w / total, below[t, i, j] + sensor_z - cell[MEAN]
+                    cell[WEIGHT] = total
+                    if cell[VIEWS] == 0.0:
+                        cell[MEAN] = below[t, i, j] + sensor_z
+                    else:
+                        cell[MEAN] += a * d
+                        cell[VARIANCE] = (1.0 - a) * (cell[VARIANCE] + a * d * d)
+                    cell[VIEWS] += 1.0
+
+
+Tile = tuple[int, int]
+
+
+def bent(tiles: Mapping[Tile, Float32], bend: Bend) -> dict[Tile, Float32]:
+    """The tiles where they are now: each cell goes by whole cells with the scan that was taken nearest, so
+    that no gap comes about inside of a piece; cells that meet are averaged by their weights."""
+    from scipy.spatial import cKDTree
+
+    keys = np.array(list(tiles), np.int64).reshape(-1, 2)
+    if not len(keys):
+        return {}
+    cells = np.stack(list(tiles.values())).reshape(-1, SIDE, SIDE, COLUMNS)
+    n, i, j = np.nonzero(cells[..., VIEWS])
+    row: Float = cells[n, i, j].astype(np.float64)
+    place = SIDE * keys[n] + np.column_stack([i, j])
+    centre: Float = (place.astype(np.float64) + 0.5) * CELL
+    _, scan = cKDTree(bend.before[: bend.last + 1, :2]).query(centre)
+    shift = np.round((bend.moved(centre, np.asarray(scan)) - centre) / CELL).astype(np.int64)
+    moved, of = np.unique(place + shift, axis=0, return_inverse=True)
+    fresh = _averaged(row, of.ravel(), len(moved))
+    home, rest = np.divmod(moved, SIDE)
+    # In the order in which they were seen, as far as they were there before.
+    order = {tile: k for k, tile in enumerate(tiles)}
+    names = [(int(a), int(b)) for a, b in np.unique(home, axis=0)]
+    names.sort(key=lambda tile: order.get(tile, len(order)))
+    out = {tile: np.zeros((SIDE, SIDE, COLUMNS), np.float32) for tile in names}
+    for k, (a, b) in enumerate(home):
+        out[(int(a), int(b))][rest[k, 0], rest[k, 1]] = fresh[k]
+    return out
+
+
+def _averaged(row: Float, of: Int, cells: int) -> Float32:
+    """Rows of cells that fall into one, by their weights."""
+    weight = np.bincount(of, row[:, WEIGHT], cells)
+    mean = np.bincount(of, row[:, WEIGHT] * row[:, MEAN], cells) / weight
+    apart = row[:, VARIANCE] + (row[:, MEAN] - mean[of]) ** 2
+    fresh = np.zeros((cells, COLUMNS), np.float32)
+    fresh[:, WEIGHT], fresh[:, MEAN] = weight, mean
+    fresh[:, VARIANCE] = np.bincount(of, row[:, WEIGHT] * apart, cells) / weight
+    fresh[:, VIEWS] = np.bincount(of, row[:, VIEWS], cells)
+    return fresh
+
+
+TILE = SIDE * CELL  # m
+REACH = 15.0  # m; farther away a cell of the scan's terrain is wider than a cell of the map by far
+NEAR_WEIGHT = 200.0  # 1/m^2; of a cell within 12 m
+LEAST = 50  # cells that must be known already to tell how high the sensor stands
+RENEW = 5  # scans after which the record is made anew, and
+TILES_A_SCAN = 100  # one scan more for so many tiles, so that it costs the same however large the map is
+MOST_TILES = 1 << 13  # 52 hectares, 34 MB; then the tile that was seen longest ago is forgotten
+_FARTHEST = 1e6  # m
+_UNKNOWN: Float32 = np.zeros((SIDE, SIDE, COLUMNS), np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightMapState:
+    """What is known between two scans. Nothing in it is ever changed, so that sharing it is a copy.
+
+    Attributes:
+        tiles: float32, shape (SIDE, SIDE, COLUMNS) each, by their number along x and y; the one that was
+            seen longest ago comes first.
+        sensor_z: Height of the sensor in the map [m]; None before the first scan.
+        scans: How many were taken.
+        record: The map as it was shown last.
+    """
+
+    tiles: Mapping[Tile, Float32]
+    sensor_z: float | None
+    scans: int
+    record: HeightMap
+
+
+class HeightMapper:
+    """Knows the height of the ground wherever scans saw it.
+
+    Height 0 is the ground below the sensor at the first scan. Odometry and SLAM are planar: how high the
+    sensor stands is found at each scan from the ground that was seen before.
+    """
+
+    def __init__(self) -> None:
+        self.state = HeightMapState({}, None, 0, no_height_map())
+
+    def add(self, terrain: Terrain, T_map_base: Pose2, sensor_offset: Float) -> None:
+        """Take the terrain of one scan.
+
+        A cell counts few views at the most: what is seen later outweighs what was laid down before the pose
+        was corrected.
+
+        Args:
+            terrain: In the level sensor frame.
+            T_map_base: The pose.
+            sensor_offset: The sensor in the level base frame, shape (3,) [m].
+        """
+        at = T_map_base.apply(np.asarray(sensor_offset[:2], np.float64))
+        if not np.all(np.abs(at) < _FARTHEST):
+            return
+        old = self.state
+        keys = _around(at)
+        corner = TILE * np.array(keys, np.float64)
+        block = np.stack([old.tiles.get(key, _UNKNOWN) for key in keys])
+        below, weight = look(corner, at, T_map_base.yaw, terrain.height, terrain.seen, REACH)
+        z = _register(block, below, weight, old.sensor_z)
+        if z is None:
+            z = -float(ground_at(terrain.height, 0.0, 0.0))
+        fuse(block, below, weight, z)
+        tiles = dict(old.tiles)
+        for n in np.flatnonzero(weight.any(axis=(1, 2))):
+            tiles.pop(keys[n], None)
+            tiles[keys[n]] = block[n].copy()  # a view would keep the whole block alive
+        while len(tiles) > MOST_TILES:
+            del tiles[next(iter(tiles))]
+        scans = old.scans + 1
+        due = scans <= 2 or scans % (RENEW + len(tiles) // TILES_A_SCAN) == 0
+        self.state = HeightMapState(tiles, z, scans, _record(tiles) if due else old.record)
+
+    def bend(self, bend: Bend) -> None:
+        """Move what is known with a path that was bent."""
+        tiles = bent(self.state.tiles, bend)
+        self.state = replace(self.state, tiles=tiles, record=_record(tiles))
+
+    def record(self) -> HeightMap:
+        """The whole map as it is now."""
+        return _record(self.state.tiles)
+
+    def heights(self, places: Float) -> Float:
+        """Height of the ground [m] at places of shape (N, 2) [m]: of the cell there or, where it is not
+        known, of the known ones next to it; NaN where those are not known either."""
+        cell = np.floor(places / CELL).astype(np.int64)
+        return np.array([self._at(int(i), int(j)) for i, j in cell])
+
+    def _at(self, i: int, j: int) -> float:
+        mean, weight = 0.0, 0.0
+        for di, dj in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+            tile = self.state.tiles.get(((i + di) // SIDE, (j + dj) // SIDE))
+            if tile is not None:
+                row = tile[(i + di) % SIDE, (j + dj) % SIDE]
+                mean, weight = mean + float(row[WEIGHT] * row[MEAN]), weight + float(row[WEIGHT])
+            if di == 0 and dj == 0 and weight > 0.0:
+                break
+        return mean / weight if weight > 0.0 else float("nan")
+
+
+def no_height_map() -> HeightMap:
+    """Nothing is known."""
+    return _record({})
+
+
+def _around(at: Float) -> list[Tile]:
+    low, high = np.floor((at - REACH) / TILE), np.floor((at + REACH) / TILE)
+    return [
+        (i, j) for i in range(int(low[0]), int(high[0]) + 1) for j in range(int(low[1]), int(high[1]) + 1)
+    ]
+
+
+def _register(block: Float32, below: Float, weight: Float, before: float | None) -> float | None:
+    """Height of the sensor in the map: the median over the cells near by that are known already."""
+    known = (block[..., VIEWS] > 0.0) & (weight > NEAR_WEIGHT)
+    if np.count_nonzero(known) < LEAST:
+        known = (block[..., VIEWS] > 0.0) & (weight > 0.0)
+        if np.count_nonzero(known) < LEAST:
+            return before
+    return float(np.median(block[known, MEAN] - below[known]))
+
+
+def _record(tiles: Mapping[Tile, Float32]) -> HeightMap:
+    keys = sorted(tiles)
+    cells = np.stack([tiles[key] for key in keys]) if keys else np.zeros((0, SIDE, SIDE, COLUMNS), np.float32)
+    n, i, j = np.nonzero(cells[..., VIEWS])
+    row = cells[n, i, j]
+    first = SIDE * np.array(keys, np.int64).reshape(-1, 2)
+    return HeightMap(
+        cell=CELL,
+        place=(first[n] + np.stack([i, j], axis=1)).astype(np.int32),
+        height=row[:, MEAN].copy(),
+        sigma=np.sqrt(row[:, VARIANCE] + 1.0 / row[:, WEIGHT]),
+        views=row[:, VIEWS].astype(np.int32),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedHeightMap:
+    """See HeightMapState; the tiles in their order. `sensor_z` is NaN where it is not known.
+
+    Attributes:
+        tile: int64, shape (T, 2); cells: float32, shape (T * SIDE * SIDE, COLUMNS).
+    """
+
+    tile: Int
+    cells: Float32
+    sensor_z: float
+    scans: int
+    record: HeightMap
+
+    @classmethod
+    def of(cls, state: HeightMapState) -> PackedHeightMap:
+        """All that the state knows."""
+        cells = np.zeros((len(state.tiles), SIDE, SIDE, COLUMNS), np.float32)
+        for n, tile in enumerate(state.tiles.values()):
+            cells[n] = tile
+        return cls(
+            np.array(list(state.tiles), np.int64).reshape(-1, 2),
+            cells.reshape(-1, COLUMNS),
+            float("nan") if state.sensor_z is None else state.sensor_z,
+            state.scans,
+            state.record,
+        )
+
+    @classmethod
+    def empty(cls) -> PackedHeightMap:
+        """Nothing is known."""
+        return cls.of(HeightMapState({}, None, 0, no_height_map()))
+
+    def unpacked(self) -> HeightMapState:
+        """The same state, to the bit.
+
+        Raises:
+            ValueError: Its parts do not fit one another; they come from a file.
+        """
+        n = len(self.tile)
+        if self.tile.shape != (n, 2) or self.cells.shape != (n * SIDE * SIDE, COLUMNS) or n > MOST_TILES:
+            raise ValueError("the tiles of the height map have another shape")
+        if not np.all(np.isfinite(self.cells)) or np.isinf(self.sensor_z) or self.scans < 0:
+            raise ValueError("a height is not finite")
+        record = self.record
+        k = len(record.height)
+        if record.place.shape != (k, 2) or not len(record.sigma) == len(record.views) == k:
+            raise ValueError("the columns of the height map have other lengths")
+        keys = [(int(i), int(j)) for i, j in self.tile]
+        if len(set(keys)) < n:
+            raise ValueError("two tiles of the height map are one")
+        tiles = self.cells.reshape(n, SIDE, SIDE, COLUMNS)
+        z = None if np.isnan(self.sensor_z) else self.sensor_z
+        return HeightMapState(
+            {key: tile.copy() for key, tile in zip(keys, tiles, strict=True)}, z, self.scans, record
+        )
