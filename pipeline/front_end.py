@@ -1,12 +1,14 @@
-"""From a scan to detections: sections 3.1 to 3.3 of the paper, which look at no other scan.
+"""Front end: from one scan to detections (sections 3.1 to 3.3 of the paper). It uses no other scan.
 
-First what the scan shows, then what is made of it: the judging of clusters costs next to nothing beside the
-finding of them, so that what was found can be kept and judged again (see `pipeline.remapping`).
+`segment` does the expensive part: filters, ground, clusters. `detect` gives each cluster its verdict, which costs
+next to nothing. The two are apart so that a cached segmentation can be used again with other verdict rules (see
+`pipeline.remapping`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,22 +28,27 @@ from pipeline.ground import scan_ground
 from pipeline.ground.terrain import NO_GROUND, Terrain, height_above, heights_of_places, shows_ground
 from pipeline.preprocessing import filters
 from pipeline.preprocessing.acquisition import acquire, acquire_near, driven_with
-from pipeline.stage_timer import Watch, no_watch
+from pipeline.stage_timer import StageTimer, no_timer
 from pipeline.types.clearance import Clearance
 from pipeline.types.records import Clusters, Detections, Float32, Int32, Sensor, Stems, Step, UInt16
-from pipeline.update_schedule import is_fused, is_gathered
+
+FIRST_SCANS = (
+    10  # every one of these updates columns and terrain, so that a short recording gets all its evidence
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Overview:
-    """What is gathered of a scan.
+class ColumnInput:
+    """What the voxel columns integrate of one scan (see `pipeline.classification`).
 
     Attributes:
-        points: Of the box, float32, shape (N, 3) [m]; height: above the ground, float32, shape (N,) [m];
-            both, and the terrain, as fine as `pipeline.geometry.quantisation` tells.
+        points: Points of the box in the level sensor frame, float32, shape (N, 3) [m].
+        height: Their heights above the ground, float32, shape (N,) [m].
         steepest: Tangent of the steepest elevation seen by direction (see `steepest_by_direction`).
-        depth: How far away the nearest return lies by direction and elevation (see `depth_image`).
-        terrain: The ground under it, as `Terrain.height`.
+        depth: Range of the nearest return by direction and elevation (see `depth_image`).
+        terrain: Ground height below the scan, as `Terrain.height`.
+
+    Points, heights and terrain are rounded to the steps of `pipeline.geometry.quantisation`.
     """
 
     points: Float32
@@ -52,16 +59,16 @@ class Overview:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looked:
-    """What one scan shows before any of it is judged; see Frame for what is not named here.
+class SegmentedScan:
+    """One scan after filtering, ground segmentation and clustering. `Frame` describes the other attributes.
 
     Attributes:
-        clusters: Without verdicts.
+        clusters: Clusters without verdicts.
         heights: Mean height of each cluster above the ground, shape (K,) [m]; None without ground.
-        free: How far the view is free by direction (see visibility).
-        overview: Of a scan that is gathered (see turns), where there is a ground, else None.
-        terrain: Of a scan whose ground goes into the height map, likewise.
-        clearance: Of the way that the robot drives; None where nobody looks for obstacles.
+        free: Free range by direction (see `pipeline.detection.free_space`).
+        column_input: Input of the voxel columns; None for scans that do not update them, or without ground.
+        terrain: Ground that updates the terrain map; None for scans that do not update it, or without ground.
+        clearance: Free space in the robot's way; None where obstacles are not looked for.
     """
 
     raw: Float32
@@ -71,97 +78,100 @@ class Looked:
     heights: Float | None
     free: Float
     sensor_offset: Float
-    overview: Overview | None
+    column_input: ColumnInput | None
     terrain: Terrain | None
     warnings: tuple[str, ...]
     counts: dict[str, int]
     clearance: Clearance | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Seen:
-    """What one scan shows, before it is known where it was taken.
+class DetectionResult(NamedTuple):
+    """Verdicts of one scan.
 
     Attributes:
-        looked: What it was made of.
-        clusters: With their verdicts.
-        detections: Those that are trees.
-        heights: Mean height above the ground of what each detection is of, shape (D,) [m]; None where the
-            scan shows no ground.
+        clusters: All clusters with their verdicts.
+        detections: The clusters that are trees.
+        heights: Mean height above the ground of each detection, shape (D,) [m]; None without ground.
     """
 
-    looked: Looked
     clusters: Clusters
     detections: Detections
     heights: Float | None
 
 
-def perceive(
-    step: Step, sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, watch: Watch = no_watch
-) -> Seen:
-    """What a scan shows.
+def updates_columns(index: int, every: int) -> bool:
+    """Whether a scan updates the voxel columns: each of the first scans, then one of `every`."""
+    return index < FIRST_SCANS or index % every == 0
+
+
+def updates_terrain(index: int, every: int) -> bool:
+    """Whether a scan updates the terrain map: midway between two scans that update the columns, so that the two
+    costs do not fall on one scan."""
+    return index < FIRST_SCANS or index % every == every // 2
+
+
+def segment(
+    step: Step, sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, timer: StageTimer = no_timer
+) -> SegmentedScan:
+    """Filter a scan and find its ground and clusters.
 
     Args:
-        step: Points of a LiDAR, or stems that another program found.
-        sensor: The LiDAR; T_base_lidar: where it stands on the robot.
-        parameters: Of all stages.
-        watch: Is entered around each stage with its name.
+        step: The scan: points of a LiDAR, or stems that another program has detected.
+        sensor: The LiDAR.
+        T_base_lidar: Pose of the LiDAR on the robot.
+        parameters: Parameters of all stages.
+        timer: Entered around each stage with its name.
     """
-    return decide(look(step, sensor, T_base_lidar, parameters, watch), parameters.detection, watch)
-
-
-def look(
-    step: Step, sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, watch: Watch = no_watch
-) -> Looked:
-    """The clusters of a scan, and what is gathered of it; see `perceive`."""
     if step.scan.stems is not None:
-        return _at_stems(step, step.scan.stems, T_base_lidar, parameters, watch)
-    return _at_points(step, sensor, T_base_lidar, parameters, watch)
+        return _segment_stems(step, step.scan.stems, T_base_lidar, parameters, timer)
+    return _segment_points(step, sensor, T_base_lidar, parameters, timer)
 
 
-def decide(looked: Looked, parameters: Detection, watch: Watch = no_watch) -> Seen:
-    """What the clusters of a scan are."""
-    with watch("detection"):
-        judged = judge(looked.clusters, parameters)
-        found = detections(judged, looked.sensor_offset, parameters)
-        heights = None if looked.heights is None else looked.heights[found.cluster]
-    return Seen(looked, judged, found, heights)
+def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_timer) -> DetectionResult:
+    """Give each cluster of a scan its verdict, and return those that are trees."""
+    with timer("detection"):
+        clusters = judge(scan.clusters, parameters)
+        found = detections(clusters, scan.sensor_offset, parameters)
+        heights = None if scan.heights is None else scan.heights[found.cluster]
+    return DetectionResult(clusters, found, heights)
 
 
-def _at_points(step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, watch: Watch) -> Looked:
-    with watch("acquisition"):
+def _segment_points(
+    step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
+) -> SegmentedScan:
+    with timer("acquisition"):
         raw, sensor_offset = acquire(step, T_base_lidar, p.acquisition)
 
-    with watch("pass-through"):
+    with timer("pass-through"):
         boxed = filters.pass_through(raw, p.filters)
 
-    with watch("ground"):
+    with timer("ground"):
         terrain = None if p.ground.method == "none" else scan_ground.find_terrain(raw, p.ground)
         height = height_above(boxed, terrain) if terrain else None
         band = boxed if height is None else scan_ground.in_band(boxed, height, p.ground)
 
-    with watch("voxel grid"):
+    with timer("voxel grid"):
         filtered = filters.voxel_grid(band, p.filters)
 
-    with watch("clustering"):
+    with timer("clustering"):
         labels = cluster(filtered, sensor, p.clustering)
 
-    with watch("shape"):
+    with timer("shape"):
         labels, described = describe_stems(filtered, labels, sensor, p.shape)
         cut = is_cut(filtered, labels, raw, sensor, p.filters, p.acquisition)
         described = replace(described, cut=cut)
 
-    with watch("free view"):
+    with timer("free view"):
         free = clear_range(raw, filtered, sensor_offset)
 
     grounded = terrain is not None and shows_ground(terrain)
-    with watch("obstacles"):
+    with timer("obstacles"):
         near = acquire_near(step, T_base_lidar, p.acquisition)
         twist = driven_with(step, p.acquisition)
         seen = terrain if grounded else None
         clearance = find_clearance(raw, near, seen, sensor_offset, twist, p.obstacles)
 
-    return Looked(
+    return SegmentedScan(
         raw=raw,
         filtered=filtered,
         labels=labels.label,
@@ -171,11 +181,11 @@ def _at_points(step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, w
         else None,
         free=free,
         sensor_offset=sensor_offset,
-        overview=_overview(raw, boxed, height, terrain, sensor_offset, sensor)
-        if p.classification.method == "columns" and is_gathered(step.index, p.classification.every)
+        column_input=_column_input(raw, boxed, height, terrain, sensor_offset, sensor)
+        if p.classification.method == "columns" and updates_columns(step.index, p.classification.every)
         else None,
         terrain=replace(terrain, height=rounded(terrain.height, GROUND))
-        if terrain is not None and is_fused(step.index, p.classification.every)
+        if terrain is not None and updates_terrain(step.index, p.classification.every)
         else None,
         warnings=(NO_GROUND,) if terrain is not None and len(raw) and not grounded else (),
         counts={
@@ -190,18 +200,18 @@ def _at_points(step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, w
     )
 
 
-def _overview(
+def _column_input(
     raw: Float32,
     boxed: Float32,
     height: Float32 | None,
     terrain: Terrain | None,
     sensor_offset: Float,
     sensor: Sensor,
-) -> Overview | None:
+) -> ColumnInput | None:
     if height is None or terrain is None:
         return None
     steepest = steepest_by_direction(raw, sensor_offset, sensor.rings > 0)
-    return Overview(
+    return ColumnInput(
         rounded(boxed, POINT),
         rounded(height, POINT),
         steepest,
@@ -211,7 +221,7 @@ def _overview(
 
 
 def _returns(step: Step, raw: Float32) -> dict[str, int]:
-    """What became of the returns before the first filter."""
+    """Counts of the returns before the first filter."""
     returns = len(step.scan.points)
     return {
         "returns": returns,
@@ -220,14 +230,16 @@ def _returns(step: Step, raw: Float32) -> dict[str, int]:
     }
 
 
-def _at_stems(step: Step, stems: Stems, T_base_lidar: Pose3, p: Parameters, watch: Watch) -> Looked:
-    with watch("acquisition"):
+def _segment_stems(
+    step: Step, stems: Stems, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
+) -> SegmentedScan:
+    with timer("acquisition"):
         places, sensor_offset, clusters = take_stems(step, stems, T_base_lidar, p.acquisition)
 
-    with watch("free view"):
+    with timer("free view"):
         free = clear_range(places, places, sensor_offset)
 
-    return Looked(
+    return SegmentedScan(
         raw=places,
         filtered=places,
         labels=np.arange(len(places), dtype=np.int32),
@@ -235,7 +247,7 @@ def _at_stems(step: Step, stems: Stems, T_base_lidar: Pose3, p: Parameters, watc
         heights=None,
         free=free,
         sensor_offset=sensor_offset,
-        overview=None,
+        column_input=None,
         terrain=None,
         warnings=(),
         counts={**_returns(step, places), "clustered": len(places)},

@@ -1,50 +1,118 @@
-"""The mapper: what becomes of one scan, from top to bottom. It reads as section 3 of the paper."""
+"""The mapper: one scan -> map, in the order and the words of section 3 of the paper.
+
+`Mapper.process` is the main loop of the program. Everything else here is a stage of it, or its state.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
-from pipeline.classification import ForestOf, Gathering, View, package_alone
+from pipeline.classification import ForestOf, Gathering, GatheringState, View, package_alone
 from pipeline.config import Parameters
-from pipeline.front_end import Looked, decide, look
+from pipeline.detection.free_space import BINS
+from pipeline.front_end import DetectionResult, SegmentedScan, detect, segment
 from pipeline.geometry.poses import Float, Pose2, Pose3
-from pipeline.ground.terrain_map import HeightMapper
-from pipeline.late import after
+from pipeline.ground.terrain_map import HeightMapper, HeightMapState
 from pipeline.loop_closure import detection
-from pipeline.loop_closure.kidnapped_robot import Mapped, Recovery, RecoveryState
-from pipeline.mapper_records import Located, MapperState, Noted
+from pipeline.loop_closure.correction import LoopClosure, Relocalisation, Restart, SearchFailure
+from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
 from pipeline.odometry.gyro import fused
-from pipeline.slam import BackEnd, Loop, Motion
+from pipeline.slam import BackEnd, BackEndState, Loop, Motion
 from pipeline.slam.motion import noise_of, step_variances
 from pipeline.slam.pose_gate import REFUSED, within_gate
 from pipeline.slam.trajectory_buffer import GrowingPath
-from pipeline.stage_timer import Watch, no_watch
+from pipeline.stage_timer import StageTimer, no_timer
 from pipeline.tracking import Tracker
-from pipeline.types.records import Frame, HeightMap, Int, Path, PoseEstimate, Sensor, Step, Trees
+from pipeline.tracking.track_table import TrackTable
+from pipeline.types.records import (
+    Columns,
+    Frame,
+    HeightMap,
+    Int,
+    Path,
+    PoseEstimate,
+    Sensor,
+    Step,
+    no_detections,
+)
 
-LOOP = "a loop is closed: path and map since the place was left are bent, so that the trees there stand once"
+NOTHING_FREE: Float = np.zeros(BINS)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapperState:
+    """An independent copy of all that the mapper knows between two scans, without its parameters.
+
+    Attributes:
+        slam: Particles or pose graph, with their path.
+        gathering: Voxel columns.
+        ground: Terrain map.
+        tracks: Kalman filter of each tree.
+        next_number: Number of the next new tree.
+        odometry: Odometry pose of the last scan that had one.
+        path_length: Number of scans.
+        placed: First scan of the path that the robot has driven since it was last put somewhere.
+        closed: Scan at which the last loop was closed.
+        recovery: Search for a lost robot.
+        last: Pose after the last scan, with its covariance.
+    """
+
+    slam: BackEndState
+    gathering: GatheringState
+    ground: HeightMapState
+    tracks: TrackTable
+    next_number: int
+    odometry: Pose2 | None
+    path_length: int
+    placed: int = 0
+    closed: int = 0
+    recovery: RelocaliserState[MapperState] = field(default_factory=RelocaliserState)
+    last: tuple[Pose2, Float] | None = None
+
+
+Correction = Restart[MapperState] | Relocalisation | LoopClosure | SearchFailure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noted:
+    """What the stages made of one scan, for a rerun that begins at a later stage.
+
+    Attributes:
+        scan: Segmentation of the scan; found: its verdicts.
+        estimate: Pose of the scan.
+        landmarks: Landmarks after the scan: positions, shape (L, 2) [m], and covariances xx, xy, yy, (L, 3).
+        columns: Voxel columns where the scan updated them, else None.
+        is_usual: Whether neither pose nor map depended on the trees.
+    """
+
+    index: int
+    stamp_ns: int
+    scan: SegmentedScan
+    found: DetectionResult
+    estimate: PoseEstimate
+    landmarks: tuple[Float, Float]
+    columns: Columns | None
+    is_usual: bool
 
 
 class Mapper:
-    """Maps a run scan by scan. Knows no clock, no thread and no file.
+    """Maps a run scan by scan. It reads no clock and no file and starts no thread.
 
     Args:
-        parameters: Of all stages; may be replaced between two scans.
+        parameters: Parameters of all stages; they may be replaced between two scans.
         sensor: The LiDAR.
-        T_base_lidar: Where it stands on the robot.
-        seed: Of every random number.
-        watch: Is entered around each stage with its name, so that the caller can measure it.
-        forests: Where the forest is found that votes on what was gathered.
-
-    Attributes:
-        note: Is told of each scan once it is mapped; None where nobody listens.
+        T_base_lidar: Pose of the LiDAR on the robot.
+        seed: Random seed.
+        timer: Entered around each stage with its name, so that the caller can measure the stages.
+        forests: Finds the random forest that classifies the columns.
 
     Raises:
-        StemmapError: There is no such forest.
+        StemmapError: The forest that the parameters name does not exist.
     """
 
     def __init__(
@@ -54,343 +122,362 @@ class Mapper:
         sensor: Sensor,
         T_base_lidar: Pose3,
         seed: int,
-        watch: Watch = no_watch,
+        timer: StageTimer = no_timer,
         forests: ForestOf = package_alone,
     ) -> None:
         self._parameters = parameters
         self._sensor = sensor
         self._T_base_lidar = T_base_lidar
-        self._watch = watch
+        self._timer = timer
         self._slam = BackEnd(parameters.slam, seed)
-        self._gathering = Gathering(parameters.classification, all_around=sensor.rings > 0, forests=forests)
-        self._ground = HeightMapper()
+        self._columns = Gathering(parameters.classification, all_around=sensor.rings > 0, forests=forests)
+        self._terrain = HeightMapper()
         self._tracker = Tracker(parameters.tracking)
-        self._odometry: Pose2 | None = None
+        self._relocaliser: Relocaliser[MapperState] = Relocaliser(seed)
         self._path = GrowingPath()
+        self._odometry: Pose2 | None = None
         self._placed = self._closed = 0
         self._last: tuple[Pose2, Float] | None = None
-        self._recovery: Recovery[MapperState] = Recovery(seed)
         self.note: Callable[[Noted], None] | None = None
-        self._asked_trees = False
+
+    def process(self, step: Step, scan: SegmentedScan | None = None) -> Frame:
+        """Map one scan.
+
+        Args:
+            step: The scan with its odometry.
+            scan: Result of `segment` for this step where it is known already; of the step's own scan only the
+                time is used then.
+        """
+        p, timer, stamp_ns = self._parameters, self._timer, step.scan.stamp_ns
+
+        # Sections 3.1 to 3.3: filters, ground, clusters, and a verdict for each cluster.
+        scan = self.segment(step) if scan is None else scan
+        found = detect(scan, p.detection, timer)
+
+        # Section 3.4: predict the motion, update the particles; look for a robot that was carried away.
+        with timer("slam"):
+            motion, notices = self._predict_motion(step)
+            self._remember(step.index, motion)
+            self._path.append(stamp_ns, motion.step)
+            estimate = self._update_slam(step.index, motion, found, scan)
+            correction = self._check_lost(step.index, motion, found, scan, estimate)
+            estimate = self._apply(step.index, correction, estimate)
+            self._path.set_sigma(estimate.covariance)
+
+        # Section 3.5: one Kalman filter per tree; the voxel columns classify the trees. A lost robot maps nothing.
+        if self._relocaliser.is_searching:
+            self._settle_columns()
+        else:
+            self._update_trees(stamp_ns, scan, found, estimate)
+            self._update_columns(step, scan, estimate)
+            self._update_terrain(scan, estimate)
+
+        # Back at a known place: close the loop.
+        closure = self._check_loop(step.index, estimate)
+        estimate = self._apply(step.index, closure, estimate)
+
+        self._last = (estimate.T_map_base, estimate.covariance)
+        self._note(step, scan, found, estimate)
+        return self._frame(step, scan, found, estimate, notices, correction, closure)
+
+    def segment(self, step: Step) -> SegmentedScan:
+        """Filter a scan and find its ground and clusters. The map stays as it is."""
+        return segment(step, self._sensor, self._T_base_lidar, self._parameters, self._timer)
+
+    def segmenter(self) -> Callable[[Step], SegmentedScan]:
+        """`segment` with the present parameters, without a timer: another thread may call it."""
+        return partial(
+            segment, sensor=self._sensor, T_base_lidar=self._T_base_lidar, parameters=self._parameters
+        )
+
+    # --- state ----------------------------------------------------------------------------------------
 
     @property
     def parameters(self) -> Parameters:
-        """The parameters in force; new ones act from the next scan on."""
+        """Parameters in force; new ones apply from the next scan onwards."""
         return self._parameters
 
     @parameters.setter
     def parameters(self, parameters: Parameters) -> None:
-        self._gathering.parameters = parameters.classification  # first: it may not find its forest
+        self._columns.parameters = parameters.classification  # first: its forest may not exist
         self._parameters = parameters
         self._slam.parameters = parameters.slam
         self._tracker.parameters = parameters.tracking
 
     @property
     def path(self) -> Path:
-        """The path so far, one row a scan. A scan may change its past: it is that of the particle which
-        explains the scans best now, as the trees are."""
+        """The path so far, one row per scan: that of the particle which explains the scans best now. A new scan
+        may therefore change earlier rows."""
         return self._path.columns(self._slam.path())
 
     @property
     def height_map(self) -> HeightMap:
-        """The ground as all scans so far saw it."""
-        return self._ground.record()
+        """The terrain map of all scans so far."""
+        return self._terrain.record()
 
-    def process(self, step: Step) -> Frame:
-        """Map one scan."""
-        return self.take(step, self.look(step))
-
-    def look(self, step: Step) -> Looked:
-        """What a scan shows; nothing of it is taken into the map yet."""
-        return look(step, self._sensor, self._T_base_lidar, self._parameters, self._watch)
-
-    def looker(self) -> Callable[[Step], Looked]:
-        """The same with the parameters of now, unwatched: it knows nothing of the mapper, so that it may look
-        at other scans meanwhile."""
-        sensor, T_base_lidar, parameters = self._sensor, self._T_base_lidar, self._parameters
-        return lambda step: look(step, sensor, T_base_lidar, parameters)
-
-    def take(self, step: Step, looked: Looked) -> Frame:
-        """Map a scan by what it shows: all of `process` that hangs on more than the scan itself. Of the
-        step's scan only the time is asked."""
-        return self.map(self.locate(step, looked))
-
-    def locate(self, step: Step, looked: Looked, caught_up: Callable[[], None] = lambda: None) -> Located:
-        """The first half of `take`: where the scan was taken.
-
-        The next scan may be located, in another thread too, while this one is mapped, unless `may_close` says
-        that it has to wait.
-
-        Args:
-            caught_up: Is called before anything is asked of the map, or done to it; returns once all scans
-                before this one are mapped.
-        """
-        p = self._parameters
-        self._asked_trees = False
-        seen = decide(looked, p.detection, self._watch)
-
-        with self._watch("slam"):
-            motion, odometry = self._motion(step)
-            moved, refused = self._gated(self._with_gyro(step, motion))
-            estimate, told = self._recovery.locate(
-                step.index,
-                moved,
-                seen.detections,
-                looked.free,
-                p,
-                Mapped(
-                    self._slam,
-                    after(caught_up, self._known),
-                    after(caught_up, self._take_back),
-                    after(caught_up, self._trees),
-                    after(
-                        caught_up,
-                        lambda estimate: self._mapped(
-                            estimate, np.concatenate([self._path.motion, [moved.step.as_array()]])
-                        ),
-                    ),
-                    after(caught_up, lambda loop: self._bend(step.index, loop)),
-                    lambda pose, covariance: self._put(step.index, pose, covariance, step.index + 1),
-                ),
-            )
-            landmarks = self._slam.landmarks()
-
-        self._path.append(step.scan.stamp_ns, estimate, moved.step)
-        self._last = (estimate.T_map_base, estimate.covariance)
-        searching = self._recovery.searching
-        sought = p.relocalisation.method != "none" and not searching
-        return Located(
-            step=step,
-            seen=seen,
-            estimate=estimate,
-            T_odom_base=odometry,
-            warnings=(*refused, *estimate.health.warnings(step.doubt), *told),
-            landmarks=landmarks,
-            searching=searching,
-            asked_trees=self._asked_trees,
-            may_close=sought and detection.is_due(step.index, self._path.sigma_xy),
-        )
-
-    def map(self, located: Located) -> Frame:
-        """The second half of `take`: what the scan makes of the map."""
-        p, step, looked = self._parameters, located.step, located.seen.looked
-        estimate, told = located.estimate, located.warnings
-
-        if not located.searching:  # while it is lost, the map stays as it is
-            self._track(located)
-            self._map(step, looked, estimate)
-        elif self._gathering.is_unsettled:
-            with self._watch("gathering"):
-                self._gathering.settle()
-
-        if located.may_close:
-            located, closed = self._close_loop(located)
-            if closed:
-                estimate, told = located.estimate, (*told, LOOP)
-        trees = self._tracker.trees()
-        if self.note is not None:
-            self.note(self._noted(located))
-        return Frame(
-            index=step.index,
-            stamp_ns=step.scan.stamp_ns,
-            raw=looked.raw,
-            filtered=looked.filtered,
-            labels=looked.labels,
-            clusters=located.seen.clusters,
-            detections=located.seen.detections,
-            estimate=estimate,
-            T_odom_base=located.T_odom_base,
-            sensor_offset=looked.sensor_offset,
-            trees=trees,
-            counts=looked.counts,
-            warnings=(*step.warnings, *looked.warnings, *told),
-            columns=self._gathering.columns if p.classification.method == "columns" else None,
-            ground=None if p.ground.method == "none" else self._ground.state.record,
-            base_z=(self._ground.state.sensor_z or 0.0) - float(looked.sensor_offset[2])
-            if self._ground.state.scans
-            else 0.0,
-            clearance=looked.clearance,
-        )
-
-    def _noted(self, located: Located) -> Noted:
-        gathered = located.seen.looked.overview is not None and not located.searching
-        return Noted(
-            located.step.index,
-            located.step.scan.stamp_ns,
-            located.seen,
-            located.estimate,
-            located.landmarks,
-            self._gathering.columns if gathered else None,
-            not located.asked_trees and not located.searching,
-        )
-
-    def _trees(self) -> Trees:
-        """For stages before the tracking."""
-        self._asked_trees = True
-        return self._tracker.trees()
-
-    def _with_gyro(self, step: Step, motion: Pose2) -> Motion:
-        moved = Motion(motion, step.slack, step.doubt, step.measured)
-        if step.turn is None or step.T_odom_base is None or not self._parameters.acquisition.gyro:
-            return moved
-        _, variance = step_variances(motion.x, motion.y, motion.yaw, noise_of(self._parameters.slam))
-        sigma = math.sqrt(variance)
-        turned, turn_sigma, slack, doubt = fused(motion, sigma, step.slack, step.turn)
-        return moved._replace(step=turned, slack=slack, doubt=step.doubt or doubt, turn_sigma=turn_sigma)
-
-    def _gated(self, moved: Motion) -> tuple[Motion, tuple[str, ...]]:
-        """The motion without a measured pose that cannot be, and what to say of that."""
-        if self._last is None or moved.measured is None:
-            return moved, ()
-        expected = moved._replace(measured=self._slam.as_seen(moved.measured))
-        if within_gate(*self._last, expected, noise_of(self._parameters.slam)):
-            return moved, ()
-        return moved._replace(measured=None), (REFUSED,)
-
-    def _track(self, located: Located) -> None:
-        """Each tree's own filter: section 3.5."""
-        tracker, view_range = self._tracker, self._parameters.slam.view_range
-        seen, estimate = located.seen, located.estimate
-        with self._watch("tracking"):
-            tracker.process(
-                located.step.scan.stamp_ns,
-                estimate.T_map_base,
-                estimate.covariance,
-                seen.detections,
-                seen.looked.free,
-                view_range,
-                seen.heights,
-                estimate.relative,
-            )
-            tracker.anchor(*located.landmarks, estimate.T_map_base, view_range)
-            # Of a scan that is gathered the columns are judged anew, and all tracks by them.
-            if seen.looked.overview is None and self._parameters.classification.method == "columns":
-                tracker.learn_between(self._gathering.columns)
-
-    def _map(self, step: Step, looked: Looked, estimate: PoseEstimate) -> None:
-        """What is not taken from every scan (see turns): the columns that judge the trees, and the ground."""
-        watch, over = self._watch, looked.overview
-        if over is not None:
-            with watch("gathering"):
-                view = View(
-                    estimate.T_map_base,
-                    looked.sensor_offset,
-                    looked.free,
-                    over.steepest,
-                    over.depth,
-                    over.terrain,
-                )
-                self._gathering.add(over.points, over.height, step.index, view)
-                p = self._parameters.classification
-                columns = self._tracker.judge(step.scan.stamp_ns, self._gathering.columns, p)
-                self._gathering.columns = columns
-        elif self._gathering.is_unsettled:
-            with watch("gathering"):
-                self._gathering.settle()
-
-        if looked.terrain is not None:
-            with watch("height map"):
-                self._ground.add(looked.terrain, estimate.T_map_base, looked.sensor_offset)
-
-    def _close_loop(self, located: Located) -> tuple[Located, bool]:
-        """What is known of the scan after a loop was looked for, and whether it closed one: see
-        `pipeline.loop_closure.detection`."""
-        index, estimate = located.step.index, located.estimate
-        self._asked_trees = located.asked_trees
-        with self._watch("slam"):
-            run = self._mapped(estimate, self._path.motion)
-            loop = detection.find_loop(run, self._parameters.relocalisation)
-            if loop is not None:
-                self._bend(index, loop)
-                self._recovery.forget()
-                estimate = self._slam.estimate(estimate)
-                self._last = (estimate.T_map_base, estimate.covariance)
-        known = replace(
-            located, estimate=estimate, landmarks=self._slam.landmarks(), asked_trees=self._asked_trees
-        )
-        return known, loop is not None
-
-    def _mapped(self, estimate: PoseEstimate, motion: Float) -> detection.Mapped:
-        path, noise = self._slam.path(), noise_of(self._parameters.slam)
-        return detection.Mapped(
-            self._path.stamp_ns, path, self._trees, self._slam.begun_since, estimate, noise, motion,
-            self._placed, self._closed,
-        )  # fmt: skip
-
-    def _bend(self, index: int, loop: Loop) -> None:
-        """Close a loop: path and map are bent."""
-        bend = self._slam.close(index, loop)
-        self._tracker.bend(bend, self._path.stamp_ns)
-        self._tracker.hold_to(self._slam.known(), bend, self._path.stamp_ns)
-        self._gathering.bend(bend)
-        self._ground.bend(bend)
-        self._closed = index
-
-    def _put(self, index: int, T_map_base: Pose2, covariance: Float, first: int) -> None:
-        """Put the base somewhere; `first`: the scan from which on the path goes on there."""
-        self._slam.place(index, T_map_base, covariance)
-        self._placed, self._last = first, (T_map_base, covariance)
-
-    def _motion(self, step: Step) -> tuple[Pose2, Pose2]:
-        """The odometry's step since the last scan that had one, and its pose; without any the robot
-        stands still."""
-        before, now = self._odometry, step.T_odom_base
-        if now is None:
-            return Pose2(), before or Pose2()
-        self._odometry = now
-        return Pose2() if before is None else before.inverse() @ now, now
+    @property
+    def motion(self) -> Float:
+        """x, y [m], yaw [rad] by odometry from each scan to the next, shape (N, 3)."""
+        return self._path.motion.copy()
 
     def snapshot(self) -> MapperState:
         """All state, copied; parameters are not part of it."""
         return MapperState(
             self._slam.state.copy(),
-            self._gathering.snapshot(),
-            self._ground.state,
+            self._columns.snapshot(),
+            self._terrain.state,
             self._tracker.tracks.copy(),
             self._tracker.next_number,
             self._odometry,
             len(self._path),
             self._placed,
             self._closed,
-            self._recovery.state.copy(),
+            self._relocaliser.state.copy(),
             self._last,
         )
 
-    def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float, motion: Float) -> None:
-        """Go on from a state of another mapper; `stamp_ns`, `sigma_xy` and `motion`, by the odometry to each
-        scan from the one before, are its path's, one a scan."""
-        self._path = GrowingPath(stamp_ns, sigma_xy, motion)
-        self.restore(state)
-
-    def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
-        """Say where the base stands before scan `index`; its odometry begins anew there.
-
-        Args:
-            covariance: Of x, y [m], yaw [rad], shape (3, 3).
-        """
-        self._put(index, T_map_base, covariance, index)
-        self._odometry = None
-
-    @property
-    def motion(self) -> Float:
-        """x, y [m], yaw [rad] by the odometry to each scan from the one before, shape (N, 3)."""
-        return self._path.motion.copy()
-
     def restore(self, state: MapperState) -> None:
-        """Go back to a snapshot of this mapper's own past; the state itself is left untouched."""
-        self._take_back(state)
+        """Return to an earlier snapshot of this mapper. The snapshot itself stays unchanged."""
+        self._restore_map(state)
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
         self._path.cut(state.path_length)
         self._placed, self._closed, self._last = state.placed, state.closed, state.last
-        self._recovery.state = state.recovery.copy()
+        self._relocaliser.state = state.recovery.copy()
 
-    def _take_back(self, before: MapperState) -> None:
-        """Leave the map as it was in a state; path, odometry and the numbers of trees go on."""
+    def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float, motion: Float) -> None:
+        """Go on from a snapshot of another mapper.
+
+        Args:
+            state: The snapshot.
+            stamp_ns: Time of each scan of its path.
+            sigma_xy: Standard deviation of each position [m].
+            motion: Motion by odometry to each scan, shape (N, 3).
+        """
+        self._path = GrowingPath(stamp_ns, sigma_xy, motion)
+        self.restore(state)
+
+    def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
+        """Set the pose of the base before scan `index`. The odometry starts again there.
+
+        Args:
+            index: Number of the next scan.
+            T_map_base: The pose.
+            covariance: Covariance of x, y [m], yaw [rad], shape (3, 3).
+        """
+        self._slam.place(index, T_map_base, covariance)
+        self._placed, self._last = index, (T_map_base, covariance)
+        self._odometry = None
+
+    # --- stages ---------------------------------------------------------------------------------------
+
+    def _predict_motion(self, step: Step) -> tuple[Motion, tuple[str, ...]]:
+        """The motion since the last scan with its uncertainty, by odometry and gyroscope, and warnings. A scan
+        without odometry has no motion."""
+        before, now = self._odometry, step.T_odom_base
+        self._odometry = before if now is None else now
+        driven = Pose2() if before is None or now is None else before.inverse() @ now
+        return self._gated(self._with_gyro(step, driven))
+
+    def _with_gyro(self, step: Step, driven: Pose2) -> Motion:
+        motion = Motion(driven, step.slack, step.doubt, step.measured)
+        if step.turn is None or step.T_odom_base is None or not self._parameters.acquisition.gyro:
+            return motion
+        _, variance = step_variances(driven.x, driven.y, driven.yaw, noise_of(self._parameters.slam))
+        sigma = math.sqrt(variance)
+        turned, turn_sigma, slack, doubt = fused(driven, sigma, step.slack, step.turn)
+        return motion._replace(step=turned, slack=slack, doubt=step.doubt or doubt, turn_sigma=turn_sigma)
+
+    def _gated(self, motion: Motion) -> tuple[Motion, tuple[str, ...]]:
+        """The motion without a measured pose that fails its gate, and the warning about it."""
+        if self._last is None or motion.measured is None:
+            return motion, ()
+        expected = motion._replace(measured=self._slam.as_seen(motion.measured))
+        if within_gate(*self._last, expected, noise_of(self._parameters.slam)):
+            return motion, ()
+        return motion._replace(measured=None), (REFUSED,)
+
+    def _update_slam(
+        self, index: int, motion: Motion, found: DetectionResult, scan: SegmentedScan
+    ) -> PoseEstimate:
+        """Sample, associate, weigh and resample the particles. A lost robot follows its odometry."""
+        if self._relocaliser.is_searching:
+            return self._slam.process(index, motion, no_detections(), NOTHING_FREE)
+        return self._slam.process(index, motion, found.detections, scan.free)
+
+    def _update_trees(
+        self, stamp_ns: int, scan: SegmentedScan, found: DetectionResult, estimate: PoseEstimate
+    ) -> None:
+        tracker, view_range = self._tracker, self._parameters.slam.view_range
+        with self._timer("tracking"):
+            tracker.process(
+                stamp_ns,
+                estimate.T_map_base,
+                estimate.covariance,
+                found.detections,
+                scan.free,
+                view_range,
+                found.heights,
+                estimate.relative,
+            )
+            tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, view_range)
+            # A scan that updates the columns classifies all tracks by them afterwards.
+            if scan.column_input is None and self._parameters.classification.method == "columns":
+                tracker.learn_between(self._columns.columns)
+
+    def _update_columns(self, step: Step, scan: SegmentedScan, estimate: PoseEstimate) -> None:
+        """Integrate the scan into the voxel columns, and classify columns and trees."""
+        given = scan.column_input
+        if given is None:
+            self._settle_columns()
+            return
+        with self._timer("gathering"):
+            pose, offset = estimate.T_map_base, scan.sensor_offset
+            view = View(pose, offset, scan.free, given.steepest, given.depth, given.terrain)
+            self._columns.add(given.points, given.height, step.index, view)
+            self._columns.columns = self._tracker.judge(
+                step.scan.stamp_ns, self._columns.columns, self._parameters.classification
+            )
+
+    def _settle_columns(self) -> None:
+        """Finish what the last update of the columns left to the scan after it."""
+        if self._columns.is_unsettled:
+            with self._timer("gathering"):
+                self._columns.settle()
+
+    def _update_terrain(self, scan: SegmentedScan, estimate: PoseEstimate) -> None:
+        if scan.terrain is not None:
+            with self._timer("height map"):
+                self._terrain.add(scan.terrain, estimate.T_map_base, scan.sensor_offset)
+
+    # --- corrections ----------------------------------------------------------------------------------
+
+    def _remember(self, index: int, motion: Motion) -> None:
+        """Store what a robot that turns out to be lost returns to; call it before the scan is mapped."""
+        relocaliser = self._relocaliser
+        if self._parameters.relocalisation.method == "none":
+            relocaliser.reset()
+        elif not relocaliser.is_searching:
+            needs_state = relocaliser.needs_state(index)
+            state = replace(self.snapshot(), recovery=RelocaliserState()) if needs_state else None
+            relocaliser.remember(index, motion, state)
+
+    def _check_lost(
+        self,
+        index: int,
+        motion: Motion,
+        found: DetectionResult,
+        scan: SegmentedScan,
+        estimate: PoseEstimate,
+    ) -> Correction | None:
+        """Whether the robot is lost, or a lost robot is found in the map."""
+        p, relocaliser = self._parameters, self._relocaliser
+        if p.relocalisation.method == "none":
+            return None
+        if relocaliser.is_searching:
+            run = self._history(estimate)
+            return relocaliser.search(index, motion, found.detections, scan.free, p, run)
+        return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_astray else None
+
+    def _check_loop(self, index: int, estimate: PoseEstimate) -> LoopClosure | None:
+        """The loop that the robot has just closed, if any."""
+        p = self._parameters.relocalisation
+        if p.method == "none" or self._relocaliser.is_searching:
+            return None
+        if not detection.is_due(index, self._path.sigma_xy):
+            return None
+        with self._timer("slam"):
+            loop = detection.find_loop(self._history(estimate), p)
+        return None if loop is None else LoopClosure(loop)
+
+    def _history(self, estimate: PoseEstimate) -> detection.RunHistory:
+        return detection.RunHistory(
+            self._path.stamp_ns, self._slam.path(), self._tracker.trees(), self._slam.begun_since, estimate,
+            noise_of(self._parameters.slam), self._path.motion, self._placed, self._closed,
+        )  # fmt: skip
+
+    def _apply(self, index: int, correction: Correction | None, estimate: PoseEstimate) -> PoseEstimate:
+        """Correct SLAM, trees, columns and terrain; returns the corrected pose."""
+        slam = self._slam
+        match correction:
+            case None:
+                return estimate
+            case Restart(state=state, motions=motions):
+                recent = slam.state.recent
+                self._restore_map(state)
+                for scan, motion in motions:
+                    estimate = slam.process(scan, motion, no_detections(), NOTHING_FREE)
+                slam.state = replace(slam.state, recent=recent)
+                return replace(estimate, health=slam.lost(estimate))
+            case SearchFailure():
+                slam.give_up()
+            case Relocalisation(T_map_base=pose, covariance=covariance):
+                slam.place(index, pose, covariance)
+                self._placed = index + 1
+                estimate = slam.estimate(estimate)
+            case LoopClosure(loop=loop):
+                self._close_loop(index, loop)
+                estimate = slam.estimate(estimate)
+        self._relocaliser.reset()
+        return estimate
+
+    def _close_loop(self, index: int, loop: Loop) -> None:
+        """Bend the path, and move the map with it."""
+        bend = self._slam.close(index, loop)
+        self._tracker.bend(bend, self._path.stamp_ns)
+        self._tracker.hold_to(self._slam.known(), bend, self._path.stamp_ns)
+        self._columns.bend(bend)
+        self._terrain.bend(bend)
+        self._closed = index
+
+    def _restore_map(self, before: MapperState) -> None:
+        """Return to the map of an earlier state; path, odometry and the numbers of trees go on."""
         self._slam.state = before.slam.copy()
-        self._gathering.restore(before.gathering)
-        self._ground.state = before.ground
+        self._columns.restore(before.gathering)
+        self._terrain.state = before.ground
         self._tracker.tracks = before.tracks
 
-    def _known(self) -> MapperState:
-        return replace(self.snapshot(), recovery=RecoveryState())
+    # --- result ---------------------------------------------------------------------------------------
+
+    def _frame(
+        self,
+        step: Step,
+        scan: SegmentedScan,
+        found: DetectionResult,
+        estimate: PoseEstimate,
+        notices: tuple[str, ...],
+        *corrections: Correction | None,
+    ) -> Frame:
+        terrain, p = self._terrain.state, self._parameters
+        base_z = (terrain.sensor_z or 0.0) - float(scan.sensor_offset[2]) if terrain.scans else 0.0
+        messages = [text for c in corrections if c is not None for text in c.messages]
+        health = estimate.health.warnings(step.doubt)
+        return Frame(
+            index=step.index,
+            stamp_ns=step.scan.stamp_ns,
+            raw=scan.raw,
+            filtered=scan.filtered,
+            labels=scan.labels,
+            clusters=found.clusters,
+            detections=found.detections,
+            estimate=estimate,
+            T_odom_base=self._odometry or Pose2(),
+            sensor_offset=scan.sensor_offset,
+            trees=self._tracker.trees(),
+            counts=scan.counts,
+            warnings=(*step.warnings, *scan.warnings, *notices, *health, *messages),
+            columns=self._columns.columns if p.classification.method == "columns" else None,
+            ground=None if p.ground.method == "none" else terrain.record,
+            base_z=base_z,
+            clearance=scan.clearance,
+        )
+
+    def _note(self, step: Step, scan: SegmentedScan, found: DetectionResult, estimate: PoseEstimate) -> None:
+        if self.note is None:
+            return
+        searching = self._relocaliser.is_searching
+        due = detection.is_due(step.index, self._path.sigma_xy)
+        columns = None if scan.column_input is None or searching else self._columns.columns
+        usual = not searching and not due
+        stamp_ns, landmarks = step.scan.stamp_ns, self._slam.landmarks()
+        self.note(Noted(step.index, stamp_ns, scan, found, estimate, landmarks, columns, usual))

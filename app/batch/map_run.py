@@ -139,7 +139,7 @@ def _map(
         sensor=description.sensor,
         T_base_lidar=description.T_base_lidar,
         seed=plan.seed,
-        watch=stopwatch,
+        timer=stopwatch,
         forests=kept_forests(),
     )
     begun = _beginning(plan, mapper, chosen)

@@ -151,9 +151,9 @@ class _Drive:
             following = next(run, None)
             if following is None:  # the last scan is mapped in every trial, which asks it for its trees
                 before_last = mapper.snapshot()
-            looked = mapper.look(step)
+            looked = mapper.segment(step)
             self._kept.put(step, looked, key)
-            frame = mapper.take(step, looked)
+            frame = mapper.process(step, looked)
             trees, number = frame.trees, number + 1
             if number == 1:
                 self._start_ns = frame.stamp_ns

@@ -35,7 +35,7 @@ def warm_up(parameters: Parameters | None = None) -> None:
         sensor=known.sensor,
         T_base_lidar=known.T_base_lidar,
         seed=0,
-        watch=Stopwatch(),
+        timer=Stopwatch(),
         forests=kept_forests(),
     )
     for step in steps(source.records()):
@@ -48,7 +48,7 @@ def warm_eyes() -> None:
     from contextlib import closing
 
     from pipeline.classification import Gathering, View
-    from pipeline.front_end import decide, look
+    from pipeline.front_end import detect, segment
     from pipeline.geometry.poses import Pose2
     from pipeline.ground.terrain_map import HeightMapper
     from pipeline.io.readers import open_source
@@ -64,13 +64,13 @@ def warm_eyes() -> None:
     heights = HeightMapper()
     with closing(KeptScans()) as kept:
         for step in steps(source.records()):
-            looked = look(step, known.sensor, known.T_base_lidar, parameters)
-            decide(looked, parameters.detection)
+            looked = segment(step, known.sensor, known.T_base_lidar, parameters)
+            detect(looked, parameters.detection)
             kept.put(step, looked, look_key(parameters))
         for index in range(len(kept)):
             step, looked = kept.scan(index)
-            decide(looked, parameters.detection)
-            pose, over = step.T_odom_base or Pose2(), looked.overview
+            detect(looked, parameters.detection)
+            pose, over = step.T_odom_base or Pose2(), looked.column_input
             if over is not None:
                 view = View(pose, looked.sensor_offset, looked.free, over.steepest, over.depth, over.terrain)
                 gathering.add(over.points, over.height, step.index, view)
@@ -104,9 +104,9 @@ def warm_map() -> None:
     states = {0: mapper.snapshot()}
     with closing(KeptScans()) as kept:
         for step in _stems():
-            looked = mapper.look(step)
+            looked = mapper.segment(step)
             kept.put(step, looked, look_key(stems))
-            mapper.take(step, looked)
+            mapper.process(step, looked)
         scans = len(journal)
         states[scans] = mapper.snapshot()
         basis = Basis.of(stems, journal.first(scans), states, mapper.path, mapper.motion)

@@ -59,7 +59,7 @@ def new_session(folder: Path | None = None) -> Session:
             sensor=known.sensor,
             T_base_lidar=known.T_base_lidar,
             seed=seed,
-            watch=watch,
+            timer=watch,
             forests=kept_forests(),
         )
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from app.common.timers import Stopwatch
 from app.explain.estimate_history import TreeHistory
-from app.worker.abreast import abreast
 from app.worker.cursor import Cursor
 from app.worker.live_cursor import LiveCursor
 from app.worker.map_cache import Left, LeftBehind, basis_of
@@ -203,9 +202,9 @@ class Run:
             return mapper.process(step)
         looked = self._kept.looked(step, self._key) if self._hurried else None
         self.is_bare = looked is not None
-        looked = looked or mapper.look(step)
+        looked = looked or mapper.segment(step)
         self._kept.put(step, looked, self._key)
-        return mapper.take(step, looked)
+        return mapper.process(step, looked)
 
     def remap(self, parameters: Parameters) -> None:
         """Begin to map the run again from its first scan; what was begun before is given up. Nothing is begun
@@ -225,7 +224,7 @@ class Run:
             return
         basis = self._basis()
         self._rough = None if basis is None else self._roughly(basis, parameters, mapper)
-        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead, abreast)
+        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead)
         if basis is None or not rerun.passed:
             self._remapping = Remapping(rerun, self.start_ns)
             return
@@ -236,7 +235,7 @@ class Run:
     def _roughly(self, basis: Basis, parameters: Parameters, mapper: Mapper) -> Trees | None:
         sample = None
         if self._reread is not None and not basis.shows_as(parameters):
-            sample = self._sample.looked(mapper.looker(), len(basis.notes), looked_at_once)
+            sample = self._sample.looked(mapper.segmenter(), len(basis.notes), looked_at_once)
         return rough_trees(basis, self._kept.clusters, parameters, sample)
 
     def _basis(self) -> Basis | None:

@@ -41,13 +41,13 @@ TIE_NEAR, TIE_APART, TIE_VIEW, TIE_TREES, TIE_SPACING = 6.0, 30.0, 12.0, 3, 2.0 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mapped:
-    """What is known of a run.
+class RunHistory:
+    """Path and map of a run.
 
     Attributes:
         stamp_ns: int64, of its scans, shape (N,); path: x, y [m], yaw [rad], shape (N, 3).
-        trees: Gives the trees of the map.
-        begun_since: Gives the landmarks that were begun at a scan or later, see FastSlam.begun_since.
+        trees: The trees of the map.
+        begun_since: Returns the landmarks that were begun at a scan or later, see FastSlam.begun_since.
         estimate: Of the pose at the newest scan; noise: of the odometry.
         motion: By it to each scan from the one before, x, y [m], yaw [rad], shape (N, 3).
         placed: Scan; the path is driven since then, for the robot was put there.
@@ -56,7 +56,7 @@ class Mapped:
 
     stamp_ns: Int
     path: Float
-    trees: Callable[[], Trees]
+    trees: Trees
     begun_since: Callable[[int], tuple[Float, Float]]
     estimate: PoseEstimate
     noise: Noise
@@ -78,21 +78,21 @@ def is_due(index: int, sigma_xy: Float) -> bool:
     return index % EVERY == 0 and bool(sigma_xy[-RECENT:].max(initial=0.0) > UNSURE)
 
 
-def find_loop(mapped: Mapped, parameters: Relocalisation) -> Loop | None:
+def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
     """The loop that the robot has just closed, if it has."""
-    way = _way(mapped.path)
-    lately = max(int(np.searchsorted(way, way[-1] - LATELY)), mapped.placed)
+    way = _way(run.path)
+    lately = max(int(np.searchsorted(way, way[-1] - LATELY)), run.placed)
     if lately == 0:
         return None
-    here = mapped.path[-1, :2]
-    place, covariance = mapped.begun_since(lately)
+    here = run.path[-1, :2]
+    place, covariance = run.begun_since(lately)
     near = np.hypot(*(place - here).T) < REACH
     if np.count_nonzero(near) < parameters.stems_min:
         return None
-    trees = mapped.trees()
+    trees = run.trees
     # A tree that a drifted scan took for another one counts as seen then, so it is old by its first view.
-    old = (trees.observations >= LEAST_HITS) & (mapped.scan_of(trees.first_seen_ns) < lately)
-    drift = drift_of(mapped.path, 0, mapped.noise)
+    old = (trees.observations >= LEAST_HITS) & (run.scan_of(trees.first_seen_ns) < lately)
+    drift = drift_of(run.path, 0, run.noise)
     reach = min(REACH + DRIFT * math.sqrt(max(drift[0, 0], drift[1, 1])), FARTHEST)
     old &= np.hypot(*(trees.position - here).T) < reach
     rows = np.flatnonzero(old)
@@ -107,13 +107,13 @@ def find_loop(mapped: Mapped, parameters: Relocalisation) -> Loop | None:
     )
     if match.pose is None:
         return None
-    pose = Pose2(*(float(value) for value in mapped.path[-1]))
+    pose = Pose2(*(float(value) for value in run.path[-1]))
     T, R = through(match.pose, match.covariance, pose, OWN)
-    return loop_to(mapped, trees.number[rows[match.reference]], T, R, len(mapped.path) - 1)
+    return loop_to(run, trees.number[rows[match.reference]], T, R, len(run.path) - 1)
 
 
 def loop_to(
-    mapped: Mapped, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
+    run: RunHistory, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
 ) -> Loop | None:
     """The loop that leads from known trees to where they were found again; None where the path cannot have
     drifted so far.
@@ -124,26 +124,26 @@ def loop_to(
         last_mapped: Scan; later ones mapped nothing.
         spread: Covariance of the pose, shape (3, 3); None takes what the odometry may have drifted since.
     """
-    trees, path = mapped.trees(), mapped.path
+    trees, path = run.trees, run.path
     rows = np.flatnonzero(np.isin(trees.number, numbers))
     # What was driven before the robot was put somewhere did not lead there, and no loop bends it; and what a
     # loop has bent has drifted no more: else trees that still stand twice would close it again, wrongly.
-    left = _left(mapped.scan_of(trees.last_seen_ns[rows]), _way(path))
-    first = max(left, mapped.placed, mapped.closed)
+    left = _left(run.scan_of(trees.last_seen_ns[rows]), _way(path))
+    first = max(left, run.placed, run.closed)
     if first >= last_mapped:
         return None
     gap = _gap(T_map_base, path[-1])
     if np.hypot(gap[0], gap[1]) < LEAST_GAP:
         return None
-    since = drift_of(path, first, mapped.noise)
+    since = drift_of(path, first, run.noise)
     if _is_beyond(gap, (since if spread is None else spread) + R):
         return None
-    driven, jumps = without_jumps(path[first:], mapped.motion[first:])
+    driven, jumps = without_jumps(path[first:], run.motion[first:])
     if jumps and _is_beyond(_gap(T_map_base, driven[-1]), since + R):
         return None
     anchor = int(np.argmin(np.hypot(*(path[: first + 1, :2] - [T_map_base.x, T_map_base.y]).T)))
-    ties = _ties(mapped, first, last_mapped)
-    return Loop(first, last_mapped, anchor, T_map_base, R, ties, mapped.motion)
+    ties = _ties(run, first, last_mapped)
+    return Loop(first, last_mapped, anchor, T_map_base, R, ties, run.motion)
 
 
 def _gap(T_map_base: Pose2, pose: Float) -> Float:
@@ -195,19 +195,19 @@ def _stems(place: Float, covariance: Float) -> Stems:
     return Stems(place, np.minimum(worst_sigma(covariance), SIGMA), unknown, unknown)
 
 
-def _ties(mapped: Mapped, first: int, last: int) -> Int:
+def _ties(run: RunHistory, first: int, last: int) -> Int:
     """Pairs of scans of one place between which the path need not bend, see Loop: trees stand there that were
     known at the earlier one and seen until the later one, so that the second was found by them."""
     from scipy.spatial import cKDTree
 
-    path, trees = mapped.path, mapped.trees()
+    path, trees = run.path, run.trees
     way = _way(path[: last + 1])
     nodes = np.flatnonzero(np.diff(np.floor(way / TIE_SPACING), prepend=-1.0) > 0)
     pairs = cKDTree(path[nodes, :2]).query_pairs(TIE_NEAR, output_type="ndarray")
     early, late = nodes[pairs.min(axis=1)], nodes[pairs.max(axis=1)]
     apart = (late > first) & (way[late] - way[early] > TIE_APART)
     early, late = early[apart], late[apart]
-    begun, seen = mapped.scan_of(trees.first_seen_ns), mapped.scan_of(trees.last_seen_ns)
+    begun, seen = run.scan_of(trees.first_seen_ns), run.scan_of(trees.last_seen_ns)
     kept: list[int] = []
     for k in np.lexsort((early, late)).tolist():
         if kept and late[k] == late[kept[-1]]:

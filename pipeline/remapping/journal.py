@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.classification import judged
 from pipeline.config import field_specs
 from pipeline.config.stages import Slam
-from pipeline.mapper_records import Noted
+from pipeline.mapper import Noted
 from pipeline.remapping.notes import Entry, Notes, Stretch
 
 MOST_BYTES = 512 << 20
@@ -79,7 +79,7 @@ class Journal:
 
 
 def _entry(noted: Noted, reach: float) -> Entry:
-    estimate, seen = noted.estimate, noted.seen
+    estimate, found = noted.estimate, noted.found
     place, covariance = noted.landmarks
     pose = estimate.T_map_base
     near = np.hypot(place[:, 0] - pose.x, place[:, 1] - pose.y) < reach
@@ -88,10 +88,10 @@ def _entry(noted: Noted, reach: float) -> Entry:
         T_map_base=pose,
         covariance=estimate.covariance,
         relative=estimate.relative,
-        detections=seen.detections,
-        heights=seen.heights,
-        free=seen.looked.free,
-        offset=seen.looked.sensor_offset,
+        detections=found.detections,
+        heights=found.heights,
+        free=noted.scan.free,
+        offset=noted.scan.sensor_offset,
         landmarks=(place[near], covariance[near]),
         columns=None if noted.columns is None else judged(noted.columns),
         is_usual=noted.is_usual,

@@ -17,7 +17,7 @@ from pipeline.classification.ray_statistics import ELEVATIONS
 from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.detection.cluster_shape import eccentricity
 from pipeline.detection.free_space import BINS
-from pipeline.front_end import Looked, Overview
+from pipeline.front_end import ColumnInput, SegmentedScan
 from pipeline.geometry.poses import Pose2
 from pipeline.geometry.quantisation import GROUND, POINT
 from pipeline.ground.terrain import SECTORS, Terrain
@@ -82,7 +82,7 @@ class TooLargeError(ValueError):
     """A scan shows more than is kept of any."""
 
 
-def pack(step: Step, looked: Looked) -> tuple[Any, bytes]:
+def pack(step: Step, looked: SegmentedScan) -> tuple[Any, bytes]:
     """A row of HEAD, and the block.
 
     Of the scan only the time is kept, of the points only those of the overview that are low enough to be
@@ -91,7 +91,7 @@ def pack(step: Step, looked: Looked) -> tuple[Any, bytes]:
     Raises:
         TooLargeError: The block is larger than `unpack` takes.
     """
-    over, fused = looked.overview, looked.terrain
+    over, fused = looked.column_input, looked.terrain
     points, height = (NO_POINTS, NO_HEIGHT) if over is None else _remembered(over.points, over.height)
     words = _words(step, looked)
     head = np.zeros((), HEAD)
@@ -122,7 +122,7 @@ def pack(step: Step, looked: Looked) -> tuple[Any, bytes]:
     return head, zstandard.ZstdCompressor(level=_LEVEL).compress(block)
 
 
-def unpack(head: Any, block: bytearray) -> tuple[Step, Looked]:  # noqa: ANN401 - a row of HEAD
+def unpack(head: Any, block: bytearray) -> tuple[Step, SegmentedScan]:  # noqa: ANN401 - a row of HEAD
     """What `pack` was given, without the raw points.
 
     Its arrays can be written to, because kernels are compiled for such arrays.
@@ -141,7 +141,7 @@ def unpack(head: Any, block: bytearray) -> tuple[Step, Looked]:  # noqa: ANN401 
     overview = terrain = None
     if points != NONE:
         places, height = places_from(cut, points, POINT)
-        overview = Overview(
+        overview = ColumnInput(
             points=places,
             height=height,
             steepest=row_from(cut, BINS),
@@ -151,7 +151,7 @@ def unpack(head: Any, block: bytearray) -> tuple[Step, Looked]:  # noqa: ANN401 
     if fused_rings != NONE:
         ground = heights_from(cut, SECTORS, fused_rings, GROUND)
         terrain = Terrain(ground, bits_from(cut, ground.size).reshape(ground.shape))
-    looked = Looked(
+    looked = SegmentedScan(
         raw=NO_POINTS,
         filtered=NO_POINTS,
         labels=NO_LABELS,
@@ -159,7 +159,7 @@ def unpack(head: Any, block: bytearray) -> tuple[Step, Looked]:  # noqa: ANN401 
         heights=heights,
         free=free,
         sensor_offset=np.array(head["offset"]),
-        overview=overview,
+        column_input=overview,
         terrain=terrain,
         warnings=tuple(told["looked"]),
         counts=told["counts"],
@@ -220,7 +220,7 @@ def _clusters_from(cut: Cutter, count: int) -> Clusters:
     return Clusters(**columns, verdict=np.full(count, Verdict.OTHER, np.int32))
 
 
-def _words(step: Step, looked: Looked) -> bytes:
+def _words(step: Step, looked: SegmentedScan) -> bytes:
     m = step.measured
     told = {
         "warnings": step.warnings,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.config import Parameters
-from pipeline.front_end import Looked
+from pipeline.front_end import SegmentedScan
 from pipeline.geometry.hash_grid import cells_for, nearest_in, per_metre, put_in, take_out
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
@@ -32,7 +32,10 @@ LEAST = 2  # looks at a tree in the sample that tell anything of it
 
 
 def rough_trees(
-    basis: Basis, clusters: ClusterTable, parameters: Parameters, sample: Mapping[int, Looked] | None = None
+    basis: Basis,
+    clusters: ClusterTable,
+    parameters: Parameters,
+    sample: Mapping[int, SegmentedScan] | None = None,
 ) -> Trees | None:
     """Where trees will be, without diameters and with numbers that hold for nothing else.
 
@@ -111,7 +114,7 @@ def _columns(notes: Notes, p: Parameters) -> Columns | None:
 
 
 def _with_sample(
-    before: _Places, basis: Basis, clusters: ClusterTable, p: Parameters, sample: Mapping[int, Looked]
+    before: _Places, basis: Basis, clusters: ClusterTable, p: Parameters, sample: Mapping[int, SegmentedScan]
 ) -> _Places:
     """The trees as a sample of scans changes them: who is found less often there has fewer hits, and what is
     found there, and was not, is a tree. What was gathered hangs on no clusters, and stays; but where

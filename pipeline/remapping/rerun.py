@@ -6,9 +6,8 @@ from collections.abc import Callable, Generator, Iterator
 from itertools import dropwhile
 
 from pipeline.errors import StemmapError
-from pipeline.front_end import Looked
-from pipeline.mapper import Mapper
-from pipeline.mapper_records import MapperState
+from pipeline.front_end import SegmentedScan
+from pipeline.mapper import Mapper, MapperState
 from pipeline.remapping.cache_key import look_key
 from pipeline.remapping.journal import Journal
 from pipeline.remapping.resume_point import Basis
@@ -17,16 +16,12 @@ from pipeline.remapping.scan_cache import DamagedError, KeptScans
 from pipeline.types.records import Frame, Step
 
 Reread = Callable[[], Iterator[Step]]
-Ahead = Callable[[Callable[[Step], Looked], Iterator[Step]], Iterator[tuple[Step, Looked]]]
-Abreast = Callable[[Mapper, Iterator[tuple[Step, Looked]]], Iterator[Frame]]
+Ahead = Callable[[Callable[[Step], SegmentedScan], Iterator[Step]], Iterator[tuple[Step, SegmentedScan]]]
 
 
-def in_turn(mapper: Mapper, scans: Iterator[tuple[Step, Looked]]) -> Iterator[Frame]:
-    """Each scan located and mapped before the next one is."""
-    return (mapper.take(step, looked) for step, looked in scans)
-
-
-def one_by_one(look: Callable[[Step], Looked], steps: Iterator[Step]) -> Iterator[tuple[Step, Looked]]:
+def one_by_one(
+    look: Callable[[Step], SegmentedScan], steps: Iterator[Step]
+) -> Iterator[tuple[Step, SegmentedScan]]:
     """Each step with what it shows."""
     return ((step, look(step)) for step in steps)
 
@@ -45,7 +40,6 @@ class Rerun:
         reread: The steps of the run from its first on; None where they come only once.
         basis: What is known of the run with other parameters; of the same seed and sensor.
         ahead: How scans are looked at that are read once more: one by one, or ahead of the mapping.
-        abreast: How scans are mapped that show something: in turn, or one located while another is mapped.
 
     Attributes:
         journal: What the stages make of each scan.
@@ -59,7 +53,6 @@ class Rerun:
         reread: Reread | None = None,
         basis: Basis | None = None,
         ahead: Ahead = one_by_one,
-        abreast: Abreast = in_turn,
     ) -> None:
         self.mapper = mapper
         self.journal = Journal()
@@ -67,8 +60,8 @@ class Rerun:
         self._kept = kept
         self._key = look_key(mapper.parameters)
         self._next = self._stop = 0
-        self._reread, self._ahead, self._abreast = reread, ahead, abreast
-        self._steps: Iterator[tuple[Step, Looked]] | None = None
+        self._reread, self._ahead = reread, ahead
+        self._steps: Iterator[tuple[Step, SegmentedScan]] | None = None
         self._fresh: KeptScans | None = None
         self._tail: Tail | None = None
         self._until = 0  # scans that are tracked anew alone
@@ -105,15 +98,9 @@ class Rerun:
         if self._next == scans:
             return
         self._stop = scans
-        mapped = self._abreast(self.mapper, self._shown())
-        try:
-            for frame in mapped:
-                self._next += 1
-                yield frame
-        finally:  # who asks for no more of them leaves a whole mapper all the same
-            self._stop = 0
-            for _ in mapped:
-                self._next += 1
+        for step, scan in self._shown():
+            self._next += 1
+            yield self.mapper.process(step, scan)
 
     def state(self) -> MapperState | None:
         """All that is known once the frames that were asked for are given; None where no mapper was."""
@@ -156,14 +143,14 @@ class Rerun:
             self._tail = None
         return recalled
 
-    def _shown(self) -> Iterator[tuple[Step, Looked]]:
+    def _shown(self) -> Iterator[tuple[Step, SegmentedScan]]:
         """What the scans show that are asked for."""
         index = self._next
         while index < self._stop:
             yield self._shown_by(index)
             index += 1
 
-    def _shown_by(self, index: int) -> tuple[Step, Looked]:
+    def _shown_by(self, index: int) -> tuple[Step, SegmentedScan]:
         kept = self.kept
         if kept.has(index, self._key):
             try:
@@ -176,7 +163,7 @@ class Rerun:
         self.kept.put(step, looked, self._key)
         return step, looked
 
-    def _read_on(self, index: int) -> tuple[Step, Looked]:
+    def _read_on(self, index: int) -> tuple[Step, SegmentedScan]:
         if self._reread is None:
             raise StemmapError(
                 "the scans of a live run cannot be read once more, and what these parameters change has to "
@@ -185,7 +172,7 @@ class Rerun:
             )
         if self._steps is None:
             left = dropwhile(lambda step: step.index != index, self._reread())
-            self._steps = self._ahead(self.mapper.looker(), left)
+            self._steps = self._ahead(self.mapper.segmenter(), left)
             if self._fresh is None:
                 self._fresh = self._begun_anew(index)
         for step, looked in self._steps:

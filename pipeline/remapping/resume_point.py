@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Float
-from pipeline.mapper_records import MapperState
+from pipeline.mapper import MapperState
 from pipeline.remapping.clusters import ClusterTable
 from pipeline.remapping.notes import Notes
 from pipeline.tracking.kalman import COMPILED

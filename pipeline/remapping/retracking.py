@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.classification import Judged, no_columns
 from pipeline.config import Parameters
-from pipeline.mapper_records import MapperState
+from pipeline.mapper import MapperState
 from pipeline.remapping.notes import Notes
 from pipeline.tracking.recorded import Seen, Tracking
 from pipeline.tracking.track_table import TrackTable

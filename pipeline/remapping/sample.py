@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from pipeline.front_end import Looked
+from pipeline.front_end import SegmentedScan
 from pipeline.types.records import Step
 
-Each = Callable[[Callable[[Step], Looked], list[Step]], Iterable[Looked]]
+Each = Callable[[Callable[[Step], SegmentedScan], list[Step]], Iterable[SegmentedScan]]
 MOST_SCANS = 56
 MOST_BYTES = 20 << 20  # of points: what a look takes grows with them
 
@@ -40,7 +40,9 @@ class Sample:
     def _are_too_many(self) -> bool:
         return len(self._steps) > MOST_SCANS or self.nbytes > MOST_BYTES
 
-    def looked(self, look: Callable[[Step], Looked], scans: int, each: Each = map) -> dict[int, Looked]:
+    def looked(
+        self, look: Callable[[Step], SegmentedScan], scans: int, each: Each = map
+    ) -> dict[int, SegmentedScan]:
         """What those of the first scans show, by their numbers, ascending.
 
         Args:

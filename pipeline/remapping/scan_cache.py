@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import StemmapError
-from pipeline.front_end import Looked
+from pipeline.front_end import SegmentedScan
 from pipeline.remapping.clusters import ClusterTable
 from pipeline.remapping.named_cache import BEGIN, CUT, ROW, Name, open_named, sealed
 from pipeline.remapping.packing import TooLargeError, pack, unpack
@@ -69,7 +69,7 @@ class KeptScans:
         """Of the file."""
         return self._end(self._count)
 
-    def put(self, step: Step, looked: Looked, key: bytes) -> None:
+    def put(self, step: Step, looked: SegmentedScan, key: bytes) -> None:
         """Keep a scan, which is the next one or one that is there; those after it are forgotten. Where there
         is no room, `refusal` says so.
 
@@ -113,7 +113,7 @@ class KeptScans:
         """Whether a scan is kept that was looked at with these parameters."""
         return index < self._count and self.key_of(index) == key
 
-    def looked(self, step: Step, key: bytes) -> Looked | None:
+    def looked(self, step: Step, key: bytes) -> SegmentedScan | None:
         """What a scan showed, if it is kept and was looked at with these parameters."""
         if not self.has(step.index, key):
             return None
@@ -140,7 +140,7 @@ class KeptScans:
         """Of the parameters that a scan was looked at with."""
         return bytes(self._rows["key"][index])
 
-    def scan(self, index: int) -> tuple[Step, Looked]:
+    def scan(self, index: int) -> tuple[Step, SegmentedScan]:
         """One scan.
 
         Raises:

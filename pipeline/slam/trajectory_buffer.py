@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.types.records import Int, Path, PoseEstimate
+from pipeline.types.records import Int, Path
 
 
 class GrowingPath:
@@ -37,16 +37,19 @@ class GrowingPath:
         """x, y [m], yaw [rad] by the odometry to each scan from the one before, shape (N, 3)."""
         return self._motion[: self._length]
 
-    def append(self, stamp_ns: int, estimate: PoseEstimate, motion: Pose2) -> None:
-        """One scan more."""
+    def append(self, stamp_ns: int, motion: Pose2) -> None:
+        """Add a scan; `set_sigma` follows once its pose is estimated."""
         if self._length == len(self._stamp):
             self._stamp = np.concatenate([self._stamp, np.zeros_like(self._stamp)])
             self._sigma = np.concatenate([self._sigma, np.zeros_like(self._sigma)])
             self._motion = np.concatenate([self._motion, np.zeros_like(self._motion)])
         self._stamp[self._length] = stamp_ns
-        self._sigma[self._length] = np.sqrt(0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]))
         self._motion[self._length] = motion.as_array()
         self._length += 1
+
+    def set_sigma(self, covariance: Float) -> None:
+        """Set the sigma of the newest pose from the covariance of x, y, yaw, shape (3, 3)."""
+        self._sigma[self._length - 1] = np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
 
     def cut(self, length: int) -> None:
         """Keep the first scans alone."""

@@ -5,8 +5,10 @@ angles radians. Tables are kept as columns of equal length, never as lists of ob
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from enum import IntEnum
+
+import numpy as np
 
 from pipeline.geometry.poses import Pose2
 from pipeline.types.clearance import Clearance as Clearance
@@ -179,9 +181,11 @@ class Detections:
     eccentricity: Float
 
 
-def nothing_found(like: Detections) -> Detections:
-    """No detection at all, with the columns of others."""
-    return Detections(*(getattr(like, f.name)[:0] for f in fields(like)))
+def no_detections() -> Detections:
+    """A table without rows."""
+    return Detections(
+        np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), *(np.zeros(0) for _ in range(4))
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

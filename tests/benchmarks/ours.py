@@ -32,7 +32,7 @@ class Ours:
             sensor=Sensor(**recording.sensor),
             T_base_lidar=Pose3(recording.rotation, recording.translation),
             seed=seed,
-            watch=self._watch,
+            timer=self._watch,
         )
         self._times = StageTimes()
         self._frame: Frame | None = None

@@ -97,7 +97,7 @@ def mapped(
             sensor=about.sensor,
             T_base_lidar=about.T_base_lidar,
             seed=0,
-            watch=watch,
+            timer=watch,
             forests=package_alone if forest is None else lambda _name, _around: forest,
         )
         records = source.records(every=every) if isinstance(source, SimulatedSource) else source.records()

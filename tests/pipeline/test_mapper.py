@@ -129,7 +129,7 @@ def test_the_stages_are_watched_in_order():
             """The stage ends."""
 
     d = run()[1]
-    m = Mapper(preset("forest"), sensor=d.sensor, T_base_lidar=d.T_base_lidar, seed=0, watch=Watch)
+    m = Mapper(preset("forest"), sensor=d.sensor, T_base_lidar=d.T_base_lidar, seed=0, timer=Watch)
     m.process(run()[0][0])
     assert entered[0] == "acquisition"
     assert entered[-4:] == ["slam", "tracking", "gathering", "height map"]

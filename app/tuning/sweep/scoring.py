@@ -26,8 +26,7 @@ from pipeline.config.model import validated
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.evaluation import evaluate
 from pipeline.io.readers import Source, open_source
-from pipeline.mapper import Mapper
-from pipeline.mapper_records import MapperState
+from pipeline.mapper import Mapper, MapperState
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import Basis, Journal, KeptScans, Rerun, look_key
 from pipeline.types.records import Path, Trees
@@ -177,9 +176,9 @@ class _OpenRun:
         for step in steps(self._source.records(), odometry=self._chosen.steps):
             if states.is_due(scans):
                 states.offer(scans, mapper.snapshot())
-            looked = mapper.look(step)
+            looked = mapper.segment(step)
             kept.put(step, looked, key)
-            trees = mapper.take(step, looked).trees
+            trees = mapper.process(step, looked).trees
             if not scans:
                 self._start_ns = step.scan.stamp_ns
             scans += 1

@@ -14,9 +14,8 @@ from pipeline.classification import GatheringState, PackedMemory, no_columns
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.ground.terrain_map import PackedHeightMap
-from pipeline.loop_closure.kidnapped_robot import RecoveryState
-from pipeline.mapper import Mapper
-from pipeline.mapper_records import MapperState
+from pipeline.loop_closure.kidnapped_robot import RelocaliserState
+from pipeline.mapper import Mapper, MapperState
 from pipeline.slam import GraphState, SlamState
 from pipeline.slam.frame_uncertainty import FrameMemory
 from pipeline.slam.particle_ancestry import BLOCK
@@ -28,7 +27,7 @@ from pipeline.types.records import Columns, Int, Trees
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """Of a robot that is lost: see RecoveryState."""
+    """Of a robot that is lost: see RelocaliserState."""
 
     local: SlamState
     driven: float
@@ -105,14 +104,14 @@ class SavedMap:
             self.placed, self.closed, self._recovery(n),
         )  # fmt: skip
 
-    def _recovery(self, scans: int) -> RecoveryState[MapperState]:
+    def _recovery(self, scans: int) -> RelocaliserState[MapperState]:
         if self.search is None:
-            return RecoveryState()
+            return RelocaliserState()
         local, driven, since = self.search.local, self.search.driven, self.search.since
         _check_slam(local)
         if not (np.isfinite(driven) and driven >= 0.0 and 0 <= since <= scans):
             raise ValueError("the search does not fit the path")
-        return RecoveryState(local=local, driven=driven, since=since)
+        return RelocaliserState(local=local, driven=driven, since=since)
 
     def trees(self, parameters: Parameters) -> Trees:
         """The trees of the map, by these parameters."""

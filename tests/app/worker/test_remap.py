@@ -15,7 +15,7 @@ from app.worker.process import new_session
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
-from pipeline.front_end import Looked
+from pipeline.front_end import SegmentedScan
 from pipeline.mapper import Mapper
 from pipeline.types.records import Frame, Step
 
@@ -345,12 +345,12 @@ def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
 def test_what_was_kept_when_it_was_open_before_is_used_by_who_is_in_a_hurry(tmp_path, monkeypatch):
     looked, mapped = [], []
 
-    def counted(self: Mapper, step: Step) -> Looked:
+    def counted(self: Mapper, step: Step) -> SegmentedScan:
         looked.append(step.index)
         return look(self, step)
 
-    look = Mapper.look
-    monkeypatch.setattr(Mapper, "look", counted)
+    look = Mapper.segment
+    monkeypatch.setattr(Mapper, "segment", counted)
     for _ in range(2):
         looked.clear()
         with closing(new_session(tmp_path)) as session:

@@ -95,7 +95,7 @@ def _steps(uri: str, until: int, every: int) -> tuple[Sensor, list[Step]]:
 def _measured(sensor: Sensor, run: Sequence[Step]) -> tuple[StageClock, tuple[int, int]]:
     """Times of the scans, gone through again and again, and their median returns and clusters."""
     from pipeline.config import preset
-    from pipeline.front_end import perceive
+    from pipeline.front_end import detect, segment
     from pipeline.geometry.poses import Pose3
 
     parameters = preset("forest")
@@ -104,7 +104,8 @@ def _measured(sensor: Sensor, run: Sequence[Step]) -> tuple[StageClock, tuple[in
         clock = StageClock() if turn == WARM else clock
         gc.collect()
         for step in run:
-            seen = perceive(step, sensor, Pose3.identity(), parameters, clock)
+            scan = segment(step, sensor, Pose3.identity(), parameters, clock)
+            seen = detect(scan, parameters.detection, clock)
             returns.append(len(step.scan.points))
             clusters.append(len(seen.clusters.size))
     return clock, (round(middle(returns)), round(middle(clusters)))

@@ -67,7 +67,7 @@ def follow(uri: str, every: int) -> list[tuple[int, float, float, int]]:
 
 def _known_mib(mapper: Mapper) -> float:
     # The gathered voxels are there twice: as they are, and as they were at the last fold.
-    voxels = in_use_bytes(mapper._gathering.memory)
+    voxels = in_use_bytes(mapper._columns.memory)
     return (array_bytes(mapper.snapshot()) + array_bytes(mapper.path) + voxels) / 2**20
 
 

@@ -56,29 +56,23 @@ class Times(NamedTuple):
 
     Attributes:
         whole_s: All scans, from their points.
-        locating_s, mapping_s: Medians of the two halves of a scan that hang on the scan before.
+        mapping_s: Median of the part of a scan that needs the scan before.
     """
 
     whole_s: float
-    locating_s: float
     mapping_s: float
 
     @property
     def in_turn_s(self) -> float:
-        """The least that a scan takes of a rerun that maps anew, on however many cores."""
-        return max(self.locating_s, self.mapping_s)
+        """Lower bound of the time per scan of a rerun, on any number of cores."""
+        return self.mapping_s
 
     def told(self) -> str:
-        """Why memory is not what such a rerun waits for."""
-        steps = SCANS * self.in_turn_s
+        """Why a rerun cannot be faster."""
         return (
-            "In turn: where a scan was taken follows from the particles of the scan before, and what it adds "
-            "to the map from the map before, so each half takes one scan after the other: "
-            f"{1e3 * self.locating_s:.3g} ms to locate it, {1e3 * self.mapping_s:.3g} ms to map it (medians "
-            "of the first mapping), of which the longer times the scans is the least on any number of cores: "
-            f"{steps:.3g} s for {SCANS:,} scans. The 0.5 s asked would leave {0.5e6 / SCANS:.0f} µs a scan, "
-            "1.5 s three times as much, 2.5 s five times: changes that move the robot's path cannot be exact "
-            "in that time with these steps, however fast memory is. The rough answer is what comes so soon."
+            "Pose and map of a scan follow from the scan before, so scans are mapped one after the other: "
+            f"{1e3 * self.mapping_s:.3g} ms each (median of the first mapping), {SCANS * self.in_turn_s:.3g} s for "
+            f"{SCANS:,} scans. The preview is what a user sees at once."
         )
 
 
@@ -177,7 +171,7 @@ def _rough(
         start = time.perf_counter()
         if sampled is not None:
             source, sample = sampled
-            look = _fresh(source, parameters).looker()
+            look = _fresh(source, parameters).segmenter()
             looks = sample.looked(look, len(basis.notes), looked_at_once)
             read = kept.clusters.nbytes + sample.nbytes
         trees = rough_trees(basis, kept.clusters, parameters, looks)
@@ -208,25 +202,22 @@ def _first_time(
     sample = Sample()
     journal, states = Journal(), {}
     mapper.note = lambda noted: journal.note(noted, parameters.slam)
-    spent: list[tuple[float, float, float]] = []
+    spent: list[tuple[float, float]] = []
     for step in islice(steps(source.records()), SCANS):
         if step.index % STATES_EVERY == 0:
             states[step.index] = mapper.snapshot()
         start = time.perf_counter()
-        looked = mapper.look(step)
+        looked = mapper.segment(step)
         seen = time.perf_counter()
-        located = mapper.locate(step, looked)
-        found = time.perf_counter()
-        mapper.map(located)
-        spent.append((seen - start, found - seen, time.perf_counter() - found))
+        mapper.process(step, looked)
+        spent.append((seen - start, time.perf_counter() - seen))
         kept.put(step, looked, key)
         sample.offer(step)
         if len(held) < READ_AGAIN:
             held.append(step)
     states[len(kept)] = mapper.snapshot()
     notes, path = journal.first(len(kept)), mapper.path
-    _, locating, mapping = np.median(spent, axis=0).tolist()
-    times = Times(float(np.sum(spent)), locating, mapping)
+    times = Times(float(np.sum(spent)), float(np.median(spent, axis=0)[1]))
     return held, sample, times, Basis.of(parameters, notes, states, path, mapper.motion)
 
 
@@ -239,7 +230,6 @@ def _again(
     basis: Basis | None = None,
 ) -> float:
     """Seconds that a rerun takes; once before for the kernels, over a few scans."""
-    from app.worker.abreast import abreast
     from app.worker.parallel import looked_ahead
     from pipeline.remapping import Rerun
 
@@ -247,7 +237,7 @@ def _again(
     for most in (min(scans, 50), scans):
         gc.collect()
         start = time.perf_counter()
-        with closing(Rerun(_fresh(source, parameters), kept, reread, basis, looked_ahead, abreast)) as rerun:
+        with closing(Rerun(_fresh(source, parameters), kept, reread, basis, looked_ahead)) as rerun:
             for _ in rerun.frames(most):
                 pass
             spent = time.perf_counter() - start

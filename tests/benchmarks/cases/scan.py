@@ -56,10 +56,10 @@ def run() -> list[Table]:
     stand_watch, lane_watch = (Stopwatch(scans=100_000) for _ in range(2))
     described = source.description
     mapper = Mapper(
-        parameters, sensor=described.sensor, T_base_lidar=described.T_base_lidar, seed=0, watch=stand_watch
+        parameters, sensor=described.sensor, T_base_lidar=described.T_base_lidar, seed=0, timer=stand_watch
     )
     stand = measure(mapper, steps(source.records()), WARM_SCANS, STAND_SCANS)
-    mapper = Mapper(parameters, sensor=lane.VLP16, T_base_lidar=lane.MOUNTING, seed=0, watch=lane_watch)
+    mapper = Mapper(parameters, sensor=lane.VLP16, T_base_lidar=lane.MOUNTING, seed=0, timer=lane_watch)
     driven = measure(mapper, lane.steps(), lane.half(), 2 * lane.half())
     return [
         Table(

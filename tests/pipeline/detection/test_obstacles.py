@@ -14,7 +14,7 @@ from pipeline.config import Parameters, preset
 from pipeline.config.stages import Obstacles
 from pipeline.detection.obstacles import BESIDE, TIGHTEST, find_clearance, way_of
 from pipeline.errors import ParameterError
-from pipeline.front_end import perceive
+from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose3
 from pipeline.ground.terrain import RINGS, SECTORS, Terrain
 from pipeline.types.clearance import Clearance, Zone
@@ -220,11 +220,11 @@ def test_no_preset_has_a_gap_between_the_robot_and_the_stop_zone(name: str, spee
     for distance in np.arange(p.obstacles.reach + 0.05, p.obstacles.reach + p.obstacles.stop_distance, 0.05):
         thing = post(np.sign(speed) * distance, 0.0, 0.5, points=8) - mounting.t
         step = Step(0, scan(1, np.vstack([far, body, thing])), None, twist=(speed, 0.0, 0.0))
-        zones.append(perceive(step, Sensor(rings=1), mounting, p).looked.clearance)
+        zones.append(segment(step, Sensor(rings=1), mounting, p).clearance)
     assert {found.zone for found in zones if found is not None} == {Zone.STOP}
     assert len(zones) > 15
     step = Step(0, scan(1, np.vstack([far, body])), None, twist=(speed, 0.0, 0.0))
-    free = perceive(step, Sensor(rings=1), mounting, p).looked.clearance
+    free = segment(step, Sensor(rings=1), mounting, p).clearance
     assert free is not None
     assert free.zone is Zone.CLEAR
 

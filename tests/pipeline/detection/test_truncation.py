@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
 from pipeline.detection.truncation import view_of
-from pipeline.front_end import perceive
+from pipeline.front_end import detect, segment
 from pipeline.geometry.azimuth_bins import bin_direction, direction_bin
 from pipeline.geometry.poses import Pose3
 from pipeline.types.records import Scan, Sensor, Step, Verdict
@@ -47,7 +47,8 @@ def verdict_at(points, place, changes=None, sensor=SENSOR):
     """Of the cluster nearest to a place (x, y)."""
     step = Step(0, Scan(0, points), None)
     mounting = Pose3(np.eye(3), np.array([0.0, 0.0, HEIGHT]))
-    found = perceive(step, sensor, mounting, FOREST.replace(changes or {})).clusters
+    p = FOREST.replace(changes or {})
+    found = detect(segment(step, sensor, mounting, p), p.detection).clusters
     nearest = int(np.hypot(*(found.centroid[:, :2] - np.asarray(place)).T).argmin())
     assert np.hypot(*(found.centroid[nearest, :2] - np.asarray(place))) < 0.4
     return Verdict(int(found.verdict[nearest]))

@@ -13,7 +13,7 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers import open_source
-from pipeline.loop_closure.kidnapped_robot import Recovery, RecoveryState
+from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import Motion, SlamState
@@ -172,14 +172,13 @@ def test_a_map_saved_while_lost_goes_on_to_the_same_bytes():
 
 
 def test_measured_poses_are_of_the_map_and_not_of_the_small_one_of_a_search():
-    recovery: Recovery[Any] = Recovery(0)
-    recovery.state = RecoveryState(local=SlamState.at_origin(20))
+    recovery: Relocaliser[Any] = Relocaliser(0)
+    recovery.state = RelocaliserState(local=SlamState.at_origin(20))
     far = PoseMeasurement(1, Pose2(100.0, 50.0, 1.0), np.eye(3) * 1e-4)
     seen = detections([[3.0, 1.0], [4.0, -2.0]])
+    run: Any = None  # not used before the next search in the map
     for index in (1, 2, 4):  # none of them is one at which it is looked for in the map
         motion = Motion(Pose2(0.1), measured=far)
-        recovery._search(
-            index, motion, seen, NOTHING_SEEN, preset("forest"), lambda: pytest.fail("nobody asks for trees")
-        )
+        assert recovery.search(index, motion, seen, NOTHING_SEEN, preset("forest"), run) is None
     assert recovery.state.local is not None
     np.testing.assert_allclose(recovery.state.local.pose.mean(axis=0), [0.3, 0.0, 0.0], atol=0.1)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.poses import Pose2
-from pipeline.loop_closure.detection import TIE_APART, TIE_NEAR, Mapped, loop_to
+from pipeline.loop_closure.detection import TIE_APART, TIE_NEAR, RunHistory, loop_to
 from pipeline.loop_closure.map_correction import Bend
 from pipeline.slam.frame_uncertainty import FrameMemory
 from pipeline.slam.loop_correction import bent_landmarks, bent_path, without_jumps
@@ -54,7 +54,7 @@ def mapped(path, motion, known, placed=0):
     n = np.zeros(0)
     estimate = PoseEstimate(Pose2(*path[-1]), SURE, path[-1:], np.ones(1), 1.0, n.reshape(0, 2), False)
     none = lambda _: (n.reshape(0, 2), n.reshape(0, 3))  # noqa: E731
-    return Mapped(np.arange(len(path)), path, lambda: known, none, estimate, NOISE, motion, placed)
+    return RunHistory(np.arange(len(path)), path, known, none, estimate, NOISE, motion, placed)
 
 
 # --- what was driven ------------------------------------------------------------------------------

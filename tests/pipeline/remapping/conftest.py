@@ -20,9 +20,9 @@ def known() -> Iterator[tuple[KeptScans, Basis]]:
         for step in run()[0]:
             if step.index % SPACING == 0:
                 states[step.index] = whole.snapshot()
-            looked = whole.look(step)
+            looked = whole.segment(step)
             kept.put(step, looked, look_key(BASE))
-            whole.take(step, looked)
+            whole.process(step, looked)
         states[len(kept)] = whole.snapshot()
         path = whole.path
         notes = journal.first(len(kept))

@@ -6,12 +6,11 @@ from contextlib import closing
 
 import pytest
 
-from app.worker.abreast import abreast
 from pipeline.config import Parameters, preset
 from pipeline.geometry.poses import Pose3
-from pipeline.mapper import LOOP, Mapper
+from pipeline.loop_closure.correction import LOOP
+from pipeline.mapper import Mapper
 from pipeline.remapping import Basis, Journal, KeptScans, Recalled, Rerun, look_key
-from pipeline.remapping.rerun import in_turn
 from tests.benchmarks.wide_ring import SENSOR, WideRing
 from tests.pipeline.remapping.test_resume_point import told
 
@@ -33,9 +32,9 @@ def ring():
         for step, _ in WideRing().steps(0):
             if step.index % SPACING == 0:
                 states[step.index] = whole.snapshot()
-            looked = whole.look(step)
+            looked = whole.segment(step)
             kept.put(step, looked, look_key(STEMS))
-            if LOOP in whole.take(step, looked).warnings:
+            if LOOP in whole.process(step, looked).warnings:
                 closed.append(step.index)
             if closed and step.index == closed[0] + SPACING:
                 break
@@ -47,7 +46,7 @@ def ring():
 def finished(parameters: Parameters, kept: KeptScans, basis: Basis | None):
     """All that is known at the end, where loops were closed, and in how many scans trees alone were anew; of
     who goes on with both halves of the mapping at once."""
-    rerun = Rerun(mapper(parameters), kept, None, basis, abreast=in_turn if basis is None else abreast)
+    rerun = Rerun(mapper(parameters), kept, None, basis)
     frames = list(rerun.frames(len(kept)))
     closed = [frame.index for frame in frames if LOOP in getattr(frame, "warnings", ())]
     recalled = sum(frame.index + 1 - frame.first for frame in frames if isinstance(frame, Recalled))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.front_end import look
+from pipeline.front_end import segment
 from pipeline.io.checkpoints import encode
 from pipeline.remapping import DamagedError, KeptScans, Name, Rerun, look_key, name_of, named_cache
 from tests.pipeline.remapping.mapped import BASE, mapper, run
@@ -22,7 +22,7 @@ def filled(name: Name, scans: int = SCANS) -> KeptScans:
     """With the first scans of the run."""
     kept, d = KeptScans(name=name), run()[1]
     for step in run()[0][:scans]:
-        kept.put(step, look(step, d.sensor, d.T_base_lidar, BASE), KEY)
+        kept.put(step, segment(step, d.sensor, d.T_base_lidar, BASE), KEY)
     return kept
 
 
@@ -56,7 +56,7 @@ def test_other_parameters_cut_what_follows_for_good(name):
     d, wider = run()[1], BASE.replace({"clustering.eps": 0.3})
     with closing(KeptScans(name=name)) as kept:
         step = run()[0][4]
-        kept.put(step, look(step, d.sensor, d.T_base_lidar, wider), look_key(wider))
+        kept.put(step, segment(step, d.sensor, d.T_base_lidar, wider), look_key(wider))
     with closing(KeptScans(name=name)) as again:
         assert [again.has(k, KEY) for k in range(6)] == [True] * 4 + [False] * 2
         assert len(again) == 5
@@ -120,7 +120,7 @@ def test_a_full_disk_ends_the_keeping_and_what_was_kept_stays(name):
         with open("/dev/full", "rb+", buffering=0) as full:  # noqa: PTH123
             os.dup2(full.fileno(), kept._file.fileno())
         step = steps[SCANS]
-        kept.put(step, look(step, d.sensor, d.T_base_lidar, BASE), KEY)
+        kept.put(step, segment(step, d.sensor, d.T_base_lidar, BASE), KEY)
         os.dup2(real, kept._file.fileno())
         os.close(real)
         assert "No space left" in kept.refusal

@@ -112,7 +112,7 @@ def sampled(parameters):
     sample = Sample()
     for step in run()[0]:
         sample.offer(step)
-    return sample.looked(mapper(parameters).looker(), len(run()[0]))
+    return sample.looked(mapper(parameters).segmenter(), len(run()[0]))
 
 
 @pytest.mark.parametrize("method", ["columns", "none"])
@@ -138,7 +138,7 @@ def test_scans_that_are_looked_at_again_tell_of_other_clusters(change, method, k
 
 def by_hits(parameters, basis):
     """Where the clusters of all scans, looked at again, show trees often enough."""
-    look = mapper(parameters).looker()
+    look = mapper(parameters).segmenter()
     every = {step.index: look(step) for step in run()[0]}
     table = ClusterTable()
     for index, looked in every.items():
@@ -179,15 +179,15 @@ def test_scans_that_are_looked_at_on_two_cores_show_the_same():
     sample, parameters = Sample(), BASE.replace({"clustering.eps": 0.3})
     for step in run()[0][:20]:
         sample.offer(step)
-    one = sample.looked(mapper(parameters).looker(), 20)
-    two = sample.looked(mapper(parameters).looker(), 20, looked_at_once)
+    one = sample.looked(mapper(parameters).segmenter(), 20)
+    two = sample.looked(mapper(parameters).segmenter(), 20, looked_at_once)
     assert list(one) == list(two) == list(range(20))
     assert encode(tuple(two.values())) == encode(tuple(one.values()))
 
 
 def test_a_sample_is_spread_over_the_run_and_bounded():
     step, sample = run()[0][0], Sample()
-    looked, asked = mapper(BASE).look(step), []
+    looked, asked = mapper(BASE).segment(step), []
 
     def look(step):
         asked.append(step.index)

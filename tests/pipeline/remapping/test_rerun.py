@@ -16,7 +16,7 @@ from app.worker.parallel import AHEAD, looked_ahead
 from pipeline.config import FieldSpec, Parameters, field_specs, preset
 from pipeline.config.model import Value
 from pipeline.errors import StemmapError
-from pipeline.front_end import Looked, look
+from pipeline.front_end import SegmentedScan, segment
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import encode
 from pipeline.io.readers import open_source
@@ -49,7 +49,7 @@ def put_all(store: KeptScans, parameters: Parameters, parts: list[Step]) -> Kept
     """Keep what these scans show under some parameters."""
     d = run()[1]
     for step in parts:
-        store.put(step, look(step, d.sensor, d.T_base_lidar, parameters), look_key(parameters))
+        store.put(step, segment(step, d.sensor, d.T_base_lidar, parameters), look_key(parameters))
     return store
 
 
@@ -143,17 +143,17 @@ def test_what_is_packed_comes_back_whole(store):
     )
     parameters = preset("forest")
     for k in range(12):  # with and without an overview, with and without ground
-        looked = look(replace(step, index=k), d.sensor, d.T_base_lidar, parameters)
+        looked = segment(replace(step, index=k), d.sensor, d.T_base_lidar, parameters)
         if k == 3:
-            looked = replace(looked, heights=None, overview=None)
+            looked = replace(looked, heights=None, column_input=None)
         store.put(replace(step, index=k, T_odom_base=None if k == 4 else step.T_odom_base), looked, b"k" * 16)
         again, shown = store.scan(k)
-        nothing, over = looked.raw[:0], looked.overview
+        nothing, over = looked.raw[:0], looked.column_input
         looked = replace(looked, clearance=None)
         if over is not None:
             low = (over.height > 0.0) & (over.height < HIGHEST)
             flat = np.where([True, True, False], over.points, np.float32(0.0))
-            looked = replace(looked, overview=replace(over, points=flat[low], height=over.height[low]))
+            looked = replace(looked, column_input=replace(over, points=flat[low], height=over.height[low]))
         assert encode(shown) == encode(
             replace(looked, raw=nothing, filtered=nothing, labels=looked.labels[:0])
         )
@@ -169,7 +169,7 @@ def test_what_is_packed_comes_back_whole(store):
 def test_a_scan_that_shows_nothing_is_kept_too(store):
     parts, d = run()
     step = replace(parts[0], scan=Scan(parts[0].scan.stamp_ns, parts[0].scan.points[:0]))
-    looked = look(step, d.sensor, d.T_base_lidar, preset("forest"))
+    looked = segment(step, d.sensor, d.T_base_lidar, preset("forest"))
     store.put(step, looked, b"k" * 16)
     again = store.scan(0)[1]
     assert len(looked.clusters.size) == 0
@@ -270,14 +270,14 @@ def test_where_nobody_may_write_nothing_is_kept_and_that_is_said(monkeypatch, tm
 
 def test_who_looks_ahead_reads_in_order_stops_when_asked_and_tells_faults_in_their_turn():
     read: list[int] = []
-    nothing = look(run()[0][0], run()[1].sensor, run()[1].T_base_lidar, preset("forest"))
+    nothing = segment(run()[0][0], run()[1].sensor, run()[1].T_base_lidar, preset("forest"))
 
     def steps() -> Iterator[Step]:
         for k in range(40):
             read.append(k)
             yield replace(run()[0][0], index=k)
 
-    def fails(step: Step) -> Looked:
+    def fails(step: Step) -> SegmentedScan:
         if step.index == 3:
             raise StemmapError("it cannot be looked at")
         return nothing

@@ -11,7 +11,7 @@ import pytest
 from app.worker.remap import Remapping, Told
 from pipeline.config import Parameters, field_specs
 from pipeline.errors import StemmapError
-from pipeline.mapper_records import MapperState
+from pipeline.mapper import MapperState
 from pipeline.remapping import Basis, Journal, KeptScans, Recalled, Rerun
 from pipeline.remapping.journal import FARTHEST, STRETCH
 from pipeline.types.records import Frame

@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.config import Parameters
 from pipeline.errors import UsageError
-from pipeline.front_end import perceive
+from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose2
 from pipeline.simulation.obstacle_aware_driver import SPEED, ObeyingDrive
 from pipeline.simulation.run import MOUNTING, SimulatedRun, open_run
@@ -62,9 +62,9 @@ def test_the_pipeline_tells_the_same_of_the_standing_robot():
     run = crossing()
     swept = run.sweep(run.scans - 1).scan
     step = Step(0, swept, Pose2())
-    seen = perceive(step, run.lidar.sensor, MOUNTING, Parameters())
-    assert seen.looked.clearance is not None
-    assert seen.looked.clearance.zone is Zone.STOP
+    clearance = segment(step, run.lidar.sensor, MOUNTING, Parameters()).clearance
+    assert clearance is not None
+    assert clearance.zone is Zone.STOP
 
 
 def test_the_same_request_drives_the_same_way_and_can_be_told_to_ignore():

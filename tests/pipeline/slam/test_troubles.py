@@ -76,7 +76,7 @@ def lived(place: str, seed: int, name: str, p: Parameters | None = None) -> Day:
     session = Session(
         open_source=lambda _uri, _options: Told(driven),
         make_mapper=lambda source, p, seed, watch: Mapper(
-            p, sensor=source.description.sensor, T_base_lidar=Pose3.identity(), seed=seed, watch=watch
+            p, sensor=source.description.sensor, T_base_lidar=Pose3.identity(), seed=seed, timer=watch
         ),
         make_synchroniser=lambda _odometry: steps,
         parameters=parameters() if p is None else p,

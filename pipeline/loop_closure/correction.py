@@ -1,0 +1,89 @@
+"""Corrections of the map: decisions that loop closure and relocalisation return, and that the mapper applies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.slam import Loop, Motion
+
+S = TypeVar("S")
+
+LOOP = "a loop is closed: path and map since the place was left are bent, so that the trees there stand once"
+ASTRAY = (
+    "the robot is lost: what was mapped since the known trees were last seen is taken back, and the map is "
+    "searched for the stems around"
+)
+BENT = "the path drifted since then: it is bent, and what was mapped from it with it"
+NOT_FOUND = "the stems around were not found in the map; it goes on where the odometry leads"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Restart(Generic[S]):
+    """The robot is lost. The map returns to an earlier state; the odometry leads from there.
+
+    Attributes:
+        state: State of the mapper before the robot was lost.
+        motions: Scan number and motion of every scan since that state.
+    """
+
+    state: S
+    motions: tuple[tuple[int, Motion], ...]
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Text for the warnings of the scan."""
+        return (ASTRAY,)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Relocalisation:
+    """A lost robot is found in the map, at a place to which it was carried.
+
+    Attributes:
+        T_map_base: Pose of the base.
+        covariance: Covariance of x, y [m], yaw [rad], shape (3, 3).
+        stems: Number of trees that agree.
+    """
+
+    T_map_base: Pose2
+    covariance: Float
+    stems: int
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Text for the warnings of the scan."""
+        return (_found_again(self.stems),)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """The path returned to known trees: it is bent so that it ends there.
+
+    Attributes:
+        loop: The constraints of the path.
+        stems: Number of trees by which a lost robot was found; None where it was not lost.
+    """
+
+    loop: Loop
+    stems: int | None = None
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Text for the warnings of the scan."""
+        return (LOOP,) if self.stems is None else (_found_again(self.stems), BENT)
+
+
+@dataclass(frozen=True, slots=True)
+class SearchFailure:
+    """A lost robot was not found in the map. Mapping goes on where the odometry leads."""
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Text for the warnings of the scan."""
+        return (NOT_FOUND,)
+
+
+def _found_again(stems: int) -> str:
+    return f"found again in the map by {stems} stems that agree"
