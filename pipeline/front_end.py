@@ -1,8 +1,8 @@
 """Front end: from one scan to detections (sections 3.1 to 3.3 of the paper). It uses no other scan.
 
-`segment` does the expensive part: filters, ground, clusters. `detect` gives each cluster its verdict, which costs
-next to nothing. The two are apart so that a cached segmentation can be used again with other verdict rules (see
-`pipeline.remapping`).
+`segment` does the expensive part: filters, ground, clusters. `detect` gives each cluster its verdict, which
+costs next to nothing. The two are apart so that a cached segmentation can be used again with other verdict
+rules (see `pipeline.remapping`).
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class SegmentedScan:
         clusters: Clusters without verdicts.
         heights: Mean height of each cluster above the ground, shape (K,) [m]; None without ground.
         free: Free range by direction (see `pipeline.detection.free_space`).
-        column_input: Input of the voxel columns; None for scans that do not update them, or without ground.
+        column_input: Input of the voxel columns; None for scans that do not update them or show no ground.
         terrain: Ground that updates the terrain map; None for scans that do not update it, or without ground.
         clearance: Free space in the robot's way; None where obstacles are not looked for.
     """
@@ -105,8 +105,8 @@ def updates_columns(index: int, every: int) -> bool:
 
 
 def updates_terrain(index: int, every: int) -> bool:
-    """Whether a scan updates the terrain map: midway between two scans that update the columns, so that the two
-    costs do not fall on one scan."""
+    """Whether a scan updates the terrain map: midway between two scans that update the columns, so that the
+    two costs do not fall on one scan."""
     return index < FIRST_SCANS or index % every == every // 2
 
 

@@ -164,7 +164,7 @@ class Mapper:
             estimate = self._apply(step.index, correction, estimate)
             self._path.set_sigma(estimate.covariance)
 
-        # Section 3.5: one Kalman filter per tree; the voxel columns classify the trees. A lost robot maps nothing.
+        # Section 3.5: one Kalman filter per tree; the columns classify the trees. A lost robot maps nothing.
         if self._relocaliser.is_searching:
             self._settle_columns()
         else:
@@ -206,8 +206,8 @@ class Mapper:
 
     @property
     def path(self) -> Path:
-        """The path so far, one row per scan: that of the particle which explains the scans best now. A new scan
-        may therefore change earlier rows."""
+        """The path so far, one row per scan: that of the particle which explains the scans best now. A new
+        scan may therefore change earlier rows."""
         return self._path.columns(self._slam.path())
 
     @property
@@ -272,8 +272,8 @@ class Mapper:
     # --- stages ---------------------------------------------------------------------------------------
 
     def _predict_motion(self, step: Step) -> tuple[Motion, tuple[str, ...]]:
-        """The motion since the last scan with its uncertainty, by odometry and gyroscope, and warnings. A scan
-        without odometry has no motion."""
+        """The motion since the last scan with its uncertainty, by odometry and gyroscope, and warnings. A
+        scan without odometry has no motion."""
         before, now = self._odometry, step.T_odom_base
         self._odometry = before if now is None else now
         driven = Pose2() if before is None or now is None else before.inverse() @ now

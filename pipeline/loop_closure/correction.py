@@ -1,4 +1,4 @@
-"""Corrections of the map: decisions that loop closure and relocalisation return, and that the mapper applies."""
+"""Corrections of the map: the decisions of loop closure and relocalisation, which the mapper applies."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Kidnapped robot: a robot that was carried away is noticed, and found again in the map.
 
-While it is lost, the stems around it are mapped apart from the map. Once their constellation is found among the
-trees of the map, mapping goes on there.
+While it is lost, the stems around it are mapped apart from the map. Once their constellation is found among
+the trees of the map, mapping goes on there.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class RelocaliserState(Generic[S]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """Pose of the robot in the map: the base, the covariance of x, y [m], yaw [rad], shape (3, 3), and the numbers
-    of the trees that agree, int64, shape (K,)."""
+    """Pose of the base in the map, the covariance of x, y [m], yaw [rad], shape (3, 3), and the numbers of the
+    trees that agree, int64, shape (K,)."""
 
     T_map_base: Pose2
     covariance: Float
