@@ -55,8 +55,8 @@ class RelocaliserState(Generic[S]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """Pose of the base in the map, the covariance of x, y [m], yaw [rad], shape (3, 3), and the numbers of the
-    trees that agree, int64, shape (K,)."""
+    """Pose of the base in the map, the covariance of x, y [m], yaw [rad], shape (3, 3), and the numbers of
+    the trees that agree, int64, shape (K,)."""
 
     T_map_base: Pose2
     covariance: Float

@@ -70,8 +70,8 @@ class Times(NamedTuple):
     def told(self) -> str:
         """Why a rerun cannot be faster."""
         return (
-            "Pose and map of a scan follow from the scan before, so scans are mapped one after the other: "
-            f"{1e3 * self.mapping_s:.3g} ms each (median of the first mapping), {SCANS * self.in_turn_s:.3g} s "
+            "Pose and map of a scan follow from the scan before, so scans are mapped in turn: "
+            f"{1e3 * self.mapping_s:.3g} ms each (median of the first run), {SCANS * self.in_turn_s:.3g} s "
             f"for {SCANS:,} scans. The preview is what a user sees at once."
         )
 
