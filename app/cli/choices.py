@@ -182,6 +182,7 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
         topics=dict(arguments.topics),
         T_base_lidar=None if mount is None else Pose3.from_euler(mount[:3], *map(radians, mount[3:])),
         seed=arguments.seed,
+        as_live=getattr(arguments, "as_live", False),
     )
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from pipeline.errors import SourceError
 
 if TYPE_CHECKING:
-    from app.robot.recording import Recording
+    from app.robot.recorder import Recorder
     from app.robot.source import LiveSource
     from pipeline.config import Parameters
     from pipeline.io.readers import Source
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _TELL_S = 5.0
 
 
-def recording_of(arguments: argparse.Namespace) -> Recording | None:
+def recording_of(arguments: argparse.Namespace) -> Recorder | None:
     """The recording that the command line asks for.
 
     Raises:
@@ -33,10 +33,10 @@ def recording_of(arguments: argparse.Namespace) -> Recording | None:
         SourceError: The file cannot be made.
     """
     from app.cli.choices import recording_place
-    from app.robot.recording import Recording
+    from app.robot.recorder import Recorder
 
     place = recording_place(arguments, arguments.source)
-    return Recording(Path(place)) if place else None
+    return Recorder(Path(place)) if place else None
 
 
 def begin_recording(source: Source | LiveSource, parameters: Parameters) -> None:
@@ -59,7 +59,7 @@ def told_of_frames(source: Source | LiveSource) -> Callable[[Frame, Mapper], Non
 @contextmanager
 def heard(
     source: Source | LiveSource,
-    recording: Recording | None = None,
+    recording: Recorder | None = None,
     *,
     publish: bool = False,
     pictures: Path | None = None,
@@ -86,7 +86,6 @@ def heard(
         del number, frame
         source.stop()
 
-    source.use(recording, publish=publish)
     if pictures is not None:
         try:
             source.keep_pictures(pictures)
@@ -95,6 +94,7 @@ def heard(
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     told = None
     try:
+        source.start(recording, publish=publish)
         warm_up()
         told = _Teller(source)
         if not source.wait():
@@ -123,9 +123,13 @@ class _Teller:
         """Say no more."""
         self._closed.set()
         self._thread.join()
+        self._print(self._source.notices())
 
     def _tell(self) -> None:
         while not self._closed.wait(_TELL_S):
-            for text in (*self._source.notices(), self._source.waiting_for()):
-                if text:
-                    print(f"stemmap: {text}", file=sys.stderr, flush=True)
+            self._print([*self._source.notices(), self._source.waiting_for()])
+
+    @staticmethod
+    def _print(lines: list[str]) -> None:
+        for line in filter(None, lines):
+            print(f"stemmap: {line}", file=sys.stderr, flush=True)

@@ -7,7 +7,7 @@ import math
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from app.cli.choices import (
     SOURCE_HELP,
@@ -59,6 +59,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=_start,
         help="of a continued map: auto (found by the stems around, the default); X,Y,YAW in m and degrees; "
         "last (where the earlier run ended); resume (the same drive goes on)",
+    )
+    parser.add_argument(
+        "--as-live",
+        action="store_true",
+        help="of a recorded live run: map only the scans that were mapped live, for the same map again",
     )
     parser.add_argument(
         "--stop-after", metavar="N", type=_scans, help="map so many scans; --start resume maps the rest"
@@ -126,7 +131,6 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     from app.cli.live_commands import begin_recording, heard, recording_of, told_of_frames
     from app.common.compile_ahead import compile_ahead
     from app.sources.opening import open_any
-    from app.sources.request import request_of_options
     from app.worker.replaying import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
 
@@ -157,7 +161,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             stop_after=arguments.stop_after,
             revisions=revisions,
             on_frame=told_of_frames(opened),
-            chosen=request_of_options(arguments.source, source_options(arguments)).kept_choices(),
+            chosen=_choices(arguments),
         )
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)
@@ -175,6 +179,14 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     return _tell(
         [*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses, replaces=replaces
     )
+
+
+def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
+    """What the flags chose about the source, for run.json."""
+    from app.sources.request import request_of_options
+
+    kept = request_of_options(arguments.source, source_options(arguments)).kept_choices()
+    return {**(kept or {}), "as_live": True} if arguments.as_live else kept
 
 
 def _cannot_write(error: OSError, out: Path) -> StemmapError:

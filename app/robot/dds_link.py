@@ -9,11 +9,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from app.robot.address import DdsAddress
-from app.robot.arrival_times import ArrivalTimes
 from app.robot.choosing import PICTURE_TYPES, SCAN_TYPES
 from app.robot.dds_discovery import DdsGraph, Offer
 from app.robot.dds_types import idl_type
-from app.robot.inbox import Inbox
+from app.robot.inbox import ArrivalTimes, Inbox
 from app.robot.ros_graph import Publisher
 from app.robot.zenoh_link import LOST_SCANS, MESSAGE_LIMIT
 from pipeline.io.readers.base import count_loss

@@ -1,95 +1,142 @@
-"""Messages that came from the network and were not mapped yet: bounded, and what falls out is counted."""
+"""Messages that arrived from the network: recorded at once, then queued in bounded memory for the mapping."""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
+from collections.abc import Iterable
 
+from app.robot.recorder import Recorder
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Message
 
-#: Two seconds of a usual LiDAR: what is older no picture needs any more.
-MOST_SCANS = 20
-MOST_BYTES = 128 << 20
-#: Odometry and IMU are small, and wanted whole.
-MOST_OTHERS = 20_000
+#: Two seconds of a usual LiDAR: an older scan shows nothing of the present.
+MAX_SCANS = 20
+MAX_BYTES = 128 << 20
+#: Odometry and IMU messages are small, and all of them are needed.
+MAX_OTHERS = 20_000
+#: Fixed transforms are sent once and must outlast a long wait, e.g. for the compiler.
+MAX_FIXED = 1000
 
-#: A scan is shown with the picture of its time: one every 0.15 s is near enough, and more fill the disk.
+#: A picture every 0.15 s is close enough to every scan; more of them fill the disk.
 PICTURE_PAUSE_NS = 150_000_000
-MOST_PICTURES, MOST_PICTURE_BYTES, LARGEST_PICTURE = 10, 64 << 20, 32 << 20
+MAX_PICTURES, MAX_PICTURE_BYTES, LARGEST_PICTURE = 10, 64 << 20, 32 << 20
 
-DROPPED = "scans dropped because mapping was behind"
-OTHERS_DROPPED = "other messages dropped because mapping was behind"
-PICTURES_DROPPED = "pictures dropped because mapping was behind"
+SKIPPED = "scans skipped because mapping was behind"
+OTHERS_SKIPPED = "other messages skipped because mapping was behind"
+PICTURES_SKIPPED = "pictures skipped because mapping was behind"
 PICTURES_TOO_LARGE = f"pictures larger than {LARGEST_PICTURE >> 20} MB"
 
 _Lane = deque[tuple[int, Message]]
 
 
-class Inbox:
-    """Filled by the threads of a network library, emptied by the loop that maps.
+class ArrivalTimes:
+    """Times of arrival that only ever grow, even if the system clock is set meanwhile."""
 
-    When there is no room the oldest scans go first: a live map wants the newest. The publisher is never
-    held up, for it may be the robot's own driver. Pictures have a room of their own.
+    def __init__(self) -> None:
+        self._wall_ns, self._start_ns = time.time_ns(), time.monotonic_ns()
+        self._last_ns = 0
+
+    def now_ns(self) -> int:
+        """The present time [ns since 1970]; never before an earlier one."""
+        return self._wall_ns + time.monotonic_ns() - self._start_ns
+
+    def next_ns(self) -> int:
+        """The present time [ns since 1970], later than every time that this method returned before."""
+        self._last_ns = max(self.now_ns(), self._last_ns + 1)
+        return self._last_ns
+
+
+class Inbox:
+    """Queue between the threads of a network library, which fill it, and the mapping loop, which empties it.
+
+    Each message goes to the recorder first. When the queue is full, the oldest scans are skipped, because a
+    live map needs the newest; the recorder is told which. The publisher is never delayed, since it may be
+    the robot's own driver. Pictures have a queue of their own.
 
     Attributes:
-        losses: What fell out, by reason.
-        pictures_come, pictures_taken: How many came, and how many of them were wanted.
+        losses: Number of messages that were skipped, by reason.
+        early_scans: Number of scans that were skipped before the first call of `take`.
+        pictures_arrived, pictures_accepted: Number of pictures that arrived, and that the rate limit let in.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._recorder: Recorder | None = None
         self._scans: _Lane = deque()
         self._others: _Lane = deque()
+        self._fixed: _Lane = deque()
+        self._fixed_channels: frozenset[int] = frozenset()
         self._pictures: _Lane = deque()
         self._bytes = self._picture_bytes = 0
         self._serial = 0
         self._picture_ns: int | None = None
+        self._mapping = False
         self.losses: dict[str, int] = {}
-        self.pictures_come = self.pictures_taken = 0
+        self.early_scans = 0
+        self.pictures_arrived = self.pictures_accepted = 0
 
     @property
     def scans_waiting(self) -> int:
-        """How many scans came and were not taken yet."""
+        """Number of queued scans."""
         return len(self._scans)
 
+    def begin(self, recorder: Recorder | None, fixed: Iterable[int]) -> None:
+        """Record each message from now on.
+
+        Args:
+            recorder: None records nothing.
+            fixed: Numbers of the channels of fixed transforms.
+        """
+        self._recorder, self._fixed_channels = recorder, frozenset(fixed)
+
     def put(self, message: Message, *, is_scan: bool) -> None:
-        """Add a message; others fall out where there is no room."""
+        """Record and queue a message; the oldest ones are skipped where there is no room."""
         with self._lock:
+            if self._recorder is not None:
+                self._recorder.add(message)
             self._serial += 1
-            (self._scans if is_scan else self._others).append((self._serial, message))
+            is_fixed = message.channel in self._fixed_channels and len(self._fixed) < MAX_FIXED
+            lane = self._scans if is_scan else self._fixed if is_fixed else self._others
+            lane.append((self._serial, message))
             self._bytes += len(message.payload)
-            while len(self._scans) > MOST_SCANS or (self._bytes > MOST_BYTES and self._scans):
-                self._bytes -= self._drop(self._scans, DROPPED)
-            while len(self._others) > MOST_OTHERS or (self._bytes > MOST_BYTES and self._others):
-                self._bytes -= self._drop(self._others, OTHERS_DROPPED)
+            while len(self._scans) > MAX_SCANS or (self._bytes > MAX_BYTES and self._scans):
+                self._bytes -= self._skip(self._scans, SKIPPED)
+            while len(self._others) > MAX_OTHERS or (self._bytes > MAX_BYTES and self._others):
+                self._bytes -= self._skip(self._others, OTHERS_SKIPPED)
 
     def wants_picture(self, arrival_ns: int, size: int) -> bool:
-        """Count a picture that came; whether it is to be put, which is asked before its bytes are copied."""
+        """Count a picture; return whether the rate limit lets it in. Called before its bytes are copied."""
         with self._lock:
-            self.pictures_come += 1
+            self.pictures_arrived += 1
             if size > LARGEST_PICTURE:
                 count_loss(self.losses, PICTURES_TOO_LARGE)
                 return False
             if self._picture_ns is not None and arrival_ns < self._picture_ns + PICTURE_PAUSE_NS:
                 return False
             self._picture_ns = arrival_ns
-            self.pictures_taken += 1
+            self.pictures_accepted += 1
             return True
 
     def put_picture(self, message: Message) -> None:
-        """Add a picture that is wanted; older ones fall out where there is no room."""
+        """Record and queue an accepted picture; the oldest ones are skipped where there is no room."""
         with self._lock:
+            if self._recorder is not None:
+                self._recorder.add(message)
             self._serial += 1
             self._pictures.append((self._serial, message))
             self._picture_bytes += len(message.payload)
-            while len(self._pictures) > MOST_PICTURES or self._picture_bytes > MOST_PICTURE_BYTES:
-                self._picture_bytes -= self._drop(self._pictures, PICTURES_DROPPED)
+            while len(self._pictures) > MAX_PICTURES or self._picture_bytes > MAX_PICTURE_BYTES:
+                _, oldest = self._pictures.popleft()
+                self._picture_bytes -= len(oldest.payload)
+                count_loss(self.losses, PICTURES_SKIPPED)
 
     def take(self) -> Message | None:
-        """The message that came first of those that are there, None when there is none."""
+        """Remove and return the message that arrived first; None when the queue is empty."""
         with self._lock:
-            lanes = [lane for lane in (self._scans, self._others, self._pictures) if lane]
+            self._mapping = True
+            lanes = [lane for lane in (self._scans, self._others, self._fixed, self._pictures) if lane]
             if not lanes:
                 return None
             first = min(lanes, key=lambda lane: lane[0][0])
@@ -100,15 +147,22 @@ class Inbox:
                 self._bytes -= len(message.payload)
             return message
 
-    def clear(self) -> None:
-        """Forget all that waits, uncounted: nobody has begun to map."""
+    def end(self) -> None:
+        """Stop recording. The recorder is told that the messages still queued are not mapped."""
         with self._lock:
-            for lane in (self._scans, self._others, self._pictures):
-                lane.clear()
-            self._bytes = self._picture_bytes = 0
+            recorder, self._recorder = self._recorder, None
+            if recorder is not None:
+                for lane in (self._scans, self._others, self._fixed):
+                    for _, message in lane:
+                        recorder.skip(message)
 
-    def _drop(self, lane: _Lane, reason: str) -> int:
-        """Let the oldest of a lane go; its size."""
-        _, dropped = lane.popleft()
-        count_loss(self.losses, reason)
-        return len(dropped.payload)
+    def _skip(self, lane: _Lane, reason: str) -> int:
+        """Skip the oldest message of a lane; return its size [bytes]."""
+        _, skipped = lane.popleft()
+        if self._recorder is not None:
+            self._recorder.skip(skipped)
+        if self._mapping:
+            count_loss(self.losses, reason)
+        else:
+            self.early_scans += lane is self._scans
+        return len(skipped.payload)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 import struct
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from app.robot.ros_graph import ADMIN, PUBLISHER, data_key
 from pipeline.io.recording import outputs
-from pipeline.types.records import Frame, Path
 
 NODE = "stemmap"
-#: The map is said anew at most so often; the pose at every scan.
-_MAP_PAUSE_S = 1.0
 # Reliability, durability (1 keeps the last message for who comes late), history and depth; the rest is usual.
 _VOLATILE, _LATCHED = "::,10:,:,:,,", ":1:,1:,:,:,,"
 
@@ -31,7 +29,6 @@ class RosPublisher:
         self._prefix = f"/{robot}/stemmap" if robot else "/stemmap"
         self._tokens: list[Any] = []
         self._publishers: dict[str, _Topic] = {}
-        self._map_at = -_MAP_PAUSE_S
         namespace = f"/{robot}".replace("/", "%") if robot else "%"
         head = f"{ADMIN}/{domain}/{session.info.zid()}/0"
         tail = f"%/{namespace}/{NODE}"
@@ -49,14 +46,9 @@ class RosPublisher:
         """The full name of a topic."""
         return f"{self._prefix}/{topic}"
 
-    def add(self, frame: Frame, path: Path) -> None:
-        """Publish what a scan gave."""
-        messages = outputs.scan_messages(frame)
-        now = time.monotonic()
-        if now >= self._map_at + _MAP_PAUSE_S:
-            self._map_at = now
-            messages |= outputs.map_messages(frame, path)
-        for topic, payload in messages.items():
+    def publish(self, messages_by_topic: Mapping[str, bytes]) -> None:
+        """Publish messages in CDR by topic, see `pipeline.io.recording.outputs`."""
+        for topic, payload in messages_by_topic.items():
             self._publishers[topic].put(payload)
 
     def _declare(self, session: Any, token: str) -> None:  # noqa: ANN401

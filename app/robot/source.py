@@ -1,4 +1,4 @@
-"""A live robot as a source: what came is taken when somebody asks, and never waited for unless wanted."""
+"""A live robot as a source of records. Reading never waits for a message unless that is asked for."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 
 from app.robot.address import ALL_ROBOTS, DdsAddress, VelodyneAddress, ZenohAddress, parse_address
 from app.robot.choosing import SCAN_TYPES, Choice, choose
-from app.robot.inbox import PICTURE_PAUSE_NS, PICTURES_DROPPED, PICTURES_TOO_LARGE, Inbox
+from app.robot.inbox import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox
 from app.robot.kept_pictures import KeptPictures
 from app.robot.links import KIND, Link, link_for
-from app.robot.recording import Recording
+from app.robot.recorder import Recorder
 from app.robot.ros_graph import Publisher
 from app.robot.ros_publisher import RosPublisher
 from app.robot.zenoh_link import ZenohLink
@@ -23,23 +23,29 @@ from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
+from pipeline.io.recording import outputs
 from pipeline.types.records import Frame, Path, Record, Truth
 
-#: A robot's nodes come up one after another: so long after its LiDAR its topics are counted.
+#: A robot's nodes start one after another: its topics are chosen this long after the first scan topic [s].
 _SETTLE_S = 1.0
 _POLL_S = 0.005
-#: Nothing for so long is worth a word; a LiDAR of 5 Hz pauses for 0.2 s.
+#: A longer silence is reported [s]; a LiDAR of 5 Hz pauses for 0.2 s.
 SILENT_S = 1.0
+#: Path and trees are published and recorded at this interval [s]; the pose at every scan.
+_MAP_PAUSE_S = 1.0
 
 
 class LiveSource:
-    """What a robot sends, from now on. It cannot be read again: its recording can.
+    """Records of what a robot sends from now on. They cannot be read again; a recording of them can.
+
+    A thread of the source watches the robot: it chooses the topics, starts the recorder and subscribes,
+    whatever the mapping does meanwhile.
 
     Args:
-        address: Where it is to be heard.
+        address: Of the robot.
         options: Topics and mounting, where the user knows better.
-        make_link: Of the address and the inbox.
-        kind: Of the source, for people.
+        make_link: Makes the connection from the address and the inbox.
+        kind: Of the source, for the user.
     """
 
     def __init__(
@@ -63,11 +69,25 @@ class LiveSource:
         self._early: list[Record] = []
         self._version = -1
         self._began_ns = time.time_ns()
-        self._recording: Recording | None = None
+        self._recorder: Recorder | None = None
         self._publishes = False
         self._publisher: RosPublisher | None = None
+        self._map_at_s = -_MAP_PAUSE_S
         self._camera: LiveCamera | None = None
         self._kept: KeptPictures | None = None
+        self._failure: SourceError | None = None
+        self._watch: threading.Thread | None = None
+
+    def start(self, recorder: Recorder | None = None, *, publish: bool = False) -> None:
+        """Begin to listen.
+
+        Args:
+            recorder: Takes every message that arrives; the source closes it.
+            publish: Whether results are published on the robot's network.
+        """
+        self._recorder, self._publishes = recorder, publish
+        self._watch = threading.Thread(target=self._watch_robot, name="live source", daemon=True)
+        self._watch.start()
 
     # --- as a source -----------------------------------------------------------------------------
 
@@ -89,10 +109,12 @@ class LiveSource:
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out so far: on the way, in the queue, and what could not be read."""
+        """Number of messages left out, by reason: lost on the network, skipped by the mapping, not recorded,
+        or not readable."""
         read = {} if self._reader is None else self._reader.losses
         kept = {} if self._kept is None else self._kept.losses
-        return {**self._link.losses, **self._inbox.losses, **read, **kept}
+        recorder = {} if self._recorder is None else self._recorder.losses
+        return {**self._link.losses, **self._inbox.losses, **recorder, **read, **kept}
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield records as they come, until `stop`; waits for them.
@@ -107,6 +129,7 @@ class LiveSource:
             yield from records
             if not records:
                 self._ending.wait(_POLL_S)
+        self._inbox.end()
         if self._reader is not None:
             yield from self._reader.finish()
 
@@ -115,13 +138,20 @@ class LiveSource:
         return None
 
     def close(self) -> None:
-        """Leave the robot, and end the recording."""
+        """End the recording, then disconnect, which can take seconds."""
         self._ending.set()
+        self.end_recording()
+        if self._watch is not None:
+            self._watch.join(timeout=5.0)
         self._link.close()
-        if self._recording is not None:
-            self._recording.close()
         if self._kept is not None:
             self._kept.close()
+
+    def end_recording(self) -> None:
+        """Finish the file of the recording; may be called from any thread, while another one maps."""
+        self._inbox.end()
+        if self._recorder is not None:
+            self._recorder.close()
 
     # --- its camera ------------------------------------------------------------------------------
 
@@ -146,9 +176,9 @@ class LiveSource:
         """How many pictures came and were taken in, in words; "" where there is no camera."""
         if self._camera is None:
             return ""
-        lost = sum(self._inbox.losses.get(reason, 0) for reason in (PICTURES_DROPPED, PICTURES_TOO_LARGE))
+        lost = sum(self._inbox.losses.get(reason, 0) for reason in (PICTURES_SKIPPED, PICTURES_TOO_LARGE))
         return (
-            f"of {self._inbox.pictures_come:,} pictures {self._inbox.pictures_taken:,} were taken in, "
+            f"of {self._inbox.pictures_arrived:,} pictures {self._inbox.pictures_accepted:,} were taken in, "
             f"one every {PICTURE_PAUSE_NS / 1e9:g} s at most; {lost:,} were dropped"
         )
 
@@ -193,28 +223,31 @@ class LiveSource:
 
     @property
     def recording(self) -> str:
-        """The recording in words, "" where there is none."""
-        return "" if self._recording is None else self._recording.words
-
-    def use(self, recording: Recording | None, *, publish: bool) -> None:
-        """Record what comes, and publish what comes of it; said before anything is heard."""
-        self._recording, self._publishes = recording, publish
+        """The state of the recording in one line, "" where there is none."""
+        return "" if self._recorder is None else self._recorder.status
 
     def mapped(self, frame: Frame, path: Path) -> None:
-        """What came of a scan."""
+        """Publish and record the results of a scan, and keep its picture where one is due."""
         if self._camera is not None and self._kept is not None and self._kept.is_due(path):
             picture = self.picture_near(frame.stamp_ns)
             if picture is not None:
                 self._kept.add(picture, path)
+        if self._publisher is None and self._recorder is None:
+            return
+        messages = outputs.scan_messages(frame)
+        now_s = time.monotonic()
+        if now_s >= self._map_at_s + _MAP_PAUSE_S:
+            self._map_at_s = now_s
+            messages |= outputs.map_messages(frame, path)
         if self._publisher is not None:
-            self._publisher.add(frame, path)
-        if self._recording is not None:
-            self._recording.add_frame(frame, path)
+            self._publisher.publish(messages)
+        if self._recorder is not None:
+            self._recorder.add_outputs(messages)
 
     def use_parameters(self, revision: int, from_scan: int, parameters: Parameters) -> None:
-        """Parameters that are in force from a scan on."""
-        if self._recording is not None:
-            self._recording.add_parameters(revision, from_scan, parameters.model_dump())
+        """Record parameters that apply from a mapped scan onwards."""
+        if self._recorder is not None:
+            self._recorder.add_parameters(revision, from_scan, parameters.model_dump())
 
     def stop(self) -> None:
         """End `records`; safe in a signal's handler."""
@@ -228,6 +261,11 @@ class LiveSource:
         """
         if not self.ready:
             self._early = self.take()
+            if self._early and self._inbox.early_scans:
+                where = "in the recording only" if self._recorder is not None else "not mapped"
+                self._notices.append(
+                    f"{self._inbox.early_scans:,} scans arrived before mapping was ready: they are {where}"
+                )
         return self.ready
 
     def wait(self) -> bool:
@@ -246,15 +284,14 @@ class LiveSource:
         Raises:
             SourceError: What comes cannot be read.
         """
-        self._look_around()
+        if self._failure is not None:
+            raise self._failure
         if self._early:
             records, self._early = self._early, []
             return records
         if self._reader is None:
             return []
         while (message := self._inbox.take()) is not None:
-            if self._recording is not None:
-                self._recording.add(message)
             if self._camera is not None and self._camera.add(message):
                 continue
             records = self._reader.add(message)
@@ -296,17 +333,25 @@ class LiveSource:
     def _name(self) -> str:
         return f"robot {self.robot}" if self.robot else "the robot"
 
-    def _look_around(self) -> None:
-        if self._recording is not None:
-            self._recording.flush_when_due()
-        if self._choice is None:
-            self._choose()
-            return
-        if self._version == self._link.version:
-            return
+    def _watch_robot(self) -> None:
+        try:
+            while not self._ending.wait(_POLL_S):
+                if self._choice is None:
+                    self._choose()
+                elif self._version != self._link.version:
+                    self._note_presence(self._choice)
+        except SourceError as error:
+            self._failure = error
+        except Exception as error:  # raised by `take`; a thread that ends silently would look like waiting
+            self._failure = SourceError(
+                f"cannot listen to the robot: {type(error).__name__}: {error}", where=self.uri
+            )
+
+    def _note_presence(self, choice: Choice) -> None:
+        """Look whether the robot's scans are still announced."""
         self._version = self._link.version
         publishers = self._link.publishers()
-        scan = self._choice.channels[0].topic
+        scan = choice.channels[0].topic
         there = any(p.topic == scan and p.msgtype in SCAN_TYPES for p in publishers)
         if there != self._there:
             if self._there is not None:
@@ -326,18 +371,19 @@ class LiveSource:
         named = {role: name for role, name in self._topics.items() if role == "pose" and name in there}
         topics = {"scan": choice.channels[0].topic, **named}
         options = replace(self._options, topics=topics)
-        self._reader = ArrivalReader(self.uri, self._kind, choice.channels, options)
-        self._choice = choice
+        reader = ArrivalReader(self.uri, self._kind, choice.channels, options)
         everything = (*choice.channels, *choice.camera)
+        fixed = [channel for channel in choice.channels if channel.topic.endswith("tf_static")]
         if choice.camera:
-            fixed = [channel for channel in choice.channels if channel.topic.endswith("tf_static")]
             self._camera = LiveCamera(choice.camera, fixed)
-        if self._recording is not None:
-            told = {"uri": self.uri, "topics": [channel.topic for channel in choice.channels],
-                    "camera": [channel.topic for channel in choice.camera]}  # fmt: skip
-            self._recording.begin(everything, told, choice.robot)
+        if self._recorder is not None:
+            header = {"uri": self.uri, "topics": [channel.topic for channel in choice.channels],
+                      "camera": [channel.topic for channel in choice.camera]}  # fmt: skip
+            self._recorder.begin(everything, header, choice.robot)
         if self._publishes and self._link.session is not None:
             self._publisher = RosPublisher(self._link.session, self._address.domain, choice.robot)
+        self._inbox.begin(self._recorder, [channel.number for channel in fixed])
+        self._choice, self._reader = choice, reader  # the mapping thread reads from here on
         self._link.subscribe(everything)
 
 

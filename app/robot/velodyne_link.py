@@ -8,8 +8,7 @@ import time
 from collections.abc import Sequence
 
 from app.robot.address import VelodyneAddress
-from app.robot.arrival_times import ArrivalTimes
-from app.robot.inbox import Inbox
+from app.robot.inbox import ArrivalTimes, Inbox
 from app.robot.ros_graph import Publisher
 from app.robot.sweeps import Sweeps
 from pipeline.io.readers.base import count_loss

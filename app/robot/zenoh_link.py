@@ -11,9 +11,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from app.robot.address import ROOT, ZenohAddress
-from app.robot.arrival_times import ArrivalTimes
 from app.robot.choosing import PICTURE_TYPES, SCAN_TYPES
-from app.robot.inbox import Inbox
+from app.robot.inbox import ArrivalTimes, Inbox
 from app.robot.ros_graph import ADMIN, MOST_ENDPOINTS, Publisher, RosGraph, data_key
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message

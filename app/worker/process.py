@@ -31,8 +31,9 @@ from pipeline.config import Parameters
 from pipeline.io.readers.base import Source
 from pipeline.jit import on_compiling
 
-# A scan that is being mapped, or a large file that is being opened, may take a moment to notice.
-_GRACE_S = 1.0
+# A scan that is being mapped, or a large file that is being opened, may take a moment to notice. A robot is
+# left in 2 to 5 s.
+_GRACE_S, _LIVE_GRACE_S = 1.0, 9.0
 
 
 def new_session(folder: Path | None = None) -> Session:
@@ -42,11 +43,9 @@ def new_session(folder: Path | None = None) -> Session:
         folder: Where what scans show is kept for the next opening of a recording; None keeps nothing.
     """
     from app.common.compile_ahead import compile_ahead
-    from app.robot.source import LiveSource
     from app.sources.opening import open_any
     from app.training.learned_forests import kept_forests
     from app.worker.numba_warmup import warm_up
-    from pipeline.io.readers import SourceOptions
     from pipeline.mapper import Mapper
     from pipeline.odometry.synchroniser import OdometryChoice, steps
 
@@ -63,19 +62,14 @@ def new_session(folder: Path | None = None) -> Session:
             forests=kept_forests(),
         )
 
-    def open_ready(uri: str, options: SourceOptions) -> Source | LiveSource:
-        source = open_any(uri, options)
-        if isinstance(source, LiveSource):  # it is not listened to before this session asks for its scans
-            warm_up()
-        return source
-
     return Session(
-        open_source=open_ready,
+        open_source=open_any,
         make_mapper=make_mapper,
         make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
         parameters=Parameters(),
         keep=keep_without_name if folder is None else keep_in(folder),
         compile_ahead=compile_ahead,
+        warm_up=warm_up,
     )
 
 
@@ -83,7 +77,7 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     """Drive a session by the commands of a stream until it ends."""
     commands: queue.Queue[ToWorker | None] = queue.Queue()
     finished = threading.Event()
-    reader = threading.Thread(target=_read, args=(incoming, commands, finished), daemon=True)
+    reader = threading.Thread(target=_read, args=(incoming, commands, finished, session), daemon=True)
     reader.start()
     recent = Recent()
     mailbox = Mailbox(outgoing, recent)
@@ -108,7 +102,9 @@ def _said_once(told: Callable[[], None]) -> Callable[[], None]:
     return compiling
 
 
-def _read(incoming: BinaryIO, commands: queue.Queue[ToWorker | None], finished: threading.Event) -> None:
+def _read(
+    incoming: BinaryIO, commands: queue.Queue[ToWorker | None], finished: threading.Event, session: Session
+) -> None:
     channel = to_worker()
     try:
         while (command := channel.read(incoming)) is not None:
@@ -116,7 +112,8 @@ def _read(incoming: BinaryIO, commands: queue.Queue[ToWorker | None], finished: 
     except WireError as error:
         print(f"stemmap worker: {error}", file=sys.stderr)  # noqa: T201
     commands.put(None)
-    if not finished.wait(_GRACE_S):
+    is_live = session.end_recording()  # first, and from here: the loop may be compiling
+    if not finished.wait(_LIVE_GRACE_S if is_live else _GRACE_S):
         os._exit(0)
 
 

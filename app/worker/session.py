@@ -14,7 +14,7 @@ from app.dashboard.map_changes import MapChanges
 from app.explain import run_queries
 from app.explain.build import make_ready
 from app.explain.records import ClusterStory, TreeStory
-from app.robot.recording import Recording
+from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
 from app.worker.internal_protocol import Opened
 from app.worker.protocol import LONGEST_S, State, Status
@@ -49,6 +49,7 @@ class Session:
         parameters: In force at the beginning.
         keep: Where what the scans show is kept.
         compile_ahead: Compiles what is not compiled on this machine yet, faster than the first scan would.
+        warm_up: Loads the kernels, while a robot is already heard and recorded.
 
     Attributes:
         on_rough: Is told a rough answer (see `Run.rough`) with the revision of the parameters, before any
@@ -63,8 +64,10 @@ class Session:
         parameters: Parameters,
         keep: Keep = keep_without_name,
         compile_ahead: Callable[[], None] = lambda: None,
+        warm_up: Callable[[], None] = lambda: None,
     ) -> None:
         self._open_source = open_source
+        self._warm_up = warm_up
         self._compile_ahead = compile_ahead
         self._begun = Beginning(make_mapper, make_synchroniser, keep)
         self._parameters = parameters
@@ -143,11 +146,12 @@ class Session:
         source = self._open_source(uri, replace(options or SourceOptions(), seed=seed))
         if isinstance(source, LiveSource):
             try:
-                source.use(Recording(FilePath(record)) if record else None, publish=publish)
+                source.start(Recorder(FilePath(record)) if record else None, publish=publish)
             except SourceError:
                 source.close()
                 raise
             self._robot, self._state, self._detail = source, "waiting", ""
+            self._warm_up()
             return None
         return self._begin(source, odometry, seed)
 
@@ -159,10 +163,9 @@ class Session:
         """
         if self._robot is None or self._asked is None:
             return None
+        is_heard = self._run is None and self._robot.listen()
         self._warn(self._robot.notices())
-        if self._run is not None or not self._robot.listen():
-            return None
-        return self._begin(self._robot, *self._asked[1:])
+        return self._begin(self._robot, *self._asked[1:]) if is_heard else None
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
         self._run, warnings = self._begun(source, odometry, seed, self._parameters)
@@ -346,6 +349,13 @@ class Session:
     def close(self) -> None:
         """Let go of the source."""
         self._leave()
+
+    def end_recording(self) -> bool:
+        """Finish the recording of a live run; whether the run is live. May be called from any thread."""
+        robot = self._robot
+        if robot is not None:
+            robot.end_recording()
+        return robot is not None
 
     def _is_live(self) -> bool:
         """Whether the run is of a robot, in whose time nobody can go; a person is told so."""

@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 
+from app.robot.address import is_live
 from app.worker.codec import LENGTH_BYTES, WireError, check_size, from_worker, to_worker
 from app.worker.internal_protocol import FromWorker, Report, ToWorker
 from app.worker.protocol import Open, Play, SetParameters, SetSpeed, Status
@@ -23,6 +24,8 @@ _log = logging.getLogger(__name__)
 _PAUSES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
 _FORGIVEN_AFTER_S = 60.0
 _GRACE_S = 0.7
+#: Of a live run: the worker finishes the recording, then leaves the robot's network.
+_LIVE_GRACE_S = 10.0
 _BUFFER = 8 * 1024 * 1024
 
 
@@ -168,7 +171,8 @@ class WorkerProcess:
         if process.stdin is not None:
             process.stdin.close()
         try:
-            await asyncio.wait_for(process.wait(), _GRACE_S)
+            grace_s = _LIVE_GRACE_S if self._open is not None and is_live(self._open.uri) else _GRACE_S
+            await asyncio.wait_for(process.wait(), grace_s)
         except TimeoutError:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()

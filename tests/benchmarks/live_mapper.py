@@ -14,7 +14,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from app.robot.recording import Recording
+from app.robot.recorder import Recorder
 from app.robot.source import LiveSource, open_live
 from app.sources.opening import with_odometry
 from app.worker.live_cursor import LiveCursor
@@ -25,7 +25,7 @@ from pipeline.mapper import Mapper
 
 
 class Costs:
-    """Adds up what some methods of an object cost this thread."""
+    """Adds up what some methods of an object cost the threads that call them."""
 
     def __init__(self) -> None:
         self.cpu_ns = 0
@@ -55,12 +55,11 @@ def main(port: str, robot: str, place: str = "") -> None:
     """Map until a line comes on stdin and nothing waits any more."""
     warm_up()
     costs = Costs()
-    recording = Recording(Path(place)) if place else None
+    recording = Recorder(Path(place)) if place else None
     if recording is not None:
-        # add and add_frame call flush_when_due, which is measured with them.
-        costs.watch(recording, "add", "add_frame", "add_parameters")
+        costs.watch(recording, "add", "add_outputs", "_write_queue", "_write_skipped")
     with closing(open_live(f"zenoh:tcp/127.0.0.1:{port}?robot={robot}")) as source:
-        source.use(recording, publish=False)
+        source.start(recording)
         arrived: list[float] = []
         put = source._inbox.put
 

@@ -103,11 +103,13 @@ class SourceOptions:
         topics: Topic by role ("scan", "odometry", "imu", "gnss", "pose"); other roles are found by type.
         T_base_lidar: Extrinsics of the LiDAR; None means those of the source, else identity.
         seed: Random seed of simulated runs.
+        as_live: Of the recording of a live run: read only the messages that the live run mapped.
     """
 
     topics: dict[str, str] = field(default_factory=dict)
     T_base_lidar: Pose3 | None = None
     seed: int = 0
+    as_live: bool = False
 
 
 class Source(Protocol):

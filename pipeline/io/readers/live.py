@@ -288,11 +288,14 @@ def placed(
     return find_camera(container, decoder, mounting.tree, base, frozenset((pictures,)))
 
 
-NAME, PARAMETERS, VERSION = "stemmap_live.json", "/stemmap/parameters", 1
+NAME, VERSION = "stemmap_live.json", 1
+#: Channels of the recorder: parameters of the live run, and log times of messages that it did not map.
+PARAMETERS, SKIPPED = "/stemmap/parameters", "/stemmap/skipped"
 KIND = "recording of a live run"
 _LIMIT = 1 << 20
 _MOST_TOPICS = 100
-_MOST_REVISIONS = 10_000
+_MOST_NOTES = 1_000_000
+_MOST_SKIPPED = 10_000_000
 
 
 class Told(msgspec.Struct, frozen=True):
@@ -352,6 +355,7 @@ class LiveRecording:
         self._options = replace(options, topics={"scan": told.topics[0], **options.topics})
         self._channels = _channels(container, told, uri)
         self._losses: dict[str, int] = {}
+        self._skipped = self._read_skipped()
         self._base, self._offset_ns = "", 0
         self._placed: tuple[Camera | None, str] | None = None
         camera = [c for c in container.channels if c.topic in told.camera]
@@ -377,7 +381,7 @@ class LiveRecording:
         self._losses = reader.losses
         reader.from_ns = start_ns
         numbers = [channel.number for channel in self._channels]
-        for message in self._container.messages(numbers, None, reader.losses):
+        for message in self._messages(numbers, reader.losses):
             yield from reader.add(message)
         yield from reader.finish()
 
@@ -416,7 +420,7 @@ class LiveRecording:
     def _describe(self, path: Path) -> SourceDescription:
         reader = self._reader()
         numbers = [channel.number for channel in self._channels]
-        for message in self._container.messages(numbers, None, {}):
+        for message in self._messages(numbers, {}):
             reader.add(message)
             if reader.description is not None:
                 break
@@ -427,35 +431,78 @@ class LiveRecording:
         if known is None:
             raise SourceError("there is no scan in it", where=self._uri, remedy="Record the LiDAR's topic.")
         scans = {c.number: c.count for c in self._container.channels if c.topic == self._told.topics[0]}
-        first_ns = next((m.log_ns for m in self._container.messages(scans, None, {})), 0)
+        recorded, skipped = sum(scans.values()), sum(len(self._skipped.get(c, ())) for c in scans)
+        first_ns = next((m.log_ns for m in self._messages(list(scans), {})), 0)
         tail_ns = self._container.tail_ns(scans)
         last_ns = max((m.log_ns for m in self._container.messages(scans, tail_ns, {})), default=first_ns)
         cut = (
             ("the recording is cut or damaged: only what is whole is read",) if self._container.damage else ()
         )
+        revisions = tuple(self._revisions())
+        partly: tuple[str, ...] = ()
+        if skipped and not self._options.as_live:
+            # Scans are counted among those that were mapped live, so the numbers do not fit here.
+            revisions = tuple(replace(last, from_scan=0) for last in revisions[-1:])
+            partly = (
+                f"the live run mapped {recorded - skipped:,} of the {recorded:,} recorded scans; all of "
+                "them are read here, with its last parameters; `stemmap map --as-live` repeats the live run",
+            )
         return replace(
             known,
-            scans=sum(scans.values()),
+            scans=recorded - (skipped if self._options.as_live else 0),
             end_ns=(known.start_ns or 0) + last_ns - first_ns,
             digest=digest_of([path]),
             preset=self._told.preset,
-            warnings=(*known.warnings, *cut),
-            revisions=tuple(self._revisions()),
+            warnings=(*known.warnings, *cut, *partly),
+            revisions=revisions,
             topics=(*known.topics, *camera_topics(self._camera)),
         )
 
+    def _messages(self, numbers: Collection[int], losses: dict[str, int]) -> Iterator[Message]:
+        """The robot's messages in order of arrival; as the live run mapped them, if that is asked for."""
+        for message in self._container.messages(numbers, None, losses):
+            skipped = self._skipped.get(message.channel) if self._options.as_live else None
+            if skipped is None or message.log_ns not in skipped:
+                yield message
+
     def _revisions(self) -> Iterator[Revision]:
-        """The parameters that the run was mapped with; what is damaged is passed over."""
-        numbers = [c.number for c in self._container.channels if c.topic == PARAMETERS]
+        """The parameters of the live run, in order."""
+        for text in self._notes(PARAMETERS):
+            try:
+                yield msgspec.json.decode(text, type=Revision)
+            except msgspec.DecodeError:
+                count_loss(self._losses, "revisions of the parameters that cannot be read")
+
+    def _read_skipped(self) -> dict[int, set[int]]:
+        """Log times of the messages that the live run did not map, by channel."""
+        skipped: dict[int, set[int]] = {c.number: set() for c in self._channels}
+        numbers = {c.topic: c.number for c in self._channels}
+        total = 0
+        for text in self._notes(SKIPPED):
+            try:
+                times_by_topic = msgspec.json.decode(text, type=dict[str, list[int]])
+            except msgspec.DecodeError:
+                count_loss(self._losses, "lists of skipped messages that cannot be read")
+                continue
+            total += sum(map(len, times_by_topic.values()))
+            if total > _MOST_SKIPPED:
+                break
+            for topic, times in times_by_topic.items():
+                if topic in numbers:
+                    skipped[numbers[topic]].update(times)
+        return {number: times for number, times in skipped.items() if times}
+
+    def _notes(self, topic: str) -> Iterator[str]:
+        """The JSON texts of a channel of the recorder; damaged ones are counted."""
+        numbers = [c.number for c in self._container.channels if c.topic == topic]
         types: Any = standard_types("cdr")
         for count, message in enumerate(self._container.messages(numbers, None, {})):
-            if count >= _MOST_REVISIONS or len(message.payload) > _LIMIT:
+            if count >= _MOST_NOTES or len(message.payload) > _LIMIT:
                 break
             try:
-                text = types.deserialize_cdr(message.payload, "std_msgs/msg/String").data
-                yield msgspec.json.decode(text, type=Revision)
+                yield types.deserialize_cdr(message.payload, "std_msgs/msg/String").data
             except Exception:  # whatever the generated decoders of rosbags raise
-                count_loss(self._losses, "revisions of the parameters that cannot be read")
+                count_loss(self._losses, "notes of the recorder that cannot be read")
 
 
 def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:

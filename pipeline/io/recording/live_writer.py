@@ -1,4 +1,4 @@
-"""Writes a live run as it goes: the robot's messages as they were taken in, and what came of them."""
+"""Writes a live run while it goes on: the messages of the robot and the results of mapping them."""
 
 from __future__ import annotations
 
@@ -9,41 +9,41 @@ from typing import Any, Protocol
 from mcap.writer import CompressionType, Writer
 
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.live import NAME, PARAMETERS, VERSION
+from pipeline.io.readers.live import NAME, PARAMETERS, SKIPPED, VERSION
 from pipeline.io.recording import messages, outputs
 from pipeline.io.recording.quality_of_service import BAG_METADATA, offered_qos_profiles
 
-#: Small, so that little is lost with the last one.
+#: Small, because a crash loses the last chunk.
 CHUNK_SIZE = 256 << 10
 _TEXT = "std_msgs/msg/String"
 
 
 class Stream(Protocol):
-    """Where the bytes go."""
+    """Sink of the bytes."""
 
     def write(self, data: bytes) -> int: ...
     def tell(self) -> int: ...
 
 
 class LiveWriter:
-    """One recording of a live run, in the profile of ROS 2.
+    """Writer of one recording of a live run, in the ROS 2 profile of MCAP.
 
-    The robot's messages are written in the order in which the run took them, at their times of arrival,
-    which is all that a replay needs for the same map. What a full queue let fall out is not in it.
+    The robot's messages are written in their order of arrival, with their times of arrival as log times. A
+    channel names those that the mapping did not use, so that a replay can repeat the live map.
 
     Args:
         stream: Of a new file.
-        channels: Of the robot; they get the numbers that they have.
-        told: What else the run hangs on, as JSON: address, topics, seed.
+        channels: Of the robot; they keep their numbers.
+        header: What else determines the run, as JSON values: address, topics, seed.
         robot: Its namespace, "" for none.
     """
 
     def __init__(
-        self, stream: Stream, channels: Sequence[Channel], told: Mapping[str, Any], robot: str
+        self, stream: Stream, channels: Sequence[Channel], header: Mapping[str, Any], robot: str
     ) -> None:
         self._writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.LZ4)
         self._writer.start(profile="ros2", library="stemmap")
-        content = {"version": VERSION, **told}
+        content = {"version": VERSION, **header}
         self._writer.add_attachment(0, 0, NAME, "application/json", json.dumps(content).encode())
         self._writer.add_metadata(*BAG_METADATA)
         self._schemas: dict[str, int] = {}
@@ -56,11 +56,12 @@ class LiveWriter:
             for topic, kind in outputs.TYPES.items()
         }
         self._parameters = self._channel(PARAMETERS, _TEXT, latched=True)
+        self._skipped = self._channel(SKIPPED, _TEXT)
         self._sequence: dict[int, int] = {}
         self._last_ns = 0
 
     def add(self, message: Message) -> None:
-        """A message that the run takes in.
+        """Write a message of the robot.
 
         Raises:
             OSError: The disk refuses.
@@ -69,7 +70,7 @@ class LiveWriter:
         self._write(self._numbers[message.channel], message.payload)
 
     def add_outputs(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """What came of the messages so far.
+        """Write results of the mapping, at the time of the last message of the robot.
 
         Raises:
             OSError: The disk refuses.
@@ -78,7 +79,7 @@ class LiveWriter:
             self._write(self._outputs[topic], payload)
 
     def add_parameters(self, revision: int, from_scan: int, values: Mapping[str, Any]) -> None:
-        """With which parameters the scans from one on are mapped.
+        """Write the parameters that apply from a mapped scan onwards.
 
         Raises:
             OSError: The disk refuses.
@@ -86,13 +87,21 @@ class LiveWriter:
         text = json.dumps({"revision": revision, "from_scan": from_scan, "values": values})
         self._write(self._parameters, messages.text(text))
 
-    def flush(self) -> None:
-        """Hand all that waits to the system.
+    def add_skipped(self, times_by_topic: Mapping[str, Sequence[int]]) -> None:
+        """Write which messages the mapping did not use: log times [ns] by topic.
 
         Raises:
             OSError: The disk refuses.
         """
-        # The library ends a chunk when it is full or the file ends, and has no public word for "now".
+        self._write(self._skipped, messages.text(json.dumps(times_by_topic)))
+
+    def flush(self) -> None:
+        """End the present chunk, so that the system has all messages.
+
+        Raises:
+            OSError: The disk refuses.
+        """
+        # The library ends a chunk when it is full or the file ends, and has no public method for it.
         self._writer._Writer__finalize_chunk()
 
     def finish(self) -> None:

@@ -12,7 +12,7 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from app.robot.recording import Recording
+from app.robot.recorder import Recorder
 from app.worker.internal_protocol import Begin
 from app.worker.protocol import Open
 from pipeline.config import Parameters
@@ -36,13 +36,13 @@ def main(run: str, out: str, most: int) -> None:
         kinds = {c.number: c for c in container.channels}
         messages = list(container.messages(list(kinds), None, {}))
     refused_s: list[float] = []
-    refuse = Recording._refused
+    refuse = Recorder._end_with
 
-    def noted(recording: Recording, error: OSError) -> None:
+    def noted(recording: Recorder, error: OSError) -> None:
         refused_s.append(time.monotonic())
         refuse(recording, error)
 
-    setattr(Recording, "_refused", noted)  # noqa: B010 - the type checker takes it for something else
+    setattr(Recorder, "_end_with", noted)  # noqa: B010 - the type checker takes it for something else
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))  # Python gets an error for it, and no signal
     with stage() as on:
         on.commands.put(Open(URI, record=out))

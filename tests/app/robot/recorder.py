@@ -10,7 +10,7 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from app.robot.recording import Recording
+from app.robot.recorder import Recorder
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.mcap_file import McapFile
 
@@ -20,7 +20,7 @@ def main(run: str, out: str) -> None:
     with closing(McapFile(Path(run))) as container:
         topics = container.channels
         messages = list(container.messages([c.number for c in topics], None, {}))
-    recording = Recording(Path(out))
+    recording = Recorder(Path(out))
     ordered = sorted(topics, key=lambda c: c.topic != "/velodyne_points")
     numbers = {channel.number: k for k, channel in enumerate(ordered, 1)}
     recording.begin(ordered, {"uri": "test", "topics": [c.topic for c in ordered]}, "")

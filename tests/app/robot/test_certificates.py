@@ -88,7 +88,7 @@ def test_with_its_certificate_stemmap_hears_the_robot_and_says_its_own_results(
         closing(open_live(address(folder, port, "stemmap"))) as own,
     ):
         _listener = session.declare_subscriber("0/**", lambda sample: heard.append(str(sample.key_expr)))
-        own.use(None, publish=True)
+        own.start(publish=True)
         until(lambda: own.listen() or "announced and silent" in own.waiting_for(), own.waiting_for)
         assert own.robots == ["robot1"]
         until(lambda: send() or own.listen(), own.waiting_for)

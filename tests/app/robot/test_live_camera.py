@@ -14,15 +14,15 @@ from app.robot.address import parse_address
 from app.robot.choosing import PICTURE_TYPES, choose
 from app.robot.inbox import (
     LARGEST_PICTURE,
-    MOST_PICTURE_BYTES,
-    MOST_PICTURES,
+    MAX_PICTURE_BYTES,
+    MAX_PICTURES,
     PICTURE_PAUSE_NS,
-    PICTURES_DROPPED,
+    PICTURES_SKIPPED,
     PICTURES_TOO_LARGE,
     Inbox,
 )
 from app.robot.kept_pictures import FULL, REFUSED, SPARED, KeptPictures
-from app.robot.recording import Recording
+from app.robot.recorder import Recorder
 from app.robot.ros_graph import Publisher
 from app.robot.source import LiveSource, open_live
 from app.worker.camera import camera_picture, has_camera
@@ -66,10 +66,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Heard:
     """A live source that gets the messages of a file, and what became of them."""
 
-    def __init__(self, run: Path, recording: Recording | None = None, address: str = "") -> None:
+    def __init__(self, run: Path, recording: Recorder | None = None, address: str = "") -> None:
         uri = f"zenoh:tcp/robot:7447{address}"
         self.source = LiveSource(parse_address(uri), SourceOptions(), self._link)
-        self.source.use(recording, publish=False)
+        self.source.start(recording)
         self.records: list[Record] = []
         with closing(McapFile(run)) as container:
             topics = {c.number: c for c in container.channels}
@@ -102,7 +102,7 @@ def told(records: list[Record]) -> list[tuple[str, int]]:
 
 
 def test_the_picture_beside_a_live_scan_is_that_of_its_recordings(run: Path, tmp_path: Path):
-    recording = Recording(tmp_path / "live.mcap")
+    recording = Recorder(tmp_path / "live.mcap")
     with closing(Heard(run, recording).source) as live, closing(open_source(str(run))) as plain:
         assert has_camera(live.description)
         assert isinstance(plain, RosSource)
@@ -216,16 +216,16 @@ def test_pictures_take_no_room_of_scans_and_are_counted():
     at_30_hz = [inbox.wants_picture(k * SECOND // 30, 100) for k in range(90)]
     assert sum(at_30_hz) == pytest.approx(3 * SECOND / PICTURE_PAUSE_NS, abs=2)
     assert not inbox.wants_picture(9 * SECOND, LARGEST_PICTURE + 1)
-    assert (inbox.pictures_come, inbox.pictures_taken) == (91, sum(at_30_hz))
-    for k in range(MOST_PICTURES + 3):
+    assert (inbox.pictures_arrived, inbox.pictures_accepted) == (91, sum(at_30_hz))
+    for k in range(MAX_PICTURES + 3):
         inbox.put_picture(message(100, k))
-    assert inbox.losses == {PICTURES_TOO_LARGE: 1, PICTURES_DROPPED: 3}
+    assert inbox.losses == {PICTURES_TOO_LARGE: 1, PICTURES_SKIPPED: 3}
     for _ in range(5):
-        inbox.put_picture(message(MOST_PICTURE_BYTES // 4))
+        inbox.put_picture(message(MAX_PICTURE_BYTES // 4))
     taken = []
     while (found := inbox.take()) is not None:
         taken.append(len(found.payload))
-    assert taken == [10] + [MOST_PICTURE_BYTES // 4] * 4
+    assert taken == [10] + [MAX_PICTURE_BYTES // 4] * 4
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,7 @@ def test_the_pictures_of_an_independent_robot_are_seen(router: int, run: Path):
 
 
 @pytest.mark.slow
-def test_pictures_come_over_plain_dds(run: Path):
+def test_pictures_arrived_over_plain_dds(run: Path):
     pytest.importorskip("cyclonedds", reason="cyclonedds, an extra, is not installed")
     from cyclonedds.core import Policy, Qos
     from cyclonedds.domain import DomainParticipant

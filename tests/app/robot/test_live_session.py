@@ -20,6 +20,7 @@ from app.worker.loop import Driver
 from app.worker.protocol import Advance, Open, Pause, Seek
 from app.worker.session import Session
 from pipeline.config import Parameters
+from pipeline.errors import SourceError
 from pipeline.io.readers import SourceOptions
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
@@ -64,12 +65,19 @@ class Stage:
         self.said: list[FromWorker] = []
         self.commands: queue.Queue[ToWorker | None] = queue.Queue()
         self.links: list[FakeLink] = []
+        self.compiled = threading.Event()
+        self.compiled.set()
         self.session = Session(
             open_source=lambda uri, _options: LiveSource(parse_address(uri), SourceOptions(), self._link),
             make_mapper=lambda _source, p, seed, watch: FakeMapper(p, seed, watch),
             make_synchroniser=lambda _odometry: steps,
             parameters=Parameters(),
+            warm_up=self.warm_up,
         )
+
+    def warm_up(self) -> None:
+        """Wait as for the compiler, if the test says so."""
+        assert self.compiled.wait(60)
 
     def _link(self, address: ZenohAddress, inbox: Inbox) -> FakeLink:
         self.links.append(FakeLink(address, inbox))
@@ -96,6 +104,7 @@ def stage() -> Iterator[Stage]:
     try:
         yield made
     finally:
+        made.compiled.set()
         made.commands.put(None)
         thread.join(30)
         assert not thread.is_alive()
@@ -176,6 +185,51 @@ def test_a_live_run_can_be_paused_and_not_stepped(sending):
         until(lambda: any("open its recording" in warning for warning in on.status.warnings))
         sending(link, 11, SCANS)
         assert on.shown[-1] == 10
+
+
+def recorded_scans(path: Path) -> int:
+    try:
+        with closing(McapFile(path)) as container:
+            return sum(channel.count for channel in container.channels if channel.msgtype == POINT_CLOUD)
+    except SourceError:  # nothing is written yet
+        return 0
+
+
+def test_a_paused_run_is_recorded(sending, tmp_path: Path):
+    with stage() as on:
+        on.commands.put(Open(URI, record=str(tmp_path / "run.mcap")))
+        until(lambda: on.links)
+        link = on.links[0]
+        announce(link, sending)
+        until(lambda: link.channels)
+        sending(link, 0, 11)
+        until(on.opened)
+        on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
+        until(lambda: on.shown and on.shown[-1] == 10)
+        on.commands.put(Pause())
+        until(lambda: on.status.state == "paused")
+        for _ in range(3):
+            sending(link, 11, SCANS)
+        until(lambda: recorded_scans(tmp_path / "run.mcap") == 11 + 3 * (SCANS - 11))  # while it is paused
+        assert on.shown[-1] == 10
+    assert recorded_scans(tmp_path / "run.mcap") == 11 + 3 * (SCANS - 11)
+
+
+def test_what_arrives_while_kernels_compile_is_recorded_and_reported(sending, tmp_path: Path):
+    with stage() as on:
+        on.compiled.clear()
+        on.commands.put(Open(URI, record=str(tmp_path / "run.mcap")))
+        until(lambda: on.links)
+        link = on.links[0]
+        announce(link, sending)
+        until(lambda: link.channels)
+        for _ in range(2):
+            sending(link, 0, SCANS)
+        until(lambda: recorded_scans(tmp_path / "run.mcap") == 2 * SCANS)
+        on.compiled.set()
+        until(on.opened)
+        until(lambda: any("10 scans arrived before mapping was ready" in w for w in on.status.warnings))
+        assert not any("skipped" in reason for reason in on.status.warnings)
 
 
 def test_another_run_leaves_a_robot_that_was_never_heard():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from app.robot.address import VelodyneAddress, ZenohAddress, is_live, parse_address
 from app.robot.choosing import choose
-from app.robot.inbox import DROPPED, MOST_BYTES, MOST_SCANS, Inbox
+from app.robot.inbox import MAX_BYTES, MAX_SCANS, SKIPPED, Inbox
 from app.robot.ros_graph import Publisher, RosGraph, data_key, publisher_of
 from app.robot.zenoh_link import ZenohLink
 from pipeline.errors import SourceError
@@ -203,15 +203,15 @@ def message(number: int, size: int = 10) -> Message:
 
 def test_the_oldest_scans_fall_out_and_are_counted():
     inbox = Inbox()
-    for k in range(MOST_SCANS + 7):
+    for k in range(MAX_SCANS + 7):
         inbox.put(message(k), is_scan=True)
         inbox.put(message(1000 + k), is_scan=False)
-    assert inbox.losses == {DROPPED: 7}
+    assert inbox.losses == {SKIPPED: 7}
     taken = []
     while (found := inbox.take()) is not None:
         taken.append(found.channel)
-    assert [k for k in taken if k < 1000] == list(range(7, MOST_SCANS + 7))
-    assert [k for k in taken if k >= 1000] == [1000 + k for k in range(MOST_SCANS + 7)]
+    assert [k for k in taken if k < 1000] == list(range(7, MAX_SCANS + 7))
+    assert [k for k in taken if k >= 1000] == [1000 + k for k in range(MAX_SCANS + 7)]
 
 
 def test_messages_come_out_in_the_order_in_which_they_came():
@@ -228,6 +228,6 @@ def test_messages_come_out_in_the_order_in_which_they_came():
 def test_large_messages_do_not_fill_the_memory():
     inbox = Inbox()
     for k in range(5):
-        inbox.put(message(k, MOST_BYTES // 3), is_scan=True)
-    assert inbox.losses == {DROPPED: 2}
+        inbox.put(message(k, MAX_BYTES // 3), is_scan=True)
+    assert inbox.losses == {SKIPPED: 2}
     assert inbox.scans_waiting == 3

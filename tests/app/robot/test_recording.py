@@ -17,9 +17,10 @@ from mcap.reader import make_reader
 from app.batch.map_run import OfflineRun, map_run
 from app.cli import main
 from app.cli.live_commands import begin_recording, told_of_frames
-from app.robot import recording as recording_module
+from app.robot import recorder as recorder_module
 from app.robot.address import parse_address
-from app.robot.recording import RawFile, Recording
+from app.robot.inbox import SKIPPED
+from app.robot.recorder import NOT_RECORDED, RawFile, Recorder
 from app.robot.source import LiveSource
 from app.worker.replaying import recorded_parameters
 from pipeline.config import Parameters
@@ -32,7 +33,7 @@ from pipeline.io.readers.ros_messages import POINT_CLOUD
 from pipeline.io.recording import write_recording
 from pipeline.io.recording.recovery import mend
 from pipeline.types.records import Scan
-from tests.app.robot.conftest import Child
+from tests.app.robot.conftest import Child, until
 from tests.app.robot.test_live_session import FakeLink, announce
 
 MAP_FILES = ("trees.csv", "path.csv", "detections.csv", "trees.geojson", "terrain.csv")
@@ -62,7 +63,8 @@ def stand(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Heard:
     """A live source that gets the messages of a file, some of them in another order or late."""
 
-    def __init__(self, run: Path, recording: Recording | None) -> None:
+    def __init__(self, run: Path, recording: Recorder | None, take_every: int = 1) -> None:
+        self._take_every = take_every
         with closing(McapFile(run)) as container:
             self.topics: list[Channel] = container.channels
             kinds = {c.number: c for c in self.topics}
@@ -70,7 +72,7 @@ class Heard:
         self._kinds = kinds
         self.links: list[FakeLink] = []
         self.source = LiveSource(parse_address("zenoh:tcp/robot:7447"), SourceOptions(), self._link)
-        self.source.use(recording, publish=False)
+        self.source.start(recording)
 
     def _link(self, address: Any, inbox: Any) -> FakeLink:
         self.links.append(FakeLink(address, inbox))
@@ -94,7 +96,8 @@ class Heard:
                 Message(numbers[channel.topic], stamp_ns, message.payload),
                 is_scan=channel.msgtype == POINT_CLOUD,
             )
-            yield from self.source.take()
+            if arrival % self._take_every == 0:
+                yield from self.source.take()
         yield from self.source._reader.finish() if self.source._reader else ()
 
 
@@ -130,7 +133,7 @@ def map_files(source: Source, out: Path, **plan: Any) -> dict[str, bytes]:
 def test_the_replay_gives_the_map_of_the_live_run_byte_for_byte(
     stand: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
-    recording = Recording(tmp_path / "live.mcap")
+    recording = Recorder(tmp_path / "live.mcap")
     heard = Heard(stand, recording)
     played = Played(heard)
     begin_recording(heard.source, TUNED)
@@ -155,7 +158,7 @@ def test_the_replay_gives_the_map_of_the_live_run_byte_for_byte(
 
 
 def test_a_recording_is_read_again_from_any_time(stand: Path, tmp_path: Path):
-    recording = Recording(tmp_path / "live.mcap")
+    recording = Recorder(tmp_path / "live.mcap")
     heard = Heard(stand, recording)
     for _ in heard.records():
         pass
@@ -167,7 +170,7 @@ def test_a_recording_is_read_again_from_any_time(stand: Path, tmp_path: Path):
 
 
 def test_other_programs_read_the_recording(stand: Path, tmp_path: Path):
-    recording = Recording(tmp_path / "live.mcap")
+    recording = Recorder(tmp_path / "live.mcap")
     heard = Heard(stand, recording)
     played = Played(heard)
     map_files(played, tmp_path / "a", on_frame=told_of_frames(heard.source))
@@ -190,6 +193,51 @@ def test_other_programs_read_the_recording(stand: Path, tmp_path: Path):
     assert topics["/robot1/stemmap/trees"] >= 1
 
 
+def count_messages(path: Path) -> dict[str, int]:
+    with closing(McapFile(path)) as container:
+        return {channel.topic: channel.count for channel in container.channels}
+
+
+def test_a_mapper_five_times_slower_than_the_robot_loses_nothing_in_the_recording(
+    stand: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("app.robot.inbox.MAX_SCANS", 3)
+    recording = Recorder(tmp_path / "live.mcap")
+    heard = Heard(stand, recording, take_every=5)
+    played = Played(heard)
+    begin_recording(heard.source, TUNED)
+    live = map_files(played, tmp_path / "a", parameters=TUNED, on_frame=told_of_frames(heard.source))
+    losses = heard.source.losses
+    played.close()
+    sent, kept = count_messages(stand), count_messages(recording.path)
+    assert {topic: kept[topic] for topic in sent} == sent
+    assert 5 < losses[SKIPPED] < 20
+    with closing(open_source(str(recording.path), SourceOptions(as_live=True))) as replay:
+        ((_, parameters),) = recorded_parameters(replay.description)
+        assert map_files(replay, tmp_path / "b", parameters=parameters) == live
+        assert replay.description.scans == 20 - losses[SKIPPED] - heard.source.scans_waiting
+    with closing(open_source(str(recording.path))) as whole:
+        assert sum(isinstance(record, Scan) for record in whole.records()) == 20
+        assert any("--as-live" in warning for warning in whole.description.warnings)
+    main(["map", str(recording.path), "--as-live", "--out", str(tmp_path / "c")])
+    assert {name: (tmp_path / "c" / name).read_bytes() for name in MAP_FILES} == live
+    assert '"as_live": true' in (tmp_path / "c" / "run.json").read_text()
+    main(["map", str(recording.path), "--out", str(tmp_path / "d")])
+    assert "of the 20 recorded scans" in capfd.readouterr().err
+    assert (tmp_path / "d" / "path.csv").read_text().count("\n") == 21
+
+
+def test_a_queue_that_is_full_is_counted_and_reported(stand: Path, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
+    recording = Recorder(tmp_path / "live.mcap")
+    heard = Heard(stand, recording)
+    assert sum(isinstance(record, Scan) for record in heard.records()) == 20
+    assert heard.source.losses[NOT_RECORDED] >= 20
+    assert "messages missing because the disk is too slow" in heard.source.recording
+    heard.source.close()
+    assert count_messages(recording.path)["/velodyne_points"] == 0
+
+
 class FullDisk(RawFile):
     """Has room for so many bytes."""
 
@@ -203,34 +251,28 @@ class FullDisk(RawFile):
 
 
 def test_a_full_disk_ends_the_recording_and_not_the_map(stand: Path, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(recording_module, "RawFile", FullDisk)
-    recording = Recording(tmp_path / "live.mcap")
+    monkeypatch.setattr(recorder_module, "RawFile", FullDisk)
+    recording = Recorder(tmp_path / "live.mcap")
     heard = Heard(stand, recording)
-    scans, told_at = 0, None
-    for record in heard.records():
-        scans += isinstance(record, Scan)
-        if heard.source.recording.startswith("not recording") and told_at is None:
-            told_at = scans
-    assert scans == 20
-    assert told_at is not None
-    assert told_at < 20
+    assert sum(isinstance(record, Scan) for record in heard.records()) == 20
+    until(lambda: heard.source.recording.startswith("not recording"))
     assert "No space left on device" in heard.source.recording
     heard.source.close()
     found = mend(recording.path, tmp_path / "mended.mcap")
     assert found.losses
     with closing(open_source(str(tmp_path / "mended.mcap"))) as mended:
-        assert 0 < sum(isinstance(record, Scan) for record in mended.records()) <= told_at + 10
+        assert 0 < sum(isinstance(record, Scan) for record in mended.records()) < 20
 
 
 def test_a_recording_never_overwrites_another(tmp_path: Path):
     (tmp_path / "live.mcap").write_bytes(b"precious")
-    recording = Recording(tmp_path / "live.mcap")
+    recording = Recorder(tmp_path / "live.mcap")
     assert recording.path == tmp_path / "live-2.mcap"
     recording.close()
     assert not recording.path.exists(), "nothing was heard, so nothing is left"
     assert (tmp_path / "live.mcap").read_bytes() == b"precious"
     with pytest.raises(SourceError, match="cannot record"):
-        Recording(tmp_path / "live.mcap" / "below.mcap")
+        Recorder(tmp_path / "live.mcap" / "below.mcap")
 
 
 def messages_of(path: Path) -> list[tuple[int, bytes]]:

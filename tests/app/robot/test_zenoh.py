@@ -83,7 +83,7 @@ def test_others_hear_the_pose_and_the_trees(router: int, robots: Callable[[str],
     robot = robots("red")
     near = Clearance(Zone.SLOW, 1.75, 0.0, 2.15, 0.0, within=3.0)
     with closing(open_live(f"zenoh:tcp/127.0.0.1:{router}")) as source:
-        source.use(None, publish=True)
+        source.start(publish=True)
         until(lambda: subscribed(source))
         listener = Child("tests/app/robot/listener.py", str(router), "red")
         assert json.loads(listener.hear()) == {"ready": True}

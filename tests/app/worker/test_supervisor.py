@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -182,6 +183,18 @@ async def test_closing_ends_it_even_when_it_hangs(both: tuple[WorkerProcess, Sai
     await worker.close()
     assert not is_running(pid)
     assert worker.pid is None
+
+
+async def test_a_live_run_has_time_to_finish_its_recording(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("app.worker.supervisor._GRACE_S", 0.1)
+    slow = "import sys, time, pathlib; sys.stdin.read(); time.sleep(1); pathlib.Path(sys.argv[1]).touch()"
+    worker = WorkerProcess(Said(), (sys.executable, "-c", slow, str(tmp_path / "finished")))
+    await worker.start()
+    await worker.send(Open("zenoh:tcp/127.0.0.1:1"))
+    await worker.close()
+    assert (tmp_path / "finished").exists()
 
 
 async def test_it_does_not_outlive_the_web_process() -> None:
