@@ -228,6 +228,7 @@ def test_what_arrives_while_kernels_compile_is_recorded_and_reported(sending, tm
         until(lambda: recorded_scans(tmp_path / "run.mcap") == 2 * SCANS)
         on.compiled.set()
         until(on.opened)
+        on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
         until(lambda: any("10 scans arrived before mapping was ready" in w for w in on.status.warnings))
         assert not any("skipped" in reason for reason in on.status.warnings)
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from app.robot.address import VelodyneAddress, ZenohAddress, is_live, parse_address
 from app.robot.choosing import choose
-from app.robot.inbox import MAX_BYTES, MAX_SCANS, SKIPPED, Inbox
+from app.robot.inbox import MAX_BYTES, MAX_OTHERS, MAX_SCANS, SKIPPED, Inbox
 from app.robot.ros_graph import Publisher, RosGraph, data_key, publisher_of
 from app.robot.zenoh_link import ZenohLink
 from pipeline.errors import SourceError
@@ -203,6 +203,7 @@ def message(number: int, size: int = 10) -> Message:
 
 def test_the_oldest_scans_fall_out_and_are_counted():
     inbox = Inbox()
+    assert inbox.take() is None
     for k in range(MAX_SCANS + 7):
         inbox.put(message(k), is_scan=True)
         inbox.put(message(1000 + k), is_scan=False)
@@ -212,6 +213,15 @@ def test_the_oldest_scans_fall_out_and_are_counted():
         taken.append(found.channel)
     assert [k for k in taken if k < 1000] == list(range(7, MAX_SCANS + 7))
     assert [k for k in taken if k >= 1000] == [1000 + k for k in range(MAX_SCANS + 7)]
+
+
+def test_fixed_transforms_outlast_a_long_wait():
+    inbox = Inbox()
+    inbox.begin(None, [7])
+    inbox.put(message(7), is_scan=False)
+    for _ in range(MAX_OTHERS + 1):
+        inbox.put(message(1), is_scan=False)
+    assert inbox.take() == message(7)
 
 
 def test_messages_come_out_in_the_order_in_which_they_came():
@@ -227,6 +237,7 @@ def test_messages_come_out_in_the_order_in_which_they_came():
 
 def test_large_messages_do_not_fill_the_memory():
     inbox = Inbox()
+    assert inbox.take() is None
     for k in range(5):
         inbox.put(message(k, MAX_BYTES // 3), is_scan=True)
     assert inbox.losses == {SKIPPED: 2}
