@@ -1,8 +1,8 @@
-"""GNSS fixes (sensor_msgs/NavSatFix) as measured poses in the frame of the map.
+"""GNSS fixes (sensor_msgs/NavSatFix) as pose measurements in the map frame.
 
-Fixes are laid into a plane that touches the Earth at the first one (azimuthal equidistant, metres). How
-that plane lies in the frame of the map nobody tells: it is found once, from the first stretch of the way,
-where odometry and fixes must agree (a rigid motion in the plane, least squares), and held from then on.
+Fixes are projected to a plane that touches the Earth at the first fix (azimuthal equidistant, metres). The
+pose
+of that plane in the map is fitted once to the odometry of the first stretch of the drive, and then fixed.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.io.readers.rigid_alignment import Laid, lay_over
+from pipeline.io.readers.rigid_alignment import RigidFit, fit_rigid
 from pipeline.types.records import PoseMeasurement
 
-#: The plane is found from this much of the way on, and from no more than that [m].
+#: Shortest and longest stretch of the drive from which the plane is fitted [m].
 SHORTEST, LONGEST = 10.0, 100.0
-#: Of fixes that do not say how good they are [m]; and no receiver on a robot is better than the second.
+#: Standard deviation of fixes without a covariance, and the smallest one that is believed [m].
 UNKNOWN_SIGMA, BEST_SIGMA = 3.0, 0.05
-#: Says nothing of the heading [rad^2].
+#: Variance of a heading that is not measured [rad^2].
 NO_HEADING = 1e4
-#: The number of its shared errors, see PoseMeasurement.
+#: Number of the shared errors of fixes, see PoseMeasurement.
 SOURCE = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """Where a receiver says it is.
+    """A position by GNSS.
 
     Attributes:
-        stamp_ns: When.
+        stamp_ns: Time.
         latitude, longitude: WGS84 [deg].
-        sigma: Of each of the two in the plane [m].
+        sigma: Standard deviation of each horizontal coordinate [m].
     """
 
     stamp_ns: int
@@ -46,29 +46,30 @@ class Fix:
     def of(
         cls, stamp_ns: int, latitude: float, longitude: float, covariance: Sequence[float], kind: int
     ) -> Fix:
-        """A fix by the numbers of its message; `kind` 0, or variances of zero (many drivers fill in
-        none), say that the covariance is not known.
+        """Make a fix of the fields of its message.
+
+        The covariance is unknown when `kind` is 0, or when its variances are zero, as many drivers send it.
 
         Raises:
-            ValueError: They are no place on Earth, or their covariance is none.
+            ValueError: The position is not on Earth, or the covariance is invalid.
         """
         if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
-            raise ValueError("no place on Earth")
+            raise ValueError("a position is not on Earth")
         sigma = UNKNOWN_SIGMA
         if kind != 0:
             variance = 0.5 * (float(covariance[0]) + float(covariance[4]))
             if not 0.0 <= variance < 1e8:
-                raise ValueError("no covariance")
+                raise ValueError("a covariance is negative or not finite")
             if variance > 0.0:
                 sigma = max(math.sqrt(variance), BEST_SIGMA)
         return cls(stamp_ns, latitude, longitude, sigma)
 
 
 class Plane:
-    """East and north of a first fix [m].
+    """Projection to east and north of an origin [m].
 
     Args:
-        latitude, longitude: Of the origin [deg].
+        latitude, longitude: The origin [deg].
     """
 
     def __init__(self, latitude: float, longitude: float) -> None:
@@ -78,73 +79,75 @@ class Plane:
         self._transform = Transformer.from_crs("EPSG:4326", local, always_xy=True).transform
 
     def place(self, fix: Fix) -> tuple[float, float]:
-        """East and north of the origin [m]; far away where it is no neighbour of it."""
+        """Return east and north of the origin [m]."""
         east, north = self._transform(fix.longitude, fix.latitude)
         return float(east), float(north)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Alignment:
-    """How the plane lies in the frame of the map.
+class GnssFrame:
+    """Pose of the GNSS plane in the map frame.
 
     Attributes:
-        plane: East, north.
-        laid: How it lies.
-        lever: How far the antenna stands from the base [m]; counts as error.
+        plane: Projection of fixes.
+        fit: Pose of the plane in the map.
+        lever: Distance of the antenna from the base [m]; it counts as an error.
     """
 
     plane: Plane
-    laid: Laid
+    fit: RigidFit
     lever: float
 
     @property
     def yaw_sigma(self) -> float:
-        """Of the direction of north [rad]."""
-        return self.laid.yaw_sigma
+        """Standard deviation of the direction of north [rad]."""
+        return self.fit.yaw_sigma
 
     @property
-    def words(self) -> str:
-        """For people."""
+    def summary(self) -> str:
+        """Summary for the user."""
         return (
-            f"fixes are used; laid over {self.laid.length:.0f} m of the way they lie "
-            f"{self.laid.residual:.2f} m from it (RMS), north is known to "
+            f"fixes are used; over {self.fit.length:.0f} m of the drive their distance from the path by "
+            f"odometry is {self.fit.residual:.2f} m (RMS), and north is known to "
             f"{math.degrees(self.yaw_sigma):.1f} degrees"
         )
 
-    def measured(self, fix: Fix) -> PoseMeasurement:
-        """The pose that a fix tells, with what it and the plane are uncertain of."""
-        T = self.laid.T_map_theirs
+    def measurement(self, fix: Fix) -> PoseMeasurement:
+        """Return the position of the base in the map, with the errors of the fix and of the plane."""
+        T = self.fit.T_map_other
         c, s = math.cos(T.yaw), math.sin(T.yaw)
         east, north = self.plane.place(fix)
         x = T.x + c * east - s * north
         y = T.y + s * east + c * north
-        # The lever errs alike as long as the robot drives straight on, and otherwise after a turn.
-        shared = self.laid.shared(x, y, math.hypot(self.laid.sigma, self.lever), self.yaw_sigma)
-        own = fix.sigma**2 * max(self.laid.rate_hz, 1.0) + self.lever**2
+        # The error by the lever is shared while the robot drives straight on, and changes in turns.
+        shared = self.fit.shared(x, y, math.hypot(self.fit.sigma, self.lever), self.yaw_sigma)
+        own = fix.sigma**2 * max(self.fit.rate_hz, 1.0) + self.lever**2
         C = np.diag([own, own, NO_HEADING]) + shared @ shared.T
         return PoseMeasurement(fix.stamp_ns, Pose2(x, y, 0.0), C, shared=shared, source=SOURCE)
 
 
-def align(
-    fixes: Sequence[Fix], stamp_ns: Sequence[int], way: Float, lever: float = 0.0
-) -> tuple[Alignment | None, str]:
-    """Find how the fixes' plane lies in the map.
+def align_fixes(
+    fixes: Sequence[Fix], stamp_ns: Sequence[int], path: Float, lever: float = 0.0
+) -> tuple[GnssFrame | None, str]:
+    """Fit the pose of the GNSS plane in the map.
 
     Args:
         fixes: In the order of time.
-        stamp_ns: Of the odometry, ascending, shape (N,).
-        way: Where it says the base was, in the frame of the map [m], shape (N, 2) or with more columns.
-        lever: See Alignment.
+        stamp_ns: Times of the odometry, ascending, shape (N,).
+        path: Positions of the base by odometry in the map frame [m], shape (N, 2) or with more columns.
+        lever: Distance of the antenna from the base [m].
 
     Returns:
-        The alignment, or None and why there is none.
+        The frame, or None and the reason why there is none.
     """
     if not fixes:
         return None, "0 fixes are too few"
     plane = Plane(fixes[0].latitude, fixes[0].longitude)
-    seen = np.array([plane.place(fix) for fix in fixes])
+    positions = np.array([plane.place(fix) for fix in fixes])
     at_ns = np.array([fix.stamp_ns for fix in fixes], dtype=np.int64)
     sigma = np.array([fix.sigma for fix in fixes])
-    names = ("fixes", "the direction of north")
-    laid, why = lay_over(at_ns, seen, sigma, stamp_ns, way[:, :2], shortest=SHORTEST, names=names)
-    return (None if laid is None else Alignment(plane, laid, lever)), why
+    fit, why = fit_rigid(
+        at_ns, positions, sigma, stamp_ns, path[:, :2],
+        shortest=SHORTEST, what="fixes", unknown="the direction of north",
+    )  # fmt: skip
+    return (None if fit is None else GnssFrame(plane, fit, lever)), why

@@ -16,7 +16,7 @@ from pipeline.io.readers import ros_messages
 from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture, RecordedPictures, find_camera
 from pipeline.io.readers.container import Channel, Container, Message, plain_message
-from pipeline.io.readers.measured_poses import MeasuredPoses
+from pipeline.io.readers.frame_alignment import FrameAlignments
 from pipeline.io.readers.message_time import WINDOW_NS, Clock, Stamped, by_stamp, header_stamp
 from pipeline.io.readers.ros_messages import LASER_SCAN, MessageDecoder
 from pipeline.io.readers.ros_records import RecordDecoder
@@ -81,9 +81,9 @@ class RosSource:
         self._description = replace(self._description, digest=digest_of(paths))
         self._records.poses = frozenset() if self._topics.pose is None else self._topics.pose.numbers
         odometry = self._moving if self._topics.odometry is None else self._topics.odometry.numbers
-        self._measured = MeasuredPoses(container, self._records, self._topics, odometry, self._times_of)
-        self._description = self._measured.begin(self._description, live=live)
-        self.notices = self._measured.notices
+        self._alignments = FrameAlignments(container, self._records, self._topics, odometry, self._times_of)
+        self._description = self._alignments.begin(self._description, live=live)
+        self.notices = self._alignments.notices
 
     @property
     def description(self) -> SourceDescription:
@@ -110,9 +110,9 @@ class RosSource:
     ) -> Iterator[Record]:
         """The records that one message gives, whenever it came, unless they lie before a time; what cannot be
         used is counted."""
-        if message.channel in self._wanted or message.channel in self._measured.numbers:
+        if message.channel in self._wanted or message.channel in self._alignments.numbers:
             for stamped in self._times_of(message, losses):
-                self._measured.add(stamped)
+                self._alignments.add(stamped)
                 if from_ns is None or stamped.stamp_ns >= from_ns:
                     yield from self._decoded(stamped, losses)
 
@@ -170,7 +170,7 @@ class RosSource:
     ) -> Iterator[Stamped[Message | Odometry]]:
         """The messages that are read, with their time, in the order of writing."""
         log_start = None if start_ns is None else start_ns - self._clock.offset_ns - WINDOW_NS
-        wanted = self._wanted | self._measured.numbers
+        wanted = self._wanted | self._alignments.numbers
         for message in self._container.messages(wanted, log_start, losses):
             for arrival in self._times_of(message, losses):
                 if start_ns is None or arrival.stamp_ns >= start_ns:

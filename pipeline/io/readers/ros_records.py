@@ -12,9 +12,9 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import ros_messages
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.gnss import Alignment, Fix
+from pipeline.io.readers.gnss import Fix, GnssFrame
 from pipeline.io.readers.message_time import SECOND_NS
-from pipeline.io.readers.other_slam import NoPoseError, Placed, Relation
+from pipeline.io.readers.other_slam import NoPoseError, OtherFrame, OtherPose
 from pipeline.io.readers.ros_messages import (
     IMU,
     LASER_SCAN,
@@ -156,16 +156,16 @@ class RecordDecoder:
 
     Attributes:
         base: Name of the base frame, "" when there is none.
-        alignment: How GNSS fixes lie in the map, None when that is not known: they are not used then.
-        relation: Likewise of the poses of another SLAM; poses: numbers of their channels.
+        frames: Frames of pose measurements by role: "gnss" (GnssFrame), "pose" (OtherFrame). Readings in a
+            frame that is not known are not used.
+        poses: Numbers of the channels with poses of another SLAM.
     """
 
     def __init__(self, channels: Mapping[int, Channel], decoder: MessageDecoder, tree: TransformTree) -> None:
         self._channels, self._decoder, self._tree = channels, decoder, tree
         self._packets = PacketDecoder()
         self.base = ""
-        self.alignment: Alignment | None = None
-        self.relation: Relation | None = None
+        self.frames: dict[str, GnssFrame | OtherFrame] = {}
         self.poses = frozenset[int]()
 
     def record(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
@@ -175,13 +175,13 @@ class RecordDecoder:
             # Damaged numbers may be of any size; what comes of them is looked at afterwards.
             with np.errstate(all="ignore"):
                 if message.channel in self.poses:
-                    return self._placed(message, stamp_ns, losses)
+                    return self._other_measurement(message, stamp_ns, losses)
                 if channel.msgtype == ODOMETRY:
                     return self._odometry(message, stamp_ns)
                 if channel.msgtype == IMU:
                     return self._imu(message, stamp_ns)
                 if channel.msgtype == NAV_SAT_FIX:
-                    return self._measured(message, stamp_ns, losses)
+                    return self._gnss_measurement(message, stamp_ns, losses)
                 scan = self.scan(message, stamp_ns, losses)[0]
         except Exception:  # the one place that catches what the generated decoders of rosbags raise
             named = _NAMES.get(channel.msgtype, "scans")
@@ -238,11 +238,11 @@ class RecordDecoder:
         kind = int(decoded.position_covariance_type)
         return Fix.of(stamp_ns, float(decoded.latitude), float(decoded.longitude), covariance, kind), frame
 
-    def placed(self, message: Message, stamp_ns: int) -> tuple[Placed, str]:
-        """A pose of another SLAM, and the name of its frame.
+    def other_pose(self, message: Message, stamp_ns: int) -> tuple[OtherPose, str]:
+        """Decode a pose of another SLAM; return it and the name of its frame.
 
         Raises:
-            NoPoseError: Its covariance is none.
+            NoPoseError: Its covariance is invalid.
             Exception: Of many kinds, when the message is damaged.
         """
         decoded = cast(ros_messages.Odometry, self.message(message))  # the other type has the same parts
@@ -251,28 +251,30 @@ class RecordDecoder:
         linked = self._tree.find(child, self.base) if child and child != self.base else None
         pose, covariance = decoded.pose.pose, decoded.pose.covariance
         at = pose_of(pose.position, pose.orientation)
-        return Placed.of(stamp_ns, at, [float(number) for number in covariance], linked), frame
+        return OtherPose.of(stamp_ns, at, [float(number) for number in covariance], linked), frame
 
     def place_of(self, frame: str) -> Pose3 | None:
         """Where a frame stands on the robot, None when no fixed transform says it."""
         return self._tree.find(self.base, frame)
 
-    def _measured(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
-        if self.alignment is None:
+    def _gnss_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
+        frame = self.frames.get("gnss")
+        if not isinstance(frame, GnssFrame):
             return None
         fix, _ = self.fix(message, stamp_ns)
         if fix is None:
             count_loss(losses, "GNSS messages without a fix")
             return None
-        return self.alignment.measured(fix)
+        return frame.measurement(fix)
 
-    def _placed(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
+    def _other_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
         try:
-            placed, _ = self.placed(message, stamp_ns)
+            pose, _ = self.other_pose(message, stamp_ns)
         except NoPoseError as error:
             count_loss(losses, f"poses of another SLAM: {error}")
             return None
-        return None if self.relation is None else self.relation.measured(placed)
+        frame = self.frames.get("pose")
+        return frame.measurement(pose) if isinstance(frame, OtherFrame) else None
 
     def _odometry(self, message: Message, stamp_ns: int) -> Odometry:
         pose = cast(ros_messages.Odometry, self.message(message)).pose.pose

@@ -15,7 +15,7 @@ from pyproj import Geod
 from app.cli import main
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers import SourceOptions
-from pipeline.io.readers.gnss import BEST_SIGMA, UNKNOWN_SIGMA, Fix, align
+from pipeline.io.readers.gnss import BEST_SIGMA, UNKNOWN_SIGMA, Fix, align_fixes
 from pipeline.types.records import PoseMeasurement, Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, STEP_NS, Author, Write, points_of, write_recording
@@ -96,13 +96,13 @@ def test_fixes_are_poses_in_the_frame_of_the_map(kind: str, tmp_path: Path, open
         assert pose.T_map_base.y == pytest.approx(0.0, abs=0.5)
         assert SIGMA**2 < pose.covariance[0, 0] < 1.0
     assert source.losses == {"GNSS messages without a fix": 1}
-    assert "laid over 37 m of the way" in source.description.gnss
+    assert "over 37 m of the drive" in source.description.gnss
 
 
 @pytest.mark.parametrize(
     ("fill", "why"),
     [
-        (lambda author, write: straight(author, write, metres=3.0), "too little to tell the direction"),
+        (lambda author, write: straight(author, write, metres=3.0), "too little to determine the direction"),
         (lambda author, write: straight(author, write, odometry=False), "without odometry"),
     ],
 )
@@ -132,14 +132,14 @@ def test_any_plane_is_found_again(yaw: float, latitude: float, longitude: float,
             longitude, latitude, np.degrees(np.arctan2(east, north)), np.hypot(east, north)
         )
         fixes.append(Fix.of(stamp_ns, lat, lon, [0.01, 0, 0, 0, 0.01, 0, 0, 0, 1], 2))
-    found, why = align(fixes, stamps, way)
+    found, why = align_fixes(fixes, stamps, way)
     if np.hypot(*np.ptp(way, axis=0)) < 10.0:
         assert found is None
         return
     assert found is not None, why
-    assert found.laid.residual < 0.02
+    assert found.fit.residual < 0.02
     for wanted, fix_ in zip(way, fixes, strict=True):
-        pose = found.measured(fix_).T_map_base
+        pose = found.measurement(fix_).T_map_base
         assert isinstance(pose, Pose2)
         assert np.hypot(pose.x - wanted[0], pose.y - wanted[1]) < 0.05
 

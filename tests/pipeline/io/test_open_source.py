@@ -72,5 +72,5 @@ def test_recordings_beside_scans_are_said_to_be_left_aside(tmp_path: Path, opene
     assert opened(tmp_path).description.warnings == ()
     (tmp_path / "run.bag").touch()
     assert opened(tmp_path).description.warnings == (
-        "not part of this run are run.bag: open each by its name",
+        "not part of this run are run.bag: open each of them by its name",
     )

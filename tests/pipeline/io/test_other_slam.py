@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers import SourceOptions
-from pipeline.io.readers.other_slam import GATE, NoPoseError, Placed, relate
+from pipeline.io.readers.other_slam import GATE, NoPoseError, OtherPose, align_poses
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import FastSlam, Motion
 from pipeline.slam.motion import noise_of
@@ -48,13 +48,15 @@ def test_any_frame_is_found_again(x: float, y: float, yaw: float, seed: int):
     for stamp_ns, pose in zip(stamps, way, strict=True):
         at = T_theirs_map @ pose
         told = Pose3.from_euler(np.array([at.x, at.y, 3.0]), 0.0, 0.0, at.yaw)
-        placed.append(Placed.of(stamp_ns, told, covariance()))
-    found, why = relate(placed, stamps, np.array([pose.as_array() for pose in way]))
+        placed.append(OtherPose.of(stamp_ns, told, covariance()))
+    found, why = align_poses(placed, stamps, np.array([pose.as_array() for pose in way]))
     assert found is not None, why
-    assert found.measured(placed[3]) is None, "it counts when the stretch is over"
+    assert found.measurement(placed[3]) is None, "it counts when the stretch is over"
     at = T_theirs_map @ Pose2(30.0, 4.0, 0.3)
-    later = Placed.of(10**11, Pose3.from_euler(np.array([at.x, at.y, 0.0]), 0.0, 0.0, at.yaw), covariance())
-    measured = found.measured(later)
+    later = OtherPose.of(
+        10**11, Pose3.from_euler(np.array([at.x, at.y, 0.0]), 0.0, 0.0, at.yaw), covariance()
+    )
+    measured = found.measurement(later)
     assert measured is not None
     assert measured.is_sound()
     np.testing.assert_allclose(measured.T_map_base.as_array(), [30.0, 4.0, 0.3], atol=1e-6)
@@ -66,7 +68,7 @@ def test_a_covariance_that_is_none_is_refused(entry: float):
         C = np.array(covariance()).reshape(6, 6)
         C[row, row] = entry
         with pytest.raises(NoPoseError):
-            Placed.of(0, Pose3.identity(), C.ravel().tolist())
+            OtherPose.of(0, Pose3.identity(), C.ravel().tolist())
 
 
 def drive(author: Author, write: Write, *, frame: str = "map", jump: float = 0.0) -> None:
