@@ -22,8 +22,8 @@ from app.cli.choices import (
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
-    from app.tuning.sweep.asking import Plan, Ready
-    from app.tuning.sweep.comparing import Comparison
+    from app.tuning.sweep.comparison import Comparison
+    from app.tuning.sweep.jobs import PreparedRun, SweepPlan
     from app.tuning.sweep.sweep import Outcome
     from app.tuning.sweep.workers import Workers
     from pipeline.config import Parameters
@@ -111,28 +111,33 @@ def run_grid(arguments: argparse.Namespace) -> int:
     if not runs:
         return 1
 
-    from app.tuning.sweep.asking import planned
-    from app.tuning.sweep.comparing import compared
+    from app.tuning.sweep.comparison import compare_answers
+    from app.tuning.sweep.jobs import plan_jobs
 
-    plan = planned(runs, sets, lambda run, changes: _base(arguments, run, changes))
+    plan = plan_jobs(runs, sets, lambda run, changes: _base(arguments, run, changes))
     numbers = list(plan.jobs)
     outcome = _swept(arguments, plan)
-    comparison = compared(plan, dict(zip(numbers, outcome.answers, strict=True)))
+    comparison = compare_answers(plan, dict(zip(numbers, outcome.answers, strict=True)))
     return _tell(arguments, comparison, outcome, refused=refused)
 
 
-def _ready(arguments: argparse.Namespace) -> tuple[list[Ready], int]:
+def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
     """The runs that can be mapped and judged; the others are said."""
-    from app.tuning.sweep.asking import Named, ready
+    from app.sources.request import SourceRequest, mount_of_degrees
+    from app.tuning.sweep.jobs import prepare_run
 
     runs, refused = [], 0
     for number, name in enumerate(arguments.runs):
         try:
             truth = _truth(arguments, number)
-            topics = dict(arguments.topics)
-            runs.append(
-                ready(Named(name, arguments.seed, arguments.odometry, topics, arguments.mount or (), truth))
+            source = SourceRequest(
+                name,
+                arguments.odometry,
+                arguments.seed,
+                dict(arguments.topics),
+                mount_of_degrees(arguments.mount),
             )
+            runs.append(prepare_run(source, truth))
         except StemmapError as error:
             print(f"stemmap: left out: {plain(str(error))}", file=sys.stderr)
             refused += 1
@@ -148,7 +153,7 @@ def _truth(arguments: argparse.Namespace, number: int) -> TruthTrees | None:
     return read_truth_trees(file, dbh_unit=arguments.dbh_unit)
 
 
-def _base(arguments: argparse.Namespace, run: Ready, changes: dict[str, Value]) -> Parameters:
+def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Value]) -> Parameters:
     """What a set is laid over: the preset of the set or that which suits the run, and the flags."""
     from app.tuning.sweep.grid import PRESET
     from pipeline.config import preset
@@ -158,12 +163,11 @@ def _base(arguments: argparse.Namespace, run: Ready, changes: dict[str, Value]) 
     return chosen_parameters(arguments, suits, present)[1]
 
 
-def _swept(arguments: argparse.Namespace, plan: Plan) -> Outcome:
+def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> Outcome:
     from tqdm import tqdm
 
     from app.common.settings import from_environment
-    from app.tuning.sweep.kept_answers import KeptAnswers
-    from app.tuning.sweep.sweep import sweep
+    from app.tuning.sweep.sweep import KeptAnswers, sweep
 
     folder = from_environment().folder
     kept = KeptAnswers(arguments.keep or (folder and folder / "results"))
@@ -178,12 +182,10 @@ def _swept(arguments: argparse.Namespace, plan: Plan) -> Outcome:
 
 @contextlib.contextmanager
 def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
-    from app.tuning.sweep.processes import Processes
+    from app.tuning.sweep.workers import DaskWorkers, Processes
 
     workers: Workers
     if arguments.dask is not None:
-        from app.tuning.sweep.dask_workers import DaskWorkers
-
         workers = DaskWorkers(arguments.dask)
     else:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

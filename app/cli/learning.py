@@ -57,7 +57,7 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
         print(f"warning: {plain(warning)}", file=sys.stderr)
     if out is None:
         name = forests.keep(learned.data)
-        print(f"kept as {name}: use them with --set gathering.forest={name}")
+        print(f"kept as {name}: use them with --set classification.forest={name}")
     else:
         write_forest(learned.data, out)
         print(f"{name_of(learned.data)}, written to {out}")

@@ -12,9 +12,8 @@ from app.cli.progress import compiling_is_said
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
-    from app.tuning.plan import Plan, PlannedRun
+    from app.tuning.plan import Plan, PlannedRun, Trial
     from app.tuning.search import Search
-    from app.tuning.trial import Trial
 
 HELP = "search for the parameters that map runs with known trees best"
 STOPPED = 3
@@ -108,7 +107,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
     from app.robot.address import is_live
     from app.tuning.goal import goal_of
     from app.tuning.plan import Plan
-    from app.tuning.space import SENSIBLE, axes_of
+    from app.tuning.search_space import SENSIBLE, axes_of
 
     for uri in (*arguments.runs, *arguments.held_out):
         if is_live(uri):
@@ -150,7 +149,8 @@ def _suggested(uri: str) -> str:
 
 
 def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
-    from app.tuning.plan import PlannedRun, TruthColumns
+    from app.sources.request import SourceRequest
+    from app.tuning.plan import PlannedRun, TruthTable
     from pipeline.io.ground_truth import read_truth_trees
 
     uris = [*arguments.runs, *arguments.held_out]
@@ -161,8 +161,9 @@ def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
             raise ParameterError("a run is named twice", where=uri, remedy="Name it once")
         truth = None
         if uri in files:
-            truth = TruthColumns.of(read_truth_trees(Path(files[uri]), dbh_unit=arguments.dbh_unit))
-        planned.append(PlannedRun(uri, truth, files.get(uri, ""), k >= len(arguments.runs)))
+            truth = TruthTable.of(read_truth_trees(Path(files[uri]), dbh_unit=arguments.dbh_unit))
+        source = SourceRequest(uri, arguments.odometry, arguments.seed)
+        planned.append(PlannedRun(source, truth, files.get(uri, ""), k >= len(arguments.runs)))
     return tuple(planned)
 
 
@@ -206,43 +207,43 @@ def _storage(arguments: argparse.Namespace) -> str:
     address = arguments.storage or from_environment().database
     if not is_server(address):
         raise ParameterError(
-            "this is no address of a PostgreSQL database" if address else "no database is named",
+            "this is not the address of a PostgreSQL database" if address else "no database is named",
             where=address,
             remedy="Give postgresql://name@host/database, or set STEMMAP_DATABASE",
         )
     return str(address)
 
 
-def _search(search: Search, workers: int) -> tuple[bool, int]:
+def _search(search: Search, number: int) -> tuple[bool, int]:
     """Make the trials. Whether it was stopped before the last, and how many processes were lost."""
     import time
 
-    from app.tuning.processes import Helpers
+    from app.tuning.search_processes import SearchWorkers
 
     plan = search.plan
-    helpers: Helpers | None = None
+    workers: SearchWorkers | None = None
     bar = _Bar(plan)
     since, before = time.monotonic(), 0
     try:
         bar.say(search.begin(), search)
-        helpers = Helpers(plan, workers - 1)
+        workers = SearchWorkers(plan, number - 1)
         since, before = time.monotonic(), len(search.trials())
         while not plan.seconds or time.monotonic() - since < plan.seconds:
-            helpers.watch()
+            workers.watch()
             trial = search.step()
             bar.show(search)
             if trial is None:
                 if not search.is_under_way:
-                    return False, helpers.lost
+                    return False, workers.lost
                 time.sleep(0.1)
-        return len(search.trials()) < plan.trials, helpers.lost
+        return len(search.trials()) < plan.trials, workers.lost
     except KeyboardInterrupt:
         if not search.trials():
             raise
-        return True, helpers.lost if helpers else 0
+        return True, workers.lost if workers else 0
     finally:
-        if helpers is not None:
-            helpers.close()
+        if workers is not None:
+            workers.close()
         bar.close(len(search.trials()) - before, time.monotonic() - since)
 
 

@@ -30,8 +30,7 @@ from app.explain.client import Asking
 from app.sources.request import SourceRequest
 from app.store.async_store import Keeper
 from app.tuning.job import TuneSearch
-from app.tuning.sweep.asking_page import question_of
-from app.tuning.sweep.sensitivity import Sensitivity
+from app.tuning.sweep.sensitivity import Sensitivity, question_of
 from app.web.connection_limits import Places, Turns
 from app.worker.internal_protocol import (
     Answer,

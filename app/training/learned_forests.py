@@ -1,6 +1,6 @@
 """Decision trees that were learned from annotations, kept in the data folder as JSON.
 
-The name of a forest is the digest of what decides in it, so a map with `gathering.forest = NAME` is the
+The name of a forest is the digest of what decides in it, so a map with `classification.forest = NAME` is the
 same everywhere, or it is refused.
 """
 
@@ -104,14 +104,14 @@ class Forests:
             raise StemmapError(
                 f"the decision trees {name} are not in the data folder",
                 where=str(file or ""),
-                remedy=f"Put their file there, or choose gathering.forest = {PACKAGE}",
+                remedy=f"Put their file there, or choose classification.forest = {PACKAGE}",
             )
         data, forests = read_forests(file, ALL_AROUND, ONE_WAY)
         if name_of(data) != name:
             raise StemmapError(
                 "the decision trees are damaged: they are not those that the name tells",
                 where=str(file),
-                remedy=f"Learn them anew, or choose gathering.forest = {PACKAGE}",
+                remedy=f"Learn them anew, or choose classification.forest = {PACKAGE}",
             )
         return data, forests
 

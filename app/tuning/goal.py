@@ -1,4 +1,4 @@
-"""What a search is for: one number from the scores of several runs, the smaller the better."""
+"""The goals of a search. A goal turns the scores of several runs into one loss; smaller is better."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ GOALS: dict[GoalName, str] = {
     "position": "position RMSE, F1 not below that of the start",
     "pairs": "mean pair error, F1 not below that of the start",
 }
-# A set that breaks its goal's bound is worse than any that keeps it: no TA, RMSE [m] or pair error [%] of one
-# that keeps it is as large as these.
+# Loss from which on a set breaks the bound of its goal; larger than any TA, RMSE [m] or pair error [%] of a
+# set that keeps it.
 _BROKEN: dict[GoalName, float] = {"f1": 1.0, "ta": 2.0, "position": 1e3, "pairs": 1e6}
 
 
 class RunScore(msgspec.Struct, frozen=True):
-    """The counts and errors of one run.
+    """Counts and errors of one run.
 
     Attributes:
-        TA, FR: Real trees that were found and that were missed.
-        FA, TR: Other things that were taken for trees and that were not.
-        spurious: Trees of the map where nothing stands.
+        TA, FR: True trees that were found, and that were missed.
+        FA, TR: Other objects that were mapped as trees, and that were not.
+        spurious: Mapped trees where no object is known.
         position_rmse: Of the TA matched trees [m]; None without any.
         pair_error: Mean error of the distances between each two of them [%]; None with fewer than two.
     """
@@ -46,13 +46,13 @@ class RunScore(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Pooled:
-    """Several runs as if they were one: each tree counts the same, each pair within a run too.
+    """Scores of several runs together. Each tree has the same weight, and each pair within a run.
 
     Attributes:
         f1: 2 TA / (2 TA + FR + FA + spurious).
         ta: TA / (TA + FR).
-        false_share: (FA + spurious) / (TA + FA + spurious), the trees of the map that are none; 0 where the
-            map has no tree.
+        false_share: (FA + spurious) / (TA + FA + spurious), the share of mapped trees that are false; 0 for
+            an empty map.
         position_rmse: sqrt(sum TA_k rmse_k^2 / sum TA_k) [m].
         pair_error: Mean over all pairs [%].
     """
@@ -66,22 +66,24 @@ class Pooled:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """What is searched for.
+    """The goal of a search.
 
     Attributes:
-        false_max: Of `ta`: the largest share of the map's trees that may be none.
+        name: See `GOALS`.
+        false_max: Largest share of false trees that the goal "ta" allows.
     """
 
     name: GoalName = "f1"
     false_max: float = 0.1
 
     def loss(self, pooled: Pooled, start: Pooled) -> float:
-        """What is made as small as it can be. A set beyond the goal's bound loses against all within it, and
-        the more the farther it lies beyond: else an empty map would have the smallest errors.
+        """The value that the search minimises. A set that breaks the goal's bound is worse than every set
+        that keeps it, and the more so the larger the violation; otherwise an empty map would have the
+        smallest errors.
 
         Args:
-            pooled: Of the set that is tried.
-            start: Of the parameters with which the search began.
+            pooled: Scores of the set.
+            start: Scores of the parameters with which the search began.
         """
         if self.name == "f1":
             return 1.0 - pooled.f1
@@ -93,13 +95,13 @@ class Goal:
         return _BROKEN[self.name] + max(short, 0.0) if error is None or short > 1e-12 else error
 
     def is_kept(self, loss: float) -> bool:
-        """Whether a loss is that of a set within the goal's bound."""
+        """Whether a loss is that of a set that keeps the goal's bound."""
         return self.name == "f1" or loss < _BROKEN[self.name]
 
     def shown(self, loss: float) -> str:
-        """A loss for people: the figure itself, with its unit."""
+        """A loss as text: the figure with its unit."""
         if not self.is_kept(loss):
-            return "beyond its bound"
+            return "outside the bound"
         if self.name in ("f1", "ta"):
             return f"{self.label} {1.0 - loss:.3f}"
         return (
@@ -113,26 +115,26 @@ class Goal:
 
     @property
     def words(self) -> str:
-        """The goal in words."""
-        bound = f" (at most {100.0 * self.false_max:g} % of the map's trees)" if self.name == "ta" else ""
+        """The goal as text."""
+        bound = f" (at most {100.0 * self.false_max:g} % of the mapped trees)" if self.name == "ta" else ""
         return GOALS[self.name] + bound
 
 
 def goal_of(name: str, false_max: float) -> Goal:
-    """The goal of a name.
+    """Return the goal of a name.
 
     Raises:
-        ParameterError: There is none, or the bound is no share.
+        ParameterError: There is no such goal, or the bound is not a share.
     """
     if name not in GOALS:
         raise ParameterError(f"there is no goal {name!r}", remedy=f"Goals: {', '.join(GOALS)}")
     if not 0.0 <= false_max <= 1.0:
-        raise ParameterError(f"{false_max:g} is no share of trees", remedy="Give one from 0 to 1")
+        raise ParameterError(f"{false_max:g} is not a share of trees", remedy="Give a number from 0 to 1")
     return Goal(name, false_max)
 
 
 def score_of(e: Evaluation) -> RunScore:
-    """What a search keeps of an evaluation."""
+    """Return the scores that a search stores of an evaluation."""
     return RunScore(
         e.TA.count,
         e.FR.count,
@@ -145,7 +147,7 @@ def score_of(e: Evaluation) -> RunScore:
 
 
 def pool(scores: Sequence[RunScore]) -> Pooled:
-    """The scores of several runs as one, see `Pooled`."""
+    """Pool the scores of several runs, see `Pooled`."""
     ta, fr = sum(s.TA for s in scores), sum(s.FR for s in scores)
     wrong = sum(s.FA + s.spurious for s in scores)
     squares = [(s.TA, s.position_rmse**2) for s in scores if s.position_rmse is not None]

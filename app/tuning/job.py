@@ -1,8 +1,8 @@
-"""The search for parameters that people ask for on the page: its process, and what is told of it.
+"""The parameter search of the page: its process, its state, and what the browsers show of it.
 
-It works on the run that is open and others of the list, with the truth and the parameters of that moment, in
-a process of its own. What was stopped can go on from its journal. When the run is left, another search begins
-or stemmap ends, the process and the journal go.
+A search maps the open run and other runs of the list, with the true trees and the parameters of the moment in
+which it begins, in a process of its own. A stopped search can continue from its journal. The process and the
+journal are removed when the run is left, another search begins or stemmap ends.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import shutil
-import sys
 import weakref
 from collections.abc import Callable, Sequence
 from datetime import date
@@ -20,55 +19,54 @@ from typing import Any, Literal
 
 import msgspec
 
-from app.tuning.payload import told_of
-from app.tuning.plan import Plan
-from app.tuning.request import SearchAsked, check_same
-from app.tuning.result import Result, best_parameters, toml_of
-from app.tuning.said import FOLDER, Said
-from app.tuning.trial import Trial
+from app.common.child_process import ChildProcess, ProtocolError, python_module
+from app.tuning.plan import JOURNAL_FOLDER, Plan, Trial
+from app.tuning.request import SearchRequest, check_same
+from app.tuning.result import Result, SearchMessage, best_parameters, for_page, toml_of
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 
-# -P: a folder that holds a file `app.py` must not decide what runs.
-SERVED = (sys.executable, "-P", "-m", "app.tuning.served")
+COMMAND = python_module("app.tuning.search_processes", "page")
 State = Literal["none", "looking", "searching", "stopping", "done", "failed"]
-
-_LONGEST_LINE = 16 << 20
 _GRACE_S = 3.0
 
 
 class TuneSearch:
-    """The newest search, if there was one.
+    """The newest search of the page.
 
     Args:
-        tell: Called with what the browsers are to know, whenever that changes.
-        command: The program and its arguments.
+        tell: Called with the state for the browsers whenever it changes.
+        command: The program of the search.
+
+    Attributes:
+        plan, asked: What is searched for, and the request of the browser.
+        result: The result, once the search has ended.
     """
 
-    def __init__(self, tell: Callable[[dict[str, Any]], None], command: Sequence[str] = SERVED) -> None:
+    def __init__(self, tell: Callable[[dict[str, Any]], None], command: Sequence[str] = COMMAND) -> None:
         self._tell, self._command = tell, command
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: ChildProcess | None = None
         self._task: asyncio.Task[None] | None = None
-        self._turn = asyncio.Lock()  # while one begins or is left
+        self._turn = asyncio.Lock()  # held while a search begins or is left
         self._state: State = "none"
         self._error = ""
         self.plan: Plan | None = None
         self.result: Result | None = None
-        self.asked: SearchAsked | None = None
+        self.asked: SearchRequest | None = None
         self._start: Trial | None = None
         self._trials: dict[int, Trial] = {}
-        # Takes the journal away, at the latest when this process ends.
+        # Deletes the journal, at the latest when this process ends.
         self._folder: weakref.finalize[..., TuneSearch] | None = None
-        self._began = False  # the process that runs has scored what it begins with
+        self._began = False  # whether the process has scored the start
 
     @property
     def is_under_way(self) -> bool:
-        """Whether there is a process."""
+        """Whether a process searches."""
         return self._task is not None and not self._task.done()
 
     @property
     def can_go_on(self) -> bool:
-        """Whether a search ended before it had made all that it was to make."""
+        """Whether a search ended before its last trial."""
         made = len(self._trials)
         return self._folder is not None and not self.is_under_way and bool(self.plan) and made < self._wanted
 
@@ -76,15 +74,15 @@ class TuneSearch:
     def _wanted(self) -> int:
         return 0 if self.plan is None else self.plan.trials
 
-    async def start(self, plan: Plan, asked: SearchAsked | None = None) -> None:
-        """Begin a search; one that was stopped is forgotten.
+    async def start(self, plan: Plan, asked: SearchRequest | None = None) -> None:
+        """Begin a search. A stopped search is removed.
 
         Args:
-            plan: What is searched for; its storage is chosen here.
-            asked: Of which the plan was made.
+            plan: What is searched for; the storage is chosen here.
+            asked: The request from which the plan was made.
 
         Raises:
-            StemmapError: One is under way, or no process can be started.
+            StemmapError: A search is under way, or no process can be started.
         """
         self._check_idle()
         async with self._turn:
@@ -95,13 +93,13 @@ class TuneSearch:
             await self._run(plan, asked)
 
     async def go_on(self, now: Plan) -> None:
-        """Go on with the search that was stopped, from its journal.
+        """Continue the stopped search from its journal.
 
         Args:
-            now: The plan that the same choices make now.
+            now: The plan that the same request makes now.
 
         Raises:
-            StemmapError: There is none, or truth or parameters have changed since it began.
+            StemmapError: No search was stopped, or true trees or parameters have changed since it began.
         """
         self._check_idle()
         if self.plan is None or not self.can_go_on:
@@ -111,14 +109,14 @@ class TuneSearch:
             await self._run(self.plan, self.asked)
 
     async def stop(self) -> None:
-        """End the search; what it found stays."""
+        """Stop the search. Its result stays."""
         if self._process is not None and self.is_under_way:
             self._state = "stopping"
             self.show()
-            await self._write(self._process, b"stop\n")
+            await self._process.send("stop")
 
     async def leave(self) -> None:
-        """End the search and forget what it found: it was of a run that is left."""
+        """End the search and remove its result, because its run is left."""
         async with self._turn:
             task, self._task = self._task, None
             if task is not None:
@@ -132,20 +130,20 @@ class TuneSearch:
         if self.is_under_way or self._turn.locked():
             raise StemmapError("a search is under way", remedy="Stop it first")
 
-    async def _run(self, plan: Plan, asked: SearchAsked | None) -> None:
-        process = self._process = await self._process_of_a_search()
+    async def _run(self, plan: Plan, asked: SearchRequest | None) -> None:
+        process = self._process = await ChildProcess.start(self._command)
         self.plan, self.asked, self._state, self._error = plan, asked, "looking", ""
         self._began = False
         self._task = asyncio.create_task(self._listen(process), name="search")
-        self._task.add_done_callback(lambda _: self.show())  # only now it may go on
-        await self._write(process, msgspec.json.encode(plan) + b"\n")
+        self._task.add_done_callback(lambda _: self.show())  # from now on it can continue
+        await process.send(plan)
         self.show()
 
     def found(self) -> tuple[str, Parameters, str]:
-        """The preset, the values and the file of the best set.
+        """Return the name of the preset, the parameters and the parameter file of the best set.
 
         Raises:
-            StemmapError: There is none.
+            StemmapError: No better set was found.
         """
         if self.plan is None or self.result is None or not self.result.better:
             raise StemmapError("no better set was found", remedy="Search, or search over other parameters")
@@ -153,18 +151,18 @@ class TuneSearch:
         return self.plan.preset, best_parameters(self.plan, self.result), text
 
     def show(self) -> None:
-        """Tell the browsers."""
+        """Send the state to the browsers."""
         self._tell(self.as_plain())
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers."""
+        """Return the state for the browsers."""
         if self.plan is None:
             return {"state": "none"}
         return {
             "state": self._state,
             "error": self._error,
             "go_on": self.can_go_on,
-            **told_of(self.plan, self._made(), self._start, self.result),
+            **for_page(self.plan, self._made(), self._start, self.result),
         }
 
     def _forget(self) -> None:
@@ -178,72 +176,41 @@ class TuneSearch:
     def _made(self) -> list[Trial]:
         return [self._trials[number] for number in sorted(self._trials)]
 
-    async def _process_of_a_search(self) -> asyncio.subprocess.Process:
+    async def _listen(self, process: ChildProcess) -> None:
         try:
-            return await asyncio.create_subprocess_exec(
-                *self._command,
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.PIPE,
-                limit=_LONGEST_LINE,
-                start_new_session=True,  # Ctrl-C in the terminal is for the server, which ends it
-            )
-        except OSError as error:
-            raise StemmapError(f"no process can be started: {error.strerror}") from None
-
-    async def _listen(self, process: asyncio.subprocess.Process) -> None:
-        assert process.stdout is not None  # noqa: S101 - it was asked for
-        try:
-            while line := await process.stdout.readline():
-                self._take(msgspec.json.decode(line, type=Said))
+            while (message := await process.receive(SearchMessage)) is not None:
+                self._take(message)
                 self.show()
-        except (ValueError, msgspec.MsgspecError) as error:
-            self._fail(f"the search spoke gibberish: {error}")
+        except ProtocolError as error:
+            self._fail(error.what)
         finally:
-            await _ended(process)
+            await process.end(_GRACE_S)
         if self._state not in ("done", "failed"):
-            self._fail("the search ended in the middle. Start it again; the terminal may show why")
+            self._fail("the search ended unexpectedly. Start it again; the terminal may show why")
 
-    def _take(self, said: Said) -> None:
-        self._trials |= {trial.number: trial for trial in said.trials}
-        if said.start is not None:
-            self._start, self._began = said.start, True
+    def _take(self, message: SearchMessage) -> None:
+        self._trials |= {trial.number: trial for trial in message.trials}
+        if message.start is not None:
+            self._start, self._began = message.start, True
             if self._state == "looking":
                 self._state = "searching"
-        if said.result is not None:
-            self.result, self._state = said.result, "done"
-        elif said.error is not None:
-            what, where, remedy = said.error
+        if message.result is not None:
+            self.result, self._state = message.result, "done"
+        elif message.error is not None:
+            what, where, remedy = message.error
             self._fail(str(StemmapError(what, where=where, remedy=remedy)))
-        elif said == Said() and self._state == "stopping" and not self._began:
-            if self._start is None:  # nothing was found, now or before
+        elif message == SearchMessage() and self._state == "stopping" and not self._began:
+            if self._start is None:  # there is no result, also not from before
                 self._forget()
             self._state = "done"
 
     def _fail(self, why: str) -> None:
         self._state, self._error = "failed", why
 
-    async def _write(self, process: asyncio.subprocess.Process, line: bytes) -> None:
-        assert process.stdin is not None  # noqa: S101 - it was asked for
-        with contextlib.suppress(ConnectionError):
-            process.stdin.write(line)
-            await process.stdin.drain()
-
-
-async def _ended(process: asyncio.subprocess.Process) -> None:
-    """End it: its stdin ends, then not kindly."""
-    if process.stdin is not None:
-        process.stdin.close()
-    try:
-        await asyncio.wait_for(process.wait(), _GRACE_S)
-    except (TimeoutError, asyncio.CancelledError):
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
-
 
 def _folder() -> Path:
-    """A new folder for a journal."""
+    """Make a folder for a journal."""
     try:
-        return Path(mkdtemp(prefix=FOLDER))
+        return Path(mkdtemp(prefix=JOURNAL_FOLDER))
     except OSError as error:
         raise StemmapError(f"the trials cannot be kept: {error.strerror}") from None

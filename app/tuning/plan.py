@@ -1,4 +1,4 @@
-"""What a search is asked to do, as plain values that go from process to process."""
+"""The records of a search: what is searched for, the runs with their true trees, and the trials."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ import numpy as np
 
 from app.common.version import version
 from app.sources.request import SourceRequest
-from app.tuning.goal import Goal, GoalName
-from app.tuning.space import Axis
+from app.tuning.goal import Goal, GoalName, RunScore
+from app.tuning.search_space import Axis
 from pipeline.config import Parameters
-from pipeline.config.model import validated
+from pipeline.config.model import Value, validated
 from pipeline.types.records import TruthTrees
 
 FORMAT = 1
+#: Prefix of the folder with the journal of a search of the page.
+JOURNAL_FOLDER = "stemmap-search-"
 
 
-class TruthColumns(msgspec.Struct, frozen=True):
-    """True trees; lengths in metres, None where a diameter is not known."""
+class TruthTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """True trees as columns, for JSON. Lengths are metres; an unknown diameter is None."""
 
     x: list[float]
     y: list[float]
@@ -29,34 +31,35 @@ class TruthColumns(msgspec.Struct, frozen=True):
     kind: list[str]
 
     @classmethod
-    def of(cls, trees: TruthTrees) -> TruthColumns:
-        """From a record."""
+    def of(cls, trees: TruthTrees) -> TruthTable:
+        """Convert arrays to a table."""
         dbh = [value if math.isfinite(value) else None for value in trees.dbh.tolist()]
         return cls(trees.x.tolist(), trees.y.tolist(), dbh, list(trees.kind))
 
-    def as_record(self) -> TruthTrees:
-        """As a record."""
-        dbh = np.array([math.nan if value is None else value for value in self.dbh], np.float64)
-        return TruthTrees(np.array(self.x, np.float64), np.array(self.y, np.float64), dbh, tuple(self.kind))
+    def trees(self) -> TruthTrees:
+        """Convert the table to arrays."""
+        dbh = [math.nan if value is None else value for value in self.dbh]
+        x, y, diameter = (np.array(column, np.float64) for column in (self.x, self.y, dbh))
+        return TruthTrees(x, y, diameter, tuple(self.kind))
 
 
 class PlannedRun(msgspec.Struct, frozen=True):
-    """A run to be searched over, or held out.
+    """A run of a search.
 
     Attributes:
-        truth: None takes the source's own.
-        truth_name: The file that the truth was read from, for the provenance.
-        annotations: Of a run of the page's list: what people said of it, which lies over the source's own.
-        opened: How the page opened it; None for the plan's own seed and odometry.
-        digest: Of the source of which the annotations are; empty for any.
+        source: What is mapped, and how.
+        truth: True trees; None for those that the source brings.
+        truth_name: Name of the file that the true trees were read from, for the provenance.
+        held_out: Whether the run is only scored, and does not guide the search.
+        annotations: Annotations of a run of the page's list, which replace and extend the source's own trees.
+        digest: Digest of the recording to which the annotations belong; empty for any.
     """
 
-    uri: str
-    truth: TruthColumns | None = None
+    source: SourceRequest
+    truth: TruthTable | None = None
     truth_name: str = ""
     held_out: bool = False
-    annotations: TruthColumns | None = None
-    opened: SourceRequest | None = None
+    annotations: TruthTable | None = None
     digest: str = ""
 
 
@@ -65,15 +68,15 @@ class Plan(msgspec.Struct, frozen=True):
 
     Attributes:
         runs: At least one that is not held out.
-        axes: What is searched over.
-        goal, false_max: See `app.tuning.goal.Goal`.
-        preset: Name of that from which the parameters come.
-        start: All parameters with which the search begins, by stage; those of the axes are tried first.
-        seed: Of the mapping and of the sampler.
-        odometry: Where the motion of each run comes from, see `app.sources.opening`.
-        trials: So many in all, those of earlier times counted.
-        seconds: Stop after this time; 0 for none.
+        axes: The parameters that are searched, with their bounds.
+        start: All parameters with which the search begins, by stage. They are the first trial.
         storage: Path of a journal, or address of a PostgreSQL database.
+        preset: Name of the preset from which the parameters come.
+        goal, false_max: See `app.tuning.goal.Goal`.
+        seed: Random seed of the mapping and of the sampler.
+        odometry: Default source of the motion, see `app.sources.opening`.
+        trials: Number of trials in all, earlier ones included.
+        seconds: Time limit [s]; 0 for none.
     """
 
     runs: tuple[PlannedRun, ...]
@@ -90,22 +93,39 @@ class Plan(msgspec.Struct, frozen=True):
 
     @property
     def parameters(self) -> Parameters:
-        """Those with which the search begins."""
+        """The parameters with which the search begins."""
         return validated({stage: dict(values) for stage, values in self.start.items()})
 
     @property
     def aim(self) -> Goal:
-        """What is searched for."""
+        """The goal of the search."""
         return Goal(self.goal, self.false_max)
 
 
+class Trial(msgspec.Struct, frozen=True):
+    """The result of one set of parameters.
+
+    Attributes:
+        number: Trials are numbered in the order in which they begin; -1 is the start of the search.
+        values: The values that were tried, by parameter name.
+        loss: See `Goal.loss`; None where the values contradict one another.
+        training, held_out: Scores by run. Held-out runs are scored only for a set that is the best so far.
+    """
+
+    number: int
+    values: dict[str, Value]
+    loss: float | None
+    training: tuple[RunScore, ...] = ()
+    held_out: tuple[RunScore, ...] = ()
+
+
 def identity(plan: Plan, digests: list[str]) -> dict[str, Any]:
-    """What a journal is of: two searches share their trials where all of this is the same. Neither where the
-    runs lie nor what is held out changes a trial.
+    """Return all that decides the result of a trial. Searches with the same identity share their trials;
+    neither the place of a recording nor the held-out runs belong to it.
 
     Args:
         plan: The search.
-        digests: Of the runs that are not held out, with their truth, in their order.
+        digests: Digests of the runs that are not held out, with their true trees, in their order.
     """
     return {
         "format": FORMAT,
@@ -119,8 +139,10 @@ def identity(plan: Plan, digests: list[str]) -> dict[str, Any]:
     }
 
 
-def digest_with_truth(digest: str, truth: TruthTrees, opened: SourceRequest | None = None) -> str:
-    """One digest of a source, its truth, and how it is opened where that is not the plan's own way."""
-    how = () if opened is None else ([opened.seed, opened.odometry, opened.topics, opened.mount],)
-    text = msgspec.json.encode([digest, TruthColumns.of(truth), *how])
+def digest_with_truth(plan: Plan, source: SourceRequest, digest: str, truth: TruthTrees) -> str:
+    """Return one SHA-256 of a source, its true trees, and its choices where they differ from the plan's."""
+    default = SourceRequest(source.uri, plan.odometry, plan.seed)
+    chosen = [source.seed, source.odometry, source.topics, source.mount]
+    differs = chosen != [default.seed, default.odometry, default.topics, default.mount]
+    text = msgspec.json.encode([digest, TruthTable.of(truth), *([chosen] if differs else [])])
     return hashlib.sha256(text).hexdigest()

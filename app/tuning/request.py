@@ -1,6 +1,5 @@
-"""What a browser asks a search for, and the plan that comes of it: the run that is open, and runs of the list
-that are searched over too or held out.
-"""
+"""The request of a browser for a search, and its plan: the open run, and runs of the list that guide the
+search too or are held out."""
 
 from __future__ import annotations
 
@@ -16,23 +15,30 @@ from app.robot.address import is_live
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.store import AnnotatedSource
 from app.tuning.goal import goal_of
-from app.tuning.plan import Plan, PlannedRun, TruthColumns
-from app.tuning.space import axes_of, check
+from app.tuning.plan import Plan, PlannedRun, TruthTable
+from app.tuning.search_space import axes_of, check
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
 
 _MOST_TRIALS = 5000
 _LONGEST_MINUTES = 24 * 60.0
-MOST_OTHERS = 7  # each holds the points of its scans in memory, half a gigabyte at most
+MOST_OTHERS = 7  # each keeps up to 0.5 GB of points in memory
 
 _Record = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 _Records = Annotated[list[_Record], Meta(max_length=MOST_OTHERS)]
 
 
-class SearchAsked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A search: `over` as after `stemmap tune --over`; `also` and `held_out` are numbers of records, searched
-    over beside the run that is open, or only scored."""
+class SearchRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Request for a search.
+
+    Attributes:
+        over: Parameters with their bounds, as `stemmap tune --over` takes them.
+        goal, false_max: See `app.tuning.goal.Goal`.
+        trials, minutes: Limits of the search.
+        also: Record numbers of further runs that guide the search.
+        held_out: Record numbers of runs that are only scored.
+    """
 
     over: Annotated[list[Annotated[str, Meta(max_length=200)]], Meta(min_length=1, max_length=30)]
     goal: Literal["f1", "ta", "position", "pairs"] = "f1"
@@ -44,28 +50,28 @@ class SearchAsked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OtherRun(msgspec.Struct, frozen=True):
-    """A run of the list that is not the one that is open.
+    """A run of the list that is not open.
 
     Attributes:
         records: Numbers of its records, the newest first.
-        name: As the list has it.
-        digest: Of its source.
+        name: Its name in the list.
+        digest: Digest of its source.
         opened: How it was opened last.
-        annotations: What people said of it.
-        why_not: Why it cannot be judged by its true trees; empty where it can.
+        annotations: Its annotations.
+        why_not: Why it cannot be scored; empty where it can.
     """
 
     records: list[int]
     name: str
     digest: str
     opened: SourceRequest
-    annotations: TruthColumns
+    annotations: TruthTable
     why_not: str
 
     def as_plain(self) -> dict[str, Any]:
         """For the browsers."""
-        told = count(len(self.annotations.x), "annotation") if self.annotations.x else "its own true trees"
-        return {"record": self.records[0], "name": self.name, "truth": told, "why_not": self.why_not}
+        truth = count(len(self.annotations.x), "annotation") if self.annotations.x else "its own true trees"
+        return {"record": self.records[0], "name": self.name, "truth": truth, "why_not": self.why_not}
 
 
 def other_runs(
@@ -74,13 +80,13 @@ def other_runs(
     open_digest: str,
     may_be_opened: Callable[[str], str | None],
 ) -> list[OtherRun]:
-    """The runs of the list, one a source, but for the one that is open. Looks at the disk.
+    """Return the runs of the list except the open one, one per source. Checks whether their files exist.
 
     Args:
         rows: Records, the newest first.
-        annotated: What was annotated.
-        open_digest: Of the run that is open.
-        may_be_opened: What is to be opened for a URI; None where it may not be.
+        annotated: Sources with annotations.
+        open_digest: Digest of the open run.
+        may_be_opened: Returns what is opened for a URI, or None where that is not allowed.
     """
     contents = {each.source: each.annotations for each in annotated}
     found: dict[str, OtherRun] = {}
@@ -98,9 +104,9 @@ def other_runs(
         opened = request_of_kept(
             uri or row["uri"], odometry=row["odometry"], seed=row["seed"], choices=row["chosen"]
         )
-        said = contents.get(digest, ())
-        table = TruthColumns(
-            [c.x for c in said], [c.y for c in said], [c.dbh for c in said], [c.kind for c in said]
+        known = contents.get(digest, ())
+        table = TruthTable(
+            [c.x for c in known], [c.y for c in known], [c.dbh for c in known], [c.kind for c in known]
         )
         why = "from another machine it cannot be opened" if uri is None else _why_gone(uri)
         found[digest] = OtherRun([row["id"]], row["name"], digest, opened, table, why)
@@ -111,7 +117,7 @@ def other_runs(
 
 
 def plan_of(
-    asked: SearchAsked,
+    asked: SearchRequest,
     source: SourceRequest,
     digest: str,
     truth: TruthTrees | None,
@@ -119,30 +125,28 @@ def plan_of(
     preset: str,
     others: Sequence[OtherRun],
 ) -> Plan:
-    """The plan of a search.
+    """Return the plan of a search.
 
     Args:
-        asked: What for.
-        source, digest, truth: Of the run that is open; digest empty where none is.
-        parameters, preset: In force.
+        asked: The request.
+        source, digest, truth: The open run; the digest is empty where none is open.
+        parameters, preset: Those in force.
         others: The other runs of the list.
 
     Raises:
-        StemmapError: It cannot be searched so, and why.
+        StemmapError: The request cannot be searched.
     """
     if not digest:
         raise StemmapError("no run is open", remedy="Open one")
     if is_live(source.uri):
-        raise StemmapError(
-            "a live run cannot be mapped again and again", where=source.uri, remedy="Open its recording"
-        )
+        raise StemmapError("a live run cannot be mapped again", where=source.uri, remedy="Open its recording")
     if truth is None or "tree" not in truth.kind:
         raise StemmapError("no true trees are known of this run", remedy="Annotate some in the tab Annotate")
     axes, goal = axes_of(asked.over), goal_of(asked.goal, asked.false_max)
     check(axes, parameters)
-    own = PlannedRun(source.uri, TruthColumns.of(truth), "annotations", opened=source.request())
+    shown = PlannedRun(source.request(), TruthTable.of(truth), "annotations")
     return Plan(
-        runs=(own, *_planned(asked, others)),
+        runs=(shown, *_planned(asked, others)),
         axes=axes,
         start=parameters.model_dump(),
         storage="",
@@ -157,10 +161,10 @@ def plan_of(
 
 
 def check_same(stopped: Plan, now: Plan) -> None:
-    """Look whether a stopped search would go on with what it began with.
+    """Check that a stopped search can continue under the same conditions.
 
     Raises:
-        StemmapError: It would not, and what has changed since.
+        StemmapError: Something has changed since it began.
     """
     before, after = stopped.parameters.flat(), now.parameters.flat()
     changed = [name for name in before if before[name] != after[name]]
@@ -172,12 +176,16 @@ def check_same(stopped: Plan, now: Plan) -> None:
     for old, new in zip(stopped.runs, now.runs, strict=True):
         if (old.truth, old.annotations) != (new.truth, new.annotations):
             remedy = "Undo that, or search again"
-            raise StemmapError("true trees were edited since the search began", where=new.uri, remedy=remedy)
+            raise StemmapError(
+                "true trees were edited since the search began", where=new.source.uri, remedy=remedy
+            )
     if msgspec.structs.replace(stopped, storage="", preset=now.preset) != now:
-        raise StemmapError("the runs were opened otherwise since the search began", remedy="Search again")
+        raise StemmapError(
+            "the runs were opened in another way since the search began", remedy="Search again"
+        )
 
 
-def _planned(asked: SearchAsked, others: Sequence[OtherRun]) -> list[PlannedRun]:
+def _planned(asked: SearchRequest, others: Sequence[OtherRun]) -> list[PlannedRun]:
     by_record = {record: run for run in others for record in run.records}
     planned: list[PlannedRun] = []
     named: set[str] = set()
@@ -185,19 +193,16 @@ def _planned(asked: SearchAsked, others: Sequence[OtherRun]) -> list[PlannedRun]
         run = by_record.get(record)
         if run is None:
             raise StemmapError(
-                "this is no other run of the list", where=f"run {record}", remedy="Load the list anew"
+                "there is no such run in the list", where=f"run {record}", remedy="Reload the list"
             )
         if run.why_not:
-            raise StemmapError(run.why_not, where=run.name, remedy="Leave it out, or see to that first")
+            raise StemmapError(run.why_not, where=run.name, remedy="Leave it out")
         if run.digest in named:
             raise StemmapError("a run is named twice", where=run.name, remedy="Name it once")
         named.add(run.digest)
         name = "annotations" if run.annotations.x else ""
-        uri, said = run.opened.uri, run.annotations
-        digest = "" if run.digest == uri else run.digest  # a source without one is known by its name
-        planned.append(
-            PlannedRun(uri, None, name, held_out, annotations=said, opened=run.opened, digest=digest)
-        )
+        digest = "" if run.digest == run.opened.uri else run.digest  # a source without digest has its URI
+        planned.append(PlannedRun(run.opened, None, name, held_out, run.annotations, digest))
     if len(planned) > MOST_OTHERS:
         raise StemmapError(
             f"{count(len(planned), 'other run')} are too many",
@@ -208,14 +213,14 @@ def _planned(asked: SearchAsked, others: Sequence[OtherRun]) -> list[PlannedRun]
 
 def _why_gone(uri: str) -> str:
     if is_live(uri):
-        return "it was a live run, which cannot be mapped again"
+        return "it is a live run, which cannot be mapped again"
     if uri.startswith("sim:"):
         return ""
     try:
         there = Path(uri.removeprefix("file://")).expanduser().exists()
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: a home of nobody
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: unknown home directory
         there = False
-    return "" if there else "its recording is not there any more"
+    return "" if there else "its recording does not exist any more"
 
 
 def _why_no_truth(run: OtherRun, scored: bool) -> str:

@@ -1,4 +1,5 @@
-"""What came of a search: the best set as a file, with where it comes from, and as lines for people."""
+"""The result of a search: as a parameter file with its provenance, as text for a terminal, and as JSON for
+the page."""
 
 from __future__ import annotations
 
@@ -13,9 +14,8 @@ import tomli_w
 from app.common.text import count
 from app.common.version import version
 from app.dashboard.parameters import file_of
-from app.tuning.goal import RunScore, pool
-from app.tuning.plan import Plan
-from app.tuning.trial import Trial
+from app.tuning.goal import Goal, GoalName, Pooled, RunScore, pool
+from app.tuning.plan import Plan, Trial
 from pipeline.config import Parameters
 from pipeline.config.model import Value
 
@@ -23,15 +23,17 @@ if TYPE_CHECKING:
     from app.tuning.search import Search
 
 
+_POINTS_LIMIT = 400  # of the page's chart
+
+
 class Result(msgspec.Struct, frozen=True):
-    """What came of a search.
+    """The result of a search.
 
     Attributes:
-        start, best: Scores of the parameters to begin with, and of the best set that was tried; the start
-            where none was better.
-        better: Whether a set was better than the start.
-        made, refused: Trials, and how many of them cannot be mapped with.
-        importance: See `importances`.
+        start, best: The start of the search, and the best trial; the start where no trial was better.
+        better: Whether a trial was better than the start.
+        made, refused: Number of trials, and of those whose values contradict one another.
+        importance: See `app.tuning.search.importances`.
         sources: URI, source hash and whether it was held out, by run.
     """
 
@@ -44,11 +46,28 @@ class Result(msgspec.Struct, frozen=True):
     sources: tuple[tuple[str, str, bool], ...]
 
 
+class SearchMessage(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Progress of a search in another process. A message without any field says that the search was stopped
+    before it had a score.
+
+    Attributes:
+        start: Scores of the parameters with which the search begins.
+        trials: Trials since the last message; with `start`, those from before the search was stopped.
+        result: The result; the last message.
+        error: What happened, where, and what to do; the last message.
+    """
+
+    start: Trial | None = None
+    trials: tuple[Trial, ...] = ()
+    result: Result | None = None
+    error: tuple[str, str, str] | None = None
+
+
 def result_of(search: Search) -> Result:
-    """What came of the trials that were made so far.
+    """Return the result of the trials so far.
 
     Raises:
-        StoppedError: It was asked to stop while a held-out run was scored.
+        StoppedError: The search was asked to stop while a held-out run was scored.
     """
     from app.tuning.search import importances
 
@@ -66,22 +85,23 @@ def result_of(search: Search) -> Result:
 
 
 def toml_of(plan: Plan, result: Result, date: str) -> str:
-    """The best set as a file that `--config` takes; where it comes from stands in it as remarks, which are
-    TOML themselves (see `provenance_in`)."""
+    """Return the best set as a parameter file for `--config`. Comments at its top hold the provenance, as
+    TOML (see `provenance_in`)."""
     parameters = best_parameters(plan, result)
     head, _, rest = file_of(plan.preset, parameters).partition("\n")
-    # Not by splitlines: a name may hold U+2028 or the like, which ends no line of TOML.
+    # Not splitlines: a name may contain U+2028, which does not end a line of TOML.
     remarks = tomli_w.dumps(provenance(plan, result, date)).strip().split("\n")
     return "\n".join([head, *(f"# {line}".rstrip() for line in remarks), rest])
 
 
 def best_parameters(plan: Plan, result: Result) -> Parameters:
-    """All values of the best set."""
+    """Return all parameters of the best set."""
     return plan.parameters.replace(dict(result.best.values) if result.better else {})
 
 
 def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
-    """Where a set comes from, as plain values."""
+    """Return the provenance of the best set: goal, trials, runs with their digests, scores before and
+    after."""
     return {
         "tuned": {
             "stemmap": version(),
@@ -102,8 +122,8 @@ def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
                 "sha256": digest,
                 "held_out": held_out,
                 **({"truth": planned.truth_name} if planned.truth_name else {}),
-                "start": _figures([start]),
-                "best": _figures([best]),
+                "start": _file_scores([start]),
+                "best": _file_scores([best]),
             }
             for (uri, digest, held_out), planned, start, best in zip(
                 result.sources,
@@ -117,7 +137,7 @@ def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
 
 
 def provenance_in(text: str) -> dict[str, Any]:
-    """Where the set of a file comes from; empty where it does not say so."""
+    """Return the provenance that the comments of a parameter file hold; empty for other files."""
     lines = text.split("\n")[1:]
     remarks = []
     for line in lines:
@@ -131,17 +151,17 @@ def provenance_in(text: str) -> dict[str, Any]:
 
 
 def lines_of(plan: Plan, result: Result) -> list[str]:
-    """What came of it, for people."""
+    """Return the result as text for a terminal."""
     goal = plan.aim
-    refused = f", {result.refused} of them contradicted themselves" if result.refused else ""
+    refused = f", {result.refused} of them with contradicting values" if result.refused else ""
     lines = [f"{goal.words}: {count(result.made, 'trial')} over {len(plan.axes)} parameters{refused}"]
-    for held_out, name in ((False, "searched over"), (True, "held out")):
+    for held_out, name in ((False, "search runs"), (True, "held out")):
         runs = [uri for uri, _, held in result.sources if held is held_out]
         if runs:
             before, after = _scores(result.start, held_out), _scores(result.best, held_out)
             lines += [f"{name} ({count(len(runs), 'run')}): {_change(before, after)}"]
     if not result.better:
-        lines.append("no set was better than the one it began with, which is what was written")
+        lines.append("no set was better than the start, which was written")
         return lines
     flat = plan.parameters.flat()
     for name, value in result.best.values.items():
@@ -152,21 +172,23 @@ def lines_of(plan: Plan, result: Result) -> list[str]:
 
 
 def warning_of(result: Result) -> str:
-    """What a person should know of a set that does worse where it was not tuned; empty for nothing."""
+    """Return a warning where the best set is worse on held-out runs; empty otherwise."""
     if not result.better or not result.best.held_out:
         return ""
     before, after = pool(result.start.held_out).f1, pool(result.best.held_out).f1
     if after >= before:
         return ""
     return (
-        f"on held-out runs F1 fell from {before:.3f} to {after:.3f}: the set is tuned to the runs that it "
-        "was searched over. Search over more runs, or over fewer parameters"
+        f"on held-out runs F1 fell from {before:.3f} to {after:.3f}: the set fits only the runs that "
+        "guided the search. Search with more runs or over fewer parameters"
     )
 
 
 def _change(before: Sequence[RunScore], after: Sequence[RunScore]) -> str:
-    a, b = _figures(before), _figures(after)
-    return ", ".join(f"{_LABELS[name]} {_shown(a.get(name))} -> {_shown(b.get(name))}" for name in _LABELS)
+    a, b = _file_scores(before), _file_scores(after)
+    return ", ".join(
+        f"{_LABELS[name]} {_decimal(a.get(name))} -> {_decimal(b.get(name))}" for name in _LABELS
+    )
 
 
 _LABELS = {
@@ -178,8 +200,8 @@ _LABELS = {
 }
 
 
-def _figures(scores: Sequence[RunScore]) -> dict[str, float]:
-    """What is known of several runs as one; TOML has no null."""
+def _file_scores(scores: Sequence[RunScore]) -> dict[str, float]:
+    """Pooled scores for a file, without those that are unknown, because TOML has no null."""
     pooled = pool(scores)
     values = {
         "f1": pooled.f1,
@@ -200,9 +222,124 @@ def _by_run(trial: Trial, sources: Sequence[tuple[str, str, bool]]) -> list[RunS
     return [next(held_out if held else training) for _, _, held in sources]
 
 
-def _shown(value: float | None) -> str:
+def _decimal(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
 def _word(value: Value) -> str:
     return f"{value:g}" if isinstance(value, float) else json.dumps(value).strip('"')
+
+
+# --- for the page ------------------------------------------------------------------
+
+
+def best_of(trials: Sequence[Trial], start: Trial | None) -> Trial | None:
+    """The trial with the smallest loss, the start included; the earliest of equals."""
+    made = [t for t in (*trials, *([start] if start else [])) if t.loss is not None]
+    return min(made, key=lambda t: (t.loss, t.number), default=None)
+
+
+def for_page(
+    plan: Plan, trials: Sequence[Trial], start: Trial | None, result: Result | None
+) -> dict[str, Any]:
+    """Return a search for the page, without its state.
+
+    Args:
+        plan: What is searched for.
+        trials: The trials so far.
+        start: The start of the search, once it is scored.
+        result: The result, once the search has ended.
+    """
+    goal, best = plan.aim, best_of(trials, start)
+    points = [(t.number, _shown(goal.name, t.loss)) for t in trials if goal.is_kept(t.loss or 0.0)]
+    every = -(-len(points) // _POINTS_LIMIT) or 1
+    return {
+        "goal": goal.words,
+        "label": goal.label,
+        "unit": {"position": "cm", "pairs": "%"}.get(goal.name, ""),
+        "over": [axis.words for axis in plan.axes],
+        "wanted": plan.trials,
+        "made": len(trials),
+        "start": _trial_figures(plan, start),
+        "best": _trial_figures(plan, best),
+        "points": points[::every],
+        "held_out": _held_points(goal, trials),
+        "scores": _rows(plan, start, best),
+        "warning": warning_of(result) if result else "",
+        "importance": result.importance if result else {},
+        "better": bool(result and result.better),
+        "changes": _changes(plan, result) if result else [],
+    }
+
+
+def _trial_figures(plan: Plan, trial: Trial | None) -> dict[str, Any] | None:
+    if trial is None:
+        return None
+    return {"number": trial.number, "shown": plan.aim.shown(trial.loss or 0.0), **_figures(trial.training)}
+
+
+def _figures(scores: Sequence[RunScore]) -> dict[str, Any]:
+    pooled = pool(scores)
+    return {
+        "f1": pooled.f1,
+        "TA": pooled.ta,
+        "false_share": pooled.false_share,
+        "rmse_cm": None if pooled.position_rmse is None else 100.0 * pooled.position_rmse,
+        "pair_error_percent": pooled.pair_error,
+    }
+
+
+def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str, Any]]:
+    """Scores of the search runs and of the held-out runs, at the start and with the best set."""
+    held = sum(run.held_out for run in plan.runs)
+    if start is None or best is None:
+        return []
+    rows: list[dict[str, Any]] = [
+        {
+            "held_out": False,
+            "runs": len(plan.runs) - held,
+            "start": _figures(start.training),
+            "best": _figures(best.training),
+        }
+    ]
+    if held:
+        rows.append(
+            {
+                "held_out": True,
+                "runs": held,
+                "start": _figures(start.held_out),
+                "best": _figures(best.held_out),
+            }
+        )
+    return rows
+
+
+def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float | None]]:
+    """Number and held-out figure of each trial that was the best when it was made."""
+    held, best = [], float("inf")
+    for trial in trials:
+        if trial.held_out and trial.loss is not None and trial.loss < best and goal.is_kept(trial.loss):
+            best = trial.loss
+            held.append((trial.number, _figure(goal.name, pool(trial.held_out))))
+    return held
+
+
+def _figure(goal: GoalName, pooled: Pooled) -> float | None:
+    if goal in ("f1", "ta"):
+        return pooled.f1 if goal == "f1" else pooled.ta
+    if goal == "pairs":
+        return pooled.pair_error
+    return None if pooled.position_rmse is None else 100.0 * pooled.position_rmse
+
+
+def _shown(goal: GoalName, loss: float | None) -> float | None:
+    """A loss as the figure of the chart; None for contradicting values."""
+    if loss is None:
+        return None
+    return 1.0 - loss if goal in ("f1", "ta") else 100.0 * loss if goal == "position" else loss
+
+
+def _changes(plan: Plan, result: Result) -> list[list[Any]]:
+    """Name, value at the start and best value of each parameter."""
+    before = plan.parameters.flat()
+    return [[name, before[name], value] for name, value in result.best.values.items()]

@@ -1,7 +1,7 @@
-"""The search itself, in one process: asks Optuna for a set, maps the runs with it, tells what came of it.
+"""The search: asks Optuna for a set of parameters, maps the runs with it, and stores the scores.
 
-What a trial tries hangs on the trials before it, its number and the seed alone. So a search that was stopped
-and goes on makes the trials that it would have made, and with one worker the same input gives the same.
+A trial depends only on the trials before it, its number and the seed. A search that was stopped therefore
+continues with the trials that it would have made, and with one worker the same input gives the same result.
 """
 
 from __future__ import annotations
@@ -9,53 +9,162 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from app.batch.run_totals import far_truth
+from app.common.text import count
+from app.dashboard.annotations import contents_of, laid_over
+from app.store.records import Annotation
 from app.tuning.goal import RunScore, pool, score_of
-from app.tuning.plan import Plan, identity
-from app.tuning.runs import ScoredRun, check_start, open_runs, scores_of
-from app.tuning.space import check, values_of
+from app.tuning.plan import Plan, PlannedRun, Trial, digest_with_truth, identity
+from app.tuning.scored_runs import OpenRun, Tick, open_run
+from app.tuning.search_space import check, values_of
 from app.tuning.storage import close_storage, open_study
-from app.tuning.trial import Trial
 from pipeline.config import Parameters
 from pipeline.config.model import Value
-from pipeline.errors import ParameterError
+from pipeline.errors import ParameterError, SourceError, StemmapError
+from pipeline.evaluation import Evaluation
+from pipeline.types.records import TruthTrees
 
-_ABANDONED_S = 1800.0  # after which a trial of another machine that tells nothing is made again
-_UNNAMED_S = 60.0  # the same, of one whose process ended before it said which it was
-_LOOK_EVERY_S = 0.2
-_FIXED = "fixed_params"  # Optuna's attribute of a trial whose values were told beforehand
+_ABANDONED_S = 1800.0  # a silent trial of another machine is repeated after this time
+_UNNAMED_S = 60.0  # the same for a trial whose process ended before it stored its name
+_STOP_CHECK_S = 0.2
+_FIXED = "fixed_params"  # Optuna's attribute of a trial whose values were given
 
 
 class StoppedError(Exception):
-    """Somebody asked the search to stop, in the middle of a trial, which is made again when it goes on."""
+    """The search was asked to stop in the middle of a trial. The trial is repeated when the search goes
+    on."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SearchRun:
+    """A run of a search, opened.
+
+    Attributes:
+        uri, held_out: As planned.
+        source_digest: Digest of the source.
+        digest: Digest of the source, how it is opened and its true trees.
+    """
+
+    uri: str
+    held_out: bool
+    source_digest: str
+    digest: str
+    run: OpenRun
+    truth: TruthTrees
+
+    def evaluate(self, parameters: Parameters, tick: Tick) -> Evaluation:
+        """Map the run and score the map."""
+        return self.run.map(parameters, tick).evaluate(self.truth, parameters)
+
+
+def open_runs(plan: Plan) -> list[SearchRun]:
+    """Open the runs of a plan.
+
+    Raises:
+        SourceError: A run cannot be read, or has no true trees.
+    """
+    opened: list[SearchRun] = []
+    try:
+        for planned in plan.runs:
+            opened.append(_open(plan, planned))
+    except BaseException:
+        for each in opened:
+            each.run.close()
+        raise
+    return opened
+
+
+def scores_of(runs: Sequence[SearchRun], parameters: Parameters, tick: Tick = lambda: None) -> list[RunScore]:
+    """Map each run and return its score."""
+    return [score_of(run.evaluate(parameters, tick)) for run in runs]
+
+
+def check_start(run: SearchRun, evaluation: Evaluation, parameters: Parameters) -> None:
+    """Check that a run can be scored at all.
+
+    Raises:
+        StemmapError: No true tree is near the path, or the first map has none of them.
+    """
+    if not evaluation.TA.of:
+        others = evaluation.TR.of > 0
+        what = "the ground truth near the path has no trees" if others else far_truth(evaluation.reach)
+        raise StemmapError(what, where=run.uri)
+    if not evaluation.TA.count:
+        raise StemmapError(
+            f"none of {count(evaluation.TA.of, 'true tree')} has a mapped tree within "
+            f"{parameters.evaluation.match_distance:g} m, with the parameters that the search begins with",
+            where=run.uri,
+            remedy="Check that the true trees are in the frame of the map (the first pose is its origin), or "
+            "begin with another --preset",
+        )
+
+
+def _open(plan: Plan, planned: PlannedRun) -> SearchRun:
+    run = open_run(planned.source)
+    try:
+        truth = _truth(planned, run.own_truth)
+        if planned.digest and planned.digest not in (run.digest, run.recording_digest):
+            raise SourceError(
+                "this is another recording than the one that was annotated",
+                where=planned.source.uri,
+                remedy="Open it and annotate it, or leave it out",
+            )
+    except BaseException:
+        run.close()
+        raise
+    digest = digest_with_truth(plan, planned.source, run.digest, truth)
+    return SearchRun(planned.source.uri, planned.held_out, run.digest, digest, run, truth)
+
+
+def _truth(planned: PlannedRun, own: TruthTrees | None) -> TruthTrees:
+    """The true trees: those that were given, else the source's own with the annotations applied."""
+    uri = planned.source.uri
+    if planned.truth is not None:
+        return planned.truth.trees()
+    if planned.annotations is not None:
+        contents = contents_of(planned.annotations.trees())
+        truth = laid_over(own, [Annotation(k, content, "", 0, 1) for k, content in enumerate(contents)])
+        if truth is None:
+            remedy = "Open it and annotate some in the tab Annotate, or leave it out"
+            raise SourceError("no true trees are known of this run", where=uri, remedy=remedy)
+        return truth
+    if own is None:
+        remedy = f"Give them with --truth {uri}=trees.csv"
+        raise SourceError("the run brings no true trees", where=uri, remedy=remedy)
+    return own
 
 
 class Search:
-    """A search of which the trials stand in a storage.
+    """A search whose trials are kept in a storage.
 
     Args:
         plan: What is searched for.
-        worker: Number of this process among those of the plan, from 0 on.
-        stop: Asked often; True ends the search at once.
+        worker: Number of this process among those of the search, from 0 on.
+        stop: Called often; the search stops at once when it returns True.
+
+    Attributes:
+        sources: URI, digest of the source and whether it is held out, by run.
 
     Raises:
-        StemmapError: A run cannot be read or judged, or the storage is not of this search.
+        StemmapError: A run cannot be read or scored, or the storage is of another search.
     """
 
     def __init__(self, plan: Plan, *, worker: int = 0, stop: Callable[[], bool] = lambda: False) -> None:
         self.plan = plan
         self._worker, self.stop = worker, stop
-        self._looked_s = 0.0
+        self._checked_s = 0.0
         self._known: dict[int, Trial] = {}
         self._start = plan.parameters
         check(plan.axes, self._start)
         self._storage: Any = None
-        self._runs = open_runs(plan.runs, plan.seed, plan.odometry)
+        self._runs = open_runs(plan)
         try:
             self.sources = [(run.uri, run.source_digest, run.held_out) for run in self._runs]
             digests = [run.digest for run in self._runs if not run.held_out]
@@ -68,27 +177,27 @@ class Search:
             raise
 
     def close(self) -> None:
-        """Let go of the runs and of the storage."""
-        for run in self._runs:
-            run.close()
+        """Close the runs and the storage."""
+        for each in self._runs:
+            each.run.close()
         if self._storage is not None:
             close_storage(self._storage)
 
     @property
-    def training(self) -> list[ScoredRun]:
-        """The runs that are searched over."""
+    def training(self) -> list[SearchRun]:
+        """The runs that guide the search."""
         return [run for run in self._runs if not run.held_out]
 
     @property
-    def held_out(self) -> list[ScoredRun]:
+    def held_out(self) -> list[SearchRun]:
         """The runs that are only scored."""
         return [run for run in self._runs if run.held_out]
 
     def begin(self) -> Trial:
-        """Score the parameters to begin with; what the scans show is kept by that.
+        """Score the parameters with which the search begins. This also fills the caches of the runs.
 
         Raises:
-            StemmapError: A run cannot be judged.
+            StemmapError: A run cannot be scored.
             StoppedError: It was asked to stop.
         """
         scores: dict[bool, list[RunScore]] = {False: [], True: []}
@@ -96,17 +205,17 @@ class Search:
             evaluation = run.evaluate(self._start, self._tick)
             check_start(run, evaluation, self._start)
             scores[run.held_out].append(score_of(evaluation))
-        self.start = Trial(-1, self._own_values(), 0.0, tuple(scores[False]), tuple(scores[True]))
+        self.start = Trial(-1, self._start_values(), 0.0, tuple(scores[False]), tuple(scores[True]))
         self._start_pool = pool(self.start.training)
         self.start = msgspec.structs.replace(self.start, loss=self._loss(self.start.training))
         self._enqueue_start()
         return self.start
 
     def step(self) -> Trial | None:
-        """Make the next trial; None when all are made or are being made elsewhere.
+        """Make the next trial. Returns None when all are made, or are under way in other processes.
 
         Raises:
-            StoppedError: It was asked to stop. The trial is made again when the search goes on.
+            StoppedError: It was asked to stop. The trial is repeated when the search goes on.
         """
         left = self._abandoned()
         if left is not None:
@@ -114,7 +223,7 @@ class Search:
         while _counted(self._all()) < self.plan.trials:
             asked = self.study.ask()
             self._note(asked.number, "by", self._me)
-            if self._is_too_much(asked.number):  # another process asked at the same time
+            if self._is_surplus(asked.number):  # another process asked at the same time
                 self._drop(asked.number)
                 continue
             self.study.sampler = self._sampler(asked.number)
@@ -125,30 +234,30 @@ class Search:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether a trial is being made by another process."""
+        """Whether another process makes a trial."""
         return any(trial.state.name == "RUNNING" for trial in self._all())
 
     def trials(self) -> list[Trial]:
-        """All that were made so far."""
+        """All trials that are complete."""
         for trial in self._all():
             if trial.number not in self._known and trial.state.name in ("COMPLETE", "PRUNED"):
-                self._known[trial.number] = self._told(trial)
+                self._known[trial.number] = self._trial(trial)
         return [self._known[number] for number in sorted(self._known)]
 
     def best(self) -> Trial | None:
-        """The best one so far, the earliest of equals."""
+        """The trial with the smallest loss, the earliest of equals; None before the first."""
         made = [trial for trial in self.trials() if trial.loss is not None]
         return min(made, key=lambda trial: (trial.loss, trial.number), default=None)
 
     def with_held_out(self, trial: Trial) -> Trial:
-        """A trial with the scores of the held-out runs, which are made where they are missing."""
+        """Return a trial with the scores of the held-out runs, which are computed where they are missing."""
         if len(trial.held_out) == len(self.held_out):
             return trial
         scores = scores_of(self.held_out, self.parameters_of(trial), self._tick)
         return msgspec.structs.replace(trial, held_out=tuple(scores))
 
     def parameters_of(self, trial: Trial) -> Parameters:
-        """All parameters of a trial.
+        """Return all parameters of a trial.
 
         Raises:
             ParameterError: They contradict one another.
@@ -157,9 +266,9 @@ class Search:
 
     # --- one trial ---------------------------------------------------------------------------------
 
-    def _is_too_much(self, number: int) -> bool:
-        """Whether a trial that begins is one more than the plan has, or the second that tries the start:
-        numbers are given one after the other, so that of two processes one alone sees the other's before its
+    def _is_surplus(self, number: int) -> bool:
+        """Whether a trial that begins exceeds the number of the plan, or is the second one with the start.
+        Numbers are given in sequence, so that of two processes only one sees the other's number before its
         own."""
         before = [trial for trial in self._all() if trial.number <= number]
         starts = [t.number for t in before if _FIXED in t.system_attrs and t.state.name != "FAIL"]
@@ -178,7 +287,7 @@ class Search:
         scores = {"training": trial.training, "held_out": trial.held_out}
         if not self._note(number, "scores", msgspec.to_builtins(scores)):
             return trial
-        if trial.loss is None:  # counts as worse than all, so that the sampler leaves such sets
+        if trial.loss is None:  # counts as the worst, so that the sampler avoids such sets
             self.study.tell(number, state=TrialState.PRUNED, skip_if_finished=True)
         else:
             self.study.tell(number, trial.loss, skip_if_finished=True)
@@ -188,8 +297,8 @@ class Search:
         return list(self.study.get_trials(deepcopy=False))
 
     def _note(self, number: int, name: str, value: object) -> bool:
-        """Write it down; False where the trial is made already: two processes that take over one make the
-        same of it."""
+        """Store an attribute of a trial. Returns False for a trial that is complete, because two processes
+        that take over the same trial get the same result."""
         from optuna.exceptions import UpdateFinishedTrialError
 
         trial_id = self._storage.get_trial_id_from_study_id_trial_number(self._study_id, number)
@@ -212,7 +321,7 @@ class Search:
         return trial
 
     def _same(self, values: dict[str, Value], number: int) -> Trial | None:
-        """A trial that tried the very same, with another number."""
+        """A complete trial with the same values, under a new number; None where there is none."""
         for trial in self.trials():
             if trial.values == values:
                 return msgspec.structs.replace(trial, number=number)
@@ -221,13 +330,13 @@ class Search:
     def _loss(self, training: tuple[RunScore, ...]) -> float:
         return self.plan.aim.loss(pool(training), self._start_pool)
 
-    def _own_values(self) -> dict[str, Value]:
+    def _start_values(self) -> dict[str, Value]:
         flat = self._start.flat()
         return {axis.name: flat[axis.name] for axis in self.plan.axes}
 
     def _enqueue_start(self) -> None:
-        """Try what the search begins with first, where it lies within the bounds."""
-        values = self._own_values()
+        """Make the start the first trial, if it is within the bounds."""
+        values = self._start_values()
         begun = any(trial.state.name != "FAIL" for trial in self._all())
         if not begun and all(axis.holds(values[axis.name]) for axis in self.plan.axes):
             self.study.enqueue_trial(values)
@@ -239,11 +348,11 @@ class Search:
         return TPESampler(seed=int(seed))
 
     def _abandoned(self) -> Any | None:  # noqa: ANN401
-        """A trial whose process is gone, now taken over."""
+        """A trial whose process has ended; this process takes it over."""
         for trial in self._all():
             if trial.state.name != "RUNNING" or not self._is_gone(trial):
                 continue
-            if len(trial.params) < len(self.plan.axes):  # it ended before it knew what to try
+            if len(trial.params) < len(self.plan.axes):  # it ended before it had values
                 self._drop(trial.number)
                 continue
             if self._note(trial.number, "by", self._me):
@@ -258,7 +367,7 @@ class Search:
         patience = _ABANDONED_S if by else _UNNAMED_S
         return begun is not None and time.time() - begun.timestamp() > patience
 
-    def _told(self, trial: Any) -> Trial:  # noqa: ANN401
+    def _trial(self, trial: Any) -> Trial:  # noqa: ANN401
         kept = trial.user_attrs.get("scores", {})
         scores = {name: msgspec.convert(of, tuple[RunScore, ...]) for name, of in kept.items()}
         loss = trial.value if trial.state.name == "COMPLETE" else None
@@ -266,20 +375,20 @@ class Search:
 
     def _tick(self) -> None:
         now = time.monotonic()
-        if now - self._looked_s > _LOOK_EVERY_S:
-            self._looked_s = now
+        if now - self._checked_s > _STOP_CHECK_S:
+            self._checked_s = now
             if self.stop():
                 raise StoppedError
 
 
 def _counted(trials: list[Any]) -> int:
-    """How many are made or being made."""
+    """How many are complete or under way."""
     return sum(trial.state.name in ("COMPLETE", "PRUNED", "RUNNING") for trial in trials)
 
 
 def importances(study: Any) -> dict[str, float]:  # noqa: ANN401 - Optuna has no types
-    """How much of the loss's variance each parameter explains (fANOVA, Hutter et al. 2014), largest first;
-    empty where the trials are too few or all alike."""
+    """Share of the variance of the loss that each parameter explains (fANOVA, Hutter et al. 2014), largest
+    first. Empty where there are too few trials or all have the same loss."""
     from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 
     try:
@@ -296,6 +405,6 @@ def _lives(pid: str) -> bool:
         os.kill(int(pid), 0)
     except ProcessLookupError:
         return False
-    except OSError:  # it is somebody else's
+    except OSError:  # the process of another user
         return True
     return True

@@ -1,19 +1,25 @@
-"""Where the trials of a search stand: a journal, which is a plain file, or a PostgreSQL database."""
+"""Storage of the trials of a search: a journal, which is a plain file, or a PostgreSQL database."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
 from pipeline.errors import StemmapError
 
 SERVER = ("postgresql://", "postgresql+psycopg://")
-_SCHEMA = "stemmap_tuning"  # Optuna's tables have names of their own there, and its own account of versions
-_OPENING = 0x73746D70  # number of the lock; any that no other program takes
+_SCHEMA = "stemmap_tuning"  # keeps Optuna's tables and their version apart from stemmap's
+_OPENING = 0x73746D70  # number of the advisory lock
 _LARGEST = 1 << 30
-_MEANT = {
+_PART = 1 << 16
+_DIFFERENCES = {
     "format": "another version of stemmap",
     "version": "another version of stemmap",
     "runs": "other runs or another truth",
@@ -27,29 +33,29 @@ _IDENTITY = "stemmap"
 
 
 class OtherSearchError(StemmapError):
-    """A journal of another search.
+    """The journal belongs to another search.
 
     Args:
-        differs: In what, in words.
+        differs: The difference, as text.
         where: The journal.
     """
 
     def __init__(self, differs: str, where: str) -> None:
         self.differs = differs
-        remedy = "Name another file with --journal, or delete this one to begin anew"
-        super().__init__(f"the journal is of another search: {differs}", where=where, remedy=remedy)
+        remedy = "Name another file with --journal, or delete this one"
+        super().__init__(f"the journal belongs to another search: {differs}", where=where, remedy=remedy)
 
 
 def is_server(storage: str) -> bool:
-    """Whether it is the address of a database, and not the path of a journal."""
+    """Whether this is the address of a database and not the path of a journal."""
     return storage.startswith(SERVER)
 
 
 def open_study(storage: str, identity: dict[str, Any]) -> tuple[Any, Any]:
-    """The study of a search, with the trials that were made before, and the storage in which it stands.
+    """Open or create Optuna's study of a search. Returns the study, with its earlier trials, and its storage.
 
     Raises:
-        StemmapError: It cannot be written to, is damaged, or is of another search.
+        StemmapError: The storage cannot be written, is damaged, or belongs to another search.
     """
     import optuna
 
@@ -65,13 +71,13 @@ def open_study(storage: str, identity: dict[str, Any]) -> tuple[Any, Any]:
         raise
     except OSError as error:
         raise unwritable(storage, error) from None
-    except Exception as error:  # whatever a damaged file or a server that went makes of Optuna
+    except Exception as error:  # Optuna raises many kinds for a damaged file or a lost server
         raise _refused(storage, error) from None
     return study, backend
 
 
 def close_storage(backend: Any) -> None:  # noqa: ANN401 - Optuna has no types
-    """Let go of a database; a journal needs no closing."""
+    """Close the connection to a database. A journal needs no closing."""
     if (engine := getattr(backend, "engine", None)) is not None:
         backend.remove_session()
         engine.dispose()
@@ -85,14 +91,12 @@ def _name(identity: dict[str, Any]) -> str:
 def _journal(path: Path, identity: dict[str, Any]) -> Any:  # noqa: ANN401
     from optuna.storages import JournalStorage
 
-    from app.tuning.journal import Journal
-
     try:
         known = _mended(path)
         storage = JournalStorage(Journal(str(path)))
     except OSError as error:
         raise unwritable(str(path), error) from None
-    except Exception as error:  # a line of JSON that is none of Optuna's
+    except Exception as error:  # a line of JSON that Optuna did not write
         raise _damaged(path, error) from None
     if known:
         _check_same(path, storage, identity)
@@ -100,17 +104,15 @@ def _journal(path: Path, identity: dict[str, Any]) -> Any:  # noqa: ANN401
 
 
 def _mended(path: Path) -> bool:
-    """Whether a journal with something in it stands there; its last line is whole from now on.
+    """Whether there is a journal that is not empty. Removes an incomplete last line.
 
     Raises:
-        StemmapError: It is no journal.
+        StemmapError: The file is not a journal.
     """
     if not path.exists() or path.stat().st_size == 0:
         return False
     if path.stat().st_size > _LARGEST:
         raise StemmapError("the journal is larger than 1 GB", where=str(path))
-    from app.tuning.journal import cut_half_line
-
     with path.open("rb") as file:
         first = file.readline(1 << 20)
     try:
@@ -119,7 +121,7 @@ def _mended(path: Path) -> bool:
         is_journal = False
     if not is_journal:
         raise StemmapError(
-            "this is no journal of a search", where=str(path), remedy="Name another file with --journal"
+            "this is not the journal of a search", where=str(path), remedy="Name another file with --journal"
         )
     cut_half_line(path)
     return True
@@ -136,13 +138,13 @@ def _check_same(path: Path, storage: Any, identity: dict[str, Any]) -> None:  # 
     before = [known[_IDENTITY] for known in attributes if isinstance(known.get(_IDENTITY), dict)]
     if not before:
         raise StemmapError(
-            "the journal is none of `stemmap tune`", where=str(path), remedy="Name another with --journal"
+            "`stemmap tune` did not write this journal", where=str(path), remedy="Name another with --journal"
         )
     plain = json.loads(json.dumps(identity))
     if plain in before:
         return
     theirs = before[-1]
-    differs = dict.fromkeys(_MEANT[key] for key in _MEANT if theirs.get(key) != plain[key])
+    differs = dict.fromkeys(_DIFFERENCES[key] for key in _DIFFERENCES if theirs.get(key) != plain[key])
     raise OtherSearchError(", ".join(differs), str(path))
 
 
@@ -154,15 +156,15 @@ def _server(address: str) -> Any:  # noqa: ANN401
     try:
         url = make_url(address).set(drivername="postgresql+psycopg")
     except (ArgumentError, ValueError):
-        raise StemmapError("this is no address of a database") from None
+        raise StemmapError("this is not the address of a database") from None
     try:
         engine = create_engine(url, connect_args={"connect_timeout": 5}, isolation_level="AUTOCOMMIT")
         options = {"connect_timeout": 5, "options": f"-csearch_path={_SCHEMA}"}
         plain = url.render_as_string(hide_password=False)
         try:
             with engine.connect() as connection:
-                # Of machines that begin at the same time one alone makes the tables. The lock goes with the
-                # connection.
+                # Of several machines that begin at the same time only one makes the tables. The lock ends
+                # with the connection.
                 connection.execute(text(f"SELECT pg_advisory_lock({_OPENING})"))
                 connection.execute(text(f"CREATE SCHEMA IF NOT EXISTS {_SCHEMA}"))
                 return RDBStorage(plain, engine_kwargs={"connect_args": options, "pool_pre_ping": True})
@@ -193,17 +195,113 @@ def _damaged(path: Path, error: Exception) -> StemmapError:
     return StemmapError(
         f"the journal is damaged: {reason}",
         where=str(path),
-        remedy="Name another with --journal, or delete it to begin anew",
+        remedy="Name another with --journal, or delete it",
     )
 
 
 def unwritable(storage: str, error: OSError) -> StemmapError:
-    """What a person is told of a disk that refuses."""
+    """The error of a disk that cannot be written."""
     reason = (error.strerror or str(error)).lower()
     return StemmapError(f"the trials cannot be kept: {reason}", where=storage)
 
 
 def unreadable(storage: str, error: OSError) -> StemmapError:
-    """What a person is told of trials that cannot be read again."""
+    """The error of trials that cannot be read."""
     reason = (error.strerror or str(error)).lower()
     return StemmapError(f"the trials cannot be read: {reason}", where=storage)
+
+
+# --- the journal ------------------------------------------------------------------
+
+
+class Journal(JournalFileBackend):  # type: ignore[misc]
+    """Optuna's journal, without waiting for the disk. It survives a process that is killed; trials that a
+    power cut loses are repeated. A trial writes a dozen lines; waiting for the disk after each line took
+    longer than mapping a short run.
+
+    Args:
+        path: Path of the file.
+    """
+
+    def __init__(self, path: str) -> None:
+        super().__init__(path, lock_obj=JournalFileOpenLock(path))
+        self._file = Path(path)
+
+    def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:
+        """Return the lines from a number on.
+
+        Raises:
+            StemmapError: The file cannot be read.
+        """
+        try:
+            yield from super().read_logs(log_number_from)
+        except OSError as error:
+            raise unreadable(str(self._file), error) from None
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """Append all lines or none.
+
+        Raises:
+            StemmapError: The file cannot be written, for example on a full disk.
+        """
+        text = "".join(f"{json.dumps(log, separators=(',', ':'))}\n" for log in logs)
+        try:
+            with _locked(self._file) as file:
+                _cut(file)
+                _append(file, text.encode())
+        except OSError as error:
+            raise unwritable(str(self._file), error) from None
+
+
+def cut_half_line(path: Path) -> None:
+    """Remove an incomplete last line, which a process leaves that is killed while it writes. The trial is
+    repeated."""
+    with path.open("rb") as file:
+        if _is_whole(file):
+            return
+    with _locked(path) as file:  # checked again: another process may have been writing
+        _cut(file)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[IO[bytes]]:
+    """Open the file while no other process writes to it."""
+    lock = JournalFileOpenLock(str(path))
+    lock.acquire()
+    try:
+        with path.open("a+b", buffering=0) as file:
+            yield file
+    finally:
+        with suppress(RuntimeError):  # the lock file was deleted
+            lock.release()
+
+
+def _is_whole(file: IO[bytes]) -> bool:
+    if not file.seek(0, os.SEEK_END):
+        return True
+    file.seek(-1, os.SEEK_END)
+    return file.read(1) == b"\n"
+
+
+def _cut(file: IO[bytes]) -> None:
+    end = file.seek(0, os.SEEK_END)
+    if _is_whole(file):
+        return
+    while end:
+        begin = max(end - _PART, 0)
+        file.seek(begin)
+        last = file.read(end - begin).rfind(b"\n")
+        end = begin + last + 1 if last >= 0 else begin
+        if last >= 0:
+            break
+    file.truncate(end)
+
+
+def _append(file: IO[bytes], data: bytes) -> None:
+    begin, rest = file.seek(0, os.SEEK_END), memoryview(data)
+    try:
+        while rest:  # a full disk may accept a part
+            rest = rest[file.write(rest) :]
+    except OSError:
+        file.truncate(begin)
+        raise

@@ -1,8 +1,8 @@
-"""Which sets of parameters are compared: every combination of the values that were asked for.
+"""Parameter grids: every combination of the values that the user names.
 
-On the command line `NAME=VALUES`, with values as `--set` takes them: a list `0.1,0.15,0.2`, a span with a
-number of values `0.1..0.4/7` (ends included), `0.01..1/5log` with equal ratios, or both in one list. In a
-TOML file one table a stage, with lists or the same texts.
+On the command line a parameter is `NAME=VALUES`, with values as `--set` takes them: a list `0.1,0.15,0.2`, a
+range with its number of values `0.1..0.4/7` (ends included), `0.01..1/5log` with equal ratios, or both in one
+list. A TOML file has one table per stage, with lists or the same texts.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pipeline.config.model import Value
 from pipeline.config.text import parsed
 from pipeline.errors import ParameterError
 
-PRESET = "preset"  # an axis of its own: what all else is laid over
+PRESET = "preset"  # the axis whose values are names of presets, which the other axes change
 MOST_SETS = 20_000
 MOST_VALUES = 1_000
 _LARGEST_FILE = 1 << 20
@@ -38,10 +38,10 @@ class Axis:
 
 
 def read_axes(words: Iterable[str]) -> tuple[Axis, ...]:
-    """The axes of the words after `--param-grid`: `NAME=VALUES`, or the name of a TOML file.
+    """Return the axes that `--param-grid` names: `NAME=VALUES`, or the name of a TOML file.
 
     Raises:
-        ParameterError: A name, a value or a file does not fit, or there are too many sets.
+        ParameterError: A name, a value or a file is invalid, or there are too many sets.
     """
     axes: dict[str, Axis] = {}
     for word in words:
@@ -49,7 +49,7 @@ def read_axes(words: Iterable[str]) -> tuple[Axis, ...]:
         found = [_axis(name, [text])] if equals else _axes_of(Path(word))
         for axis in found:
             if axis.name in axes:
-                raise ParameterError(f"{axis.name} is asked for twice", remedy="Put its values into one list")
+                raise ParameterError(f"{axis.name} is given twice", remedy="Put its values into one list")
             axes[axis.name] = axis
     sets = math.prod(len(axis.values) for axis in axes.values())
     if sets > MOST_SETS:
@@ -62,29 +62,20 @@ def read_axes(words: Iterable[str]) -> tuple[Axis, ...]:
 
 
 def combinations(axes: Sequence[Axis]) -> list[dict[str, Value]]:
-    """Every combination of the values, the last axis changing fastest."""
+    """Return every combination of the values; the last axis changes fastest."""
     return [
         dict(zip((axis.name for axis in axes), values, strict=True))
         for values in itertools.product(*(axis.values for axis in axes))
     ]
 
 
-def laid_over(base: Parameters, changes: Mapping[str, Value]) -> Parameters:
-    """Parameters with the values of a combination; its PRESET was laid below `base` already.
-
-    Raises:
-        ParameterError: Two values contradict one another.
-    """
-    return base.replace({name: value for name, value in changes.items() if name != PRESET})
-
-
 def words_of(changes: Mapping[str, Value]) -> str:
-    """A combination for people, as `--set` would take it."""
-    return " ".join(f"{name}={shown(value)}" for name, value in changes.items()) or "as it is"
+    """A combination as text, in the syntax of `--set`."""
+    return " ".join(f"{name}={shown(value)}" for name, value in changes.items()) or "unchanged"
 
 
 def shown(value: Value) -> str:
-    """A value as `--set` takes it."""
+    """A value in the syntax of `--set`."""
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -111,7 +102,9 @@ def _axes_of(file: Path) -> list[Axis]:
             ]
         else:
             raise ParameterError(
-                f"{stage} stands outside of a stage", where=str(file), remedy="Write it below a line [stage]"
+                f"{stage} is not in the table of a stage",
+                where=str(file),
+                remedy="Write it below a line [stage]",
             )
     return axes
 
@@ -138,7 +131,7 @@ def _axis(name: str, entries: Sequence[Any]) -> Axis:
 
 
 def _text(entry: object) -> str:
-    """An entry of TOML as it would stand on the command line."""
+    """An entry of a TOML file in the syntax of the command line."""
     return str(entry).lower() if isinstance(entry, bool) else str(entry)
 
 
@@ -150,17 +143,17 @@ def _values(spec: FieldSpec, text: str) -> list[Value]:
     start, dots, rest = text.partition("..")
     if not dots:
         return [_value(spec, text)]
-    end, _, how_many = rest.rpartition("/")  # of the last: units have slashes too
+    end, _, how_many = rest.rpartition("/")  # the last slash: units contain slashes too
     counted = _COUNT.fullmatch(how_many.strip())
     if spec.kind not in ("int", "float") or counted is None:
         raise ParameterError(
-            f"{spec.name} = {text!r} is no span of numbers with how many values it has", remedy=_EXAMPLE
+            f"{spec.name} = {text!r} is not a range of numbers with a number of values", remedy=_EXAMPLE
         )
     low, high = float(_value(spec, start)), float(_value(spec, end))
     count, ratio = int(counted[1]), counted[2] is not None
     if not 2 <= count <= MOST_VALUES or not (math.isfinite(low) and math.isfinite(high)):
         raise ParameterError(
-            f"{spec.name} = {text!r}: a span has 2 to {MOST_VALUES:,} values between two numbers",
+            f"{spec.name} = {text!r}: a range has 2 to {MOST_VALUES:,} values between two numbers",
             remedy=_EXAMPLE,
         )
     if ratio and min(low, high) <= 0.0:
@@ -169,7 +162,7 @@ def _values(spec: FieldSpec, text: str) -> list[Value]:
 
 
 def spread(low: float, high: float, count: int, *, ratio: bool) -> list[float]:
-    """So many values from one to the other, ends included, with equal steps or equal ratios."""
+    """Return `count` values from low to high, ends included, with equal steps or equal ratios."""
     shares = [k / (count - 1) for k in range(count)]
     if ratio:
         between = [low * (high / low) ** share for share in shares]
@@ -179,12 +172,12 @@ def spread(low: float, high: float, count: int, *, ratio: bool) -> list[float]:
 
 
 def _rounded(spec: FieldSpec, value: float) -> Value:
-    # Twelve digits: 0.1..0.3/3 has the value 0.2 and not 0.2 and a last bit.
+    # Twelve digits, so that 0.1..0.3/3 contains exactly 0.2.
     return round(value) if spec.kind == "int" else float(f"{value:.12g}")
 
 
 def _value(spec: FieldSpec, text: str) -> Value:
-    """A value; its unit may stand behind it."""
+    """Parse a value, with or without its unit."""
     bare = text.strip()
     if spec.kind in ("int", "float") and spec.unit:
         bare = bare.removesuffix(spec.unit).strip()
@@ -192,7 +185,7 @@ def _value(spec: FieldSpec, text: str) -> Value:
 
 
 def _check(spec: FieldSpec, value: Value) -> None:
-    """Of a value alone; whether two contradict one another hangs on what they are laid over."""
+    """Check a single value. Contradictions between two values depend on the other parameters."""
     if spec.kind in ("int", "float") and spec.minimum is not None and spec.maximum is not None:
         if not spec.minimum <= float(value) <= spec.maximum:
             raise ParameterError(
@@ -201,4 +194,6 @@ def _check(spec: FieldSpec, value: Value) -> None:
     elif (spec.kind == "choice" and value not in spec.choices) or (
         spec.kind == "bool" and not isinstance(value, bool)
     ):
-        raise ParameterError(f"{spec.name} = {value!r} is none of {', '.join(spec.choices) or 'true, false'}")
+        raise ParameterError(
+            f"{spec.name} = {value!r} is not one of {', '.join(spec.choices) or 'true, false'}"
+        )

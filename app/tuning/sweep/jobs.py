@@ -1,110 +1,83 @@
-"""What is sent to a worker and what comes back, as JSON: paths, parameters and scores, never clouds."""
+"""The jobs of a comparison: runs with their true trees, each under many sets of parameters.
+
+Jobs and answers travel to the workers and back as JSON: paths, parameters and scores, never point clouds.
+"""
 
 from __future__ import annotations
 
 import hashlib
-import math
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
-import numpy as np
 
+import pipeline
+from app.batch.run_folder import read_run, read_run_record
+from app.common.text import count
 from app.common.version import version
-from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import SourceOptions
+from app.sources.opening import with_odometry
+from app.sources.request import SourceRequest, request_of_kept
+from app.tuning.plan import TruthTable
+from app.tuning.sweep.grid import PRESET, words_of
+from pipeline.config import Parameters
+from pipeline.config.model import Value
+from pipeline.errors import ParameterError, SourceError, StemmapError
+from pipeline.io.readers import open_source
+from pipeline.io.readers.clouds import is_cloud
 from pipeline.types.records import TruthTrees
 
-PIPELINE = Path(__file__).resolve().parents[2] / "pipeline"
-# What went wrong: of the job, wherever it is done; or of the worker, so that another may do it.
+NO_TRUTH = "Give its true trees with --truth trees.csv, in the frame of the map"
+#: Reason of a failure: "job" is the same on every worker; "worker" and "version" concern only this worker.
 Fault = Literal["", "job", "worker", "version"]
 
 
-class TruthTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """True trees as columns [m]; a diameter that is not known is None."""
-
-    x: list[float]
-    y: list[float]
-    dbh: list[float | None]
-    kind: list[str]
-
-    @staticmethod
-    def of(truth: TruthTrees) -> TruthTable:
-        """From records."""
-        return TruthTable(
-            truth.x.tolist(),
-            truth.y.tolist(),
-            [dbh if math.isfinite(dbh) else None for dbh in truth.dbh.tolist()],
-            list(truth.kind),
-        )
-
-    def trees(self) -> TruthTrees:
-        """As records."""
-        dbh = [math.nan if value is None else value for value in self.dbh]
-        x, y, diameter = (np.array(column, np.float64) for column in (self.x, self.y, dbh))
-        return TruthTrees(x, y, diameter, tuple(self.kind))
-
-
-class RunAsked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A run that is mapped, and what it is judged by.
+class RunWithTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A run that is mapped and scored.
 
     Attributes:
-        uri: Of the source; a path is absolute, and leads to the same recording for every worker.
-        digest: SHA-256 of what is read, so that a worker with another recording says so.
-        seed: Of every random number.
-        odometry: As asked, see `app.sources.opening`.
-        topics: Chosen topic by role.
-        mount: x, y, z [m], roll, pitch, yaw [deg] of the LiDAR on the robot; empty for what the source says.
-        truth: The true trees in the frame of the map.
+        source: What is mapped, and how. A path is absolute and leads every worker to the same recording.
+        digest: SHA-256 of the source, with which a worker recognises another recording.
+        truth: True trees in the frame of the map.
     """
 
-    uri: str
+    source: SourceRequest
     digest: str
-    seed: int
-    odometry: str
-    topics: dict[str, str]
-    mount: list[float]
     truth: TruthTable
-
-    def options(self) -> SourceOptions:
-        """With which the source is opened."""
-        placed = (
-            Pose3.from_euler(
-                (self.mount[0], self.mount[1], self.mount[2]), *map(math.radians, self.mount[3:])
-            )
-            if self.mount
-            else None
-        )
-        return SourceOptions(topics=dict(self.topics), T_base_lidar=placed, seed=self.seed)
 
 
 class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One run under one set of parameters.
+    """A run under one set of parameters.
 
     Attributes:
         parameters: All values, by stage and name.
-        code: Of the program that asks; another one would give other scores, see `code_digest`.
+        code: Digest of the code that asks, see `code_digest`; other code may give other scores.
     """
 
-    run: RunAsked
+    run: RunWithTruth
     parameters: dict[str, dict[str, Any]]
     code: str
 
     def key(self) -> str:
-        """SHA-256 (hex) of all that the scores hang on; where the recording lies is not among it."""
-        asked = msgspec.structs.replace(self, run=msgspec.structs.replace(self.run, uri=""))
-        return hashlib.sha256(msgspec.json.encode(asked, order="sorted")).hexdigest()
+        """SHA-256 (hex) of everything that decides the scores, without the place of the recording."""
+        source = msgspec.structs.replace(self.run.source, uri="")
+        placeless = msgspec.structs.replace(self, run=msgspec.structs.replace(self.run, source=source))
+        return hashlib.sha256(msgspec.json.encode(placeless, order="sorted")).hexdigest()
 
 
 class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What came of a job.
+    """The result of a job.
 
     Attributes:
-        scores: See `pipeline.evaluation.Evaluation`, with how many scans and trees; None where it failed.
-        seconds: That it took.
-        looked: Whether its scans had to be looked at; else what was kept of them was used.
-        error: Why it failed, in words.
+        scores: Fields of `pipeline.evaluation.Evaluation`, with the numbers of scans and trees; None for a
+            failure.
+        seconds: Computing time [s].
+        looked: Whether the front end ran; False where its cached results were used.
+        error: Reason of the failure.
+        fault: Kind of the failure.
     """
 
     scores: dict[str, Any] | None
@@ -116,9 +89,128 @@ class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @cache
 def code_digest() -> str:
-    """The version, and a SHA-256 of all that makes a map: other code's results are not taken for its own."""
+    """The version and a SHA-256 of the sources of the pipeline. Results of other code are not used."""
+    assert pipeline.__file__ is not None  # noqa: S101 - the package has an __init__.py
+    folder = Path(pipeline.__file__).parent
     state = hashlib.sha256()
-    for file in sorted(PIPELINE.rglob("*")):
+    for file in sorted(folder.rglob("*")):
         if file.suffix in (".py", ".json"):
-            state.update(f"{file.relative_to(PIPELINE).as_posix()}\0".encode() + file.read_bytes() + b"\0")
+            state.update(f"{file.relative_to(folder).as_posix()}\0".encode() + file.read_bytes() + b"\0")
     return f"{version()}+{state.hexdigest()[:16]}"
+
+
+# --- the plan of a comparison -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedRun:
+    """A run that can be mapped and scored.
+
+    Attributes:
+        name: As the user named it.
+        run: The run with its true trees.
+        preset: Name of the preset that suits it.
+    """
+
+    name: str
+    run: RunWithTruth
+    preset: str
+
+
+@dataclass(frozen=True, slots=True)
+class SweepPlan:
+    """All jobs of a comparison.
+
+    Attributes:
+        runs: The runs, in the order in which they were named.
+        sets: The combinations of parameter values.
+        jobs: Jobs by number of the set and of the run.
+        left_out: Sets whose values contradict one another for a run, by the same numbers, with the reason.
+    """
+
+    runs: tuple[PreparedRun, ...]
+    sets: tuple[dict[str, Value], ...]
+    jobs: dict[tuple[int, int], Job]
+    left_out: dict[tuple[int, int], str]
+
+
+def prepare_run(source: SourceRequest, truth: TruthTrees | None) -> PreparedRun:
+    """Open a run and read its true trees.
+
+    Args:
+        source: The run; the URI may be a folder that `stemmap map` wrote, which names its source.
+        truth: True trees that replace the source's own.
+
+    Raises:
+        StemmapError: It cannot be read, or has no true trees.
+    """
+    name, source = source.uri, _source_of(source)
+    if is_cloud(source.uri):
+        raise SourceError(
+            "a whole cloud has no scans",
+            where=source.uri,
+            remedy='Drive through it: "sim:cloud?file=...&truth=..."',
+        )
+    with closing(open_source(source.uri, source.options())) as opened:
+        with_motion, _ = with_odometry(opened, source.odometry)
+        trees = truth or (known.trees if (known := opened.truth()) else None)
+        if trees is None or not len(trees.x):
+            raise StemmapError("the run has no true trees", where=name, remedy=NO_TRUTH)
+        absolute = msgspec.structs.replace(source, uri=_absolute(source.uri))
+        run = RunWithTruth(absolute, with_motion.description.digest, TruthTable.of(trees))
+        return PreparedRun(name, run, opened.description.preset)
+
+
+def plan_jobs(
+    runs: Sequence[PreparedRun],
+    sets: Sequence[dict[str, Value]],
+    base: Callable[[PreparedRun, dict[str, Value]], Parameters],
+) -> SweepPlan:
+    """Return the jobs of all sets and runs.
+
+    Args:
+        runs, sets: What is combined.
+        base: Returns the parameters that a combination changes, for a run.
+
+    Raises:
+        ParameterError: Every set contradicts itself.
+    """
+    jobs: dict[tuple[int, int], Job] = {}
+    left_out: dict[tuple[int, int], str] = {}
+    code = code_digest()
+    for s, changes in enumerate(sets):
+        values = {name: value for name, value in changes.items() if name != PRESET}
+        for r, run in enumerate(runs):
+            try:
+                jobs[s, r] = Job(run.run, base(run, changes).replace(values).model_dump(), code)
+            except ParameterError as error:
+                left_out[s, r] = error.what
+    if not jobs:
+        (s, _), why = next(iter(left_out.items()))
+        raise ParameterError(f"none of {count(len(sets), 'set')} can be used: {why}", where=words_of(sets[s]))
+    return SweepPlan(tuple(runs), tuple(sets), jobs, left_out)
+
+
+def _source_of(source: SourceRequest) -> SourceRequest:
+    """The source itself; of a folder that `stemmap map` wrote the source with its choices."""
+    folder = Path(source.uri)
+    if not (folder / "run.json").is_file():
+        return source
+    run, record = read_run(folder), read_run_record(folder)
+    if record.get("continued"):
+        raise SourceError(
+            "this map was made of several sources", where=source.uri, remedy="Name the sources themselves"
+        )
+    kept = request_of_kept(run.uri, odometry=source.odometry, seed=run.seed, choices=record.get("chosen"))
+    return msgspec.structs.replace(
+        kept, topics=source.topics or kept.topics, mount=source.mount or kept.mount
+    )
+
+
+def _absolute(uri: str) -> str:
+    """A path as workers in other folders find it; other URIs unchanged."""
+    try:
+        path = Path(uri).expanduser()
+        return str(path.absolute()) if path.exists() else uri
+    except (OSError, RuntimeError, ValueError):
+        return uri

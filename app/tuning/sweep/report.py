@@ -1,5 +1,8 @@
-"""A comparison as lines for a terminal and as files. Times are in a file of their own, so that the tables and
-the JSON have the same bytes for the same runs and parameters, wherever they were computed."""
+"""A comparison as text for a terminal, as tables and as a web page.
+
+Times are in a file of their own, so that the tables and the JSON have the same bytes for the same runs and
+parameters, wherever they were computed.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from typing import Any
 
 from app.common.text import count
 from app.common.version import version
-from app.tuning.sweep.comparing import COLUMNS, SHOWN, Comparison, Row, figure_words
+from app.tuning.sweep.comparison import COLUMNS, SHOWN, Comparison, Row, figure_words
 from app.tuning.sweep.grid import words_of
 from app.tuning.sweep.report_html import page
 from pipeline.io.atomic_files import write_beside
@@ -22,30 +25,31 @@ _COMPUTED = ("=", "+", "-", "@", "\t", "\r")
 
 
 def lines(comparison: Comparison) -> list[str]:
-    """What came of it: a row a set, with the rows of its runs where they are few, and the best."""
+    """Return a table with a row per set, preceded by the rows of its runs if they are few, and the best
+    sets."""
     plan = comparison.plan
     one = len(plan.runs) == 1
     rows: list[Row] = []
     for mean in comparison.means:
         of_set = [row for row in comparison.rows if row.set_number == mean.set_number]
         rows += of_set if one else [*of_set, mean]
-    told = []
+    notes = []
     if len(rows) > MOST_LINES and not one:
         rows = list(comparison.means)
     if len(rows) > MOST_LINES:
         left_out = len(rows) - MOST_LINES
         rows = sorted(rows, key=lambda row: -(row.figures.get("f1") or -1.0))[:MOST_LINES]
-        told.append(f"{count(left_out, 'set')} with a smaller F1 not shown; --out DIR writes all of them")
+        notes.append(f"{count(left_out, 'set')} with a smaller F1 not shown; --out DIR writes all of them")
     heads = ["set", "parameters", *([] if one else ["run"]), *(_head(h, u) for _, h, u, _ in SHOWN), "s"]
     cells = [_cells(comparison, row, one=one) for row in rows]
-    return [*_aligned([heads, *cells]), *told, *_best_lines(comparison)]
+    return [*_aligned([heads, *cells]), *notes, *_best_lines(comparison)]
 
 
 def files(comparison: Comparison, folder: Path) -> list[str]:
-    """Write results.csv, means.csv, results.json, times.csv and report.html; their names.
+    """Write results.csv, means.csv, results.json, times.csv and report.html, and return their names.
 
     Raises:
-        StemmapError: The disk refuses; each file is whole, or as it was.
+        StemmapError: A file cannot be written. Each file is complete or unchanged.
     """
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
@@ -62,18 +66,18 @@ def files(comparison: Comparison, folder: Path) -> list[str]:
 
 
 def json_text(comparison: Comparison) -> str:
-    """All of it but the times."""
+    """Return everything but the times as JSON."""
     plan = comparison.plan
-    told: dict[str, Any] = {
+    record: dict[str, Any] = {
         "stemmap": version(),
         "runs": [
             {
                 "run": k + 1,
                 "name": run.name,
-                "sha256": run.asked.digest,
-                "seed": run.asked.seed,
-                "odometry": run.asked.odometry,
-                "true_trees": sum(kind == "tree" for kind in run.asked.truth.kind),
+                "sha256": run.run.digest,
+                "seed": run.run.source.seed,
+                "odometry": run.run.source.odometry,
+                "true_trees": sum(kind == "tree" for kind in run.run.truth.kind),
             }
             for k, run in enumerate(plan.runs)
         ],
@@ -82,14 +86,14 @@ def json_text(comparison: Comparison) -> str:
         "means": [_record(row) for row in comparison.means],
         "best": comparison.best,
     }
-    return json.dumps(told, indent=1) + "\n"
+    return json.dumps(record, indent=1) + "\n"
 
 
 def _record(row: Row) -> dict[str, Any]:
-    whose = {"set": row.set_number, **({"run": row.run} if row.run else {})}
+    numbers = {"set": row.set_number, **({"run": row.run} if row.run else {})}
     if row.error:
-        return {**whose, "error": row.error}
-    return {**whose, **{name: row.figures[name] for name in COLUMNS}}
+        return {**numbers, "error": row.error}
+    return {**numbers, **{name: row.figures[name] for name in COLUMNS}}
 
 
 def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
@@ -127,8 +131,8 @@ def _csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def _cell(cell: object) -> object:
-    """As it is written. A text that a spreadsheet would compute, as a file named `=1+1.mcap`, gets an
-    apostrophe, by which it stays one."""
+    """A cell as it is written. A text that a spreadsheet would compute, such as a file name `=1+1.mcap`, gets
+    an apostrophe in front."""
     if cell is None:
         return ""
     if isinstance(cell, bool):
@@ -157,7 +161,7 @@ def _cells(comparison: Comparison, row: Row, *, one: bool) -> list[str]:
 def _aligned(rows: list[list[str]]) -> list[str]:
     whole = [row for row in rows if len(row) == len(rows[0])]
     width = [max(len(row[k]) for row in whole) for k in range(len(rows[0]))]
-    words = len(rows[0]) - len(SHOWN) - 1  # so many columns stand left, figures right
+    words = len(rows[0]) - len(SHOWN) - 1  # columns of text, aligned left; figures are aligned right
     return [
         "  ".join(
             cell.ljust(width[k]) if k < words else cell.rjust(width[k]) if len(row) == len(rows[0]) else cell
@@ -168,10 +172,10 @@ def _aligned(rows: list[list[str]]) -> list[str]:
 
 
 def _best_lines(comparison: Comparison) -> list[str]:
-    told = []
+    lines = []
     for goal, number in comparison.best.items():
         if number:
-            told.append(f"best {goal}: set {number} ({words_of(comparison.plan.sets[number - 1])})")
+            lines.append(f"best {goal}: set {number} ({words_of(comparison.plan.sets[number - 1])})")
         elif len(comparison.plan.sets) > 1:
-            told.append(f"best {goal}: none, the sets are alike in it or do not tell")
-    return told
+            lines.append(f"best {goal}: none; all sets are equal or unknown")
+    return lines

@@ -1,4 +1,4 @@
-"""A comparison as one page that needs nothing else: no script, no address, every text escaped."""
+"""The web page of a comparison: one file without scripts or links, every text escaped."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from html import escape
 
 from app.common.text import count
 from app.common.version import version
-from app.tuning.sweep.comparing import SHOWN, Comparison, Row, figure_words
+from app.tuning.sweep.comparison import SHOWN, Comparison, Row, figure_words
 from app.tuning.sweep.grid import shown as value_words
 from app.tuning.sweep.grid import words_of
 from pipeline.config.model import Value
@@ -24,18 +24,18 @@ td.failed { text-align: left; white-space: normal; color: #d55e00; }
 svg { width: 22rem; max-width: 100%; height: auto; border: 1px solid var(--line); margin: 0 1rem 1rem 0; }
 svg text { font: 11px system-ui, sans-serif; fill: CanvasText; }
 """
-# Of these the least is best, of the others the most.
+# Figures whose smallest value is best.
 _LEAST = {"FR", "FA", "spurious", "position_rmse_m", "position_bias_m", "mean_pair_error_percent"}
 
 
 def page(comparison: Comparison) -> str:
-    """The whole page."""
+    """Return the page as HTML."""
     plan = comparison.plan
     title = f"{count(len(plan.sets), 'set')} of parameters on {count(len(plan.runs), 'run')}"
     parts = [f"<h1>{escape(title)}</h1>", _about(comparison), *_charts(comparison)]
     if len(plan.runs) > 1:
         parts.append(
-            "<h2>Means over the runs</h2><p>Counts are added up, all else is the mean of the runs.</p>"
+            "<h2>Means over the runs</h2><p>Counts are summed; other figures are means of the runs.</p>"
         )
         parts.append(_table(comparison, list(comparison.means)))
     for r, run in enumerate(plan.runs):
@@ -55,12 +55,12 @@ def _about(comparison: Comparison) -> str:
     best = "".join(
         f"<li>{escape(goal)}: set {number}, <code>{escape(words_of(sets[number - 1]))}</code></li>"
         if number
-        else f"<li>{escape(goal)}: none, the sets are alike in it or do not tell</li>"
+        else f"<li>{escape(goal)}: none; all sets are equal or unknown</li>"
         for goal, number in comparison.best.items()
     )
     runs = "".join(
-        f"<li>{escape(run.name)}, seed {run.asked.seed}, "
-        f"SHA-256 <code>{escape(run.asked.digest[:16])}</code></li>"
+        f"<li>{escape(run.name)}, seed {run.run.source.seed}, "
+        f"SHA-256 <code>{escape(run.run.digest[:16])}</code></li>"
         for run in comparison.plan.runs
     )
     failed = comparison.failed
@@ -102,7 +102,7 @@ def _best(rows: list[Row], name: str) -> float | None:
 
 
 def _charts(comparison: Comparison) -> list[str]:
-    """F1 over each axis of numbers: the best of all sets with this value, and their mean."""
+    """F1 over each numeric parameter: the best and the mean of all sets with a value."""
     plan = comparison.plan
     charts = []
     for axis in plan.sets[0] if plan.sets else ():

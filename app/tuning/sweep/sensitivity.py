@@ -1,74 +1,107 @@
-"""How much a parameter matters: the score of the whole run over its range, computed in a process of its own
-that gives way to all others, while the run goes on."""
+"""Sensitivity of the score to a parameter: the score of the whole run over the range of the parameter.
+
+The points are computed one by one in a process of low priority, while the run goes on.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import msgspec
-
-from app.tuning.sweep.jobs import Answer, Job, RunAsked, code_digest
+from app.common.child_process import ChildProcess, ProtocolError, python_module
+from app.sources.request import SourceRequest
+from app.tuning.plan import TruthTable
+from app.tuning.sweep.jobs import Answer, Job, RunWithTruth, code_digest
+from app.worker.protocol import Status
 from pipeline.config import Parameters, field_specs
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
+from pipeline.types.records import TruthTrees
 
-# -P: a folder that holds a file `app.py` must not decide what runs.
-WORKER = (sys.executable, "-P", "-m", "app.tuning.sweep.worker", "--last")
+COMMAND = python_module("app.tuning.sweep.scoring", "--low-priority")
 MOST_VALUES = 65
 REMEMBERED = 4096  # answers
-IDLE_S = 120.0  # after which the process is ended, with what it keeps of the run
+IDLE_S = 120.0  # the process and its cache end after this time without a question
 _LONGEST_ANSWER = 1 << 20
-_ONE_CORE = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What is asked.
+    """A sensitivity curve to be computed.
 
     Attributes:
-        run: The run, with its truth.
-        parameters: All values; that of the parameter is replaced.
-        name: Of the parameter, dotted.
-        values: In the order in which they are computed: coarse first.
+        run: The run with its true trees.
+        parameters: The parameters in force.
+        name: Dotted name of the parameter.
+        values: Values of the parameter in the order in which they are computed, coarse steps first.
     """
 
-    run: RunAsked
+    run: RunWithTruth
     parameters: Parameters
     name: str
     values: tuple[Value, ...]
 
 
-class Sensitivity:
-    """Answers the newest question, point by point.
+def question_of(
+    source: SourceRequest,
+    digest: str,
+    status: Status,
+    truth: TruthTrees | None,
+    parameters: Parameters,
+    name: str,
+    values: list[Value],
+) -> Question:
+    """Return the question about the open run.
 
     Args:
-        tell: Told what is known, as plain values, after each point; {} where nothing is asked any more.
-        command: Of the process.
-        idle_s: How long the process waits for another question.
+        source, digest, status: The open run; the digest is empty where none is open.
+        truth: True trees, with the annotations.
+        parameters: The parameters in force.
+        name, values: The parameter and its values.
+
+    Raises:
+        StemmapError: The run cannot be read again, or has no true trees.
+    """
+    if not digest:
+        raise StemmapError("no run is open", remedy="Open one")
+    if status.live:
+        raise StemmapError("a live run cannot be read again", remedy="Open its recording")
+    if truth is None or not len(truth.x):
+        raise StemmapError(
+            "the run has no true trees to score by",
+            remedy="Annotate some trees in the tab Annotate, or import a table",
+        )
+    run = RunWithTruth(source.request(), digest, TruthTable.of(truth))
+    return Question(run, parameters, name, tuple(values))
+
+
+class Sensitivity:
+    """Computes the newest question, point by point.
+
+    Args:
+        tell: Called with the points so far after each point, and with {} when no question is left.
+        command: The program of the process.
+        idle_s: The process ends after this time without a question [s].
     """
 
     def __init__(
         self,
         tell: Callable[[dict[str, Any]], None],
-        command: Sequence[str] = WORKER,
+        command: Sequence[str] = COMMAND,
         idle_s: float = IDLE_S,
     ) -> None:
         self._tell, self._command, self._idle_s = tell, command, idle_s
         self._task: asyncio.Task[None] | None = None
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: ChildProcess | None = None
         self._turn = asyncio.Lock()
         self._known: dict[str, Answer] = {}
         self._scorings: set[asyncio.Task[Answer]] = set()
         self._lefts = self._asked = 0
 
     def ask(self, question: Question) -> None:
-        """Begin with a question; the one before is given up.
+        """Begin a question. The one before is cancelled.
 
         Raises:
             ParameterError: There is no such parameter, or there are too many values.
@@ -76,19 +109,19 @@ class Sensitivity:
         if question.name not in {spec.name for spec in field_specs()}:
             raise ParameterError(f"there is no parameter {question.name!r}")
         if not 1 <= len(question.values) <= MOST_VALUES:
-            raise ParameterError(f"{len(question.values)} values are not 1 to {MOST_VALUES}")
+            raise ParameterError(f"{len(question.values)} values are not between 1 and {MOST_VALUES}")
         self._stop()
         self._asked += 1
         self._task = asyncio.create_task(self._answer(question), name="sensitivity")
 
     async def leave(self) -> None:
-        """Nobody asks any more, or the run is left: the process ends."""
+        """Cancel the question and end the process, because the run is left or the curve is closed."""
         self._lefts += 1
         task, scorings = self._stop(), set(self._scorings)
         if task is not None:
             await asyncio.wait([task])
         await self._end()
-        if scorings:  # one of them may be starting the process, and ends it then
+        if scorings:  # one of them may just start the process, and then ends it
             await asyncio.wait(scorings)
         self._known.clear()
         self._tell({})
@@ -100,24 +133,24 @@ class Sensitivity:
         return task
 
     async def _answer(self, question: Question) -> None:
-        told: dict[str, Any] = {
+        state: dict[str, Any] = {
             "name": question.name,
             "asked_with": question.parameters.flat(),
             "of": len(question.values),
             "points": [],
             "error": "",
         }
-        self._tell(told)
+        self._tell(state)
         try:
             code = await asyncio.to_thread(code_digest)
             for value in question.values:
                 point = await self._point(question, value, code)
-                told = {**told, "points": [*told["points"], point]}
-                self._tell(told)
+                state = {**state, "points": [*state["points"], point]}
+                self._tell(state)
         except StemmapError as error:
-            self._tell({**told, "error": str(error)})
+            self._tell({**state, "error": str(error)})
         await asyncio.sleep(self._idle_s)
-        async with self._turn:  # what was begun for a question before may still be under way
+        async with self._turn:  # a job of an earlier question may still run
             await self._end()
 
     async def _point(self, question: Question, value: Value, code: str) -> dict[str, Any]:
@@ -129,8 +162,10 @@ class Sensitivity:
         key = job.key()
         answer = self._known.get(key)
         if answer is None:
-            # What is begun is ended even if another is asked meanwhile: the scans are looked at for both.
-            scoring = asyncio.create_task(self._scored(job, key), name="sensitivity of a value")
+            # A job is completed even if another question comes meanwhile, because its cache serves both.
+            scoring = asyncio.create_task(
+                self._scored(job, key, (self._lefts, self._asked)), name="sensitivity of a value"
+            )
             self._scorings.add(scoring)
             scoring.add_done_callback(self._is_scored)
             answer = await asyncio.shield(scoring)
@@ -138,26 +173,25 @@ class Sensitivity:
             raise StemmapError(answer.error)
         return {"value": value, **_figures(answer)}
 
-    async def _scored(self, job: Job, key: str) -> Answer:
-        """What the process answers; it is started anew once where it ends.
+    async def _scored(self, job: Job, key: str, asked: tuple[int, int]) -> Answer:
+        """The answer of the process, which is restarted once if it ends.
 
         Raises:
-            StemmapError: It ends again, or nobody asks for this any more.
+            StemmapError: It ends again, or the question was cancelled.
         """
-        lefts, asked = self._lefts, self._asked
         async with self._turn:
-            if (lefts, asked) != (self._lefts, self._asked):  # it was not begun
+            if asked != (self._lefts, self._asked):  # not begun yet
                 raise StemmapError("something else was asked for")
-            if key in self._known:  # begun for the question before
+            if key in self._known:  # the earlier question had it computed
                 return self._known[key]
             for _ in range(2):
                 process = await self._started()
-                if lefts != self._lefts:  # nobody else ends one that was being started then
+                if asked[0] != self._lefts:  # `leave` could not end it while it started
                     await self._end()
                     break
-                answer = await _said(process, job)
+                answer = await _ask(process, job)
                 if answer is not None:
-                    if lefts == self._lefts and len(self._known) < REMEMBERED:
+                    if asked[0] == self._lefts and len(self._known) < REMEMBERED:
                         self._known[key] = answer
                     return answer
                 await self._end()
@@ -166,49 +200,32 @@ class Sensitivity:
     def _is_scored(self, scoring: asyncio.Task[Answer]) -> None:
         self._scorings.discard(scoring)
         if not scoring.cancelled():
-            scoring.exception()  # heard, though nobody may wait for it any more
+            scoring.exception()  # retrieved, because no task may wait for it any more
 
-    async def _started(self) -> asyncio.subprocess.Process:
+    async def _started(self) -> ChildProcess:
         if self._process is None:
-            try:
-                self._process = await asyncio.create_subprocess_exec(
-                    *self._command,
-                    stdin=asyncio.subprocess.PIPE,
-                    stdout=asyncio.subprocess.PIPE,
-                    start_new_session=True,  # Ctrl-C in the terminal is for the server
-                    env={**_ONE_CORE, **os.environ},
-                    limit=_LONGEST_ANSWER,
-                )
-            except OSError as error:
-                raise StemmapError(
-                    f"no process can be started to map the run: {error.strerror}",
-                    remedy="Close other programs, and ask again",
-                ) from None
+            self._process = await ChildProcess.start(
+                self._command, line_limit=_LONGEST_ANSWER, one_thread=True
+            )
         return self._process
 
     async def _end(self) -> None:
         process, self._process = self._process, None
         if process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
+            await process.end()
 
 
-async def _said(process: asyncio.subprocess.Process, job: Job) -> Answer | None:
-    """The answer to a job; None where the process ends, or says something else."""
-    assert process.stdin is not None  # noqa: S101 - it was asked for
-    assert process.stdout is not None  # noqa: S101
-    with contextlib.suppress(ConnectionError):
-        process.stdin.write(msgspec.json.encode(job) + b"\n")
-        await process.stdin.drain()
+async def _ask(process: ChildProcess, job: Job) -> Answer | None:
+    """The answer to a job; None where the process ends or sends something else."""
+    await process.send(job)
     try:
-        return msgspec.json.decode(await process.stdout.readline(), type=Answer)
-    except (msgspec.MsgspecError, ValueError):  # a line may be too long
+        return await process.receive(Answer)
+    except ProtocolError:
         return None
 
 
 def _figures(answer: Answer) -> dict[str, Any]:
-    """Of a point, with the units in the names."""
+    """The figures of a point, with units in the names."""
     s = answer.scores
     if s is None:
         return {"error": answer.error}

@@ -1,4 +1,4 @@
-"""Has all jobs done: what is known already is not done again, and who is lost on the way is replaced."""
+"""Distributes the jobs of a comparison to workers, replaces lost workers, and stores the answers."""
 
 from __future__ import annotations
 
@@ -6,30 +6,85 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec
 
 from app.common.text import count
-from app.tuning.sweep.checking import is_answer
+from app.tuning.sweep.comparison import is_valid
 from app.tuning.sweep.jobs import Answer, Job
-from app.tuning.sweep.kept_answers import KeptAnswers
 from app.tuning.sweep.workers import Done, Lost, Workers
 from pipeline.config.model import validated
+from pipeline.errors import StemmapError
+from pipeline.io.atomic_files import write_beside
 from pipeline.remapping import look_key
 
-MOST_LOSSES = 3  # workers that a job may take along before it is taken for the reason
-NOBODY_S = 120.0  # so long nobody may be there
-_LOOK_S = 1.0
+MOST_LOSSES = 3  # a job that loses so many workers fails
+NOBODY_S = 120.0
+_LARGEST_FILE = 1 << 20
+_WAIT_S = 1.0
+
+
+class KeptAnswers:
+    """Answers on disk by the key of their job, so that no job is computed twice.
+
+    Args:
+        folder: One file per answer; None stores nothing.
+
+    Attributes:
+        damaged: Number of files that could not be read; their answers are computed again.
+        refusal: Why nothing more is written; empty while answers are written.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self.damaged = 0
+        self.refusal = ""
+
+    def get(self, key: str) -> Answer | None:
+        """Return the answer to the job with this key, None where it is not stored."""
+        file = self._file(key)
+        if file is None:
+            return None
+        try:
+            if file.stat().st_size <= _LARGEST_FILE:
+                answer = msgspec.json.decode(file.read_bytes(), type=Answer)
+                if answer.scores is not None and is_valid(answer):
+                    return answer
+        except FileNotFoundError:
+            return None
+        except (OSError, msgspec.MsgspecError):
+            pass
+        self.damaged += 1
+        return None
+
+    def put(self, key: str, answer: Answer) -> None:
+        """Store an answer that has scores. Failures are not stored, because they may not happen again. After
+        an error of the disk nothing more is written."""
+        file = self._file(key)
+        if file is None or answer.scores is None or self.refusal:
+            return
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with write_beside(file) as partial:
+                partial.write_bytes(msgspec.json.encode(answer))
+        except (OSError, StemmapError) as error:
+            why = getattr(error, "strerror", None) or str(error)
+            self.refusal = f"results are not stored for later: {why}"
+
+    def _file(self, key: str) -> Path | None:
+        return None if self._folder is None else self._folder / key[:2] / f"{key}.json"
 
 
 @dataclass(slots=True, eq=False)
 class Outcome:
-    """What came of the jobs.
+    """The results of all jobs.
 
     Attributes:
-        answers: One a job, in their order.
-        known: How many were known from before.
-        lost: How often a worker was lost in the middle of a job, by reason.
+        answers: One per job, in their order.
+        known: Number of answers that were stored before.
+        lost: Number of workers that were lost during a job, by reason.
+        warnings: Text for people.
     """
 
     answers: list[Answer]
@@ -45,14 +100,14 @@ def sweep(
     progress: Callable[[int], object] = lambda _jobs: None,
     nobody_s: float = NOBODY_S,
 ) -> Outcome:
-    """The answers to all jobs.
+    """Have all jobs computed.
 
     Args:
-        jobs: In the order of the answers.
-        workers: Do them; closed by whoever made them.
-        kept: Asked before, and told of each answer at once.
-        progress: Told how many jobs more are done.
-        nobody_s: After so long without a single worker what is left fails.
+        jobs: The jobs; the answers have the same order.
+        workers: Compute the jobs; the caller closes them.
+        kept: Stored answers; each new answer is added at once.
+        progress: Called with the number of jobs that were completed.
+        nobody_s: After this time without any worker the remaining jobs fail [s].
     """
     return _Sweep(jobs, workers, kept, progress, nobody_s).run()
 
@@ -70,16 +125,16 @@ class _Sweep:
         self._progress, self._nobody_s = progress, nobody_s
         self._keys = [job.key() for job in jobs]
         self._answers: dict[int, Answer] = {}
-        self._waiting: dict[bytes, deque[int]] = {}  # by what can share the scans that were looked at
+        self._waiting: dict[bytes, deque[int]] = {}  # by group: jobs that share front-end results
         self._doing: dict[str, int] = {}
-        self._looked: dict[str, bytes] = {}  # what each worker did last
+        self._groups: dict[str, bytes] = {}  # the last group of each worker
         self._losses = Counter[int]()
-        self._unfit: dict[str, set[str]] = {}  # workers by the digest of a run that they do not have
+        self._unfit: dict[str, set[str]] = {}  # workers that lack a run, by the run's digest
         self._outcome = Outcome([])
 
     def run(self) -> Outcome:
         first = {key: number for number, key in reversed(list(enumerate(self._keys)))}
-        for number in sorted(first.values()):  # jobs that are the same are done once
+        for number in sorted(first.values()):  # equal jobs are computed once
             job = self._jobs[number]
             answer = self._kept.get(self._keys[number])
             if answer is None:
@@ -97,10 +152,10 @@ class _Sweep:
             elif now > somebody_at + self._nobody_s:
                 self._give_up()
                 break
-            for event in self._workers.told(_LOOK_S):
+            for event in self._workers.events(_WAIT_S):
                 self._hear(event)
         self._outcome.answers = [self._answers[first[key]] for key in self._keys]
-        self._outcome.warnings += self._told_of_keeping()
+        self._outcome.warnings += self._storage_warnings()
         return self._outcome
 
     def _hand_out(self) -> None:
@@ -111,15 +166,15 @@ class _Sweep:
             number = self._waiting[group].popleft()
             if not self._waiting[group]:
                 del self._waiting[group]
-            self._doing[worker], self._looked[worker] = number, group
-            self._workers.give(worker, msgspec.json.encode(self._jobs[number]))
+            self._doing[worker], self._groups[worker] = number, group
+            self._workers.give(worker, self._jobs[number])
 
     def _best_group(self, worker: str) -> bytes | None:
-        """What it looked at last; else what nobody else is at; else what most is left of."""
-        if self._looked.get(worker) in self._waiting:
-            return self._looked[worker]
+        """The group of its last job; else one that no other worker has; else the largest."""
+        if self._groups.get(worker) in self._waiting:
+            return self._groups[worker]
         fit = [g for g, jobs in self._waiting.items() if worker not in self._unfit_for(jobs[0])]
-        others = {self._looked[w] for w in self._doing}
+        others = {self._groups[w] for w in self._doing}
         return max(fit, key=lambda g: (g not in others, len(self._waiting[g])), default=None)
 
     def _unfit_for(self, number: int) -> set[str]:
@@ -127,19 +182,16 @@ class _Sweep:
 
     def _hear(self, event: Done | Lost) -> None:
         number = self._doing.pop(event.worker, None)
-        if number is None:  # it was lost while it waited; the next job starts it anew
-            self._looked.pop(event.worker, None)
+        if number is None:  # it was lost while it had no job; the next job restarts it
+            self._groups.pop(event.worker, None)
             return
         if isinstance(event, Lost):
-            self._looked.pop(event.worker, None)
+            self._groups.pop(event.worker, None)
             self._lost(number, event.reason)
             return
-        try:
-            answer = msgspec.json.decode(event.answer, type=Answer)
-        except msgspec.MsgspecError:
-            answer = Answer(None)
-        if not is_answer(answer):
-            self._lost(number, "it answered something that is no answer")
+        answer = event.answer
+        if not is_valid(answer):
+            self._lost(number, "it sent an invalid answer")
             return
         if answer.fault in ("worker", "version"):
             self._is_unfit(event.worker, number, answer)
@@ -150,18 +202,18 @@ class _Sweep:
         self._outcome.lost[reason] += 1
         self._losses[number] += 1
         if self._losses[number] >= MOST_LOSSES:
-            ended = f"{count(MOST_LOSSES, 'worker')} ended in the middle of it, the last because {reason}"
+            ended = f"{count(MOST_LOSSES, 'worker')} were lost during this job; the last one: {reason}"
             self._finish(number, Answer(None, error=ended, fault="job"))
         else:
             self._again(number)
 
     def _is_unfit(self, worker: str, number: int, answer: Answer) -> None:
-        """Leave the job, and its like, to others; where there are none, it fails as it did here."""
-        told = f"{worker}: {answer.error}"
-        if told not in self._outcome.warnings:
-            self._outcome.warnings.append(told)
+        """Give the job to other workers. Where no worker fits, all jobs of its run fail."""
+        warning = f"{worker}: {answer.error}"
+        if warning not in self._outcome.warnings:
+            self._outcome.warnings.append(warning)
         digest = self._jobs[number].run.digest
-        self._looked.pop(worker, None)
+        self._groups.pop(worker, None)
         self._unfit.setdefault(digest, set()).add(worker)
         present = set(self._workers.free()) | set(self._doing)
         if present <= self._unfit[digest]:
@@ -176,7 +228,7 @@ class _Sweep:
         self._waiting.setdefault(_group(self._jobs[number]), deque()).appendleft(number)
 
     def _give_up(self) -> None:
-        gone = Answer(None, error=f"no worker was there for {self._nobody_s:.0f} s", fault="worker")
+        gone = Answer(None, error=f"no worker was available for {self._nobody_s:.0f} s", fault="worker")
         for number in [n for jobs in self._waiting.values() for n in jobs]:
             self._finish(number, gone)
         self._waiting.clear()
@@ -186,15 +238,15 @@ class _Sweep:
         self._kept.put(self._keys[number], answer)
         self._progress(1)
 
-    def _told_of_keeping(self) -> list[str]:
-        told = []
+    def _storage_warnings(self) -> list[str]:
+        warnings = []
         if self._kept.damaged:
-            told.append(f"{count(self._kept.damaged, 'kept result')} could not be read and came anew")
+            warnings.append(f"{count(self._kept.damaged, 'stored result')} could not be read; computed again")
         if self._kept.refusal:
-            told.append(self._kept.refusal)
-        return told
+            warnings.append(self._kept.refusal)
+        return warnings
 
 
 def _group(job: Job) -> bytes:
-    """The same where two jobs look at the same scans in the same way."""
+    """Equal for jobs that share the results of the front end."""
     return msgspec.json.encode(job.run) + look_key(validated(job.parameters))

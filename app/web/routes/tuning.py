@@ -15,8 +15,8 @@ from app.dashboard.dashboard import Dashboard
 from app.dashboard.user import NAME
 from app.tuning.goal import GOALS
 from app.tuning.plan import Plan
-from app.tuning.request import MOST_OTHERS, OtherRun, SearchAsked, other_runs, plan_of
-from app.tuning.space import SENSIBLE
+from app.tuning.request import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
+from app.tuning.search_space import SENSIBLE
 from app.web.responses import body_of, json_reply
 from app.web.routes.access import Dash
 from app.web.routes.parameter_sets import SET_NAME
@@ -50,7 +50,7 @@ async def read(request: Request, dashboard: Dash) -> Response:
 @router.post("")
 async def start(request: Request, dashboard: Dash) -> Response:
     """Search over the run that is open, from its first scan to its last, and over others of the list."""
-    wanted: SearchAsked = await body_of(request, SearchAsked)
+    wanted: SearchRequest = await body_of(request, SearchRequest)
     await dashboard.search.start(await _plan(request, dashboard, wanted), wanted)
     return json_reply(dashboard.search.as_plain(), 202)
 
@@ -89,7 +89,7 @@ async def save(request: Request, dashboard: Dash) -> Response:
     return json_reply(dashboard.sets.as_plain(), 201)
 
 
-async def _plan(request: Request, dashboard: Dashboard, wanted: SearchAsked) -> Plan:
+async def _plan(request: Request, dashboard: Dashboard, wanted: SearchRequest) -> Plan:
     others = await _others(request, dashboard) if wanted.also or wanted.held_out else []
     state = dashboard.parameters
     source, digest, truth = dashboard.source, dashboard.digest, dashboard.truth

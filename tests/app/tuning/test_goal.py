@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.dashboard.parameters import read_file
+from app.sources.request import SourceRequest
 from app.tuning.goal import Goal, RunScore, goal_of, pool
-from app.tuning.plan import Plan, PlannedRun
+from app.tuning.plan import Plan, PlannedRun, Trial
 from app.tuning.result import Result, best_parameters, provenance_in, toml_of, warning_of
-from app.tuning.space import SENSIBLE, Axis, axes_of, check, values_of
-from app.tuning.trial import Trial
+from app.tuning.search_space import SENSIBLE, Axis, axes_of, check, values_of
 from pipeline.config import field_specs, preset
 from pipeline.errors import ParameterError
 
@@ -82,7 +82,7 @@ def test_the_start_itself_is_within_the_bound_of_errors():
     assert Goal("position").shown(0.0123) == "RMSE 1.23 cm"
 
 
-@pytest.mark.parametrize(("name", "share", "words"), [("best", 0.1, "Goals: f1"), ("ta", 1.5, "no share")])
+@pytest.mark.parametrize(("name", "share", "words"), [("best", 0.1, "Goals: f1"), ("ta", 1.5, "not a share")])
 def test_a_goal_that_is_none_is_refused(name, share, words):
     with pytest.raises(ParameterError, match=words):
         goal_of(name, share)
@@ -123,16 +123,16 @@ def test_bounds_come_from_the_declaration_and_can_be_narrowed():
     [
         ("detection.emin=1..5", "there is no parameter"),
         ("detection.e_min=5..1", "must be less"),
-        ("detection.e_min=0..5", "beyond what the parameter may be"),
+        ("detection.e_min=0..5", "outside of the parameter's range"),
         ("detection.e_min=1", "two numbers"),
         ("detection.e_min=nan..5", "must be less"),
         ("tracking.hits_to_confirm=1.5..4", "whole numbers"),
-        ("shape.centre=circle,square", "none of its values"),
-        ("shape.centre=circle", "nothing to choose"),
+        ("shape.centre=circle,square", "not one of its values"),
+        ("shape.centre=circle", "at least two values"),
         ("classification.forest", "has no bounds"),
         ("classification.forest=package,any", "classification.forest"),
-        ("evaluation.reach=1..50", "how a map is judged"),
-        ("obstacles.width=1..2", "no part of the map"),
+        ("evaluation.reach=1..50", "how a map is scored"),
+        ("obstacles.width=1..2", "does not change the map"),
     ],
 )
 def test_bounds_that_cannot_be_are_told(text, words):
@@ -141,7 +141,7 @@ def test_bounds_that_cannot_be_are_told(text, words):
 
 
 def test_a_parameter_is_named_once():
-    with pytest.raises(ParameterError, match="searched over twice"):
+    with pytest.raises(ParameterError, match="given twice"):
         axes_of(["detection.e_min", "detection.e_min=1..2"])
 
 
@@ -166,7 +166,10 @@ def test_what_is_tried_lies_within_the_bounds(spec, data):
 
 AXES = axes_of(["detection.e_max=10..200", "shape.centre"])
 PLAN = Plan(
-    runs=(PlannedRun("a run"), PlannedRun('another"\n[detection]', truth_name="trees.csv", held_out=True)),
+    runs=(
+        PlannedRun(SourceRequest("a run")),
+        PlannedRun(SourceRequest('another"\n[detection]'), truth_name="trees.csv", held_out=True),
+    ),
     axes=AXES,
     start=FOREST.model_dump(),
     storage="unused",

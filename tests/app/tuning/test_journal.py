@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from app.training.learned_forests import Forests
-from app.tuning.journal import Journal, _alone_with, cut_half_line
 from app.tuning.search import Search
+from app.tuning.storage import Journal, _locked, cut_half_line
 from pipeline.classification.forest import ALL_AROUND, FILE
 from pipeline.config import preset
 from pipeline.errors import StemmapError
@@ -68,7 +68,7 @@ def test_a_journal_that_is_taken_away_is_told_in_a_line(tmp_path):
 def test_a_lock_that_somebody_took_away_does_not_hide_what_was_written(tmp_path):
     path = tmp_path / "a.journal"
     journal = Journal(str(path))
-    with _alone_with(path):
+    with _locked(path):
         Path(f"{path}.lock").unlink()
     journal.append_logs([LINE])
     assert entries(path) == [LINE]

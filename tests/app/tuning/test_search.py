@@ -16,12 +16,12 @@ from app.batch.run_folder import read_run_record
 from app.cli import main
 from app.cli.tune import files_of
 from app.dashboard.parameters import read_file
-from app.tuning.plan import Plan, PlannedRun, TruthColumns
-from app.tuning.processes import Helpers
+from app.sources.request import SourceRequest
+from app.tuning.plan import Plan, PlannedRun, Trial, TruthTable
 from app.tuning.result import provenance_in, result_of
 from app.tuning.search import Search, StoppedError
-from app.tuning.space import axes_of
-from app.tuning.trial import Trial
+from app.tuning.search_processes import SearchWorkers
+from app.tuning.search_space import axes_of
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
 
@@ -32,7 +32,7 @@ OVER = ["detection.e_max=5..200", "classification.tree_share=0.1..1"]
 def plan(folder: Path, name: str = "a", **changes: object) -> Plan:
     """A search over two parameters of a short run."""
     told = Plan(
-        runs=(PlannedRun(RUN),),
+        runs=(PlannedRun(SourceRequest(RUN)),),
         axes=axes_of(OVER),
         start=preset("forest").model_dump(),
         storage=str(folder / f"{name}.journal"),
@@ -151,7 +151,7 @@ def test_a_process_that_is_killed_is_started_again_and_its_trial_made(whole, tmp
     told = plan(tmp_path, trials=4)
     search = Search(told)
     search.begin()
-    helpers = Helpers(told, 1)
+    helpers = SearchWorkers(told, 1)
     try:
         (pid,) = helpers.pids
         while not search.is_under_way:  # until it makes a trial of its own
@@ -227,7 +227,7 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
         ([RUN, RUN], 2, "named twice"),
         (["zenoh:tcp/127.0.0.1:7447"], 2, "live run"),
         ([RUN, "--over", "detection.e_min=9..1"], 2, "must be less"),
-        ([RUN, "--storage", "mysql://somewhere"], 2, "no address of a PostgreSQL"),
+        ([RUN, "--storage", "mysql://somewhere"], 2, "not the address of a PostgreSQL"),
         ([RUN, OTHER, "--truth", "{far}"], 2, "Say which run each is of"),
     ],
 )
@@ -259,5 +259,5 @@ def test_truths_are_given_in_order_or_by_name():
 
 
 def test_truth_goes_through_as_plain_values():
-    columns = TruthColumns([1.0], [2.0], [None], ["tree"])
-    assert TruthColumns.of(columns.as_record()) == columns
+    columns = TruthTable([1.0], [2.0], [None], ["tree"])
+    assert TruthTable.of(columns.trees()) == columns

@@ -14,10 +14,8 @@ import msgspec
 import pytest
 
 from app.tuning.goal import RunScore
-from app.tuning.plan import Plan
-from app.tuning.runs import ScoredRun
-from app.tuning.search import Search
-from app.tuning.trial import Trial
+from app.tuning.plan import Plan, Trial
+from app.tuning.search import Search, SearchRun
 from pipeline.config import Parameters
 from tests.app.tuning.test_search import exhaust, plan, searched
 from tests.postgresql import empty, running
@@ -42,7 +40,7 @@ def told(server: str, tmp_path: Path) -> Plan:
 def _scored_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a set scores is no matter here; the run itself is opened and mapped with the start."""
 
-    def scores(runs: list[ScoredRun], parameters: Parameters, _tick: object) -> list[RunScore]:
+    def scores(runs: list[SearchRun], parameters: Parameters, _tick: object) -> list[RunScore]:
         found = round(parameters.detection.e_max)
         return [RunScore(found, 200 - found, 0, 0, 0, 0.1, 1.0) for _ in runs]
 
@@ -130,7 +128,6 @@ HANG = """
 import sys, time
 import msgspec
 from app.tuning.plan import Plan
-from app.tuning.runs import ScoredRun
 from app.tuning.search import Search
 
 def hang(*_):

@@ -14,13 +14,12 @@ import msgspec
 import pytest
 import pytest_asyncio
 
+from app.sources.request import SourceRequest
 from app.tuning.goal import RunScore
 from app.tuning.job import TuneSearch
-from app.tuning.plan import Plan, PlannedRun, TruthColumns
-from app.tuning.result import Result, provenance_in
-from app.tuning.said import Said
-from app.tuning.space import axes_of
-from app.tuning.trial import Trial
+from app.tuning.plan import Plan, PlannedRun, Trial, TruthTable
+from app.tuning.result import Result, SearchMessage, provenance_in
+from app.tuning.search_space import axes_of
 from app.worker.protocol import Open
 from pipeline.config import preset
 from pipeline.errors import StemmapError
@@ -29,7 +28,7 @@ from tests.app.fakes import opened, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
 
 PLAN = Plan(
-    runs=(PlannedRun("sim:stand?duration=1"),),
+    runs=(PlannedRun(SourceRequest("sim:stand?duration=1")),),
     axes=axes_of(["classification.tree_share=0.1..0.9"]),
     start=preset("forest").model_dump(),
     storage="",
@@ -43,17 +42,21 @@ BEST = Trial(1, {"classification.tree_share": 0.7}, 1 / 19, (GOOD,))
 RESULT = Result(
     START, BEST, True, 2, 0, {"classification.tree_share": 1.0}, (("sim:stand?duration=1", "ab", False),)
 )
-SAID = (Said(start=START), Said(trials=(msgspec.structs.replace(START, number=0), BEST)), Said(result=RESULT))
+SAID = (
+    SearchMessage(start=START),
+    SearchMessage(trials=(msgspec.structs.replace(START, number=0), BEST)),
+    SearchMessage(result=RESULT),
+)
 
 
-def says(*lines: Said, then: str = "") -> list[str]:
+def says(*lines: SearchMessage, then: str = "") -> list[str]:
     """A process that says some lines when it was told a plan."""
     texts = [_line(line) for line in lines]
     code = f"import sys, time, os\nsys.stdin.readline()\nfor t in {texts!r}: print(t, flush=True)\n{then}"
     return [sys.executable, "-c", code]
 
 
-def _line(said: Said) -> str:
+def _line(said: SearchMessage) -> str:
     return msgspec.json.encode(said).decode()
 
 
@@ -88,11 +91,11 @@ async def test_what_a_search_says_is_told_and_its_set_is_a_file_with_its_provena
     ("command", "words"),
     [
         (
-            says(Said(error=("the run is empty", "run.mcap", "Take another"))),
+            says(SearchMessage(error=("the run is empty", "run.mcap", "Take another"))),
             "the run is empty (run.mcap). Take",
         ),
-        (says(SAID[0]), "ended in the middle"),
-        (says(then="print('no JSON')"), "gibberish"),
+        (says(SAID[0]), "ended unexpectedly"),
+        (says(then="print('no JSON')"), "protocol error"),
     ],
 )
 async def test_a_search_that_fails_says_why_and_another_can_begin(command, words):
@@ -114,7 +117,8 @@ async def test_one_search_at_a_time_and_leaving_the_run_ends_its_process():
     process = search._process
     assert process is not None
     await search.leave()
-    assert process.returncode is not None
+    with pytest.raises(ProcessLookupError):
+        os.kill(process.pid, 0)
     assert search.as_plain() == {"state": "none"}
 
 
@@ -161,8 +165,8 @@ async def test_what_a_search_had_on_disk_goes_with_it(tmp_path, monkeypatch):
 async def test_a_stopped_search_goes_on_from_its_journal_and_only_with_what_it_began_with():
     pages: list[dict[str, Any]] = []
     search = TuneSearch(pages.append)
-    first = Said(trials=(msgspec.structs.replace(START, number=0),))
-    ended = Said(result=msgspec.structs.replace(RESULT, better=False, best=START, made=1))
+    first = SearchMessage(trials=(msgspec.structs.replace(START, number=0),))
+    ended = SearchMessage(result=msgspec.structs.replace(RESULT, better=False, best=START, made=1))
     search._command = says(SAID[0], first, then=f"sys.stdin.readline()\nprint({_line(ended)!r}, flush=True)")
     await search.start(PLAN)
     assert search.plan is not None
@@ -174,16 +178,16 @@ async def test_a_stopped_search_goes_on_from_its_journal_and_only_with_what_it_b
     await until(lambda: not search.is_under_way)
     await until(lambda: pages[-1] == search.as_plain())
     assert (pages[-1]["state"], pages[-1]["go_on"]) == ("done", True)
-    edited = msgspec.structs.replace(PLAN.runs[0], truth=TruthColumns.of(truth_trees()))
+    edited = msgspec.structs.replace(PLAN.runs[0], truth=TruthTable.of(truth_trees()))
     for changed, words in (
         ({"start": preset("paper").model_dump()}, r"parameters were changed since .*\(.* and \d+ more"),
         ({"runs": (edited,)}, "true trees were edited"),
-        ({"seed": 1}, "opened otherwise"),
+        ({"seed": 1}, "opened in another way"),
     ):
         with pytest.raises(StemmapError, match=words):
             await search.go_on(msgspec.structs.replace(PLAN, **changed))
     # The journal knows the first trial, and what was made since.
-    news = Said(trials=(BEST, msgspec.structs.replace(START, number=2)))
+    news = SearchMessage(trials=(BEST, msgspec.structs.replace(START, number=2)))
     search._command = says(msgspec.structs.replace(SAID[0], trials=first.trials), news, SAID[2])
     assert journal.parent.is_dir()
     await search.go_on(msgspec.structs.replace(PLAN, storage=""))
@@ -291,14 +295,14 @@ async def test_runs_of_the_list_are_searched_over_or_held_out_where_they_can_be_
         "sim:a": "",
         "sim:b": "",
         "sim:none": "no true trees are known of it",
-        "run.mcap": "its recording is not there any more",
+        "run.mcap": "its recording does not exist any more",
     }
     a, b, none, gone = (listed[name]["record"] for name in ("sim:a", "sim:b", "sim:none", "run.mcap"))
     for wanted, words in (
         ({"also": [none]}, "no true trees are known of it"),
-        ({"held_out": [gone]}, "not there any more"),
+        ({"held_out": [gone]}, "does not exist any more"),
         ({"also": [a], "held_out": [a]}, "named twice"),
-        ({"also": [999]}, "no other run of the list"),
+        ({"also": [999]}, "no such run in the list"),
     ):
         answer = await client.post("/api/search", json={**BODY, **wanted})
         assert (answer.status_code, words in answer.json()["error"]["what"]) == (409, True)
@@ -306,11 +310,13 @@ async def test_runs_of_the_list_are_searched_over_or_held_out_where_they_can_be_
     start = msgspec.structs.replace(START, held_out=(GOOD,))
     sources = tuple((name, "ab", name == "b") for name in ("fake:", "a", "b"))
     result = msgspec.structs.replace(RESULT, start=start, best=best, sources=sources)
-    dashboard.search._command = says(Said(start=start), Said(trials=(best,)), Said(result=result))
+    dashboard.search._command = says(
+        SearchMessage(start=start), SearchMessage(trials=(best,)), SearchMessage(result=result)
+    )
     await client.post("/api/search", json={**BODY, "also": [a], "held_out": [b]})
     await until(lambda: not dashboard.search.is_under_way)
     assert dashboard.search.plan is not None
-    assert [(run.uri, run.held_out) for run in dashboard.search.plan.runs[1:]] == [
+    assert [(run.source.uri, run.held_out) for run in dashboard.search.plan.runs[1:]] == [
         ("sim:a", False),
         ("sim:b", True),
     ]

@@ -14,9 +14,9 @@ from tests.app.tuning.sweep.scores import scores
 def dies_once(text: bytes) -> bytes:
     """The score; but who is first asked for seven particles is killed, which a file then tells."""
     _die_once(text)
-    from app.tuning.sweep.scoring import score_text
+    from app.tuning.sweep.scoring import score_json
 
-    return score_text(text)
+    return score_json(text)
 
 
 def dies_once_for_nothing(text: bytes) -> bytes:

@@ -1,26 +1,26 @@
-"""A worker for tests: answers each job with its eps, and dies as its seed says.
+"""A worker for tests that answers each job with the value of its clustering.eps and ends as the seed says.
 
-Run with a folder: of the seed 666 it dies each time, of 13 once, which it writes down there. With the name
-of a file too, it writes there what it was asked for. While the folder holds `wait`, it gives no answer.
+The argument is a folder: a job with seed 666 kills the worker each time, one with seed 13 only once, which a
+file in the folder records. A second argument names a file that gets the values of the jobs. While the folder
+contains `wait`, no answer is sent.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
-from app.tuning.sweep.worker import work
+from app.common.child_process import ParentConnection, run_child
 from tests.app.tuning.sweep.scores import scores
 
 
-def score(text: bytes, folder: Path) -> bytes:
-    """The answer to a job, or death."""
-    job = json.loads(text)
-    seed, eps = job["run"]["seed"], job["parameters"]["clustering"]["eps"]
+def score(job: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The answer to a job."""
+    seed, eps = job["run"]["source"]["seed"], job["parameters"]["clustering"]["eps"]
     died = folder / "died"
     if seed == 666:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -32,8 +32,14 @@ def score(text: bytes, folder: Path) -> bytes:
             told.write(f"{eps}\n")
     while (folder / "wait").exists():
         time.sleep(0.01)
-    return json.dumps({"scores": scores(eps), "seconds": 1.0, "looked": True}).encode()
+    return {"scores": scores(eps), "seconds": 1.0, "looked": True}
+
+
+def work(parent: ParentConnection) -> None:
+    """Answer jobs until the parent ends."""
+    while True:
+        parent.send(score(parent.receive(dict), Path(sys.argv[1])))
 
 
 if __name__ == "__main__":
-    work(sys.stdin.buffer, sys.stdout.buffer, lambda text: score(text, Path(sys.argv[1])))
+    run_child(work)

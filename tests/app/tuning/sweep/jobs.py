@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from app.tuning.sweep.jobs import Job, RunAsked, TruthTable, code_digest
+from app.sources.request import SourceRequest
+from app.tuning.plan import TruthTable
+from app.tuning.sweep.jobs import Job, RunWithTruth, code_digest
 from pipeline.config import preset
 from tests.app.tuning.sweep.scores import scores
 
@@ -13,5 +15,5 @@ def job(eps: float, *, seed: int = 0, digest: str = "d", particles: int = 100) -
     """A job that differs by its eps, particles, seed and source."""
     truth = TruthTable([1.0], [2.0], [None], ["tree"])
     parameters = preset("forest").replace({"clustering.eps": eps, "slam.particles": particles})
-    run = RunAsked("sim:nothing", digest, seed, "auto", {}, [], truth)
+    run = RunWithTruth(SourceRequest("sim:nothing", seed=seed), digest, truth)
     return Job(run, parameters.model_dump(), code_digest())

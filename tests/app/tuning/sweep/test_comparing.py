@@ -10,9 +10,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from app.tuning.sweep.asking import Plan, Ready
-from app.tuning.sweep.comparing import GOALS, Comparison, best_of, compared
-from app.tuning.sweep.jobs import Answer
+from app.tuning.sweep.comparison import GOALS, Comparison, best_of, compare_answers
+from app.tuning.sweep.jobs import Answer, PreparedRun, SweepPlan
 from app.tuning.sweep.report import files, json_text, lines
 from app.tuning.sweep.report_html import page
 from pipeline.config.model import Value
@@ -26,7 +25,7 @@ def comparison() -> Comparison:
     """Three sets on two runs; the last failed on one of them, one has a name that would do harm."""
     values = (0.1, 0.2, 0.3)
     sets: tuple[dict[str, Value], ...] = tuple({"clustering.eps": eps} for eps in values)
-    runs = (Ready("first", job(0.1).run, "forest"), Ready(EVIL, job(0.1).run, "forest"))
+    runs = (PreparedRun("first", job(0.1).run, "forest"), PreparedRun(EVIL, job(0.1).run, "forest"))
     jobs = {(s, r): job(values[s], seed=r) for s in range(3) for r in range(2)}
     answers = {
         (0, 0): Answer(scores(0.8, found=3), 2.0, True),
@@ -36,7 +35,7 @@ def comparison() -> Comparison:
         (2, 0): Answer(scores(1.0), 2.0),
         (2, 1): Answer(None, error="the disk is full", fault="job"),
     }
-    return compared(Plan(runs, sets, jobs, {}), answers)
+    return compare_answers(SweepPlan(runs, sets, jobs, {}), answers)
 
 
 def test_counts_are_added_up_and_all_else_is_the_mean(comparison):
@@ -60,7 +59,7 @@ def test_sets_that_are_alike_in_a_goal_have_no_best(comparison):
     assert best_of(alike, goal) == 0
     assert best_of(alike[:1], goal) == alike[0].set_number
     told = lines(replace(comparison, best=dict.fromkeys(comparison.best, 0)))
-    assert "best F1: none, the sets are alike in it or do not tell" in told
+    assert "best F1: none; all sets are equal or unknown" in told
 
 
 def test_the_tables_hold_every_row(comparison, tmp_path):

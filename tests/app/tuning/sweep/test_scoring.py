@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 from app.cli import main
-from app.tuning.sweep.asking import Named, ready
-from app.tuning.sweep.jobs import Answer, Job, code_digest
-from app.tuning.sweep.scoring import Scorer, score_text
+from app.sources.request import SourceRequest
+from app.tuning.sweep.jobs import Answer, Job, PreparedRun, code_digest, prepare_run
+from app.tuning.sweep.scoring import Scorer, score_json
 from pipeline.config import preset
 from pipeline.errors import StemmapError
 
@@ -29,16 +29,13 @@ SETS: tuple[tuple[dict[str, float], bool], ...] = (
 )
 
 
-def named(name: str, **given: object) -> Named:
+def ready(name: str) -> PreparedRun:
     """A run as on the command line."""
-    flags = {"seed": 3, "odometry": "auto", "topics": {}, "mount": (), "truth": None, **given}
-    return Named(name, **flags)  # type: ignore[arg-type]
+    return prepare_run(SourceRequest(name, seed=3), None)
 
 
 def test_scores_are_those_of_mapping(tmp_path, capsys):
-    job = Job(
-        ready(named(RUN)).asked, preset("forest").replace({"slam.gate": 2.0}).model_dump(), code_digest()
-    )
+    job = Job(ready(RUN).run, preset("forest").replace({"slam.gate": 2.0}).model_dump(), code_digest())
     answer = Scorer().score(job)
     assert main(["map", RUN, "--seed", "3", "--out", str(tmp_path), "--set", "slam.gate=2"]) == 0
     mapped = json.loads((tmp_path / "run.json").read_text())
@@ -48,9 +45,9 @@ def test_scores_are_those_of_mapping(tmp_path, capsys):
 
 
 def test_scans_are_looked_at_once_for_like_sets_and_the_scores_are_those_of_looking_anew():
-    run, one = ready(named(LONGER)), Scorer()
+    run, one = ready(LONGER), Scorer()
     for changes, looks in SETS:
-        job = Job(run.asked, preset("forest").replace(changes).model_dump(), code_digest())
+        job = Job(run.run, preset("forest").replace(changes).model_dump(), code_digest())
         answer, fresh = one.score(job), Scorer()
         assert answer.scores == fresh.score(job).scores is not None, changes
         assert answer.looked == looks, changes
@@ -59,8 +56,8 @@ def test_scans_are_looked_at_once_for_like_sets_and_the_scores_are_those_of_look
 
 
 def test_what_was_kept_and_is_damaged_is_looked_at_again(monkeypatch):
-    run, scorer = ready(named(RUN)), Scorer()
-    job = Job(run.asked, preset("forest").model_dump(), code_digest())
+    run, scorer = ready(RUN), Scorer()
+    job = Job(run.run, preset("forest").model_dump(), code_digest())
     first = scorer.score(job)
     monkeypatch.setattr("pipeline.remapping.scan_cache.KeptScans.scan", _damaged)
     second = scorer.score(job)
@@ -73,30 +70,32 @@ def _damaged(_kept: object, index: int) -> object:
 
 
 def test_a_worker_of_another_version_or_with_another_recording_says_so():
-    run = ready(named(RUN))
-    fine = Job(run.asked, preset("forest").model_dump(), code_digest())
+    run = ready(RUN)
+    fine = Job(run.run, preset("forest").model_dump(), code_digest())
     older = msgspec.structs.replace(fine, code="0.0.1")
-    other = msgspec.structs.replace(fine, run=msgspec.structs.replace(run.asked, digest="another"))
-    gone = msgspec.structs.replace(fine, run=msgspec.structs.replace(run.asked, uri="gone.mcap"))
+    other = msgspec.structs.replace(fine, run=msgspec.structs.replace(run.run, digest="another"))
+    gone = msgspec.structs.replace(
+        fine, run=msgspec.structs.replace(run.run, source=SourceRequest("gone.mcap"))
+    )
     for job, fault, says in (
         (older, "version", "same version"),
         (other, "worker", "another"),
         (gone, "worker", "gone"),
     ):
-        answer = msgspec.json.decode(score_text(msgspec.json.encode(job)), type=Answer)
+        answer = msgspec.json.decode(score_json(msgspec.json.encode(job)), type=Answer)
         assert (answer.scores, answer.fault) == (None, fault)
         assert says in answer.error
 
 
 @pytest.mark.parametrize("text", [b"", b"{}", b"[1]", b'{"run": 3}', b"\xff"])
 def test_what_is_no_job_is_answered(text):
-    assert msgspec.json.decode(score_text(text), type=Answer).error.startswith("this is no job")
+    assert msgspec.json.decode(score_json(text), type=Answer).error.startswith("this is not a job")
 
 
 def test_truth_far_from_the_path_is_no_score():
-    run = ready(named(RUN))
-    far = msgspec.structs.replace(run.asked.truth, x=[x + 900.0 for x in run.asked.truth.x])
-    asked = msgspec.structs.replace(run.asked, truth=far)
+    run = ready(RUN)
+    far = msgspec.structs.replace(run.run.truth, x=[x + 900.0 for x in run.run.truth.x])
+    asked = msgspec.structs.replace(run.run, truth=far)
     scorer = Scorer()
     answer = scorer.score(Job(asked, preset("forest").model_dump(), code_digest()))
     scorer.close()

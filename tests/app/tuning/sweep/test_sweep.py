@@ -11,11 +11,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from app.tuning.sweep.jobs import Answer, Job
-from app.tuning.sweep.kept_answers import KeptAnswers
-from app.tuning.sweep.processes import Processes
-from app.tuning.sweep.sweep import MOST_LOSSES, sweep
-from app.tuning.sweep.workers import Done, Lost, Told
+from app.tuning.sweep.jobs import Answer, Job, code_digest
+from app.tuning.sweep.sweep import MOST_LOSSES, KeptAnswers, sweep
+from app.tuning.sweep.workers import Done, Event, Lost, Processes
 from tests.app.tuning.sweep.jobs import job, scores
 
 NOTHING = KeptAnswers(None)
@@ -32,21 +30,19 @@ class InMemory:
 
     def __init__(self, names: list[str], does: Does) -> None:
         self._free, self._does = names, does
-        self._events: deque[Told] = deque()
+        self._events: deque[Event] = deque()
         self.done: list[tuple[str, Job]] = []
 
     def free(self) -> list[str]:
         return list(self._free)
 
-    def give(self, worker: str, text: bytes) -> None:
+    def give(self, worker: str, asked: Job) -> None:
         self._free.remove(worker)
-        asked = msgspec.json.decode(text, type=Job)
         self.done.append((worker, asked))
         answer = self._does(worker, asked)
-        lost = isinstance(answer, str)
-        self._events.append(Lost(worker, str(answer)) if lost else Done(worker, msgspec.json.encode(answer)))
+        self._events.append(Lost(worker, answer) if isinstance(answer, str) else Done(worker, answer))
 
-    def told(self, _patience_s: float) -> list[Told]:
+    def events(self, _timeout_s: float, /) -> list[Event]:
         if not self._events:
             return []
         event = self._events.popleft()
@@ -93,8 +89,8 @@ def test_processes_that_are_killed_in_the_middle_are_replaced_and_counted(tmp_pa
     with processes(2, tmp_path) as workers:
         outcome = sweep(jobs, workers, NOTHING)
     assert f1_of(outcome.answers) == [0.1, 0.2, 0.3, None]
-    assert outcome.lost == {"it was ended by signal 9": 1 + MOST_LOSSES}
-    assert f"{MOST_LOSSES} workers ended" in outcome.answers[3].error
+    assert outcome.lost == {"ended by signal 9": 1 + MOST_LOSSES}
+    assert f"{MOST_LOSSES} workers were lost" in outcome.answers[3].error
 
 
 def test_what_a_killed_sweep_had_done_is_not_done_again(tmp_path):
@@ -125,7 +121,7 @@ def test_damaged_and_foreign_files_are_computed_again_and_failures_are_not_kept(
     files[0].write_bytes(files[0].read_bytes()[:-5])
     outcome = sweep(jobs, InMemory(["a"], fine), KeptAnswers(tmp_path))
     assert outcome.known == 1
-    assert any("1 kept result could not be read" in warning for warning in outcome.warnings)
+    assert any("1 stored result could not be read" in warning for warning in outcome.warnings)
     assert sweep(jobs, InMemory(["a"], fine), KeptAnswers(tmp_path)).known == 2
 
 
@@ -139,19 +135,19 @@ def test_an_answer_without_the_figures_is_none_wherever_it_comes_from(harm, tmp_
 
     outcome = sweep([job(0.1)], InMemory(["a", "b"], odd), NOTHING)
     assert f1_of(outcome.answers) == [0.1]
-    assert outcome.lost == {"it answered something that is no answer": 1}
+    assert outcome.lost == {"it sent an invalid answer": 1}
     kept = KeptAnswers(tmp_path)
     kept.put(job(0.1).key(), odd("a", job(0.1)))
     outcome = sweep([job(0.1)], InMemory(["b"], fine), kept)
     assert (outcome.known, f1_of(outcome.answers)) == (0, [0.1])
-    assert any("1 kept result could not be read" in warning for warning in outcome.warnings)
+    assert any("1 stored result could not be read" in warning for warning in outcome.warnings)
 
 
 def test_where_nothing_can_be_written_the_results_come_all_the_same(tmp_path):
     (tmp_path / "file").touch()
     outcome = sweep([job(0.1)], InMemory(["a"], fine), KeptAnswers(tmp_path / "file"))
     assert f1_of(outcome.answers) == [0.1]
-    assert any("not kept" in warning for warning in outcome.warnings)
+    assert any("not stored" in warning for warning in outcome.warnings)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +163,8 @@ def test_where_nothing_can_be_written_the_results_come_all_the_same(tmp_path):
 def test_another_run_or_set_has_another_key(change):
     assert job(0.1).key() != job(**{"eps": 0.1, **change}).key()
     other_code = msgspec.structs.replace(job(0.1), code="older")
-    elsewhere = msgspec.structs.replace(job(0.1), run=msgspec.structs.replace(job(0.1).run, uri="/else"))
+    source = msgspec.structs.replace(job(0.1).run.source, uri="/else")
+    elsewhere = msgspec.structs.replace(job(0.1), run=msgspec.structs.replace(job(0.1).run, source=source))
     assert other_code.key() != job(0.1).key() == elsewhere.key()
 
 
@@ -196,4 +193,9 @@ def test_where_no_worker_has_the_recording_its_jobs_fail_and_others_go_on():
 
 def test_without_workers_the_sweep_ends_and_says_so():
     outcome = sweep([job(0.1)], InMemory([], fine), NOTHING, nobody_s=0.0)
-    assert "no worker was there" in outcome.answers[0].error
+    assert "no worker was available" in outcome.answers[0].error
+
+
+def test_the_digest_of_the_code_depends_on_the_sources_of_the_pipeline(monkeypatch):
+    monkeypatch.setattr("pathlib.Path.rglob", lambda *_: iter(()))
+    assert code_digest.__wrapped__() != code_digest()

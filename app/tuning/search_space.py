@@ -1,4 +1,4 @@
-"""Which parameters are searched over, and within which bounds."""
+"""The parameters that a search varies, and their bounds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.config import FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError
 
-# What decides most about which clusters and columns are trees, within bounds in which trunks can be found.
+# The parameters with the largest effect on which clusters and columns become trees, within plausible bounds.
 SENSIBLE = (
     "detection.e_max=10..200",
     "detection.cylindrical_stddev_thresh=0.02..0.2",
@@ -25,16 +25,16 @@ SENSIBLE = (
     "tracking.proximity_radius=0.2..1",
 )
 _NO_PART_OF_THE_MAP = {
-    "evaluation": "decides how a map is judged, not how it is made",
-    "obstacles": "is no part of the map",
+    "evaluation": "decides how a map is scored, not how it is made",
+    "obstacles": "does not change the map",
 }
 _LOG_FROM = 100.0  # a range whose ends differ by more than this factor is searched by its logarithm
-_DIGITS = 4  # of a number that is tried: nobody can tell more apart, and a file is to be read by people
+_DIGITS = 4  # significant digits of a value, so that the file stays readable
 _CORNERS = 4096
 
 
 class Axis(msgspec.Struct, frozen=True):
-    """A parameter that is searched over.
+    """A parameter of a search.
 
     Attributes:
         low, high: Of a number.
@@ -48,7 +48,7 @@ class Axis(msgspec.Struct, frozen=True):
     choices: tuple[str | bool, ...] = ()
 
     def suggest(self, trial: Any) -> None:  # noqa: ANN401 - Optuna has no types
-        """Let a trial of Optuna choose a value, which is among its `params` then."""
+        """Let a trial of Optuna choose a value; it is in the trial's `params` afterwards."""
         log = self.low > 0.0 and self.high >= _LOG_FROM * self.low
         if self.kind == "choice":
             trial.suggest_categorical(self.name, self.choices)
@@ -58,7 +58,7 @@ class Axis(msgspec.Struct, frozen=True):
             trial.suggest_float(self.name, self.low, self.high, log=log)
 
     def value_of(self, suggested: Any) -> Value:  # noqa: ANN401
-        """The parameter's value for what Optuna suggests: a number of few digits within the bounds."""
+        """Return the parameter's value for a suggestion of Optuna: few digits, within the bounds."""
         if self.kind == "choice":
             return suggested if isinstance(suggested, bool) else str(suggested)
         if self.kind == "int":
@@ -66,21 +66,21 @@ class Axis(msgspec.Struct, frozen=True):
         return min(max(float(f"{suggested:.{_DIGITS}g}"), self.low), self.high)
 
     def holds(self, value: Value) -> bool:
-        """Whether a value lies within the bounds."""
+        """Whether a value is within the bounds."""
         if self.kind == "choice":
             return any(type(c) is type(value) and c == value for c in self.choices)
         return not isinstance(value, str) and self.low <= value <= self.high
 
     @property
     def words(self) -> str:
-        """As it is written after --over."""
+        """The axis in the syntax of --over."""
         if self.kind == "choice":
             return f"{self.name}={','.join(_word(c) for c in self.choices)}"
         return f"{self.name}={self.low:g}..{self.high:g}"
 
 
 def axes_of(texts: Sequence[str]) -> tuple[Axis, ...]:
-    """The axes that `NAME`, `NAME=LOW..HIGH` or `NAME=A,B` name.
+    """Return the axes of `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`.
 
     Raises:
         ParameterError: A name is unknown or named twice, or its bounds contradict its declaration.
@@ -89,20 +89,20 @@ def axes_of(texts: Sequence[str]) -> tuple[Axis, ...]:
     names = [axis.name for axis in axes]
     for name in names:
         if names.count(name) > 1:
-            raise ParameterError(f"{name} is searched over twice", remedy="Name it once")
+            raise ParameterError(f"{name} is given twice", remedy="Name it once")
     return axes
 
 
 def check(axes: Iterable[Axis], start: Parameters) -> None:
-    """Look whether the bounds leave any set that can be mapped with.
+    """Check that the bounds contain a set without contradictions.
 
     Raises:
-        ParameterError: None of the corners of the space is such a set; the line names the contradiction.
+        ParameterError: All corners of the space contradict themselves; the message names the contradiction.
     """
     ends = [[(axis.name, value) for value in _ends(axis)] for axis in axes]
     refusal: ParameterError | None = None
     if math.prod(len(values) for values in ends) > _CORNERS:
-        return  # each set that is tried is looked at anyway
+        return  # each trial is checked anyway
     for corner in product(*ends):
         try:
             start.replace(dict(corner))
@@ -112,13 +112,13 @@ def check(axes: Iterable[Axis], start: Parameters) -> None:
             return
     if refusal is not None:
         raise ParameterError(
-            f"no set within these bounds can be mapped with: {refusal.what}",
+            f"all sets within these bounds contradict themselves: {refusal.what}",
             remedy="Widen the bounds, or set the other value with --set",
         )
 
 
 def values_of(axes: Iterable[Axis], suggested: Mapping[str, Any]) -> dict[str, Value]:
-    """The parameters' values by their names."""
+    """Return the values of the parameters by name."""
     return {axis.name: axis.value_of(suggested[axis.name]) for axis in axes}
 
 
@@ -126,11 +126,11 @@ def _axis(text: str) -> Axis:
     name, given, bounds = (part.strip() for part in text.partition("="))
     spec = next((spec for spec in field_specs() if spec.name == name), None)
     if spec is None:
-        Parameters().replace({name: 0})  # which says that there is none, and which is the nearest
+        Parameters().replace({name: 0})  # raises an error that names the nearest parameter
         raise ParameterError(f"there is no parameter {name!r}")
     why = _NO_PART_OF_THE_MAP.get(name.partition(".")[0])
     if why is not None:
-        raise ParameterError(f"{name} {why}, and cannot be searched over", remedy="Set it with --set")
+        raise ParameterError(f"{name} {why}; it cannot be searched over", remedy="Set it with --set")
     if spec.kind == "name":
         return _names(spec, bounds)
     if spec.minimum is None or spec.maximum is None:
@@ -149,7 +149,7 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
     except (ValueError, OverflowError):
         kind = "whole numbers" if spec.kind == "int" else "numbers"
         raise ParameterError(
-            f"{spec.name}={bounds}: should be two {kind} with .. between", remedy=f"E.g. {_example(spec)}"
+            f"{spec.name}={bounds}: not two {kind} with .. between", remedy=f"E.g. {_example(spec)}"
         ) from None
     assert spec.minimum is not None  # noqa: S101 - it is a number
     assert spec.maximum is not None  # noqa: S101
@@ -157,7 +157,7 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
         raise ParameterError(f"{spec.name}={bounds}: the lower bound must be less than the upper one")
     if not (spec.minimum <= low and high <= spec.maximum):
         raise ParameterError(
-            f"{spec.name}={bounds} lies beyond what the parameter may be",
+            f"{spec.name}={bounds} is outside of the parameter's range",
             remedy=f"It goes from {spec.minimum:g} to {spec.maximum:g}",
         )
     return low, high
@@ -168,8 +168,8 @@ def _choice(spec: FieldSpec, words: str) -> Axis:
     asked = [word.strip() for word in words.split(",")]
     unknown = [word for word in asked if word not in known]
     if unknown or len(set(asked)) < 2:
-        what = f"{unknown[0]!r} is none of its values" if unknown else "one value is nothing to choose from"
-        raise ParameterError(f"{spec.name}={words}: {what}", remedy=f"Choose among {', '.join(known)}")
+        what = f"{unknown[0]!r} is not one of its values" if unknown else "at least two values are needed"
+        raise ParameterError(f"{spec.name}={words}: {what}", remedy=f"Choose from {', '.join(known)}")
     return Axis(spec.name, "choice", choices=tuple(known[word] for word in dict.fromkeys(asked)))
 
 
@@ -177,10 +177,10 @@ def _names(spec: FieldSpec, words: str) -> Axis:
     asked = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
     if len(asked) < 2:
         raise ParameterError(
-            f"{spec.name} is a name, and has no bounds", remedy=f"Name some to choose among: {spec.name}=A,B"
+            f"{spec.name} is a name and has no bounds", remedy=f"Give at least two names: {spec.name}=A,B"
         )
     for word in asked:
-        Parameters().replace({spec.name: word})  # which says what a name looks like
+        Parameters().replace({spec.name: word})  # raises an error that says how a name is written
     return Axis(spec.name, "choice", choices=asked)
 
 

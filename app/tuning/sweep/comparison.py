@@ -1,4 +1,5 @@
-"""What came of sets and runs side by side: a row each, the means over the runs, the best for each goal."""
+"""Results of a comparison side by side: a row per set and run, means over the runs, the best set for each
+goal."""
 
 from __future__ import annotations
 
@@ -7,18 +8,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from app.tuning.sweep.asking import Plan
-from app.tuning.sweep.jobs import Answer
+from app.tuning.sweep.jobs import Answer, SweepPlan
 
 Figures = dict[str, float | int | None]
 
-# Figure, its heading, unit and what it is multiplied with for people.
+# Figure, heading, unit and factor from the stored value to the shown one.
 SHOWN: tuple[tuple[str, str, str, float], ...] = (
     ("TA", "TA", "", 1.0),
     ("FR", "FR", "", 1.0),
     ("TR", "TR", "", 1.0),
     ("FA", "FA", "", 1.0),
-    ("spurious", "none", "", 1.0),
+    ("spurious", "spurious", "", 1.0),
     ("completeness", "compl.", "%", 100.0),
     ("correctness", "corr.", "%", 100.0),
     ("f1", "F1", "%", 100.0),
@@ -35,15 +35,15 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A set on a run, or on the mean of all of them.
+    """The result of a set on one run, or its mean over all runs.
 
     Attributes:
-        set_number: From 1 on.
-        run: Its number from 1 on, 0 for the mean.
-        figures: By name, see COLUMNS; empty where it failed.
-        seconds: That it took; of a mean their sum.
-        looked: Whether scans had to be looked at in this time.
-        error: Why there are no figures.
+        set_number: Number of the set, from 1 on.
+        run: Number of the run, from 1 on; 0 for the mean.
+        figures: Scores by name, see COLUMNS; empty for a failure.
+        seconds: Computing time [s]; for a mean the sum.
+        looked: Whether the front end ran in this time.
+        error: Reason of the failure.
     """
 
     set_number: int
@@ -56,11 +56,11 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """What a set may be best at.
+    """A criterion for the best set.
 
     Attributes:
-        words: For people.
-        value: Of a row's figures, the larger the better; None where it cannot be said.
+        words: Its name.
+        value: Value of a row's figures, larger is better; None where it is unknown.
     """
 
     words: str
@@ -73,11 +73,11 @@ class Comparison:
 
     Attributes:
         rows: By set and run.
-        means: A row a set.
-        best: Number of the best set by goal, in words; 0 where none is better than others.
+        means: A row per set.
+        best: Number of the best set by name of the goal; 0 where all sets are equal or unknown.
     """
 
-    plan: Plan
+    plan: SweepPlan
     rows: tuple[Row, ...]
     means: tuple[Row, ...]
     best: dict[str, int]
@@ -110,8 +110,8 @@ GOALS = (
 )
 
 
-def compared(plan: Plan, answers: dict[tuple[int, int], Answer]) -> Comparison:
-    """Rows, means and the best."""
+def compare_answers(plan: SweepPlan, answers: dict[tuple[int, int], Answer]) -> Comparison:
+    """Return rows, means and the best sets."""
     rows, means = [], []
     for s in range(len(plan.sets)):
         of_set = [_row(plan, answers, s, r) for r in range(len(plan.runs))]
@@ -120,7 +120,7 @@ def compared(plan: Plan, answers: dict[tuple[int, int], Answer]) -> Comparison:
     return Comparison(plan, tuple(rows), tuple(means), {goal.words: best_of(means, goal) for goal in GOALS})
 
 
-def _row(plan: Plan, answers: dict[tuple[int, int], Answer], s: int, r: int) -> Row:
+def _row(plan: SweepPlan, answers: dict[tuple[int, int], Answer], s: int, r: int) -> Row:
     if (s, r) in plan.left_out:
         return Row(s + 1, r + 1, {}, error=plan.left_out[s, r])
     answer = answers[s, r]
@@ -130,46 +130,62 @@ def _row(plan: Plan, answers: dict[tuple[int, int], Answer], s: int, r: int) -> 
 
 
 def figures(scores: dict[str, Any]) -> Figures:
-    """The columns from what a worker answered."""
-    told: Figures = {name: scores[name]["count"] for name in ("TA", "FR", "TR", "FA")}
-    told["TA_of"], told["TR_of"] = scores["TA"]["of"], scores["TR"]["of"]
+    """Return the columns of a worker's scores."""
+    columns: Figures = {name: scores[name]["count"] for name in ("TA", "FR", "TR", "FA")}
+    columns["TA_of"], columns["TR_of"] = scores["TA"]["of"], scores["TR"]["of"]
     for name in COLUMNS:
-        if name not in told:
-            told[name] = scores[name.removesuffix("_m")]
-    return told
+        if name not in columns:
+            columns[name] = scores[name.removesuffix("_m")]
+    return columns
 
 
 def _mean(set_number: int, rows: Sequence[Row]) -> Row:
-    """Counts are added up over the runs; all else is the mean of the runs that can tell it, each as weighty
-    as the others. A set that failed on a run has no mean: it would not be that of the same runs."""
+    """Counts are summed over the runs; all other figures are means of the runs that have them, with equal
+    weights. A set that failed on a run has no mean, because it could not be compared with the others."""
     failed = [row for row in rows if row.error]
     seconds = sum(row.seconds for row in rows)
     if failed:
         return Row(set_number, 0, {}, seconds, error=failed[0].error)
-    told: Figures = {}
+    mean: Figures = {}
     for name in COLUMNS:
         known = [value for row in rows if (value := row.figures[name]) is not None]
         if all(isinstance(value, int) for value in known) and known:
-            told[name] = sum(known)
+            mean[name] = sum(known)
         else:
-            told[name] = math.fsum(known) / len(known) if known else None
-    return Row(set_number, 0, told, seconds, any(row.looked for row in rows))
+            mean[name] = math.fsum(known) / len(known) if known else None
+    return Row(set_number, 0, mean, seconds, any(row.looked for row in rows))
 
 
 def best_of(means: Sequence[Row], goal: Goal) -> int:
-    """The first of the best, 0 where no set tells or several do no better than one another."""
-    told = [
+    """Return the number of the best set, the first of equals; 0 where no value is known or all are equal."""
+    values = [
         (value, -m.set_number) for m in means if m.figures and (value := goal.value(m.figures)) is not None
     ]
-    alike = len(told) > 1 and max(told)[0] == min(told)[0]
-    return -max(told)[1] if told and not alike else 0
+    equal = len(values) > 1 and max(values)[0] == min(values)[0]
+    return -max(values)[1] if values and not equal else 0
 
 
 def figure_words(figures: Figures, name: str, scale: float) -> str:
-    """A figure for people; a count with what it is out of."""
+    """A figure as text; TA and TR with their totals."""
     value = figures[name]
     if value is None:
         return "-"
     if name in ("TA", "TR"):
         return f"{value}/{figures[f'{name}_of']}"
     return str(value) if isinstance(value, int) and scale == 1.0 else f"{scale * value:.2f}"
+
+
+def is_valid(answer: Answer) -> bool:
+    """Whether the scores of an answer have all figures, each a finite number or None; for a failure, whether
+    it has a reason."""
+    if answer.scores is None:
+        return bool(answer.error)
+    try:
+        columns = figures(answer.scores)
+    except (KeyError, TypeError):
+        return False
+    if any(columns[name] is None for name in ("TA", "TA_of", "FR", "TR", "TR_of", "FA", "spurious")):
+        return False
+    return math.isfinite(answer.seconds) and all(
+        value is None or (type(value) in (int, float) and math.isfinite(value)) for value in columns.values()
+    )

@@ -1,0 +1,136 @@
+"""Measures the size of the code: `python -m tests.benchmarks.code_size [ROOT]`.
+
+Code lines of `app` and `pipeline` are lines that are neither blank, nor comments, nor part of a docstring. An
+import chain counts the modules (or the folders) of `app` of which each imports the next when it is loaded.
+Imports inside of functions and for type checking do not count; members of a circle of imports count once.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parents[2]).resolve()
+PACKAGES = ("app", "pipeline")
+
+
+def code_lines(text: str) -> int:
+    """Number of lines of a module without blanks, comments and docstrings."""
+    docstrings: set[int] = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            first = node.body[0] if node.body else None
+            if isinstance(first, ast.Expr) and isinstance(getattr(first.value, "value", None), str):
+                docstrings |= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    return sum(
+        1
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.strip().startswith("#") and number not in docstrings
+    )
+
+
+def files(package: str) -> list[Path]:
+    """All modules of a package."""
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def imports_of(package: str) -> dict[str, set[str]]:
+    """The modules of a package that each of its modules imports when it is loaded."""
+    modules = {_name(path): path for path in files(package)}
+    graph = {}
+    for name, path in modules.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        found = {target for target in _targets(tree) if target in modules}
+        graph[name] = found - {name}
+    return graph
+
+
+def folders_of(graph: dict[str, set[str]]) -> dict[str, set[str]]:
+    """The same for folders: `app.tuning` for all modules in it."""
+    folders: dict[str, set[str]] = {}
+    for name, targets in graph.items():
+        folder = ".".join(name.split(".")[:2])
+        found = {".".join(target.split(".")[:2]) for target in targets} - {folder, "app"}
+        folders.setdefault(folder, set()).update(found)
+    return folders
+
+
+def longest_chain(graph: dict[str, set[str]]) -> list[str]:
+    """The longest chain of modules of which each imports the next."""
+    sys.setrecursionlimit(10_000)
+
+    @cache
+    def from_module(name: str) -> tuple[str, ...]:
+        chains = [from_module(target) for target in sorted(graph[name]) if name not in _reach(target)]
+        return (name, *max(chains, key=len, default=()))
+
+    @cache
+    def _reach(name: str) -> frozenset[str]:
+        seen, waiting = {name}, [name]
+        while waiting:
+            for target in graph[waiting.pop()] - seen:
+                seen.add(target)
+                waiting.append(target)
+        return frozenset(seen)
+
+    return list(max((from_module(name) for name in sorted(graph)), key=len, default=()))
+
+
+def imported_by(module: str) -> list[str]:
+    """The modules of this project that `import module` loads."""
+    code = f"import json, sys, {module}; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=True)
+    return [name for name in json.loads(done.stdout) if name.split(".")[0] in PACKAGES]
+
+
+def _name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _targets(tree: ast.Module) -> Iterator[str]:
+    waiting: list[ast.AST] = list(tree.body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+                continue
+            waiting += ast.iter_child_nodes(node)
+
+
+def main() -> None:
+    """Print the table."""
+    lines = {
+        package: [code_lines(path.read_text(encoding="utf-8")) for path in files(package)]
+        for package in PACKAGES
+    }
+    every = sorted(count for counts in lines.values() for count in counts)
+    graph = imports_of("app")
+    modules, folders = longest_chain(graph), longest_chain(folders_of(graph))
+    rows = [
+        *((f"code lines in {package}", f"{sum(lines[package]):,}") for package in PACKAGES),
+        ("code lines in app + pipeline", f"{sum(every):,}"),
+        ("files in app + pipeline", f"{len(every):,}"),
+        ("median code lines of a file", f"{every[len(every) // 2]:,}"),
+        ("deepest chain of modules inside app", f"{len(modules)}"),
+        ("deepest chain of folders inside app", f"{len(folders)}"),
+        ("modules imported by pipeline.mapper", f"{len(imported_by('pipeline.mapper'))}"),
+    ]
+    for name, value in rows:
+        print(f"{name:38}{value:>8}")
+    print("modules: " + " -> ".join(modules))
+    print("folders: " + " -> ".join(folders))
+
+
+if __name__ == "__main__":
+    main()
