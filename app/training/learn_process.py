@@ -40,7 +40,7 @@ def answer(question: Question, say: Any) -> dict[str, Any]:  # noqa: ANN401 - a 
     """Learn, and keep the new forest under its name; nothing uses it yet."""
     folder = Path(question.folder)
     forests, gathering = Forests(folder), Classification.model_validate(question.gathering)
-    old = classification.forest
+    old = gathering.forest
     asked = Asked(
         in_force=gathering,
         forests=forests,

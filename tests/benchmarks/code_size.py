@@ -67,7 +67,10 @@ def longest_chain(graph: dict[str, set[str]]) -> list[str]:
     @cache
     def from_module(name: str) -> tuple[str, ...]:
         chains = [from_module(target) for target in sorted(graph[name]) if name not in _reach(target)]
-        return (name, *max(chains, key=len, default=()))
+        longest: tuple[str, ...] = ()
+        for chain in chains:
+            longest = chain if len(chain) > len(longest) else longest
+        return (name, *longest)
 
     @cache
     def _reach(name: str) -> frozenset[str]:
@@ -78,7 +81,7 @@ def longest_chain(graph: dict[str, set[str]]) -> list[str]:
                 waiting.append(target)
         return frozenset(seen)
 
-    return list(max((from_module(name) for name in sorted(graph)), key=len, default=()))
+    return max((list(from_module(name)) for name in sorted(graph)), key=len, default=[])
 
 
 def imported_by(module: str) -> list[str]:
