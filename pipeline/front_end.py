@@ -17,11 +17,11 @@ from pipeline.config import Parameters
 from pipeline.config.stages import Detection
 from pipeline.detection.cluster_shape import describe_stems
 from pipeline.detection.clustering import cluster
-from pipeline.detection.external_stems import take_stems
+from pipeline.detection.external_stems import external_clusters
 from pipeline.detection.free_space import clear_range
 from pipeline.detection.obstacles import find_clearance
-from pipeline.detection.truncation import is_cut
-from pipeline.detection.verdicts import detections, judge
+from pipeline.detection.truncation import is_truncated
+from pipeline.detection.verdicts import classify_clusters, detections
 from pipeline.geometry.poses import Float, Pose3
 from pipeline.geometry.quantisation import GROUND, POINT, rounded
 from pipeline.ground import scan_ground
@@ -130,7 +130,7 @@ def segment(
 def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_timer) -> DetectionResult:
     """Give each cluster of a scan its verdict, and return those that are trees."""
     with timer("detection"):
-        clusters = judge(scan.clusters, parameters)
+        clusters = classify_clusters(scan.clusters, parameters)
         found = detections(clusters, scan.sensor_offset, parameters)
         heights = None if scan.heights is None else scan.heights[found.cluster]
     return DetectionResult(clusters, found, heights)
@@ -158,7 +158,7 @@ def _segment_points(
 
     with timer("shape"):
         labels, described = describe_stems(filtered, labels, sensor, p.shape)
-        cut = is_cut(filtered, labels, raw, sensor, p.filters, p.acquisition)
+        cut = is_truncated(filtered, labels, raw, sensor, p.filters, p.acquisition)
         described = replace(described, cut=cut)
 
     with timer("free view"):
@@ -234,7 +234,7 @@ def _segment_stems(
     step: Step, stems: Stems, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
 ) -> SegmentedScan:
     with timer("acquisition"):
-        places, sensor_offset, clusters = take_stems(step, stems, T_base_lidar, p.acquisition)
+        places, sensor_offset, clusters = external_clusters(step, stems, T_base_lidar, p.acquisition)
 
     with timer("free view"):
         free = clear_range(places, places, sensor_offset)

@@ -7,38 +7,17 @@ from dataclasses import fields
 import numpy as np
 
 from pipeline.config.stages import Shape
-from pipeline.detection.cluster_splitting import take_apart
+from pipeline.detection.cluster_splitting import split_trunks
+from pipeline.detection.clustering import group_rows
 from pipeline.detection.cylinder_fit import COLUMNS, fit_stems
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import Clusters, Float32, Int, Int32, Labels, Sensor, Verdict
-
-
-@compiled
-def gather(label: Int32, clusters: int) -> tuple[Int, Int]:
-    """The rows of each cluster side by side.
-
-    Returns:
-        order, shape (points in clusters,): rows, cluster after cluster, each in the points' order;
-        bounds, shape (clusters + 1,): where each cluster begins in `order`.
-    """
-    bounds = np.zeros(clusters + 1, np.int64)
-    for k in label:
-        if k >= 0:
-            bounds[k + 1] += 1
-    bounds = np.cumsum(bounds)
-    place = bounds[:-1].copy()
-    order = np.empty(bounds[clusters], np.int64)
-    for i in range(label.shape[0]):
-        if label[i] >= 0:
-            order[place[label[i]]] = i
-            place[label[i]] += 1
-    return order, bounds
+from pipeline.types.records import Clusters, Float32, Int, Labels, Sensor, Verdict
 
 
 @compiled
 def take_rows(points: Float32, order: Int) -> Float:
-    """The points in that order, in double precision, shape (M, 3)."""
+    """Return the points in the given order in double precision, shape (M, 3)."""
     taken = np.empty((order.shape[0], 3))
     for k in range(order.shape[0]):
         i = order[k]
@@ -48,9 +27,11 @@ def take_rows(points: Float32, order: Int) -> Float:
 
 @compiled
 def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
-    """Centroid (K, 3) [m], covariance (K, 3, 3) [m^2] with 1/N, and extent (K, 3) [m].
+    """Return the moments of each cluster (Eq. 3).
 
-    The extent is measured along the ray from the sensor to the centroid, across it and upwards.
+    Returns:
+        Centroid, shape (K, 3) [m]; covariance normalised by N, shape (K, 3, 3) [m^2]; and extent along the
+        ray from the sensor to the centroid, across it and upwards, shape (K, 3) [m].
     """
     clusters = bounds.shape[0] - 1
     centroid = np.zeros((clusters, 3))
@@ -92,7 +73,8 @@ def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
 
 @compiled
 def planar_eigenvalues(covariance: Float) -> Float:
-    """Descending eigenvalues of the upper left 2 x 2 of each matrix, shape (K, 3); the third is 0."""
+    """Return the descending eigenvalues of the upper left 2 x 2 block of each matrix, shape (K, 3); the third
+    is 0."""
     values = np.zeros((covariance.shape[0], 3))
     for k in range(covariance.shape[0]):
         C = covariance[k]
@@ -104,7 +86,8 @@ def planar_eigenvalues(covariance: Float) -> Float:
 
 @compiled
 def spread_about(points: Float, bounds: Int, centre: Float) -> Float:
-    """Standard deviation of the points' horizontal distances to the centre, shape (K,) [m]."""
+    """Return the standard deviation of the horizontal distances to the centre of each cluster, shape (K,)
+    [m]."""
     clusters = bounds.shape[0] - 1
     spread = np.zeros(clusters)
     for k in range(clusters):
@@ -119,29 +102,34 @@ def spread_about(points: Float, bounds: Int, centre: Float) -> Float:
     return spread
 
 
-CENTROID_BIAS = 0.18  # m; measured on trunks of 8 to 35 cm radius at 2 to 10 m
-FLAT = 1e-12  # m^2; rounding of 32-bit coordinates leaves such a variance to what has none
+CENTROID_BIAS = 0.18  # m; centroid to trunk centre, measured on radii of 8 to 35 cm at 2 to 10 m
+FLAT = 1e-12  # m^2; variance caused by rounding of 32-bit coordinates
 
 
 def describe_stems(
     points: Float32, labels: Labels, sensor: Sensor, parameters: Shape
 ) -> tuple[Labels, Clusters]:
-    """The figures of each cluster, as `describe`, after a trunk was taken out of those in which something
-    else is joined to it; and the labels, in which that is a cluster of its own."""
+    """Describe each cluster, after trunks are separated from vegetation that is clustered with them.
+
+    Returns:
+        Labels in which the vegetation forms clusters of its own, and the shape of each cluster; see
+        `describe`.
+    """
     whole = describe(points, labels, sensor, parameters)
     if parameters.split_slices == 0 or parameters.centre != "circle":
         return labels, whole
-    parted, changed = take_apart(points, labels, whole, sensor, parameters.split_slices)
+    parted, changed = split_trunks(points, labels, whole, sensor, parameters.split_slices)
     if not len(changed):
         return labels, whole
-    number = np.full(parted.clusters + 1, -1, np.int32)  # the last entry serves noise, -1
+    number = np.full(parted.clusters + 1, -1, np.int32)  # the last entry is for noise, -1
     number[changed] = np.arange(len(changed), dtype=np.int32)
     some = Labels(number[parted.label], len(changed), parted.hidden[changed])
     return parted, _with_rows(whole, describe(points, some, sensor, parameters), changed)
 
 
 def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
-    """The clusters, in these ascending rows the others; rows beyond the last are added."""
+    """Return the clusters with the given ascending rows replaced by others; rows beyond the last are
+    appended."""
     columns = []
     for column in fields(Clusters):
         old, new = getattr(clusters, column.name), getattr(others, column.name)
@@ -152,15 +140,15 @@ def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
 
 
 def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape) -> Clusters:
-    """The figures of each cluster; the verdict is left open (OTHER).
+    """Return the shape of each cluster; all verdicts are OTHER.
 
     Args:
         points: float32, shape (N, 3) [m], level sensor frame.
-        labels: The cluster of each point.
-        sensor: Its range sigma and azimuth step scale the fit.
-        parameters: Of this stage.
+        labels: Cluster of each point.
+        sensor: Range sigma and azimuth step of the LiDAR scale the fit.
+        parameters: Choice of covariance and centre.
     """
-    order, bounds = gather(labels.label, labels.clusters)
+    order, bounds = group_rows(labels.label, labels.clusters)
     members = take_rows(points, order)
     centroid, covariance, extent = moments(members, bounds)
     eigenvalues = _eigenvalues(covariance, parameters.plane)
@@ -189,11 +177,13 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
 
 @compiled
 def eccentricity(eigenvalues: Float) -> Float:
-    """e = lambda1 / lambda2 (Eq. 4) of descending eigenvalues, shape (K, 2 or 3) [m^2].
+    """Return the eccentricity e = lambda1 / lambda2 (Eq. 4) of each cluster, shape (K,).
 
-    It is inf for points on a line and 1 for points in one place.
+    It is infinite for points on a line and 1 for coincident points. The paper calls this ratio eccentricity;
+    the geometric eccentricity is sqrt(1 - lambda2 / lambda1).
 
-    This is the paper's word. The eccentricity of geometry, sqrt(1 - lambda2 / lambda1), is another.
+    Args:
+        eigenvalues: Descending, shape (K, 2 or 3) [m^2].
     """
     ratio = np.ones(eigenvalues.shape[0])
     for k in range(eigenvalues.shape[0]):
@@ -206,7 +196,7 @@ def eccentricity(eigenvalues: Float) -> Float:
 
 
 def _eigenvalues(covariance: Float, dimensions: int) -> Float:
-    """Descending eigenvalues of shape (K, 3); the third is 0 when only x and y are taken."""
+    """Return descending eigenvalues, shape (K, 3); the third is 0 if only x and y are used."""
     if dimensions == 2:
         return planar_eigenvalues(covariance)
     values: Float = np.maximum(np.linalg.eigvalsh(covariance)[:, ::-1], 0.0)
@@ -214,14 +204,15 @@ def _eigenvalues(covariance: Float, dimensions: int) -> Float:
 
 
 def _centroids_as_stems(members: Float, bounds: Int, centroid: Float, range_sigma: float) -> Float:
-    """The paper's choice: the centroid of the visible arc stands for the trunk's centre."""
+    """Return stems whose centre is the centroid of the visible arc, as in the paper; columns as in
+    `fit_stems`."""
     stem = np.full((len(centroid), COLUMNS), np.nan)
     stem[:, 0:2] = centroid[:, :2]
     x, y = centroid[:, 0], centroid[:, 1]
     bearing = np.arctan2(y, x)
     ux, uy = np.cos(bearing), np.sin(bearing)
-    # It lies before the centre by more than half of a radius that nobody knows: along the ray this is
-    # an error of that size, the same in each scan from one side, and not a noise that averages out.
+    # The centroid is in front of the centre by more than half of the unknown radius. Along the ray, this is
+    # an error of that size that is equal in all scans from one side and does not average out.
     along = CENTROID_BIAS**2
     across = range_sigma**2 / np.maximum(np.diff(bounds), 1) + 0.02**2
     stem[:, 2] = along * ux * ux + across * uy * uy

@@ -530,3 +530,25 @@ def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
     label = ENGINES[parameters.engine](plane, parameters.eps, parameters.min_points, weight).label
     clusters = int(label.max(initial=-1)) + 1
     return Labels(label, clusters, np.zeros(clusters, np.bool_))
+
+
+@compiled
+def group_rows(label: Int32, clusters: int) -> tuple[Int, Int]:
+    """Sort the rows of the points by cluster, without noise.
+
+    Returns:
+        Rows sorted by cluster, stable, shape (points in clusters,); and the index of the first row of each
+        cluster in that order, shape (clusters + 1,).
+    """
+    bounds = np.zeros(clusters + 1, np.int64)
+    for k in label:
+        if k >= 0:
+            bounds[k + 1] += 1
+    bounds = np.cumsum(bounds)
+    place = bounds[:-1].copy()
+    order = np.empty(bounds[clusters], np.int64)
+    for i in range(label.shape[0]):
+        if label[i] >= 0:
+            order[place[label[i]]] = i
+            place[label[i]] += 1
+    return order, bounds

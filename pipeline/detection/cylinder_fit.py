@@ -30,10 +30,10 @@ from pipeline.jit import compiled, compiled_borrowing, compiled_sums
 from pipeline.types.records import Int, Sensor
 
 RAY = 4
-TUKEY = 3.0  # sigma; what lies farther off has no weight
-BARK = 0.01  # m; roughness of a trunk
-BEAM = 0.0015  # rad; half a beam's divergence: so far beside the trunk its middle may pass
-PRIOR_RADIUS, PRIOR_RADIUS_SIGMA = 0.15, 0.15  # m; half of the stems of a stand lie within
+TUKEY = 3.0  # sigma; residuals beyond have no weight
+BARK = 0.01  # m; roughness of the bark
+BEAM = 0.0015  # rad; half the beam divergence
+PRIOR_RADIUS, PRIOR_RADIUS_SIGMA = 0.15, 0.15  # m; a weak prior on the stem radius
 PRIOR_LEAN_SIGMA = 0.05  # 3 degrees
 
 
@@ -41,23 +41,22 @@ PRIOR_LEAN_SIGMA = 0.05  # 3 degrees
 def normal_equations(
     rays: Float, n: int, p: Float, sigma: float, within: float, back: float, g: Float, H: Float
 ) -> tuple[float, float]:
-    """Fill H = J^T W J and the gradient g = J^T W r, shapes (5, 5) and (5,), with the priors on lean and
-    radius; of H the lower triangle alone.
+    """Compute the normal equations of the cylinder fit, with the priors on lean and radius.
 
-    A return's Jacobian is (nx, ny, nx h, ny h, -1), with n the normal that looks from it to the axis; its
-    weight is Tukey's over its variance. With e the error of a range, phi the angle between ray and normal:
-    E[r] = sigma^2 sin^2 phi / 2 r, and E[n r] beyond that = sigma^2 / r cos phi (u - n cos phi).
+    Fills the lower triangle of H = J^T W J, shape (5, 5), and the gradient g = J^T W r, shape (5,). The
+    Jacobian of a return is (nx, ny, nx h, ny h, -1), where n is the normal from the return to the axis; its
+    weight is Tukey's weight divided by the variance. With the range error sigma and the angle phi between ray
+    and normal, E[r] = sigma^2 sin^2 phi / 2 r and, beyond that, E[n r] = sigma^2 / r cos phi (u - n cos phi).
 
     Args:
-        rays: shape (RAY, room), of which the first n count.
-        p: The cylinder, shape (5,); sigma: of a range [m].
-        within: Returns farther from the cylinder have no weight [m].
-        back: Nor have those that lie so much farther away than the axis [m], for no beam reaches the back of
-            a trunk.
+        rays: shape (RAY, capacity), of which n columns are valid.
+        p: Parameters of the cylinder, shape (5,).
+        sigma: Standard deviation of a range [m].
+        within: Returns with a larger residual have no weight [m].
+        back: Returns farther behind the axis have no weight [m], since no beam reaches the back of a trunk.
 
     Returns:
-        Sum of all squared residuals [m^2], and of those that are no larger than `within`, others counted
-        as that large.
+        Sum of all squared residuals, and the sum of squared residuals clipped to `within` [m^2].
     """
     xx0, xx1, xx2, xy0, xy1, xy2, yy0, yy1, yy2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     x0, x1, y0, y1, n0 = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -70,7 +69,7 @@ def normal_equations(
         ux, uy, reach, h = directions_x[i], directions_y[i], lengths[i], heights[i]
         axis_x, axis_y = cx + ax * h, cy + ay * h
         behind, across = reach - (ux * axis_x + uy * axis_y), uy * axis_x - ux * axis_y
-        # Of a beam that meets the trunk in part the middle of that part returns, and not its own.
+        # A beam that hits the trunk partially returns the middle of the part that hits.
         beam, aside = BEAM * reach, abs(across)
         part = 0.5 * (max(aside - beam, -radius) + min(aside + beam, radius))
         aside = max(part, aside - beam)
@@ -109,7 +108,7 @@ def normal_equations(
         gr += wr
     precision = 1.0 / (sigma * sigma + BARK * BARK)
     lean, size = 1.0 / PRIOR_LEAN_SIGMA**2, 1.0 / PRIOR_RADIUS_SIGMA**2
-    # The centre has no prior; 0.01 only keeps a degenerate cluster solvable (sigma of 10 m).
+    # The centre has no prior; 0.01 (a sigma of 10 m) keeps degenerate clusters solvable.
     H[0, 0] = precision * xx0 + 0.01
     H[1, 0], H[1, 1] = precision * xy0, precision * yy0 + 0.01
     H[2, 0], H[2, 1], H[2, 2] = precision * xx1, precision * xy1, precision * xx2 + lean
@@ -125,7 +124,7 @@ def normal_equations(
 
 @compiled
 def angular_width(rays: Float, n: int) -> tuple[float, float]:
-    """Direction of a cluster's middle and the angle between its outermost rays [rad]."""
+    """Return the bearing of the middle of a cluster and the angle between its outermost rays [rad]."""
     mean_x, mean_y = 0.0, 0.0
     for i in range(n):
         mean_x += rays[0, i] * rays[2, i]
@@ -137,7 +136,7 @@ def angular_width(rays: Float, n: int) -> tuple[float, float]:
         sine = c * rays[1, i] - s * rays[0, i]
         least, most = min(least, sine), max(most, sine)
         ahead = ahead and c * rays[0, i] + s * rays[1, i] > 0.0
-    if ahead:  # the sine tells all, and two arcsines do for all rays
+    if ahead:  # sines are sufficient: two arcsines serve all rays
         right, left = np.arcsin(max(least, -1.0)), np.arcsin(min(most, 1.0))
     else:
         right, left = np.inf, -np.inf
@@ -147,13 +146,15 @@ def angular_width(rays: Float, n: int) -> tuple[float, float]:
     return middle + 0.5 * (left + right), left - right
 
 
-class Middle(NamedTuple):
-    """What the middle half of a cluster's returns, counted from side to side, tells of a trunk.
+class MiddleHalf(NamedTuple):
+    """Initial estimate of a trunk from the middle half of a cluster's returns, ordered from side to side.
 
     Attributes:
-        c, s: Direction of the cluster, cosine and sine; across: how far to the left of it the middle is [m].
-        x, y: Front of the trunk in the middle [m].
-        radius: Beams that stand evenly over a trunk fill its radius with their middle half [m].
+        c, s: Cosine and sine of the bearing of the cluster.
+        across: Lateral offset of the median return from that bearing, positive to the left [m].
+        x, y: Front of the trunk at the median return [m].
+        radius: Interquartile range of the lateral offsets [m]; beams that are evenly spaced over a trunk
+            cover its radius with their middle half.
     """
 
     c: float
@@ -165,10 +166,12 @@ class Middle(NamedTuple):
 
 
 @compiled
-def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> Middle:
-    """The quartiles ask nothing of what stands beside the trunk, as branches do.
+def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> MiddleHalf:
+    """Return the initial estimate of a trunk; quartiles are robust against branches beside the trunk.
 
-    The axis shifts by so much in x and y per metre of height, which would else be taken for width.
+    Args:
+        rays: shape (RAY, capacity), of which n columns are valid.
+        lean_x, lean_y: Shift of the axis per metre of height, which is removed before the width is measured.
     """
     x, y = 0.0, 0.0
     for i in range(n):
@@ -194,17 +197,21 @@ def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> Middle:
             front[i] = rays[2, i] * (c * rays[0, i] + s * rays[1, i])
         m = n
     reach = quantile(front, 0, m, 0.5)
-    return Middle(c, s, middle, c * reach - s * middle, s * reach + c * middle, radius)
+    return MiddleHalf(c, s, middle, c * reach - s * middle, s * reach + c * middle, radius)
 
 
 @compiled_borrowing
 def quantile(numbers: Float, low: int, n: int, part: float) -> float:
-    """Of the first n numbers, linear between two of them; they are moved about for it, which takes half the
-    time of sorting them.
+    """Return the quantile `part` of the first n numbers with linear interpolation.
+
+    The numbers are partially reordered in place, which takes half the time of a sort.
 
     Args:
-        low: None of the numbers before this row is greater than any from it on: it is that of a smaller part,
-            asked for before, or 0.
+        numbers: shape (capacity,).
+        low: Row before which no number is greater than any number from it on: the row of a smaller quantile
+            computed before, or 0.
+        n: Numbers to use.
+        part: Between 0 and 1.
     """
     at = part * (n - 1)
     k = int(at)
@@ -219,8 +226,8 @@ def quantile(numbers: Float, low: int, n: int, part: float) -> float:
 
 @compiled_borrowing
 def _put_in_place(numbers: Float, low: int, n: int, k: int) -> None:
-    """Move the numbers of the rows from low to n so that in row k stands what would if they were sorted, none
-    greater before it and none less behind it (Hoare 1961)."""
+    """Reorder rows low..n-1 so that row k holds its sorted value, smaller ones before it (quickselect, Hoare
+    1961)."""
     high = n - 1
     while low < high:
         pivot, i, j = numbers[k], low, high
@@ -241,7 +248,7 @@ def _put_in_place(numbers: Float, low: int, n: int, k: int) -> None:
 
 @compiled
 def visible_arc(rays: Float, n: int, p: Float) -> float:
-    """The angle around the axis that the returns fill: full turn minus the largest gap [rad]."""
+    """Return the visible arc [rad]: a full turn minus the largest gap between returns around the axis."""
     away = max(np.sqrt(p[0] * p[0] + p[1] * p[1]), 1e-9)
     c, s = -p[0] / away, -p[1] / away  # from the axis to the sensor
     least, most = np.inf, -np.inf
@@ -252,7 +259,7 @@ def visible_arc(rays: Float, n: int, p: Float) -> float:
             return _full_turn_less_largest_gap(rays, n, p)
         tangent = (c * y - s * x) / towards
         least, most = min(least, tangent), max(most, tangent)
-    # All lie on the sensor's side: no gap between them is wider than that behind.
+    # All returns are on the side of the sensor, so the largest gap is behind the trunk.
     return float(np.arctan(most) - np.arctan(least))
 
 
@@ -275,37 +282,37 @@ def _full_turn_less_largest_gap(rays: Float, n: int, p: Float) -> float:
     return float(2.0 * np.pi - gap)
 
 
-MODEL = 0.003  # m; what a round trunk and a normal error leave out
-RADIUS_MIN, RADIUS_MAX = 0.03, 0.6  # m; within these a fit begins
-SIGMA_MIN = 0.001  # m; no range is better than that, and weights must stay finite
-# Of a cluster enter its fit; more would sharpen what bark and lean blur anyway. A prime, because points
-# may come ring after ring: every 16th of them would be of one ring.
+MODEL = 0.003  # m; model error of a circular section
+RADIUS_MIN, RADIUS_MAX = 0.03, 0.6  # m; bounds of the initial radius
+SIGMA_MIN = 0.001  # m; lower bound of the range sigma, which keeps weights finite
+# Maximum number of points of a fit; bark and lean limit the accuracy beyond it. A prime number, because
+# points may be ordered by ring: a stride of 16 would select a single ring.
 MOST_POINTS = 499
-ENOUGH = 60  # points, of which a third still is an arc
+ENOUGH = 60  # points above which the first iterations use a third of them
 ITERATIONS = 20
-SMOOTH = 0.8  # of the variance that is taken for bark and sensor; few points may look smoother by chance
-BACK = 1.5  # sigma; what lies so much farther away than the axis is not of the trunk
-NEARLY, CONVERGED = 1e-2, 3e-4  # m; the latter is a tenth of what the best arc allows
-NEGLIGIBLE = 0.2  # sigma; a step so short against what the points tell gains nothing
-WIDTH_SIGMA, WIDTH_SIGMA_LEAST = 0.2, 0.01  # of the radius, and m: how far the width is to be believed
+SMOOTH = 0.8  # lower bound of the variance factor; few points may look smoother by chance
+BACK = 1.5  # sigma; returns farther behind the axis do not belong to the trunk
+NEARLY, CONVERGED = 1e-2, 3e-4  # m; step lengths that end the first and the second phase
+NEGLIGIBLE = 0.2  # sigma; a shorter step is not significant
+WIDTH_SIGMA, WIDTH_SIGMA_LEAST = 0.2, 0.01  # fraction of the radius, and m: sigma of the width prior
 COLUMNS = 11  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial deviation, arc, lean x, lean y
 
 
 @compiled
 def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: float) -> Float:
-    """Fit each cluster.
+    """Fit a leaning cylinder to each cluster.
 
     Args:
-        points: shape (N, 3) [m], level sensor frame, cluster after cluster.
-        bounds: shape (K + 1,): where each begins.
-        range_sigma: [m].
-        azimuth_step: [rad].
+        points: shape (N, 3) [m], level sensor frame, sorted by cluster.
+        bounds: Index of the first point of each cluster, shape (K + 1,).
+        range_sigma: Standard deviation of a range [m].
+        azimuth_step: Angle between successive shots [rad].
 
     Returns:
-        Shape (K, 11): centre x, y; its variances xx, xy, yy; radius; its sigma; standard deviation of
-        the residuals; visible arc [rad]; shift of the axis in x and y per metre of height. Below five
-        points radius and sigma are NaN, and the centre lies behind the points by the radius that
-        their angular width tells.
+        Shape (K, 11): centre x, y [m]; its covariance xx, xy, yy [m^2]; radius and its sigma [m]; standard
+        deviation of the residuals [m]; visible arc [rad]; shift of the axis in x and y per metre of height.
+        For clusters with fewer than five points, radius and sigma are NaN and the centre is estimated from
+        the angular width.
     """
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
@@ -321,7 +328,7 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
 
 @compiled
 def _to_rays(points: Float, begin: int, end: int, rays: Float) -> int:
-    """Fill rays (see the module `residuals`) from points, at most MOST_POINTS; returns how many."""
+    """Fill the rays from points begin..end-1, at most MOST_POINTS; return the number of rays."""
     n = min(end - begin, MOST_POINTS)
     z0 = 0.0
     for k in range(n):
@@ -337,15 +344,17 @@ def _to_rays(points: Float, begin: int, end: int, rays: Float) -> int:
 
 @compiled
 def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> None:
-    """Too few points for a circle lie before their centre by r = R sin w / (1 - sin w), with w half the angle
-    that they fill and R their mean range."""
+    """Estimate the centre of a trunk with too few points for a circle from its angular width.
+
+    The radius is r = R sin w / (1 - sin w), where w is half the angular width and R the mean range.
+    """
     distance = 0.0
     for i in range(n):
         distance += rays[2, i] / n
     middle, width = angular_width(rays, n)
     w = min(0.5 * width + 0.5 * azimuth_step, 1.0)
     r = min(distance * np.sin(w) / (1.0 - np.sin(w)), 1.0)
-    # The mean range of an arc lies about a fifth of the radius behind its nearest point.
+    # The mean range of an arc is about a fifth of the radius behind its nearest point.
     reach = distance + 0.8 * r
     sigma_along, sigma_across = 0.05 + 0.3 * r, 0.02 + 0.5 * azimuth_step * distance
     c, s = np.cos(middle), np.sin(middle)
@@ -359,10 +368,11 @@ def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> No
 
 @compiled
 def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, stem: Float) -> None:
-    """The answer into `stem`; `some` is room for a part of the rays."""
+    """Fit one cluster and write the result to `stem`; `some` is a buffer for a subset of the rays."""
     half = middle_half(rays, n, 0.0, 0.0)
     away = np.hypot(half.x, half.y)
-    # The outermost beams leave a part of the trunk between them and the next, less what their width catches.
+    # Between the outermost beam and the next one, a part of the trunk is not hit, less the width of the
+    # beams.
     coarse = 0.5 * max(azimuth_step - 2.0 * BEAM, 0.0) * away
     width = half.radius + coarse
     p = np.array([half.x, half.y, 0.0, 0.0, min(max(width, RADIUS_MIN), RADIUS_MAX)])
@@ -379,17 +389,18 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
             squares, kept = normal_equations(rays, n, p, sigma, within, back, g, H)
         else:
             normal_equations(some, few, p, sigma, within, np.inf, g, H)
-        # The returns fill a trunk's width where its middle is theirs; what is hidden on one side is not told.
+        # The width prior holds where the middle of the returns is the middle of the trunk; if one side is
+        # hidden, the returns do not determine the width.
         beside = half.c * p[1] - half.s * p[0] - half.across
         told = 1.0 / (least * least + beside * beside)
         H[4, 4] += told
         g[4] += told * (p[4] - width)
         factorise(H, L)
         solve(L, g, step)
-        gain = 0.0  # squared length of the step in its own sigma
+        gain = 0.0  # squared length of the step in units of its sigma
         for a in range(5):
             gain += g[a] * step[a]
-        # A step longer than the trunk itself would throw the circle to its other side.
+        # A longer step could move the circle to the other side of the returns.
         longest = max(abs(step[0]), abs(step[1]), abs(step[4]))
         limit = 0.5 * p[4] + 0.02
         if longest > limit:
@@ -400,11 +411,12 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
             break
         if not nearly and (longest < NEARLY or k >= ITERATIONS // 2):
             nearly = True
-            # A leaning trunk fills more than its width; now that the lean is known, it is taken out.
+            # Lean widens the returns; it is known now and removed.
             half = middle_half(rays, n, p[2], p[3])
             width = half.radius + coarse
             least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * width + 0.3 * azimuth_step * away
-    # The residuals tell how rough the bark is, and a poor fit knows less than the sensor's sigma promises.
+    # Rough bark or a poor fit inflates the covariance by the ratio of the residual variance to the expected
+    # one.
     _write(p, L, max(SMOOTH, kept / (n * (sigma * sigma + BARK * BARK))), stem)
     stem[7], stem[8] = np.sqrt(squares / n), visible_arc(rays, n, p)
     stem[9], stem[10] = p[2], p[3]
@@ -412,8 +424,10 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
 
 @compiled
 def _some(rays: Float, n: int, some: Float) -> int:
-    """Fill `some` with a third of the rays, which leads near the circle; all of them then make it sharp.
-    Few enough are all taken. Returns how many."""
+    """Fill `some` with every third ray, or all rays if they are few; return the number of rays.
+
+    The first iterations use this subset; the last ones use all rays.
+    """
     stride = 3 if n > ENOUGH else 1
     few = (n + stride - 1) // stride
     for row in range(RAY):
@@ -424,7 +438,7 @@ def _some(rays: Float, n: int, some: Float) -> int:
 
 @compiled
 def _write(p: Float, L: Float, inflate: float, stem: Float) -> None:
-    """Centre, radius and their covariance, that of the last step: (L L^T)^-1 times `inflate`."""
+    """Write centre, radius and their covariance (L L^T)^-1 times `inflate` to `stem`."""
     unit, column = np.zeros(5), np.empty(5)
     stem[0], stem[1], stem[5] = p[0], p[1], p[4]
     unit[0] = 1.0
@@ -440,15 +454,16 @@ def _write(p: Float, L: Float, inflate: float, stem: Float) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StemFit:
-    """A leaning cylinder through the points of one cluster, in the level sensor frame.
+    """Leaning cylinder through the points of one cluster, in the level sensor frame.
 
     Attributes:
-        centre: Of the axis at the points' mean height, shape (2,) [m].
+        centre: Axis at the mean height of the points, shape (2,) [m].
         lean: Shift of the axis in x and y per metre of height, shape (2,).
-        radius, radius_sigma: [m].
-        arc: Visible part of the circle [rad]; arc_start: where it begins, counter-clockwise [rad].
-        offset: Horizontally from the axis at its own height to each point, shape (N, 2) [m].
-        residual: Distance of each point from the cylinder, outside positive, shape (N,) [m].
+        radius, radius_sigma: Radius and its standard deviation [m].
+        arc: Visible part of the circle [rad].
+        arc_start: Direction from the axis at which the visible arc begins, counter-clockwise [rad].
+        offset: Horizontal vector from the axis to each point, shape (N, 2) [m].
+        residual: Distance of each point from the cylinder surface, positive outside, shape (N,) [m].
     """
 
     centre: Float
@@ -462,7 +477,7 @@ class StemFit:
 
 
 def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
-    """The fit of `describe` for the points (N, 3) of one cluster; None where they are too few for it."""
+    """Return the fit for the points of one cluster, shape (N, 3) [m], or None if the points are too few."""
     if not len(points):
         return None
     stem = fit_stems(points, np.array([0, len(points)]), sensor.range_sigma, sensor.azimuth_step)[0]
@@ -470,7 +485,7 @@ def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
         return None
     lean = stem[9:11]
     n = min(len(points), MOST_POINTS)
-    fitted = np.arange(n) * len(points) // n  # the points that the fit itself takes
+    fitted = np.arange(n) * len(points) // n  # the points that the fit uses
     height = points[:, 2] - points[fitted, 2].mean()
     offset: Float = points[:, :2] - stem[:2] - height[:, None] * lean
     return StemFit(
@@ -486,7 +501,8 @@ def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
 
 
 def arc_start(angle: Float) -> float:
-    """Where the arc that directions (N,) fill begins, counter-clockwise: after their largest gap [rad]."""
+    """Return the direction [rad] at which the arc covered by angles of shape (N,) begins: after the largest
+    gap."""
     ordered = np.sort(angle)
     gaps = np.diff(np.append(ordered, ordered[0] + 2.0 * np.pi))
     return float(ordered[(int(np.argmax(gaps)) + 1) % len(ordered)])

@@ -1,6 +1,6 @@
-"""Ready stems: what another program found in a scan, taken as this pipeline's own clusters.
+"""External stems: stems detected by another program, converted to clusters.
 
-All that follows - verdicts, SLAM, tracking - is the same as for stems found here.
+The following stages (verdicts, SLAM, tracking) are the same as for stems detected by stemmap.
 """
 
 from __future__ import annotations
@@ -11,30 +11,31 @@ from pipeline.config.stages import Acquisition
 from pipeline.geometry.poses import Float, Pose3
 from pipeline.types.records import Clusters, Float32, Stems, Step, Verdict
 
-#: Standard deviation of a given DBH: the same trees of 1.5 km of forest (Oxford Evo) differ by a median of
-#: 4.9 cm from frame to frame.
+#: Standard deviation of an external DBH [m]: DBH of the same trees differ by a median of 4.9 cm between
+#: frames of the Oxford Evo data (1.5 km of forest).
 DBH_SIGMA = 0.05
-#: With fewer axes the forest's lean is not told from the robot's.
+#: Minimum number of stem axes from which the tilt of the robot is estimated.
 AXES_TO_LEVEL = 5
 
 
-def take_stems(
+def external_clusters(
     step: Step, stems: Stems, T_base_lidar: Pose3, parameters: Acquisition
 ) -> tuple[Float32, Float, Clusters]:
-    """The stems of a step's scan in the level sensor frame, each as a cluster of one point.
+    """Return the stems of a scan in the level sensor frame, each as a cluster of one point.
 
-    They are levelled by the step's tilt; where none is known, by the median of the stems' axes, which
-    stand upright on average. Without any tilt, stems far below the sensor would move with every nod.
+    The positions are rotated by the tilt of the step or, if it is unknown, by the median of the stem axes,
+    which are vertical on average. Without levelling, pitch of the robot would displace stems far below the
+    sensor.
 
     Args:
-        step: Its scan's points are the stems' places in the sensor frame.
+        step: Step whose scan points are the stem positions in the sensor frame.
         stems: Axes and diameters.
-        T_base_lidar: Where the sensor stands on the robot.
-        parameters: Range and levelling.
+        T_base_lidar: Pose of the sensor on the robot.
+        parameters: Range limits and levelling.
 
     Returns:
-        The places, float32, shape (N, 3) [m], the sensor's place in the level base frame, shape (3,) [m],
-        and the clusters; what nobody measured of them is NaN.
+        Positions, float32, shape (N, 3) [m]; position of the sensor in the level base frame, shape (3,) [m];
+        and the clusters, in which unknown values are NaN.
     """
     R_level_base = _levelling(step, stems, T_base_lidar, parameters)
     place = step.scan.points.astype(np.float64)
@@ -45,7 +46,7 @@ def take_stems(
 
 
 def _levelling(step: Step, stems: Stems, T_base_lidar: Pose3, parameters: Acquisition) -> Float:
-    """R_level_base: the turn without yaw that makes the base upright."""
+    """Return R_level_base, the rotation without yaw that levels the base frame."""
     if parameters.level == "none":
         return np.eye(3)
     if step.tilt_known:
@@ -54,14 +55,14 @@ def _levelling(step: Step, stems: Stems, T_base_lidar: Pose3, parameters: Acquis
     if len(axis) < AXES_TO_LEVEL:
         return np.eye(3)
     up = T_base_lidar.R @ np.median(axis, axis=0)
-    # The third row of Ry(pitch) Rx(roll) is the vertical, seen from the base.
+    # The third row of Ry(pitch) Rx(roll) is the vertical in the base frame.
     roll = float(np.arctan2(up[1], up[2]))
     pitch = float(np.arctan2(-up[0], np.hypot(up[1], up[2])))
     return Pose3.from_euler(np.zeros(3), roll, pitch, 0.0).R
 
 
 def _clusters(place: Float, dbh: Float) -> Clusters:
-    """Columns of the clusters at places of shape (N, 3) [m]."""
+    """Return clusters of one point each at positions of shape (N, 3) [m]."""
     n = len(place)
     unknown = np.full(n, np.nan)
     radius = 0.5 * dbh

@@ -1,5 +1,4 @@
-"""Visibility: how far the view is free in each direction, so that a missing tree can be told from a
-hidden one."""
+"""Free space of a scan by direction, which distinguishes a missing tree from an occluded one."""
 
 from __future__ import annotations
 
@@ -11,21 +10,23 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
 from pipeline.types.records import Bool, Float32
 
-BINS = 360  # of about a degree each
-BEHIND = 1.0  # m; what is seen this far behind a tree's place proves that nothing stands there
-FIELD = 10  # bins; a direction is looked at when any return of the scan lies this near to it
+BINS = 360  # sectors of about one degree
+BEHIND = 1.0  # m; a return this far behind the position of a tree shows that the tree is absent
+FIELD = 10  # bins; a direction with a return within this distance is inside the field of view
 
 
 @compiled
 def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
-    """Free distance by direction of the base frame, shape (BINS,), in the order of `direction_bin` [m].
+    """Return the free distance by direction in the base frame, shape (BINS,), in the order of `direction_bin`
+    [m].
 
-    It is the distance to the nearest filtered point; infinite where none is; and 0 where the scan
-    has no return at all in the neighbourhood, because there the sensor may not look.
+    The free distance is the distance to the nearest filtered point; infinite without a point; and 0 where the
+    scan has no return in the neighbourhood, since that direction may be outside of the field of view.
 
     Args:
-        raw, filtered: float32, shape (N, 3) and (M, 3) [m], level sensor frame.
-        sensor_offset: shape (3,) [m].
+        raw: The scan before the filters, float32, shape (N, 3) [m], level sensor frame.
+        filtered: The scan after the filters, float32, shape (M, 3) [m].
+        sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
     """
     looked = np.zeros(BINS, np.bool_)
     for k in directions(raw, sensor_offset):
@@ -41,7 +42,7 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
             near = near or looked[(k + j) % BINS]
         if not near:
             free[k] = 0.0
-    # A trunk's edge lies in two bins; the nearer of neighbours is the safe answer.
+    # The edge of a trunk may be in either of two bins; the minimum over neighbouring bins is conservative.
     safe = free.copy()
     for k in range(BINS):
         safe[k] = min(free[k], free[(k + 1) % BINS], free[k - 1])
@@ -50,8 +51,10 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
 
 @compiled
 def directions(points: Float32, sensor_offset: Float) -> NDArray[np.uint16]:
-    """The `direction_bin` of each point, written without branches over plain rows, so that the processor
-    takes several at once."""
+    """Return the `direction_bin` of each point, uint16, shape (N,).
+
+    The loop has no branches and reads contiguous rows, so that the compiler vectorises it.
+    """
     n = points.shape[0]
     xs, ys = np.empty(n), np.empty(n)
     for i in range(n):
@@ -64,18 +67,19 @@ def directions(points: Float32, sensor_offset: Float) -> NDArray[np.uint16]:
         side = y / length if length > 0.0 else 0.0
         behind = -1.0 - side if y < 0.0 else 3.0 - side
         turn = ((1.0 + side if x >= 0.0 else behind) + 1.0) * 0.25
-        bins[i] = min(np.int32(turn * BINS), last)  # never negative, so that cutting off rounds down
+        bins[i] = min(np.int32(turn * BINS), last)  # never negative, so that truncation rounds down
     return bins
 
 
 @compiled
 def in_free_view(place: Float, pose: Float, clear_range: Float, view_range: float) -> Bool:
-    """Whether the scan saw past each place, so that a tree there would have been seen, shape (N,).
+    """Return whether a tree at each place would have been visible to the scan, shape (N,).
 
     Args:
-        place: shape (N, 2) [m]; pose: x, y [m], yaw [rad], shape (3,), both in the frame of the map.
-        clear_range: As `clear_range` gives it.
-        view_range: Places farther than this are never asked for [m].
+        place: Positions in the map frame, shape (N, 2) [m].
+        pose: x, y [m] and yaw [rad] of the base in the map frame, shape (3,).
+        clear_range: Free distance by direction, as returned by `clear_range`.
+        view_range: Farther places are never in free view [m].
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     free = np.zeros(place.shape[0], np.bool_)
@@ -88,7 +92,7 @@ def in_free_view(place: Float, pose: Float, clear_range: Float, view_range: floa
 def is_in_free_view(
     place: Float, pose: Float, c: float, s: float, clear_range: Float, view_range: float
 ) -> bool:
-    """The same for one place; c and s are the cosine and sine of the yaw."""
+    """Return whether a tree at one place would have been visible; c and s are cosine and sine of the yaw."""
     dx, dy = place[0] - pose[0], place[1] - pose[1]
     reach = np.sqrt(dx * dx + dy * dy)
     if reach > view_range:

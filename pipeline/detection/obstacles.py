@@ -1,8 +1,8 @@
-"""Obstacles: what stands in the way that the robot drives, from one scan.
+"""Obstacle detection in the path of the robot, from one scan.
 
-The way is the arc that the present velocities lead along. With v the forward velocity and omega the turn,
-its centre is (0, R) in the base frame, R = v / omega; a point (x, y) lies at the angle
-theta = atan2(x, sign(R) (R - y)) on it, s = |R| theta along it, and |R| - |(x, y - R)| beside it.
+The path is the arc that results from the current velocities. With the forward velocity v and the yaw rate
+omega, its centre is (0, R) in the base frame, R = v / omega. A point (x, y) has the angle theta = atan2(x,
+sign(R) (R - y)), the arc length s = |R| theta and the lateral distance |R| - |(x, y - R)|.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from pipeline.jit import compiled
 from pipeline.types.clearance import Clearance, Zone
 from pipeline.types.records import Float, Float32
 
-#: Slower than this the robot stands [m/s]: it is asked what lies straight before it.
+#: Below this speed [m/s] the robot counts as standing and its path is straight ahead.
 STANDING = 0.05
-#: The tightest way, 1 / curvature [m]: velocities of a robot that turns on the spot tell of none.
+#: Minimum radius of the path [m], for robots that turn on the spot.
 TIGHTEST = 0.5
-#: Returns that stand within such a depth of one another are one obstacle [m].
+#: Returns within this depth form one obstacle [m].
 DEPTH = 0.5
-#: What stands farther beside the robot than this is not asked for [m].
+#: Maximum lateral distance that is searched [m].
 BESIDE = 3.0
-#: The sensor looks along the way when returns lie within 30 degrees of its beginning.
+#: The sensor covers the path if there are returns within 30 degrees of its beginning.
 _LOOKING = math.tan(math.radians(30.0))
-STRAIGHT = 1e-6  # 1/m; a way that bends less does not bend
+STRAIGHT = 1e-6  # 1/m; a smaller curvature counts as straight
 _NO_GROUND = np.zeros((0, 0))
 
 
@@ -39,18 +39,19 @@ def find_clearance(
     twist: tuple[float, float, float],
     parameters: Obstacles,
 ) -> Clearance | None:
-    """The clearance of the way that the robot drives; None where it is not asked for. What stands beside the
-    robot, within the width of the way, is nearer than anything. Where there is no terrain and the sensor
-    stands lower than the lowest obstacle (as where nobody told how it is mounted), what stands below it would
-    be left out, so that such a way is never free.
+    """Return the clearance of the path of the robot, or None if obstacle detection is off.
+
+    An obstacle beside the robot, within the path width, has distance 0. Without terrain and with a sensor
+    below the minimum obstacle height (for example with an unknown mounting), lower obstacles would be missed;
+    the zone of such a path is never free but unknown.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame, the whole scan from `acquisition.range_min` on.
-        near: float32, shape (M, 3) [m], likewise, what is nearer; of these, what lies within the robot is it.
-        terrain: Of the scan; without one, heights are those above the base.
-        sensor_offset: shape (3,) [m], of the sensor in the level base frame.
-        twist: Velocity of the base: forward, left [m/s], turn [rad/s].
-        parameters: Of this stage.
+        points: The whole scan beyond `acquisition.range_min`, float32, shape (N, 3) [m], level sensor frame.
+        near: Closer returns, float32, shape (M, 3) [m], same frame; returns inside the robot are removed.
+        terrain: Terrain of the scan; without it, heights are relative to the base.
+        sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
+        twist: Velocity of the base: forward, left [m/s], yaw rate [rad/s].
+        parameters: Path width, zones and thresholds.
     """
     if parameters.method == "none":
         return None
@@ -77,13 +78,13 @@ def find_clearance(
 
 
 def _reach(sensor_offset: Float, backward: bool, parameters: Obstacles) -> tuple[float, float]:
-    """How far the robot reaches along its way and against it, to its sensor at least [m]."""
+    """Return the extent of the robot along its path and against it, at least to its sensor [m]."""
     along = -float(sensor_offset[0]) if backward else float(sensor_offset[0])
     return max(parameters.reach, along), max(parameters.reach, -along)
 
 
 def _beyond_the_robot(near: Float32, sensor_offset: Float, parameters: Obstacles) -> Float32:
-    """The points that do not lie within the box of the robot, which holds its base and its sensor."""
+    """Return the points outside of the box of the robot, which contains its base and its sensor."""
     half = np.array([parameters.reach, 0.5 * parameters.width])
     place = near[:, :2] + sensor_offset[:2]
     own = (np.minimum(-half, sensor_offset[:2]) <= place) & (place <= np.maximum(half, sensor_offset[:2]))
@@ -92,7 +93,7 @@ def _beyond_the_robot(near: Float32, sensor_offset: Float, parameters: Obstacles
 
 
 def way_of(twist: tuple[float, float, float]) -> float:
-    """Curvature of the way that velocities lead along [1/m], no tighter than `TIGHTEST`."""
+    """Return the curvature [1/m] of the path that results from the velocities, bounded by `TIGHTEST`."""
     forward, _, turn = twist
     if abs(forward) < STANDING or not math.isfinite(turn / forward):
         return 0.0
@@ -121,10 +122,10 @@ def _along(
     for i in range(points.shape[0]):
         x, y = points[i, 0] + sensor[0], points[i, 1] + sensor[1]
         looks += abs(y) < way * x * _LOOKING
-        if not x * x + y * y < farthest:  # neither what is no number
+        if not x * x + y * y < farthest:  # also false for NaN
             continue
         off = _beside_the_way(way * x, y, curvature)
-        if off > half + BESIDE:  # asked first: most of the ground around the robot fails it
+        if off > half + BESIDE:  # checked first: most ground returns fail here
             continue
         along = _on_the_way(way * x, y, curvature)
         if along <= -behind or along > most:
@@ -153,7 +154,7 @@ def _along(
 
 @compiled
 def _beside_the_way(x: float, y: float, curvature: float) -> float:
-    """How far beside an arc from the origin a place lies [m]."""
+    """Return the lateral distance of a place from the arc through the origin [m]."""
     if abs(curvature) < STRAIGHT:
         return abs(y)
     radius = 1.0 / abs(curvature)
@@ -163,8 +164,7 @@ def _beside_the_way(x: float, y: float, curvature: float) -> float:
 
 @compiled
 def _on_the_way(x: float, y: float, curvature: float) -> float:
-    """How far along an arc from the origin a place lies [m]; half a turn at most lies before the robot, all
-    else behind it."""
+    """Return the arc length from the origin to a place [m]; up to half a turn is in front of the robot."""
     if abs(curvature) < STRAIGHT:
         return x
     radius = 1.0 / abs(curvature)
@@ -173,8 +173,10 @@ def _on_the_way(x: float, y: float, curvature: float) -> float:
 
 @compiled
 def _nearest(values: Float, least: int) -> float:
-    """Where the first `least` values begin that lie within DEPTH; infinite where there are none. A few single
-    returns (rain, an insect) are no obstacle."""
+    """Return the smallest value that starts a group of `least` values within DEPTH, or infinity.
+
+    Fewer returns, such as rain or an insect, are not an obstacle.
+    """
     ordered = np.sort(values)
     for i in range(ordered.shape[0] - least + 1):
         if ordered[i + least - 1] - ordered[i] <= DEPTH:

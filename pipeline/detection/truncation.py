@@ -18,21 +18,21 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int32, Labels, Sensor, UInt16
 
-SHOTS = 2.0  # between the last return and a border; the next one would have lain beyond it
-BLIND = BINS // 4  # bins without a return in a row, about a quarter of a turn: there the sensor does not look
-EDGE = 2  # bins of about a degree, whose returns show where the view ends
-OTHERS = 5  # returns of other things that end there too, or else it is the trunk's own edge
-APART = 0.5  # m; what lies so much nearer or farther is another thing
+SHOTS = 2.0  # a cluster within this many shots of a border is truncated
+BLIND = BINS // 4  # empty bins in a row, about a quarter turn, outside of the field of view
+EDGE = 2  # bins of about one degree at the edge of the field of view
+OTHERS = 5  # returns at other ranges that end at the same edge; without them the edge is that of the trunk
+APART = 0.5  # m; range difference that separates two objects
 
 
-class View(NamedTuple):
-    """Where a field of view ends at its sides.
+class FieldOfView(NamedTuple):
+    """Horizontal field of view of a scan.
 
     Attributes:
-        c, s: Direction of its middle, cosine and sine.
-        right, left: Its last returns there, from the middle, positive to the left [rad]; infinite when the
-            sensor looks all around.
-        at_right, at_left: How far away the returns beside these lie [m].
+        c, s: Cosine and sine of the bearing of its middle.
+        right, left: Bearings of the outermost returns relative to the middle, positive to the left [rad];
+            infinite for a field of view of 360 degrees.
+        at_right, at_left: Ranges of the returns at the two edges [m].
     """
 
     c: float
@@ -43,7 +43,7 @@ class View(NamedTuple):
     at_left: Float
 
 
-def is_cut(
+def is_truncated(
     points: Float32,
     labels: Labels,
     raw: Float32,
@@ -51,44 +51,44 @@ def is_cut(
     filters: Filters,
     acquisition: Acquisition,
 ) -> Bool:
-    """Whether each cluster reaches to within two shots of a border, shape (K,).
+    """Return whether each cluster extends to within two shots of a border, shape (K,).
 
     Args:
         points: float32, shape (N, 3) [m], level sensor frame.
-        labels: The cluster of each point.
-        raw: float32, shape (M, 3) [m], same frame: the whole scan, which tells the field of view.
-        sensor: Its angle between shots, and how far it reaches.
-        filters: The pass-through box, of which the upright faces are borders.
-        acquisition: The least and greatest range.
+        labels: Cluster of each point.
+        raw: The whole scan, from which the field of view is estimated, float32, shape (M, 3) [m], same frame.
+        sensor: Angle between shots and maximum range of the LiDAR.
+        filters: The pass-through box, whose vertical faces are borders.
+        acquisition: Minimum and maximum range.
     """
     box = np.array([filters.x_min, filters.x_max, filters.y_min, filters.y_max])
     ranges = np.array([acquisition.range_min, min(acquisition.range_max, sensor.range_max)])
     least = sensor.range_sigma
     return _touches(
-        points, labels.label, labels.clusters, box, ranges, sensor.azimuth_step, least, view_of(raw)
+        points, labels.label, labels.clusters, box, ranges, sensor.azimuth_step, least, field_of_view(raw)
     )
 
 
-def view_of(raw: Float32) -> View:
-    """Where a scan's field of view ends; points of shape (M, 3) [m], sensor frame."""
+def field_of_view(raw: Float32) -> FieldOfView:
+    """Estimate the horizontal field of view from the points of a scan, shape (M, 3) [m], sensor frame."""
     bins = directions(raw, np.zeros(3))
     first, blind = _widest_gap(bins)
     if blind < BLIND:
-        return View(1.0, 0.0, -np.inf, np.inf, np.zeros(0), np.zeros(0))
+        return FieldOfView(1.0, 0.0, -np.inf, np.inf, np.zeros(0), np.zeros(0))
     c, s = bin_direction(first + blind + (BINS - blind) // 2, BINS)
     right, at_right = _end(raw[_within(bins, first + blind)], c, s, -1.0)
     left, at_left = _end(raw[_within(bins, first - EDGE)], c, s, 1.0)
-    return View(c, s, -right, left, at_right, at_left)
+    return FieldOfView(c, s, -right, left, at_right, at_left)
 
 
 @compiled
 def _widest_gap(bins: UInt16) -> tuple[int, int]:
-    """The first of the most bins in a row without a return, and how many; none of a scan without any."""
+    """Return the first bin and the length of the longest run of empty bins; length 0 for an empty scan."""
     lit = np.zeros(BINS, np.bool_)
     for k in bins:
         lit[k] = True
     first, most, run = 0, 0, 0
-    for k in range(2 * BINS):  # twice around, so that a gap over the seam counts as one
+    for k in range(2 * BINS):  # two turns, so that a run across the seam counts once
         run = 0 if lit[k % BINS] else run + 1
         if most < run <= BINS:
             first, most = k + 1 - run, run
@@ -96,13 +96,13 @@ def _widest_gap(bins: UInt16) -> tuple[int, int]:
 
 
 def _within(bins: UInt16, first: int) -> Bool:
-    """Which returns lie in the EDGE bins from that one on."""
+    """Return the mask of the returns in the EDGE bins from `first` on."""
     inside: Bool = (bins.astype(np.int64) - first) % BINS < EDGE
     return inside
 
 
 def _end(beside: Float32, c: float, s: float, side: float) -> tuple[float, Float]:
-    """How far to that side (1 left, -1 right) returns lie [rad], and how far away they all are [m]."""
+    """Return the largest bearing of the returns to a side (1 left, -1 right) [rad], and their ranges [m]."""
     x, y = beside[:, 0].astype(np.float64), beside[:, 1].astype(np.float64)
     turn = side * np.arctan2(c * y - s * x, c * x + s * y)
     return float(turn.max()), np.hypot(x, y)
@@ -117,7 +117,7 @@ def _touches(
     ranges: Float,
     azimuth_step: float,
     least: float,
-    view: View,
+    view: FieldOfView,
 ) -> Bool:
     cut = np.zeros(clusters, np.bool_)
     one_way = np.isfinite(view.left)
@@ -142,7 +142,7 @@ def _touches(
 
 @compiled
 def _others(away: Float, reach: float) -> bool:
-    """Whether enough other things end at the edge too."""
+    """Return whether enough returns at other ranges end at the same edge."""
     others = 0
     for d in away:
         others += abs(d - reach) > APART

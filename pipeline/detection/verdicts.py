@@ -1,4 +1,4 @@
-"""Detection: which clusters are trees, and for each other one the reason why it is not."""
+"""Verdicts on clusters (section 3.3 of the paper): tree, or the reason for the rejection."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from pipeline.jit import compiled
 from pipeline.types.records import Bool, Clusters, Detections, Int, Int32, Verdict
 
 
-def judge(clusters: Clusters, parameters: Detection) -> Clusters:
-    """The clusters with their verdicts: the first reason that holds, in the order below, else TREE."""
+def classify_clusters(clusters: Clusters, parameters: Detection) -> Clusters:
+    """Return the clusters with their verdicts: the first check that fails, in the order of `checks`, else
+    TREE."""
     p, c = parameters, clusters
     verdict = _verdicts(
         c.hidden,
@@ -58,7 +59,7 @@ def _verdicts(
 ) -> Int32:
     verdict = np.empty(len(hidden), np.int32)
     for k in range(len(hidden)):
-        # What is not a number fails every comparison: without a circle its figures are not asked for.
+        # Without a circle, radius and arc are NaN and are not checked.
         has_circle = np.isfinite(radius[k])
         if hidden[k]:
             verdict[k] = Verdict.HIDDEN
@@ -66,7 +67,7 @@ def _verdicts(
             verdict[k] = Verdict.TOO_THICK
         elif extent[k, 2] < height_extent_min:
             verdict[k] = Verdict.TOO_LOW
-        elif whole and cut[k]:  # what comes below is told by a whole side of the trunk
+        elif whole and cut[k]:  # the checks below need a whole side of the trunk
             verdict[k] = Verdict.AT_BORDER
         elif eccentricity[k] < e_min:
             verdict[k] = Verdict.TOO_ROUND
@@ -86,7 +87,7 @@ def _verdicts(
 
 
 def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) -> Detections:
-    """The clusters judged to be trees, in the base frame (Eq. 8: p_base = T_base_lidar p_lidar)."""
+    """Return the clusters with the verdict TREE in the base frame (Eq. 8: p_base = T_base_lidar p_lidar)."""
     rows = np.flatnonzero(clusters.verdict == Verdict.TREE)
     centre, covariance = _seen_from_base(
         rows,
@@ -116,9 +117,14 @@ def _seen_from_base(
     sigma_range: float,
     sigma_bearing: float,
 ) -> tuple[Float, Float]:
-    """Centres of the clusters in these rows in the base frame, shape (D, 2) [m], and covariances, shape
-    (D, 2, 2) [m^2]: the fit's and what it does not know of, an error of `sigma_range` along the ray and
-    of `sigma_bearing` times the distance across it."""
+    """Return centres and covariances of the given clusters in the base frame.
+
+    The covariance is that of the fit plus `sigma_range` along the ray and `sigma_bearing` times the range
+    across it.
+
+    Returns:
+        Centres, shape (D, 2) [m]; covariances, shape (D, 2, 2) [m^2].
+    """
     place, spread = np.empty((len(rows), 2)), np.empty((len(rows), 2, 2))
     for d in range(len(rows)):
         x, y = centre[rows[d], 0], centre[rows[d], 1]
@@ -136,17 +142,17 @@ def _seen_from_base(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Check:
-    """One question that every cluster is asked.
+    """One check of all clusters.
 
     Attributes:
-        verdict: Of a cluster that fails, when no earlier check failed.
-        figure: What is looked at, in words.
-        unit: Of `value` and `limit`.
-        value: shape (K,), NaN where it cannot be told.
-        relation: "at least" or "at most" the limit; empty where yes (1) fails and no (0) passes.
-        limit: NaN where there is none.
-        parameter: Dotted name of the limit, empty where there is none.
-        fails: shape (K,); what cannot be told does not fail.
+        verdict: Verdict of a cluster that fails this check and no earlier one.
+        figure: Name of the checked quantity.
+        unit: Unit of `value` and `limit`.
+        value: shape (K,), NaN if unknown.
+        relation: "at least" or "at most" the limit; empty for a yes/no check, which fails for yes (1).
+        limit: NaN without a limit.
+        parameter: Dotted name of the parameter that sets the limit, empty without one.
+        fails: shape (K,); a check of an unknown value does not fail.
     """
 
     verdict: Verdict
@@ -160,7 +166,8 @@ class Check:
 
 
 def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
-    """What `judge` asks, in its order, with every figure and limit: for who wants to know why."""
+    """Return the checks of `classify_clusters` in their order, with all values and limits, as an
+    explanation."""
     p, c = parameters, clusters
     has_circle = np.isfinite(c.radius)
     radius = np.where(has_circle, c.radius, np.nan)

@@ -14,13 +14,13 @@ from pipeline.ground.terrain import RINGS, SECTORS, Terrain, on_the_grid, ring_d
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float, Float32, Int32
 
-GHOST = 0.4  # m; ground returns of one cell lie nearer to one another than this
-WIDEST = 1.4  # a sector of the diamond against one of the circle
-TOLERANCE = 0.15  # m; grass and noise over the steepest slope
-LAYER = 0.2  # m above a cell's lowest return; what lies there is ground as well
-STANDS, STANDS_UP_TO = 0.3, 2.0  # m above it; what lies there stands on the ground, or is a trunk
-WIDE = 0.4  # m; a layer that is spread so far is no trunk's,
-WIDELY = 0.6  # and weighs so much, whatever stands on it
+GHOST = 0.4  # m; a lowest return that is lower than the next one by more is a ghost echo
+WIDEST = 1.4  # ratio of the widest diamond sector to the mean sector
+TOLERANCE = 0.15  # m; grass and noise above the maximum slope
+LAYER = 0.2  # m; returns up to this height above the lowest return of a cell are ground
+STANDS, STANDS_UP_TO = 0.3, 2.0  # m; height range of objects on the ground, for example trunks
+WIDE = 0.4  # m; a ground layer with this spread is wider than a trunk
+WIDELY = 0.6  # minimum weight of such a layer
 FARTHEST = np.float32(1e6)  # m
 X, Y, Z = 0, 1, 2
 LOW, AT_X, AT_Y, TOTAL, COUNT, STANDING, SPREAD = range(7)
@@ -28,21 +28,21 @@ LOW, AT_X, AT_Y, TOTAL, COUNT, STANDING, SPREAD = range(7)
 
 @compiled
 def lowest_returns(points: Float32) -> tuple[Int32, Float]:
-    """The lowest return of each cell; one that lies alone far below the next is an echo's ghost.
+    """Return the cell of each point and the lowest return of each cell, without ghost echoes.
 
     Returns:
-        cell: int32, shape (N,), of each point, sector times RINGS plus ring; -1 where it has none.
-        lowest: shape (SECTORS, rings, 3): x, y, z [m] of the lowest return; z is inf where none is.
+        Cell of each point (sector * RINGS + ring), int32, shape (N,), -1 outside of the grid; and x, y, z [m]
+        of the lowest return of each cell, shape (SECTORS, rings, 3), with infinite z for an empty cell.
     """
     cell, rings = _cell_of(points)
-    row = np.full((SECTORS * RINGS, 2), -1, np.int32)  # of the lowest return and the next one
+    row = np.full((SECTORS * RINGS, 2), -1, np.int32)  # rows of the lowest and second lowest return
     bottom = np.full((SECTORS * RINGS, 2), np.float32(np.inf))
     for i in range(points.shape[0]):
         c = cell[i]
         if c < 0:
             continue
         z, low, next_low, r, next_r = points[i, Z], bottom[c, 0], bottom[c, 1], row[c, 0], row[c, 1]
-        # Chosen without a branch, which the processor could not foresee.
+        # Selection without a branch, which would be unpredictable.
         lower, between = z < low, z < next_low
         as_low, as_next = z == low, z == next_low
         if as_low or as_next:
@@ -63,7 +63,7 @@ def lowest_returns(points: Float32) -> tuple[Int32, Float]:
 
 @compiled
 def _cell_of(points: Float32) -> tuple[Int32, int]:
-    """The cell of each point, see `lowest_returns`, and how many rings there are."""
+    """Return the cell of each point, see `lowest_returns`, and the number of rings."""
     n = points.shape[0]
     sector, ring = on_the_grid(points)
     cell = np.empty(n, np.int32)
@@ -71,7 +71,7 @@ def _cell_of(points: Float32) -> tuple[Int32, int]:
     for i in range(n):
         k = np.int32(ring[i])
         c = min(np.int32(sector[i]), last) * np.int32(RINGS) + k
-        # Written so that a coordinate that is not a number fails it.
+        # A NaN coordinate fails these comparisons.
         known = ring[i] < np.float32(RINGS) and abs(points[i, Z]) < FARTHEST
         cell[i] = c if known else np.int32(-1)
         outermost = max(outermost, k if known else np.int32(0))
@@ -80,16 +80,16 @@ def _cell_of(points: Float32) -> tuple[Int32, int]:
 
 @compiled
 def _comes_first(points: Float32, i: int, other: int) -> bool:
-    """Of two returns of the same height the order of the points must not decide."""
+    """Return whether point i precedes another of equal height, independently of the order of the points."""
     x, y = points[i, X], points[i, Y]
     return bool(x < points[other, X] or (x == points[other, X] and y < points[other, Y]))
 
 
 @compiled
-def forget_what_overhangs(lowest: Float, slope: float) -> None:
-    """Take away cells that rise steeper than `slope` above a lower cell near by: hedges and crowns.
+def remove_overhanging(lowest: Float, slope: float) -> None:
+    """Remove candidates that are steeper than `slope` above a nearby candidate, such as hedges and crowns.
 
-    Two sweeps there and back carry each cell's cone of the steepest slope over the whole grid.
+    Two passes in each direction propagate the cone of the maximum slope of each cell over the grid.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     cone = lowest[:, :, Z].copy()
@@ -103,7 +103,7 @@ def forget_what_overhangs(lowest: Float, slope: float) -> None:
                 cone[s, k] = min(cone[s, k], cone[s, k - 1] + rise[k])
             for k in range(rings - 2, -1, -1):
                 cone[s, k] = min(cone[s, k], cone[s, k + 1] + rise[k + 1])
-        for there in (1, -1):  # around the circle, twice, so that the seam is none
+        for there in (1, -1):  # twice around the circle, so that the seam has no effect
             for turn in range(2 * sectors):
                 s = (there * turn) % sectors
                 before = (s - there) % sectors
@@ -117,20 +117,22 @@ def forget_what_overhangs(lowest: Float, slope: float) -> None:
 
 @compiled
 def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple[Float, Float]:
-    """What the returns of each cell say of the ground in it.
+    """Return the height of the ground candidate of each cell and its weight.
 
     Args:
-        points: shape (N, 3) [m]; cell, lowest: from `lowest_returns`.
-        plane: The trend: its height at the origin [m] and its slopes along x and y.
+        points: shape (N, 3) [m].
+        cell, lowest: Results of `lowest_returns`.
+        plane: Trend: height at the origin [m] and slopes along x and y, shape (3,).
 
     Returns:
-        height: shape (SECTORS, rings) [m], mean height above the plane of the lowest layer, NaN where the
-            cell has no candidate.
-        weight: The same shape, 0 to 1: how much of what lies low in the cell is that layer.
+        Mean height of the lowest layer above the plane, shape (SECTORS, rings) [m], NaN without a candidate;
+        and its
+        weight from 0 to 1, same shape: the fraction of low returns that belong to the layer.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
-    # One row a cell, so that a point touches one line of the cache: residual, x and y of the lowest
-    # return; sum of the layer's residuals, its returns, what stands on it, squared distances from it.
+    # One row per cell, so that each point accesses one cache line: residual, x and y of the lowest return;
+    # for the layer the sum of residuals, the number of returns, the returns above it and the sum of squared
+    # distances.
     sums = np.zeros((SECTORS * RINGS, 8), np.float32)
     sums[:, LOW] = np.inf
     for s in range(sectors):
@@ -146,7 +148,7 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
             continue
         up = residual[i] - sums[c, LOW]
         x, y = points[i, X] - sums[c, AT_X], points[i, Y] - sums[c, AT_Y]
-        # Zeros are added where nothing is to be: a branch here could not be foreseen.
+        # Zeros are added instead of an unpredictable branch.
         layer, standing = -LAYER < up < LAYER, STANDS < up <= STANDS_UP_TO
         sums[c, TOTAL] += up if layer else zero
         sums[c, COUNT] += one if layer else zero
@@ -173,21 +175,23 @@ def _above_plane(points: Float32, plane: Float) -> Float32:
     return above
 
 
-FAR = 12.0  # m; candidates farther away say less of the trend
-LEVEL = 4.0  # m^2; how surely the trend is level, in candidates a metre away
-STIFFNESS = 0.15  # of the membrane, against a cell that surely is ground
-ABOVE, BELOW = 0.08, 0.25  # m; farther from the surface a candidate pulls with the same force only
-FIRM = 0.7  # weight of a candidate that the surface passes above
-SEEN_WITHIN = 0.15  # m
+FAR = 12.0  # m; distance beyond which candidates lose weight in the trend
+LEVEL = 4.0  # m^2; prior of a level trend, in candidates at a distance of 1 m
+STIFFNESS = 0.15  # of the membrane, relative to a cell with weight 1
+ABOVE, BELOW = 0.08, 0.25  # m; residual above which the force of a candidate is constant (Huber)
+FIRM = 0.7  # weight of a candidate below the surface
+SEEN_WITHIN = 0.15  # m; maximum residual of a cell whose ground counts as seen
 ROUNDS, TREND_ROUNDS = 3, 4
 X, Y, Z = 0, 1, 2
 
 
 @compiled
 def trend(lowest: Float, slope: float) -> Float:
-    """A plane through the candidates, the lower ones first: shape (3,), height at the origin [m], slopes.
+    """Fit a plane through the candidates by iteratively reweighted least squares with asymmetric Huber
+    weights.
 
-    Least squares, reweighted: what lies above the plane pulls with a force that no longer grows.
+    Returns:
+        Height at the origin [m] and slopes along x and y, shape (3,).
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     rows = np.empty((sectors * rings, 3))
@@ -229,16 +233,17 @@ def trend(lowest: Float, slope: float) -> Float:
 
 @compiled
 def smooth_surface(height: Float, weight: Float, plane: Float) -> tuple[Float, Bool]:
-    """The membrane h that minimises sum w (h - z)^2 + sum c (h_i - h_j)^2 over neighbouring cells i, j.
+    """Return the membrane h that minimises sum w (h - z)^2 + sum c (h_i - h_j)^2 over neighbouring cells i,
+    j.
 
-    Lines along and across the rays are solved in turn. Far above or below the surface a candidate's pull
-    stops growing; one below it pulls as firmly as the surest.
+    Rays and circles are solved in turn (alternating direction). Residuals have asymmetric Huber weights.
 
     Args:
-        height, weight: shape (SECTORS, rings), see `evidence`; plane: shape (3,).
+        height, weight: Candidates, shape (SECTORS, rings), see `evidence`.
+        plane: Trend, shape (3,).
 
     Returns:
-        The heights of the nodes [m] and whether the ground was seen there, both of the same shape.
+        Heights of the nodes [m] and whether the ground was seen there, both of shape (SECTORS, rings).
     """
     sectors, rings = height.shape
     along, across = _couplings(rings)
@@ -265,7 +270,7 @@ def smooth_surface(height: Float, weight: Float, plane: Float) -> tuple[Float, B
 
 @compiled
 def _couplings(rings: int) -> tuple[Float, Float]:
-    """Stiffness between a node and the next one outwards, and the next one around, by ring."""
+    """Return the stiffness between a node and the next node outwards, and the next node around, per ring."""
     along, across = np.zeros(rings), np.zeros(rings)
     for k in range(rings):
         wide = ring_distance(k + 0.5) * 2.0 * np.pi / SECTORS
@@ -279,7 +284,8 @@ def _couplings(rings: int) -> tuple[Float, Float]:
 
 @compiled
 def _solve_rays(h: Float, w: Float, wz: Float, along: Float, across: Float) -> None:
-    """Thomas' algorithm along each ray, its neighbours as they are."""
+    """Solve the membrane along each ray by the Thomas algorithm, with the neighbouring rays fixed, in
+    place."""
     sectors, rings = h.shape
     upper, right = np.empty(rings), np.empty(rings)
     for s in range(sectors):
@@ -300,7 +306,7 @@ def _solve_rays(h: Float, w: Float, wz: Float, along: Float, across: Float) -> N
 
 @compiled
 def _solve_circles(h: Float, w: Float, wz: Float, along: Float, across: Float) -> None:
-    """The same around each circle, all of them at once; the seam is coupled to the values before."""
+    """Solve the membrane around all circles at once, in place; the seam uses the previous values."""
     sectors, rings = h.shape
     upper, right = np.empty((sectors, rings)), np.empty((sectors, rings))
     for s in range(sectors):
@@ -329,7 +335,7 @@ def _solve_circles(h: Float, w: Float, wz: Float, along: Float, across: Float) -
 
 @compiled
 def _middle(sector: int, ring: int) -> tuple[float, float]:
-    """Place of a node [m]: the inverse of `direction_turn` at the middle of its cell."""
+    """Return the position of a node [m]: the inverse of `direction_turn` at the middle of its cell."""
     turn = 4.0 * (sector + 0.5) / SECTORS - 1.0
     if turn < 0.0:
         x, y = -abs(turn), -(1.0 - abs(turn))
@@ -344,27 +350,25 @@ def _middle(sector: int, ring: int) -> tuple[float, float]:
 
 
 def find_terrain(points: Float32, parameters: Ground) -> Terrain:
-    """The terrain of one scan: a smooth surface that the lowest returns of a polar grid carry.
+    """Return the terrain of one scan.
 
-    The lowest return of each cell is a candidate unless it rises steeper than `slope_max` above another
-    one. A plane below most candidates is the trend; on it a membrane is laid through what lies near
-    each candidate. A cell in which much stands above the lowest return carries little, because there
-    it may be a trunk's; but no cell lets the surface pass above its lowest return.
+    A cell with many returns above its lowest layer has a small weight, since that layer may belong to a
+    trunk. The surface does not pass far above the lowest return of any cell.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame, the whole scan.
-        parameters: Of this stage.
+        points: The whole scan, float32, shape (N, 3) [m], level sensor frame.
+        parameters: Maximum slope.
     """
     slope = float(np.tan(np.radians(parameters.slope_max)))
     cell, lowest = lowest_returns(points)
-    forget_what_overhangs(lowest, slope)
+    remove_overhanging(lowest, slope)
     plane = trend(lowest, slope)
     height, weight = evidence(points, cell, lowest, plane)
     return Terrain(*smooth_surface(height, weight, plane))
 
 
 def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
-    """The points whose height above the ground lies in the band. Shape (N, 3) -> (M, 3)."""
+    """Return the points whose height above the ground is within the height band, shape (M, 3)."""
     return _between(points, height, np.array([parameters.height_min, parameters.height_max], np.float32))
 
 
@@ -375,6 +379,6 @@ def _between(points: Float32, height: Float32, band: Float32) -> Float32:
     n = 0
     for i in range(points.shape[0]):
         inside[n, 0], inside[n, 1], inside[n, 2] = points[i, 0], points[i, 1], points[i, 2]
-        # Counted without a branch, which the processor could not foresee.
+        # Counted without an unpredictable branch.
         n += low <= height[i] <= high
     return inside[:n].copy()

@@ -1,4 +1,4 @@
-"""Terrain: the height of the ground around the sensor, and of each point above it."""
+"""Terrain of a scan on a polar grid, and heights of points above it."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32
 
 SECTORS = 72
-RINGS = 48  # would reach to infinity
-HALF_WAY = 20.0  # m; half of them lie nearer
-LEAST_SEEN = 60  # cells; the foot of walls around a sensor fills up to 50, ground that is seen over 400
+RINGS = 48  # the last ring is at infinity
+HALF_WAY = 20.0  # m; half of the rings are closer
+LEAST_SEEN = 60  # cells; walls around a sensor give up to 50 cells, visible ground gives over 400
 NO_GROUND = (
-    "a scan shows no ground (a wall or a ceiling only?): heights are guesses, and diameters are not told "
-    "for breast height"
+    "a scan shows no ground (only a wall or a ceiling?): heights are uncertain, and no diameters at breast "
+    "height are reported"
 )
 
 
@@ -26,13 +26,14 @@ NO_GROUND = (
 class Terrain:
     """Heights of the ground around the sensor, in the level sensor frame.
 
-    The nodes stand in the middle of the cells of a polar grid, whose rings grow wider with the distance as
-    its sectors do: 0.4 m at the sensor, 0.9 m at 10 m, 1.7 m at 20 m.
+    The nodes are the middles of the cells of a polar grid. The ring width grows with the distance like the
+    sector
+    width: 0.4 m at the sensor, 0.9 m at 10 m, 1.7 m at 20 m.
 
     Attributes:
-        height: shape (SECTORS, rings) [m]: the ground at each node.
-        seen: shape (SECTORS, rings): whether returns of the ground lay in the cell; elsewhere the height
-            goes on smoothly from the cells around.
+        height: Height of the ground at each node, shape (SECTORS, rings) [m].
+        seen: Whether the cell contains ground returns, shape (SECTORS, rings); other heights are extrapolated
+            smoothly.
     """
 
     height: Float
@@ -40,15 +41,19 @@ class Terrain:
 
 
 def shows_ground(terrain: Terrain) -> bool:
-    """Whether a scan saw ground at all, not only the foot of a wall, a ceiling or a heap of points."""
+    """Return whether a scan shows the ground, not only the foot of a wall, a ceiling or scattered points."""
     seen = int(np.count_nonzero(terrain.seen))
     return seen >= LEAST_SEEN and ground_at(terrain.height, 0.0, 0.0) < 0.0
 
 
 @compiled
 def heights_of_places(places: Float, height: Float) -> Float:
-    """Height of places (N, 3) [m] of the level sensor frame above the ground, shape (N,) [m]; `height` is
-    a Terrain's."""
+    """Return the heights of places above the ground, shape (N,) [m].
+
+    Args:
+        places: Level sensor frame, shape (N, 3) [m].
+        height: `Terrain.height`.
+    """
     above = np.empty(places.shape[0])
     for i in range(places.shape[0]):
         above[i] = places[i, 2] - ground_at(height, places[i, 0], places[i, 1])
@@ -56,27 +61,28 @@ def heights_of_places(places: Float, height: Float) -> Float:
 
 
 def height_above(points: Float32, terrain: Terrain) -> Float32:
-    """Height of each point above the terrain, float32, shape (N,) [m]."""
+    """Return the height of each point above the terrain, float32, shape (N,) [m]."""
     return _height_above(points, terrain.height)
 
 
 @compiled
 def ring_at(distance: float) -> float:
-    """How many rings lie within a distance from the sensor [m]; never as many as RINGS."""
+    """Return the (fractional) number of rings within a distance from the sensor [m], less than RINGS."""
     return float(RINGS * distance / (distance + HALF_WAY))
 
 
 @compiled
 def ring_distance(ring: float) -> float:
-    """The distance from the sensor [m] within which so many rings lie, the inverse of `ring_at`."""
+    """Return the distance from the sensor [m] that contains the given number of rings: the inverse of
+    `ring_at`."""
     return float(HALF_WAY * ring / (RINGS - ring))
 
 
 @compiled
 def ground_at(height: Float, x: float, y: float) -> float:
-    """Height of the ground at a place [m] of the level sensor frame; `height` is a Terrain's.
+    """Return the height of the ground at (x, y) [m], level sensor frame, by bilinear interpolation.
 
-    Between nodes it is interpolated along both directions; beyond the last ring it stays as it is there.
+    Beyond the last ring, the height of the last ring is used. `height` is `Terrain.height`.
     """
     sectors, rings = height.shape
     turn = direction_turn(x, y) * sectors - 0.5
@@ -94,10 +100,10 @@ def ground_at(height: Float, x: float, y: float) -> float:
 
 @compiled
 def on_the_grid(points: Float32) -> tuple[Float32, Float32]:
-    """Of each point how many sectors and how many rings lie before it, both float32, shape (N,).
+    """Return the (fractional) sector and ring of each point, both float32, shape (N,).
 
-    Two plain loops over plain rows, so that the processor takes eight points at once. What is not finite
-    or farther than a number can tell has no ring: NaN, or all RINGS of them.
+    The loops are simple so that the compiler vectorises them. The ring of a point that is not finite is NaN
+    or RINGS.
     """
     n = points.shape[0]
     xs, ys = np.empty(n, np.float32), np.empty(n, np.float32)
@@ -134,8 +140,11 @@ def _height_above(points: Float32, height: Float) -> Float32:
 
 @compiled
 def _corners(height: Float) -> Float32:
-    """Of each node, sector times rings plus ring, its height, that of the next one around, and of the two
-    beyond these: float32, shape (N, 4) [m], in one row, so that a point touches one place."""
+    """Return the four corner heights of each grid cell, float32, shape (sectors * rings, 4) [m].
+
+    A row holds the heights of the node, the next node around, and the two nodes beyond them, so that the
+    interpolation of a point accesses one row.
+    """
     sectors, rings = height.shape
     corners = np.empty((sectors * rings, 4), np.float32)
     for s in range(sectors):
@@ -151,11 +160,9 @@ def _corners(height: Float) -> Float32:
 def _nodes(
     sector: Float32, ring: Float32, sectors: int, rings: int
 ) -> tuple[NDArray[np.uint32], Float32, Float32]:
-    """The node before each point, and which part of the way to the next one it lies around and outwards; of
-    what has no ring that is not a number.
+    """Return the grid cell of each point and its fractional position in it; NaN for a point without a ring.
 
-    A plain loop over plain rows, so that the processor takes eight points at once; the parts are left in
-    the two rows that are given, which come from `on_the_grid`.
+    The fractions overwrite `sector` and `ring`, the results of `on_the_grid`.
     """
     node = np.empty(sector.shape[0], np.uint32)
     zero, half, last = np.float32(0.0), np.float32(0.5), np.float32(rings - 1)

@@ -15,28 +15,29 @@ from pipeline.loop_closure.map_correction import Bend
 from pipeline.types.records import Bool, Float32, HeightMap, Int
 
 CELL = 0.5  # m
-SIDE = 16  # cells of a tile
+SIDE = 16  # cells along each side of a tile
 WEIGHT, MEAN, VARIANCE, VIEWS = range(4)
 COLUMNS = 4
-SIGMA, SIGMA_A_METRE = 0.03, 0.005  # of one view: grass, and the tilt that is left
-MOST = 50.0  # views at 5 m that a cell counts at the most
+SIGMA, SIGMA_A_METRE = 0.03, 0.005  # m, m/m; sigma of one view: grass, and residual tilt
+MOST = 50.0  # maximum weight of a cell, in views at 5 m
 
 
 @compiled
-def look(
+def observe_cells(
     corner: Float, at: Float, yaw: float, height: Float, seen: Bool, reach: float
 ) -> tuple[Float, Float]:
-    """What a scan saw of the cells of some tiles.
+    """Return the ground heights that a scan shows in the cells of some tiles.
 
     Args:
-        corner: Of the tiles, shape (T, 2) [m]; at: the sensor, shape (2,) [m], both in the map.
-        yaw: Of the sensor [rad].
-        height, seen: Of its Terrain.
-        reach: Cells farther away are left out [m].
+        corner: Lower corner of each tile in the map frame, shape (T, 2) [m].
+        at: Position of the sensor in the map frame, shape (2,) [m].
+        yaw: Yaw of the sensor [rad].
+        height, seen: Arrays of the Terrain of the scan.
+        reach: Maximum distance of a cell [m].
 
     Returns:
-        Height of the ground in the sensor's frame [m], NaN where it was not seen, and the weight of that
-        view [1/m^2], 0 likewise; both of shape (T, SIDE, SIDE).
+        Height of the ground in the level sensor frame [m], NaN if not seen; and the weight of the view
+        [1/m^2], 0 if not seen; both of shape (T, SIDE, SIDE).
     """
     tiles = corner.shape[0]
     below, weight = np.full((tiles, SIDE, SIDE), np.nan), np.zeros((tiles, SIDE, SIDE))
@@ -59,10 +60,12 @@ def look(
 
 @compiled
 def fuse(block: Float32, below: Float, weight: Float, sensor_z: float) -> None:
-    """Average one view into the cells, in place.
+    """Update the weighted mean and variance of the cells with one view, in place.
 
     Args:
-        block: shape (T, SIDE, SIDE, COLUMNS); below, weight: from `look`; sensor_z: see HeightMapState.
+        block: Cells, shape (T, SIDE, SIDE, COLUMNS).
+        below, weight: Results of `observe_cells`.
+        sensor_z: Height of the sensor in the map frame [m].
     """
     most = MOST / (SIGMA**2 + (5.0 * SIGMA_A_METRE) ** 2)
     for t in range(block.shape[0]):
@@ -126,26 +129,27 @@ def _averaged(row: Float, of: Int, cells: int) -> Float32:
 
 
 TILE = SIDE * CELL  # m
-REACH = 15.0  # m; farther away a cell of the scan's terrain is wider than a cell of the map by far
-NEAR_WEIGHT = 200.0  # 1/m^2; of a cell within 12 m
-LEAST = 50  # cells that must be known already to tell how high the sensor stands
-RENEW = 5  # scans after which the record is made anew, and
-TILES_A_SCAN = 100  # one scan more for so many tiles, so that it costs the same however large the map is
-MOST_TILES = 1 << 13  # 52 hectares, 34 MB; then the tile that was seen longest ago is forgotten
+REACH = 15.0  # m; beyond it, a cell of the scan is much wider than a cell of the map
+NEAR_WEIGHT = 200.0  # 1/m^2; weight of a view within 12 m
+LEAST = 50  # known cells that are needed to estimate the height of the sensor
+RENEW = 5  # scans between updates of the record, plus
+TILES_A_SCAN = 100  # one scan per this many tiles, which bounds the cost per scan
+MOST_TILES = 1 << 13  # 52 hectares, 34 MB; beyond it, the least recently seen tile is removed
 _FARTHEST = 1e6  # m
 _UNKNOWN: Float32 = np.zeros((SIDE, SIDE, COLUMNS), np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeightMapState:
-    """What is known between two scans. Nothing in it is ever changed, so that sharing it is a copy.
+    """State of the terrain map between two scans. Its arrays are never modified, so that states can share
+    them.
 
     Attributes:
-        tiles: float32, shape (SIDE, SIDE, COLUMNS) each, by their number along x and y; the one that was
-            seen longest ago comes first.
-        sensor_z: Height of the sensor in the map [m]; None before the first scan.
-        scans: How many were taken.
-        record: The map as it was shown last.
+        tiles: Cells of each tile by tile index along x and y, float32, shape (SIDE, SIDE, COLUMNS), least
+            recently seen first.
+        sensor_z: Height of the sensor in the map frame [m]; None before the first scan.
+        scans: Number of scans.
+        record: The most recently published map.
     """
 
     tiles: Mapping[Tile, Float32]
@@ -155,25 +159,25 @@ class HeightMapState:
 
 
 class HeightMapper:
-    """Knows the height of the ground wherever scans saw it.
+    """Fuses the terrain of all scans.
 
-    Height 0 is the ground below the sensor at the first scan. Odometry and SLAM are planar: how high the
-    sensor stands is found at each scan from the ground that was seen before.
+    Height 0 is the ground below the sensor at the first scan. Odometry and SLAM are planar; the height of the
+    sensor is estimated at each scan from the cells that are known already.
     """
 
     def __init__(self) -> None:
         self.state = HeightMapState({}, None, 0, no_height_map())
 
     def add(self, terrain: Terrain, T_map_base: Pose2, sensor_offset: Float) -> None:
-        """Take the terrain of one scan.
+        """Add the terrain of one scan.
 
-        A cell counts few views at the most: what is seen later outweighs what was laid down before the pose
-        was corrected.
+        The weight of a cell is bounded, so that later views replace heights that were added before a
+        correction of the pose.
 
         Args:
-            terrain: In the level sensor frame.
-            T_map_base: The pose.
-            sensor_offset: The sensor in the level base frame, shape (3,) [m].
+            terrain: Terrain in the level sensor frame.
+            T_map_base: Pose of the base.
+            sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
         """
         at = T_map_base.apply(np.asarray(sensor_offset[:2], np.float64))
         if not np.all(np.abs(at) < _FARTHEST):
@@ -182,7 +186,7 @@ class HeightMapper:
         keys = _around(at)
         corner = TILE * np.array(keys, np.float64)
         block = np.stack([old.tiles.get(key, _UNKNOWN) for key in keys])
-        below, weight = look(corner, at, T_map_base.yaw, terrain.height, terrain.seen, REACH)
+        below, weight = observe_cells(corner, at, T_map_base.yaw, terrain.height, terrain.seen, REACH)
         z = _register(block, below, weight, old.sensor_z)
         if z is None:
             z = -float(ground_at(terrain.height, 0.0, 0.0))
@@ -190,7 +194,7 @@ class HeightMapper:
         tiles = dict(old.tiles)
         for n in np.flatnonzero(weight.any(axis=(1, 2))):
             tiles.pop(keys[n], None)
-            tiles[keys[n]] = block[n].copy()  # a view would keep the whole block alive
+            tiles[keys[n]] = block[n].copy()  # a view would reference the whole block
         while len(tiles) > MOST_TILES:
             del tiles[next(iter(tiles))]
         scans = old.scans + 1
@@ -203,12 +207,14 @@ class HeightMapper:
         self.state = replace(self.state, tiles=tiles, record=_record(tiles))
 
     def record(self) -> HeightMap:
-        """The whole map as it is now."""
+        """Return the current map."""
         return _record(self.state.tiles)
 
     def heights(self, places: Float) -> Float:
-        """Height of the ground [m] at places of shape (N, 2) [m]: of the cell there or, where it is not
-        known, of the known ones next to it; NaN where those are not known either."""
+        """Return the height of the ground [m] at places of shape (N, 2) [m].
+
+        An unknown cell takes the weighted mean of its known neighbours; without any the height is NaN.
+        """
         cell = np.floor(places / CELL).astype(np.int64)
         return np.array([self._at(int(i), int(j)) for i, j in cell])
 
@@ -225,7 +231,7 @@ class HeightMapper:
 
 
 def no_height_map() -> HeightMap:
-    """Nothing is known."""
+    """Return an empty map."""
     return _record({})
 
 
@@ -237,7 +243,8 @@ def _around(at: Float) -> list[Tile]:
 
 
 def _register(block: Float32, below: Float, weight: Float, before: float | None) -> float | None:
-    """Height of the sensor in the map: the median over the cells near by that are known already."""
+    """Return the height of the sensor in the map frame: the median over known cells, nearby ones
+    preferred."""
     known = (block[..., VIEWS] > 0.0) & (weight > NEAR_WEIGHT)
     if np.count_nonzero(known) < LEAST:
         known = (block[..., VIEWS] > 0.0) & (weight > 0.0)
@@ -263,10 +270,11 @@ def _record(tiles: Mapping[Tile, Float32]) -> HeightMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedHeightMap:
-    """See HeightMapState; the tiles in their order. `sensor_z` is NaN where it is not known.
+    """HeightMapState as plain arrays for saving, with the tiles in their order; an unknown `sensor_z` is NaN.
 
     Attributes:
-        tile: int64, shape (T, 2); cells: float32, shape (T * SIDE * SIDE, COLUMNS).
+        tile: Tile indices, int64, shape (T, 2).
+        cells: float32, shape (T * SIDE * SIDE, COLUMNS).
     """
 
     tile: Int
@@ -277,7 +285,7 @@ class PackedHeightMap:
 
     @classmethod
     def of(cls, state: HeightMapState) -> PackedHeightMap:
-        """All that the state knows."""
+        """Return the arrays of a state."""
         cells = np.zeros((len(state.tiles), SIDE, SIDE, COLUMNS), np.float32)
         for n, tile in enumerate(state.tiles.values()):
             cells[n] = tile
@@ -291,27 +299,27 @@ class PackedHeightMap:
 
     @classmethod
     def empty(cls) -> PackedHeightMap:
-        """Nothing is known."""
+        """Return an empty map."""
         return cls.of(HeightMapState({}, None, 0, no_height_map()))
 
     def unpacked(self) -> HeightMapState:
-        """The same state, to the bit.
+        """Return the state, identical to the bit.
 
         Raises:
-            ValueError: Its parts do not fit one another; they come from a file.
+            ValueError: The arrays, which come from a file, do not match each other.
         """
         n = len(self.tile)
         if self.tile.shape != (n, 2) or self.cells.shape != (n * SIDE * SIDE, COLUMNS) or n > MOST_TILES:
-            raise ValueError("the tiles of the height map have another shape")
+            raise ValueError("the tiles of the terrain map have a wrong shape")
         if not np.all(np.isfinite(self.cells)) or np.isinf(self.sensor_z) or self.scans < 0:
             raise ValueError("a height is not finite")
         record = self.record
         k = len(record.height)
         if record.place.shape != (k, 2) or not len(record.sigma) == len(record.views) == k:
-            raise ValueError("the columns of the height map have other lengths")
+            raise ValueError("the columns of the terrain map have different lengths")
         keys = [(int(i), int(j)) for i, j in self.tile]
         if len(set(keys)) < n:
-            raise ValueError("two tiles of the height map are one")
+            raise ValueError("two tiles of the terrain map have the same index")
         tiles = self.cells.reshape(n, SIDE, SIDE, COLUMNS)
         z = None if np.isnan(self.sensor_z) else self.sensor_z
         return HeightMapState(

@@ -1,4 +1,4 @@
-"""Acquisition (Eq. 1): the returns of one sweep, taken at one instant and turned upright."""
+"""Acquisition (Eq. 1): de-skewing and levelling of the returns of one sweep."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from pipeline.geometry.poses import Float, Pose3
 from pipeline.jit import compiled
 from pipeline.types.records import Float32, Int32, Step
 
-CHUNK = 512  # points; what is computed of them stays in the nearest cache
-#: What is told nearer than this is the sensor's own housing, or a beam without a return [m].
+CHUNK = 512  # points per block, so that intermediate results stay in the first-level cache
+#: Closer returns are the housing of the sensor or beams without a return [m].
 HOUSING = 0.1
 Bytes = NDArray[np.uint8]
 
 
 def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float32, Float]:
-    """The points of a step's scan in the level sensor frame.
+    """Return the points of a scan in the level sensor frame, de-skewed.
 
-    That frame has its origin in the sensor, its x axis along the robot's heading and, when the scan
-    is levelled, its z axis against gravity. Points are moved to where they would be had the robot
-    stood still at the scan's stamp: p' = R(w dt) p + v dt, with dt the point's time offset.
+    The level sensor frame has its origin in the sensor, x along the heading of the robot and, if the scan is
+    levelled, z against gravity. De-skewing moves each point to its position at the stamp of the scan:
+    p' = R(w dt) p + v dt, where dt is the time offset of the point.
 
     Returns:
-        The points, float32, shape (N, 3) [m], and the sensor's place in the level base frame,
-        shape (3,) [m]; point plus place is the point in the level base frame.
+        Points, float32, shape (N, 3) [m]; and the position of the sensor in the level base frame, shape (3,)
+        [m]. Their sum is the point in the level base frame.
     """
     R_level_lidar, sensor_offset = _turn(step, T_base_lidar, parameters)
     offset_ns = step.scan.offset_ns
@@ -44,11 +44,10 @@ def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[F
 
 
 def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Float32:
-    """The points that `acquire` leaves out as nearer than `range_min`, in its frame: of the robot itself,
-    or of what stands close before it. They stay where they were seen: the robot moves with itself.
+    """Return the points closer than `range_min`, in the level sensor frame, float32, shape (N, 3) [m].
 
-    Returns:
-        float32, shape (N, 3) [m].
+    These returns are from the robot itself or from objects close to it. They are not de-skewed, since the
+    robot does not move relative to itself.
     """
     points = step.scan.points
     rows = _nearer(points, min(HOUSING, parameters.range_min), parameters.range_min)
@@ -58,15 +57,17 @@ def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Fl
 
 
 def _turn(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
-    """The turn from the sensor's axes to level ones, and the sensor's place in the level base frame [m]."""
+    """Return R_level_lidar and the position of the sensor in the level base frame, shape (3,) [m]."""
     level = parameters.level == "imu" and step.tilt_known
     R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)
     return R_level_base @ T_base_lidar.R, R_level_base @ T_base_lidar.t
 
 
 def driven_with(step: Step, parameters: Acquisition) -> tuple[float, float, float]:
-    """Velocity of the base at a scan: forward, left [m/s], turn [rad/s], the turn by the gyroscope where it
-    is asked."""
+    """Return the velocity of the base at a scan: forward, left [m/s], yaw rate [rad/s].
+
+    The yaw rate is that of the gyroscope if it is available and enabled.
+    """
     if parameters.gyro and step.turn_rate is not None:
         return (step.twist[0], step.twist[1], step.turn_rate)
     return step.twist
@@ -74,7 +75,7 @@ def driven_with(step: Step, parameters: Acquisition) -> tuple[float, float, floa
 
 @compiled
 def _nearer(points: Float32, least: float, below: float) -> Int32:
-    """Rows of the points that lie from `least` to below `below` away."""
+    """Return the rows of the points with `least` <= range < `below`."""
     rows = np.empty(points.shape[0], np.int32)
     n = 0
     for i in range(points.shape[0]):
@@ -97,7 +98,7 @@ def _take(
 ) -> Float32:
     kept = np.empty((points.shape[0], 3), np.float32)
     n = 0
-    # Some points at a time, in plain rows and plain loops, so that the processor takes several at once.
+    # Blocks of contiguous rows and simple loops, which the compiler vectorises.
     u, v, w = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
     dt, inside = np.empty(CHUNK), np.empty(CHUNK, np.uint8)
     for start in range(0, points.shape[0], CHUNK):
@@ -119,14 +120,14 @@ def _take(
 def _turn_upright(
     u: Float, v: Float, w: Float, inside: Bytes, R: Float, square_min: float, square_max: float
 ) -> None:
-    """Turn points by R, in place, and tell which lie within the range."""
+    """Rotate points by R, in place, and mark those within the range limits."""
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
     for i in range(CHUNK):
         x, y, z = u[i], v[i], w[i]
         square = x * x + y * y + z * z
-        # Written so that a coordinate that is not a number fails it.
+        # A NaN coordinate fails these comparisons.
         inside[i] = (square_min <= square) & (square <= square_max)
         u[i] = r00 * x + r01 * y + r02 * z
         v[i] = r10 * x + r11 * y + r12 * z
@@ -135,10 +136,10 @@ def _turn_upright(
 
 @compiled
 def _move_to_one_time(u: Float, v: Float, dt: Float, sensor: Float, twist: Float) -> None:
-    """Move points to where they would be at the scan's stamp, in place.
+    """De-skew points, in place.
 
-    A robot turns by less than half a radian within a sweep, where these series are exact to a tenth of a
-    millimetre at 100 m; the library's sine would cost more than all else.
+    The rotation within a sweep is less than 0.5 rad; there, the series of sine and cosine are accurate to 0.1
+    mm at 100 m and faster than the library functions.
     """
     at_x, at_y, vx, vy, turning = sensor[0], sensor[1], twist[0], twist[1], twist[2]
     for i in range(CHUNK):

@@ -1,4 +1,4 @@
-"""Filters: the pass-through box and the voxel grid with averaging (Eq. 2)."""
+"""Pass-through filter and voxel grid filter (section 3.1 of the paper, Eq. 2)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pipeline.config.stages import Filters
 from pipeline.jit import compiled
 from pipeline.types.records import Float32
 
-# Odd 64-bit constant that spreads neighbouring cells over the whole table (Fibonacci hashing).
+# Odd 64-bit constant that distributes neighbouring cells over the hash table (Fibonacci hashing).
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 _AXIS_CELLS = 1 << 21  # three axes of 21 bits fit one 64-bit key
 
 
 def pass_through(points: Float32, parameters: Filters) -> Float32:
-    """The points inside the box; its faces belong to it. Shape (N, 3) -> (M, 3) [m]."""
+    """Return the points inside the box including its faces, shape (M, 3) [m]."""
     p = parameters
     low = np.array([p.x_min, p.y_min, p.z_min], np.float32)
     high = np.array([p.x_max, p.y_max, p.z_max], np.float32)
@@ -34,14 +34,20 @@ def _box(points: Float32, low: Float32, high: Float32) -> Float32:
 
 
 def voxel_grid(points: Float32, parameters: Filters) -> Float32:
-    """Replace the points of each cube of `voxel_size` by their mean, in the order of first visit.
+    """Replace the points of each voxel by their mean, in the order of the first point of each voxel.
 
-    The cubes are fixed in the frame, so that one point more does not shift all the others' cubes.
-    Shape (N, 3) -> (M, 3) [m]; size 0 changes nothing.
+    The voxels are fixed in the frame of the points. A voxel size of 0 returns the points unchanged.
+
+    Args:
+        points: float32, shape (N, 3) [m].
+        parameters: `voxel_size` is the edge length of a voxel [m].
+
+    Returns:
+        Means, float32, shape (M, 3) [m].
     """
     size = parameters.voxel_size
     if size == 0.0 or len(points) == 0 or float(np.abs(points).max()) / size >= _AXIS_CELLS // 2 - 1:
-        return points  # cubes so small against the cloud hold one point each
+        return points  # voxels this small contain one point each
     return _voxel_means(points, size)
 
 
@@ -52,7 +58,8 @@ def _voxel_means(points: Float32, size: float) -> Float32:
     while slots < 2 * n:
         slots *= 2
     shift = np.uint64(64 - int(np.log2(slots) + 0.5))
-    # The table has rows alone, and their keys stand one after another: most cubes are new, and ask for none.
+    # The hash table stores row numbers; keys are stored per row. Most voxels are new and need no key
+    # comparison.
     row_of, keys = np.full(slots, -1, np.int32), np.empty(n, np.int64)
     sums = np.zeros((n, 3))
     counts = np.zeros(n, np.int64)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.stages import Detection
-from pipeline.detection.verdicts import judge
+from pipeline.detection.verdicts import classify_clusters
 from pipeline.geometry.poses import Float
 from pipeline.types.records import Clusters, Int, Int32, Verdict
 
@@ -87,7 +87,7 @@ class ClusterTable:
             radius_sigma=nothing,
             verdict=nothing.astype(np.int32),
         )
-        return judge(asked, parameters).verdict
+        return classify_clusters(asked, parameters).verdict
 
     def first_judged_otherwise(self, before: Detection, after: Detection, scans: int) -> int:
         """The first of some scans whose detections differ between two sets of parameters; `scans` if none."""

@@ -18,7 +18,7 @@ from app.training.streets import simulate_street
 from pipeline.config import Parameters, preset
 from pipeline.detection.cluster_shape import describe_stems
 from pipeline.detection.clustering import cluster
-from pipeline.detection.verdicts import detections, judge
+from pipeline.detection.verdicts import classify_clusters, detections
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground import scan_ground
 from pipeline.ground.terrain import height_above
@@ -86,7 +86,7 @@ def _count(place: Place, parameters: Parameters) -> np.ndarray[tuple[int, int], 
     height = height_above(boxed, scan_ground.find_terrain(raw, p.ground))
     points = filters.voxel_grid(scan_ground.in_band(boxed, height, p.ground), p.filters)
     _, described = describe_stems(points, cluster(points, sensor, p.clustering), sensor, p.shape)
-    found = detections(judge(described, p.detection), offset, p.detection).centre
+    found = detections(classify_clusters(described, p.detection), offset, p.detection).centre
     here = _in_base_frame(trees, step.T_odom_base or Pose2())
     reach, away = np.hypot(*here.T), np.hypot(*found.T)
     seen = _returns_near(here, points, offset) >= LEAST

@@ -13,7 +13,7 @@ from pipeline.config import Parameters, preset
 from pipeline.detection.cluster_shape import describe_stems
 from pipeline.detection.clustering import cluster
 from pipeline.detection.free_space import clear_range
-from pipeline.detection.verdicts import detections, judge
+from pipeline.detection.verdicts import classify_clusters, detections
 from pipeline.evaluation import path_error
 from pipeline.geometry.poses import Pose2
 from pipeline.ground import scan_ground
@@ -77,7 +77,7 @@ def seen_in(uri: str, parameters: Parameters | None = None) -> tuple[list[Seen],
         filtered = filters.voxel_grid(band, p.filters)
         labels = cluster(filtered, known.sensor, p.clustering)
         _, described = describe_stems(filtered, labels, known.sensor, p.shape)
-        found = detections(judge(described, p.detection), offset, p.detection)
+        found = detections(classify_clusters(described, p.detection), offset, p.detection)
         odometry = step.T_odom_base or Pose2()
         rows.append(Seen(step.scan.stamp_ns, odometry, found, clear_range(raw, filtered, offset)))
     return rows, source.truth() or Truth(), p

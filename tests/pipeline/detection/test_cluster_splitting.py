@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.detection.cluster_shape import describe, describe_stems
-from pipeline.detection.verdicts import judge
+from pipeline.detection.verdicts import classify_clusters
 from pipeline.types.records import Clusters, Labels, Verdict
 from tests.pipeline.strategies import LAW, SENSOR, one_cluster
 
@@ -66,11 +66,11 @@ def test_a_shrub_at_its_foot_does_not_hide_a_trunk(top):
     rng = np.random.default_rng(1)
     stem, leaves = trunk(rng), shrub(rng, beside=0.25, top=top)
     points = np.concatenate([leaves, stem])
-    (whole,) = judge(parts_of(points, slices=0)[1], DETECTION).verdict
+    (whole,) = classify_clusters(parts_of(points, slices=0)[1], DETECTION).verdict
     assert whole != Verdict.TREE
     labels, clusters = parts_of(points)
     assert labels.clusters == 2
-    assert judge(clusters, DETECTION).verdict[0] == Verdict.TREE
+    assert classify_clusters(clusters, DETECTION).verdict[0] == Verdict.TREE
     assert np.hypot(*(clusters.centre[0] - TRUNK)) < 0.02
     assert clusters.radius[0] == pytest.approx(0.15, abs=0.02)
     taken = labels.label == 0

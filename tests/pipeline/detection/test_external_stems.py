@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import preset
 from pipeline.config.stages import Acquisition
-from pipeline.detection.external_stems import take_stems
+from pipeline.detection.external_stems import external_clusters
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.mapper import Mapper
 from pipeline.types.records import Scan, Sensor, Stems, Step, Verdict
@@ -48,7 +48,7 @@ def test_stems_are_levelled_by_the_pose(roll: float, pitch: float, seed: int):
     tilt = Pose3.from_euler(np.zeros(3), roll, pitch, 0.0)
     level = stand(seed)
     step, stems = step_of(tilt.inverse().apply(level), roll=roll, pitch=pitch, tilt_known=True)
-    places, _, clusters = take_stems(step, stems, Pose3.identity(), LEVEL)
+    places, _, clusters = external_clusters(step, stems, Pose3.identity(), LEVEL)
     np.testing.assert_allclose(places, level, atol=1e-5)
     np.testing.assert_allclose(clusters.centre, level[:, :2], atol=1e-5)
 
@@ -61,15 +61,19 @@ def test_without_a_tilt_they_are_levelled_by_their_axes(roll: float, pitch: floa
     axis = np.tile(tilt.R.T @ [0.0, 0.0, 1.0], (len(level), 1))
     axis[:3] = NAN  # some are not known
     step, stems = step_of(tilt.inverse().apply(level), axis=axis)
-    np.testing.assert_allclose(take_stems(step, stems, Pose3.identity(), LEVEL)[0], level, atol=1e-5)
+    np.testing.assert_allclose(external_clusters(step, stems, Pose3.identity(), LEVEL)[0], level, atol=1e-5)
 
 
 def test_few_axes_level_nothing_and_none_may_be_asked_for():
     level = stand(1)
     step, stems = step_of(level[:4], axis=np.tile([0.6, 0.0, 0.8], (4, 1)))
-    np.testing.assert_allclose(take_stems(step, stems, Pose3.identity(), LEVEL)[0], level[:4], atol=1e-6)
+    np.testing.assert_allclose(
+        external_clusters(step, stems, Pose3.identity(), LEVEL)[0], level[:4], atol=1e-6
+    )
     step, stems = step_of(level, roll=0.3, tilt_known=True)
-    places, _, _ = take_stems(step, stems, Pose3.identity(), LEVEL.model_copy(update={"level": "none"}))
+    places, _, _ = external_clusters(
+        step, stems, Pose3.identity(), LEVEL.model_copy(update={"level": "none"})
+    )
     np.testing.assert_allclose(places, level, atol=1e-6)
 
 
@@ -84,7 +88,7 @@ def test_the_real_axes_tell_the_tilt_of_the_real_poses(shared_data):
             evo["xyz"][rows], axis=evo["axis_z"][rows], roll=roll, pitch=pitch, tilt_known=True
         )
         unknown, _ = step_of(evo["xyz"][rows], axis=evo["axis_z"][rows])
-        by_pose, by_axes = (take_stems(s, stems, Pose3.identity(), LEVEL)[0] for s in (known, unknown))
+        by_pose, by_axes = (external_clusters(s, stems, Pose3.identity(), LEVEL)[0] for s in (known, unknown))
         far.append(np.median(np.linalg.norm(by_pose[:, :2] - by_axes[:, :2], axis=1)))
     assert np.median(far) < 0.2  # the untilted ones are 0.5 m off
 
@@ -92,7 +96,9 @@ def test_the_real_axes_tell_the_tilt_of_the_real_poses(shared_data):
 def test_mounting_and_range():
     mount = Pose3.from_euler(np.array([0.5, 0.0, 1.0]), 0.0, 0.0, np.pi / 2)
     step, stems = step_of([[1.0, 0.0, 0.0], [30.0, 0.0, 0.0]], dbh=[0.3, 0.4])
-    places, offset, clusters = take_stems(step, stems, mount, LEVEL.model_copy(update={"range_max": 20.0}))
+    places, offset, clusters = external_clusters(
+        step, stems, mount, LEVEL.model_copy(update={"range_max": 20.0})
+    )
     np.testing.assert_allclose(places, [[0.0, 1.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(offset, [0.5, 0.0, 1.0])
     np.testing.assert_allclose(clusters.radius, [0.15])

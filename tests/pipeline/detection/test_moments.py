@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
-from pipeline.detection.cluster_shape import describe, eccentricity, gather, moments
+from pipeline.detection.cluster_shape import describe, eccentricity, moments
+from pipeline.detection.clustering import group_rows
 from pipeline.types.records import Labels
 from tests.pipeline.strategies import LAW, SENSOR, arc, one_cluster
 
@@ -126,7 +127,7 @@ def test_eccentricity_is_at_least_one():
 @LAW
 @given(arrays.arrays(np.int32, st.integers(0, 40), elements=st.integers(-1, 4)))
 def test_gathering_puts_the_rows_of_each_cluster_side_by_side(label):
-    order, bounds = gather(label, 5)
+    order, bounds = group_rows(label, 5)
     assert len(bounds) == 6
     for k in range(5):
         np.testing.assert_array_equal(order[bounds[k] : bounds[k + 1]], np.flatnonzero(label == k))

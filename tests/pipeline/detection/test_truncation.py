@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
-from pipeline.detection.truncation import view_of
+from pipeline.detection.truncation import field_of_view
 from pipeline.front_end import detect, segment
 from pipeline.geometry.azimuth_bins import bin_direction, direction_bin
 from pipeline.geometry.poses import Pose3
@@ -122,7 +122,7 @@ def test_a_sector_is_found_again_by_its_middle(k):
 def test_the_view_is_told_by_where_returns_end(heading, half):
     turn = heading + np.linspace(-half, half, 800)
     points = np.stack([9.0 * np.cos(turn), 9.0 * np.sin(turn), 0.0 * turn], axis=1).astype(np.float32)
-    view = view_of(points)
+    view = field_of_view(points)
     middle = np.arctan2(view.s, view.c)
     off = np.angle(np.exp(1j * (middle + 0.5 * (view.left + view.right) - heading)))
     assert abs(off) < 1e-4
@@ -133,4 +133,4 @@ def test_who_looks_all_around_or_nowhere_has_no_sides():
     around = np.linspace(-np.pi, np.pi, 2000)
     ring = np.stack([np.cos(around), np.sin(around), 0.0 * around], axis=1).astype(np.float32)
     for points in (ring, np.zeros((0, 3), np.float32)):
-        assert not np.isfinite([view_of(points).left, view_of(points).right]).any()
+        assert not np.isfinite([field_of_view(points).left, field_of_view(points).right]).any()

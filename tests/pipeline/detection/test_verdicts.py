@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import PRESETS, Parameters, preset
-from pipeline.detection.verdicts import checks, detections, judge
+from pipeline.detection.verdicts import checks, classify_clusters, detections
 from pipeline.types.records import Clusters, Verdict
 from tests.pipeline.strategies import clusters
 
@@ -35,13 +35,13 @@ REASONS: list[tuple[Verdict, dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("verdict", "columns"), REASONS, ids=lambda v: getattr(v, "label", str(v)))
 def test_each_reason_is_reached(verdict, columns):
-    assert judge(clusters(**columns), FOREST).verdict.tolist() == [verdict]
+    assert classify_clusters(clusters(**columns), FOREST).verdict.tolist() == [verdict]
 
 
 def test_too_round_is_reached_by_the_preset_of_the_text():
     p = preset("paper-text").detection
-    assert judge(clusters(eccentricity=[9.9]), p).verdict.tolist() == [Verdict.TOO_ROUND]
-    assert judge(clusters(eccentricity=[10.0]), p).verdict.tolist() == [Verdict.TREE]
+    assert classify_clusters(clusters(eccentricity=[9.9]), p).verdict.tolist() == [Verdict.TOO_ROUND]
+    assert classify_clusters(clusters(eccentricity=[10.0]), p).verdict.tolist() == [Verdict.TREE]
 
 
 @pytest.mark.parametrize(
@@ -55,21 +55,21 @@ def test_too_round_is_reached_by_the_preset_of_the_text():
     ],
 )
 def test_a_figure_on_its_bound_is_still_a_tree(column, value):
-    assert judge(clusters(**{column: [value]}), FOREST).verdict.tolist() == [Verdict.TREE]
+    assert classify_clusters(clusters(**{column: [value]}), FOREST).verdict.tolist() == [Verdict.TREE]
 
 
 def test_the_first_reason_in_the_order_wins():
     worst = clusters(
         hidden=[True], extent=[[9, 9, 0]], eccentricity=[999.0], radial_std=[9.0], arc=[0.0], radius=[9.0]
     )
-    assert judge(worst, FOREST).verdict.tolist() == [Verdict.HIDDEN]
+    assert classify_clusters(worst, FOREST).verdict.tolist() == [Verdict.HIDDEN]
     seen = clusters(extent=[[0.2, 0.4, 0]], eccentricity=[999.0], radial_std=[9.0], arc=[0.0])
-    assert judge(seen, FOREST).verdict.tolist() == [Verdict.TOO_LOW]
+    assert classify_clusters(seen, FOREST).verdict.tolist() == [Verdict.TOO_LOW]
 
 
 def test_without_a_circle_its_figures_are_not_asked_for():
     no_circle = clusters(radius=[np.nan], radius_sigma=[np.nan], arc=[0.0])
-    assert judge(no_circle, FOREST).verdict.tolist() == [Verdict.TREE]
+    assert classify_clusters(no_circle, FOREST).verdict.tolist() == [Verdict.TREE]
 
 
 def test_the_paper_keeps_by_eccentricity_and_radial_deviation_alone():
@@ -81,12 +81,12 @@ def test_the_paper_keeps_by_eccentricity_and_radial_deviation_alone():
         eccentricity=[19.9],
         cut=[True],
     )
-    assert judge(thing, PAPER).verdict.tolist() == [Verdict.TREE]
+    assert classify_clusters(thing, PAPER).verdict.tolist() == [Verdict.TREE]
     for column, value, verdict in (
         ("eccentricity", 20.1, Verdict.TOO_LONG),
         ("radial_std", 0.11, Verdict.NOT_ROUND),
     ):
-        assert judge(clusters(**{column: [value]}), PAPER).verdict.tolist() == [verdict]
+        assert classify_clusters(clusters(**{column: [value]}), PAPER).verdict.tolist() == [verdict]
 
 
 def _many():
@@ -98,14 +98,14 @@ def _many():
 
 def test_nothing_is_dropped_and_nothing_left_open():
     many = _many()
-    judged = judge(many, FOREST)
+    judged = classify_clusters(many, FOREST)
     assert len(judged.verdict) == len(many.size)
     assert judged.verdict.tolist() == [verdict for verdict, _ in REASONS]
     np.testing.assert_array_equal(judged.centre, many.centre)
 
 
 def test_detections_are_the_trees_in_the_base_frame():
-    judged = judge(_many(), FOREST)
+    judged = classify_clusters(_many(), FOREST)
     found = detections(judged, np.array([0.3, -0.2, 0.8]), FOREST)
     assert found.cluster.tolist() == [0]
     np.testing.assert_allclose(found.centre, [[4.5, -0.2]])
@@ -116,7 +116,7 @@ def test_detections_are_the_trees_in_the_base_frame():
 def test_the_error_of_the_sensor_lies_along_and_across_the_ray(bearing):
     ray = np.array([np.cos(bearing), np.sin(bearing)])
     across = np.array([-ray[1], ray[0]])
-    judged = judge(clusters(centre=[5.0 * ray], covariance=[np.eye(2) * 1e-4]), FOREST)
+    judged = classify_clusters(clusters(centre=[5.0 * ray], covariance=[np.eye(2) * 1e-4]), FOREST)
     R = detections(judged, np.zeros(3), FOREST).covariance[0]
     assert ray @ R @ ray == pytest.approx(1e-4 + FOREST.sigma_range**2)
     assert across @ R @ across == pytest.approx(1e-4 + (5.0 * np.radians(FOREST.sigma_bearing)) ** 2)
@@ -124,19 +124,19 @@ def test_the_error_of_the_sensor_lies_along_and_across_the_ray(bearing):
 
 
 def test_a_tree_without_a_circle_gives_no_radius():
-    judged = judge(clusters(radius=[np.nan], radius_sigma=[np.nan]), FOREST)
+    judged = classify_clusters(clusters(radius=[np.nan], radius_sigma=[np.nan]), FOREST)
     assert np.isnan(detections(judged, np.zeros(3), FOREST).radius).all()
 
 
 def test_no_clusters_give_no_detections():
     none = Clusters(*(getattr(_many(), name)[:0] for name in Clusters.__dataclass_fields__))
-    assert len(detections(judge(none, FOREST), np.zeros(3), FOREST).cluster) == 0
+    assert len(detections(classify_clusters(none, FOREST), np.zeros(3), FOREST).cluster) == 0
 
 
 def test_what_a_missing_part_changes_is_asked_after_the_border():
     cut = clusters(cut=[True], eccentricity=[999.0], radial_std=[9.0], arc=[0.0], radius=[9.0])
-    assert judge(cut, FOREST).verdict.tolist() == [Verdict.AT_BORDER]
-    assert judge(clusters(cut=[True], extent=[[0.2, 1.3, 1.0]]), FOREST).verdict.tolist() == [
+    assert classify_clusters(cut, FOREST).verdict.tolist() == [Verdict.AT_BORDER]
+    assert classify_clusters(clusters(cut=[True], extent=[[0.2, 1.3, 1.0]]), FOREST).verdict.tolist() == [
         Verdict.TOO_THICK
     ]
 
@@ -182,4 +182,4 @@ def test_the_checks_decide_as_the_judge_does(row, hidden, cut, name):
     )
     p = preset(name).detection
     failing = [check.verdict for check in checks(table, p) if check.fails[0]]
-    assert judge(table, p).verdict.tolist() == (failing[:1] or [Verdict.TREE])
+    assert classify_clusters(table, p).verdict.tolist() == (failing[:1] or [Verdict.TREE])
