@@ -30,7 +30,6 @@ from pipeline.stage_timer import StageTimer, no_timer
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import (
-    Columns,
     Frame,
     HeightMap,
     Int,
@@ -78,28 +77,6 @@ class MapperState:
 Correction = Restart[MapperState] | Relocalisation | LoopClosure | SearchFailure
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Noted:
-    """What the stages made of one scan, for a rerun that begins at a later stage.
-
-    Attributes:
-        scan: Segmentation of the scan; found: its verdicts.
-        estimate: Pose of the scan.
-        landmarks: Landmarks after the scan: positions, shape (L, 2) [m], and covariances xx, xy, yy, (L, 3).
-        columns: Voxel columns where the scan updated them, else None.
-        is_usual: Whether neither pose nor map depended on the trees.
-    """
-
-    index: int
-    stamp_ns: int
-    scan: SegmentedScan
-    found: DetectionResult
-    estimate: PoseEstimate
-    landmarks: tuple[Float, Float]
-    columns: Columns | None
-    is_usual: bool
-
-
 class Mapper:
     """Maps a run scan by scan. It reads no clock and no file and starts no thread.
 
@@ -138,7 +115,6 @@ class Mapper:
         self._odometry: Pose2 | None = None
         self._placed = self._closed = 0
         self._last: tuple[Pose2, Float] | None = None
-        self.note: Callable[[Noted], None] | None = None
 
     def process(self, step: Step, scan: SegmentedScan | None = None) -> Frame:
         """Map one scan.
@@ -177,7 +153,6 @@ class Mapper:
         estimate = self._apply(step.index, closure, estimate)
 
         self._last = (estimate.T_map_base, estimate.covariance)
-        self._note(step, scan, found, estimate)
         return self._frame(step, scan, found, estimate, notices, correction, closure)
 
     def segment(self, step: Step) -> SegmentedScan:
@@ -471,13 +446,3 @@ class Mapper:
             base_z=base_z,
             clearance=scan.clearance,
         )
-
-    def _note(self, step: Step, scan: SegmentedScan, found: DetectionResult, estimate: PoseEstimate) -> None:
-        if self.note is None:
-            return
-        searching = self._relocaliser.is_searching
-        due = detection.is_due(step.index, self._path.sigma_xy)
-        columns = None if scan.column_input is None or searching else self._columns.columns
-        usual = not searching and not due
-        stamp_ns, landmarks = step.scan.stamp_ns, self._slam.landmarks()
-        self.note(Noted(step.index, stamp_ns, scan, found, estimate, landmarks, columns, usual))

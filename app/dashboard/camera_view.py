@@ -9,10 +9,9 @@ from collections import OrderedDict
 from typing import Any
 
 from app.common.draw_picture import drawn
+from app.dashboard.camera_marks import marks_of, motion
 from app.explain.client import Asking
 from app.explain.questions import NoStoryError
-from app.worker.camera_marks import marks_of
-from app.worker.camera_motion import motion
 from pipeline.types.records import Frame, Path
 
 #: All browsers together get so many pictures a second at most.

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.explain.records import History
-from pipeline.remapping import Recalled
 from pipeline.types.records import Frame
 
 _WIDTH = 11  # scan, number, observations, time, x, y, var x, cov xy, var y, DBH, its sigma
@@ -32,24 +31,15 @@ class TreeHistory:
     def __len__(self) -> int:
         return self._count
 
-    def before(self, scan: int) -> TreeHistory:
-        """A memory of its own, of what the scans before one made of the trees."""
-        known = TreeHistory()
-        count = int(np.searchsorted(self._rows[: self._count, _SCAN], scan))
-        known._rows, known._count = self._rows[: max(count, 1024)].copy(), count
-        known._spacing = self._spacing
-        return known
-
-    def record(self, frame: Frame | Recalled, start_ns: int) -> None:
-        """Take a scan, or several. What was known of these and later scans is forgotten: the run went back.
+    def record(self, frame: Frame, start_ns: int) -> None:
+        """Add a scan. The rows of this scan and of later ones are replaced, because the run went back.
 
         Args:
-            frame: The results.
-            start_ns: Time of the run's first scan.
+            frame: Result of the scan.
+            start_ns: Time of the first scan of the run.
         """
         rows = _rows_of(frame, start_ns)
-        first = frame.first if isinstance(frame, Recalled) else frame.index
-        self._count = int(np.searchsorted(self._rows[: self._count, _SCAN], first))
+        self._count = int(np.searchsorted(self._rows[: self._count, _SCAN], frame.index))
         if self._spacing > 1:
             rows = rows[(rows[:, _SCAN] % self._spacing == 0) | (rows[:, _OBSERVATIONS] <= _ALL_OF_FIRST)]
         self._append(rows)
@@ -99,30 +89,20 @@ def _matrices(xx_xy_yy: NDArray[np.float64]) -> NDArray[np.float64]:
     return xx_xy_yy[:, [[0, 1], [1, 2]]]
 
 
-def _rows_of(frame: Frame | Recalled, start_ns: int) -> NDArray[np.float64]:
-    """What scans made of the trees that they detected, shape (R, _WIDTH)."""
-    if isinstance(frame, Recalled):
-        seen = frame.seen
-        place, covariance, dbh, dbh_sigma = seen.position, seen.covariance, seen.dbh, seen.dbh_sigma
-        scan, number, observations = seen.scan, seen.number, seen.observations
-        stamp_ns = frame.stamps_ns[scan - frame.first]
-    else:
-        trees = frame.trees
-        # A tree that its column began has a place before any scan detected it.
-        there = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
-        place, covariance = trees.position[there], trees.covariance[there]
-        dbh, dbh_sigma = trees.dbh[there], trees.dbh_sigma[there]
-        scan, number = np.full(len(there), frame.index), trees.number[there]
-        observations, stamp_ns = trees.observations[there], np.full(len(there), frame.stamp_ns)
+def _rows_of(frame: Frame, start_ns: int) -> NDArray[np.float64]:
+    """A row for each tree that the scan has detected, shape (R, _WIDTH)."""
+    trees = frame.trees
+    # A tree that began as a voxel column has a place before any scan detects it.
+    rows = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
     return np.column_stack(
         [
-            scan,
-            number,
-            observations,
-            (stamp_ns - start_ns) / _NS,
-            place,
-            covariance[:, [0, 0, 1], [0, 1, 1]],
-            dbh,
-            dbh_sigma,
+            np.full(len(rows), frame.index),
+            trees.number[rows],
+            trees.observations[rows],
+            np.full(len(rows), (frame.stamp_ns - start_ns) / _NS),
+            trees.position[rows],
+            trees.covariance[rows][:, [0, 0, 1], [0, 1, 1]],
+            trees.dbh[rows],
+            trees.dbh_sigma[rows],
         ]
     )

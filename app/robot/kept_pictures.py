@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.camera import Picture
-from pipeline.remapping.scan_cache import SPARE_BYTES, room
+from pipeline.remapping.scan_cache import SPARE_BYTES, free_space
 from pipeline.types.records import Path
 
 #: A picture each metre or a quarter of a turn shows every tree from near; the disk that they may take.
@@ -73,7 +73,7 @@ class KeptPictures:
             count_loss(self.losses, FULL)
             return
         try:
-            if room(self._folder) < SPARE_BYTES + size:
+            if free_space(self._folder) < SPARE_BYTES + size:
                 count_loss(self.losses, SPARED)
                 return
             self._file.seek(self._length)

@@ -21,20 +21,18 @@ from app.sources.request import SourceRequest
 from app.training.learned_forests import kept_forests
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
-from pipeline.errors import SourceError, StemmapError
+from pipeline.errors import SourceError
 from pipeline.evaluation import Evaluation, evaluate
 from pipeline.io.readers import open_source
 from pipeline.io.readers.clouds import is_cloud, open_cloud
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.remapping import KeptScans, look_key
+from pipeline.remapping import ScanCache, ScanCaches
 from pipeline.types.records import Frame, Path, Step, Trees, TruthTrees
 
 #: Points of the scans that are held in memory [bytes]; a longer run is read again when the front end runs
 # again.
 _STEPS_LIMIT = 512 << 20
-#: Front-end parameter sets whose results are cached at the same time.
-_CACHES = 2
 # The temporary folder of the system may be in memory. The file has no name.
 _CACHE_FOLDER = FilePath("/var/tmp")  # noqa: S108
 
@@ -122,7 +120,7 @@ class OpenDrive:
         self.digest = self._source.description.digest
         self.preset = self._source.description.preset
         self._steps: list[Step] | None = None
-        self._caches: dict[bytes, KeptScans] = {}
+        self._caches = ScanCaches(_CACHE_FOLDER if _CACHE_FOLDER.is_dir() else None)
         self._scans = -1  # unknown before the first mapping
 
     def map(self, parameters: Parameters, tick: Tick = lambda: None) -> MappedRun:
@@ -131,29 +129,18 @@ class OpenDrive:
         Raises:
             SourceError: There is no scan.
         """
-        key = look_key(parameters)
-        cache = self._caches.get(key)
-        if cache is not None and len(cache) == self._scans:
+        cache, mapper = self._caches.of(parameters), self._mapper(parameters)
+        if self._scans > 0 and cache.has_all(self._scans):
             with suppress(_DamagedCacheError):
-                mapper = self._mapper(parameters)
                 return self._mapped(mapper, self._from_cache(mapper, cache), tick, front_end_ran=False)
-        self._forget(key)
-        while len(self._caches) >= _CACHES:
-            self._forget(next(iter(self._caches)))
-        cache = KeptScans(_CACHE_FOLDER if _CACHE_FOLDER.is_dir() else None)
-        try:
             mapper = self._mapper(parameters)
-            mapped = self._mapped(mapper, self._from_scans(mapper, cache, key), tick, front_end_ran=True)
-        except BaseException:
-            cache.close()
-            raise
-        self._scans, self._caches[key] = mapped.scans, cache
+        mapped = self._mapped(mapper, self._from_scans(mapper, cache), tick, front_end_ran=True)
+        self._scans = mapped.scans
         return mapped
 
     def close(self) -> None:
         """Close the source and delete the caches."""
-        for key in list(self._caches):
-            self._forget(key)
+        self._caches.close()
         self._source.close()
 
     def _mapper(self, parameters: Parameters) -> Mapper:
@@ -172,20 +159,19 @@ class OpenDrive:
         trees, path = as_written(frame.trees, mapper.path, start_ns)
         return MappedRun(trees, path, frame.index + 1, front_end_ran)
 
-    def _from_cache(self, mapper: Mapper, cache: KeptScans) -> Iterator[Frame]:
+    def _from_cache(self, mapper: Mapper, cache: ScanCache) -> Iterator[Frame]:
         for index in range(self._scans):
-            try:
-                step, scan = cache.scan(index)
-            except StemmapError as error:  # the source still has the scan
-                raise _DamagedCacheError(str(error)) from None
-            yield mapper.process(step, scan)
+            cached = cache.read(index)
+            if cached is None:  # the source still has the scan
+                raise _DamagedCacheError
+            yield mapper.process(*cached)
 
-    def _from_scans(self, mapper: Mapper, cache: KeptScans, key: bytes) -> Iterator[Frame]:
+    def _from_scans(self, mapper: Mapper, cache: ScanCache) -> Iterator[Frame]:
         held: list[Step] | None = []
         size = 0
         for step in self._read_steps():
             scan = mapper.segment(step)
-            cache.put(step, scan, key)
+            cache.put(step, scan)
             size += step.scan.points.nbytes
             if held is not None:
                 held.append(step)
@@ -198,10 +184,6 @@ class OpenDrive:
         if self._steps is not None:
             return iter(self._steps)
         return steps(self._source.records(), odometry=self._odometry.steps)
-
-    def _forget(self, key: bytes) -> None:
-        if key in self._caches:
-            self._caches.pop(key).close()
 
 
 class OpenCloud:

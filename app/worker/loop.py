@@ -77,7 +77,7 @@ class Driver:
         recent: Recent | None = None,
     ) -> None:
         self._session = session
-        session.on_rough = lambda revision, trees: put(Rough(self._run, revision, trees))
+        session.on_preview = lambda revision, trees: put(Rough(self._run, revision, trees))
         self._commands = commands
         self._put = put
         self._clock = clock

@@ -43,8 +43,8 @@ def warm_up(parameters: Parameters | None = None) -> None:
 
 
 def warm_eyes() -> None:
-    """Look at the scans of that second, keep what they show, and gather it where odometry says that they were
-    taken: all of the mapper but SLAM and the trees' tracks."""
+    """Segment the scans of that second, cache them, and integrate them into columns and terrain at the poses
+    of the odometry: all of the mapper but SLAM and the Kalman filters of the trees."""
     from contextlib import closing
 
     from pipeline.classification import Gathering, View
@@ -53,7 +53,7 @@ def warm_eyes() -> None:
     from pipeline.ground.terrain_map import HeightMapper
     from pipeline.io.readers import open_source
     from pipeline.odometry.synchroniser import steps
-    from pipeline.remapping import KeptScans, look_key
+    from pipeline.remapping import ScanCaches
     from pipeline.tracking.track_classification import nearest_other
 
     source = open_source(_SCENE)
@@ -62,57 +62,44 @@ def warm_eyes() -> None:
         parameters.classification, all_around=known.sensor.rings > 0, forests=kept_forests()
     )
     heights = HeightMapper()
-    with closing(KeptScans()) as kept:
+    with closing(ScanCaches()) as caches:
+        cache = caches.of(parameters)
         for step in steps(source.records()):
-            looked = segment(step, known.sensor, known.T_base_lidar, parameters)
-            detect(looked, parameters.detection)
-            kept.put(step, looked, look_key(parameters))
-        for index in range(len(kept)):
-            step, looked = kept.scan(index)
-            detect(looked, parameters.detection)
-            pose, over = step.T_odom_base or Pose2(), looked.column_input
-            if over is not None:
-                view = View(pose, looked.sensor_offset, looked.free, over.steepest, over.depth, over.terrain)
-                gathering.add(over.points, over.height, step.index, view)
-            if looked.terrain is not None:
-                heights.add(looked.terrain, pose, looked.sensor_offset)
+            cache.put(step, segment(step, known.sensor, known.T_base_lidar, parameters))
+        for index in range(len(cache)):
+            cached = cache.read(index)
+            if cached is None:
+                continue
+            step, scan = cached
+            detect(scan, parameters.detection)
+            pose, given = step.T_odom_base or Pose2(), scan.column_input
+            if given is not None:
+                view = View(pose, scan.sensor_offset, scan.free, given.steepest, given.depth, given.terrain)
+                gathering.add(given.points, given.height, step.index, view)
+            if scan.terrain is not None:
+                heights.add(scan.terrain, pose, scan.sensor_offset)
     gathering.snapshot().folded()  # as a step back does
     place = gathering.columns.axis[:, :2].copy()
-    nearest_other(place, place, 1.0)  # as a rough answer asks
+    nearest_other(place, place, 1.0)  # as the preview does
 
 
 def warm_map() -> None:
-    """Map stems that nobody had to look for, and again with another parameter: SLAM, the trees' tracks, and
-    what is kept of a run."""
-    from contextlib import closing
-
+    """Map detected stems, and compute a preview: SLAM and the Kalman filters of the trees."""
     from pipeline.classification import no_columns
     from pipeline.config import preset
     from pipeline.geometry.poses import Pose3
     from pipeline.mapper import Mapper
-    from pipeline.remapping import Basis, Journal, KeptScans, Rerun, look_key, rough_trees
+    from pipeline.remapping import ClusterTable, KnownMap, preview_trees
     from pipeline.tracking import Tracker
     from pipeline.tracking.track_classification import tree_columns
     from pipeline.types.records import Sensor
 
-    stems, journal = preset("stems"), Journal()
-    mapper, again = (
-        Mapper(p, sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
-        for p in (stems, stems.replace({"tracking.hits_to_confirm": 4}))
-    )
-    mapper.note = lambda noted: journal.note(noted, stems.slam)
-    states = {0: mapper.snapshot()}
-    with closing(KeptScans()) as kept:
-        for step in _stems():
-            looked = mapper.segment(step)
-            kept.put(step, looked, look_key(stems))
-            mapper.process(step, looked)
-        scans = len(journal)
-        states[scans] = mapper.snapshot()
-        basis = Basis.of(stems, journal.first(scans), states, mapper.path, mapper.motion)
-        rough_trees(basis, kept.clusters, again.parameters)
-        for _ in Rerun(again, kept, None, basis).frames(scans):
-            pass
+    stems, clusters = preset("stems"), ClusterTable()
+    mapper = Mapper(stems, sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
+    for step in _stems():
+        clusters.record(mapper.process(step))
+    known = KnownMap(stems, clusters, mapper.path, None)
+    preview_trees(known, stems.replace({"tracking.hits_to_confirm": 4}))
     tree_columns(Tracker(stems.tracking).judge(0, no_columns(), stems.classification))
 
 

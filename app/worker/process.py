@@ -25,7 +25,7 @@ from app.worker.codec import WireError, to_worker
 from app.worker.internal_protocol import ToWorker
 from app.worker.loop import Driver
 from app.worker.outbox import Mailbox
-from app.worker.scan_cache import keep_in, keep_without_name
+from app.worker.run_factory import caches_in, unnamed_caches
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.io.readers.base import Source
@@ -67,7 +67,7 @@ def new_session(folder: Path | None = None) -> Session:
         make_mapper=make_mapper,
         make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
         parameters=Parameters(),
-        keep=keep_without_name if folder is None else keep_in(folder),
+        open_caches=unnamed_caches if folder is None else caches_in(folder),
         compile_ahead=compile_ahead,
         warm_up=warm_up,
     )

@@ -7,70 +7,44 @@ mapped with, and on nothing else: not on pauses, jumps, or which states happen t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from dataclasses import replace
 
 import numpy as np
 
 from app.common.timers import Stopwatch
 from app.explain.estimate_history import TreeHistory
-from app.worker.cursor import Cursor
-from app.worker.live_cursor import LiveCursor
-from app.worker.map_cache import Left, LeftBehind, basis_of
-from app.worker.parallel import looked_ahead, looked_at_once
-from app.worker.remap import Remapping, Told
-from app.worker.snapshots import ParameterHistory, Snapshots
+from app.worker.cursor import Cursor, LiveCursor
+from app.worker.remap import NOT_OF_THE_MAP, EarlierMaps, MapperLike, Remapping, RunMap
+from app.worker.snapshots import ParameterHistory
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import Source
 from pipeline.mapper import Mapper
-from pipeline.remapping import (
-    Basis,
-    Journal,
-    KeptScans,
-    Reread,
-    Rerun,
-    Sample,
-    look_key,
-    rough_trees,
-)
+from pipeline.remapping import KnownMap, Reread, Rerun, Sample, ScanCaches, preview_trees
 from pipeline.types.records import Float, Frame, Path, Step, Trees
-
-_NO_PART_OF_THE_MAP = {"evaluation", "obstacles"}  # stages
-_NS = 1_000_000_000
-
-
-class MapperLike(Protocol):
-    """What a run needs of `pipeline.mapper.Mapper`; its state is opaque here."""
-
-    parameters: Parameters
-
-    def process(self, step: Step) -> Frame: ...
-    def snapshot(self) -> Any: ...  # noqa: ANN401
-    def restore(self, state: Any) -> None: ...  # noqa: ANN401
-    @property
-    def path(self) -> Path: ...
-
 
 MakeMapper = Callable[[Source, Parameters, int, Stopwatch], MapperLike]
 Remake = Callable[[Parameters], MapperLike]
 
 
 class Run:
-    """A source, from its first scan to wherever it stands.
+    """A source, from its first scan to the current one.
 
     Args:
-        source: What is mapped; closed by `close`.
-        mapper: Fresh, for this source.
-        cursor: Reads the source's steps.
-        parameters: In force from the first scan on.
-        stopwatch: The one that the mapper measures with.
-        odometry: Where the motion comes from, in words.
-        remake: Makes a fresh mapper for this source, so that the run can be mapped again.
-        reread: The steps from the first scan on; None where they come only once.
-        kept: What is kept of the scans, of this run or an earlier opening of its source.
+        source: What is mapped; `close` closes it.
+        mapper: A fresh mapper for this source.
+        cursor: Reads the steps of the source.
+        parameters: Parameters in force from the first scan onwards.
+        stopwatch: Times of the stages; the mapper measures with it.
+        odometry: Source of the motion, in words.
+        remake: Returns a fresh mapper for this source, so that the run can be mapped again.
+        reread: Returns the steps from the first scan; None for a live run.
+        caches: Caches of the segmented scans of this source.
 
     Attributes:
-        is_bare: Whether the picture of the standing scan lacks its points, see `map_next`.
+        frame: Result of the current scan; None before the first.
+        standing: Number of the current scan; -1 before the first.
+        is_bare: Whether the frame lacks its points, see `map_next`.
     """
 
     def __init__(
@@ -83,41 +57,35 @@ class Run:
         odometry: str = "",
         remake: Remake | None = None,
         reread: Reread | None = None,
-        kept: KeptScans | None = None,
+        caches: ScanCaches | None = None,
     ) -> None:
         self.source = source
         self.odometry = odometry
         self.stopwatch = stopwatch
         self.frame: Frame | None = None
         self.standing = -1
-        self._told = Told()
-        self._mapper = mapper
+        self.is_bare = False
         self._cursor = cursor
-        self._parameters = ParameterHistory(parameters)
-        self._snapshots: Snapshots[Any] = Snapshots(mapper.snapshot())
+        self._map = RunMap.fresh(mapper, parameters)
         self._step: Step | None = None
-        self._before: Any = None
         self._broken = False
         self._remake, self._reread = remake, reread
-        self._kept = KeptScans() if kept is None else kept
-        self.is_bare = self._hurried = False
-        self._key = look_key(parameters)
+        self._caches = ScanCaches() if caches is None else caches
+        self._cache = self._caches.of(parameters)
+        self._sample = Sample()
         self._remapping: Remapping | None = None
-        self._left = LeftBehind()
-        self._returning: tuple[Left, Parameters] | None = None
-        self._journal, self._sample = Journal(), Sample()
-        self._rough: Trees | None = None
-        if isinstance(mapper, Mapper):
-            mapper.note = lambda noted: self._journal.note(noted, mapper.parameters.slam)
+        self._earlier = EarlierMaps()
+        self._returning: tuple[RunMap, Parameters] | None = None
+        self._preview: Trees | None = None
 
     @property
     def history(self) -> TreeHistory:
-        """What each scan made of the trees."""
-        return self._told.history
+        """Estimate of each tree over time."""
+        return self._map.record.history
 
     def confirmed_s(self, trees: Trees) -> Float:
-        """When each of the trees was first confirmed [s since the first scan], NaN where it was not: (T,)."""
-        known = self._told.confirmed_s
+        """When each tree was first confirmed [s since the first scan], shape (T,); NaN where it was not."""
+        known = self._map.record.confirmed_s
         return np.array([known.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
 
     @property
@@ -130,8 +98,8 @@ class Run:
 
     @property
     def path(self) -> Path:
-        """Where the robot was, up to the standing scan."""
-        return self._mapper.path
+        """The path up to the current scan."""
+        return self._map.mapper.path
 
     def peek_ns(self) -> int | None:
         """Time of the next scan, None at the end."""
@@ -139,82 +107,83 @@ class Run:
         return None if step is None else step.scan.stamp_ns
 
     def map_next(self, *, hurried: bool = False) -> Frame | None:
-        """Map the next scan; None at the end of the run. Who is in a hurry takes what is kept of it, and gets
-        a picture without points."""
+        """Map the next scan; returns None at the end of the run.
+
+        Args:
+            hurried: Whether to take the segmented scan from the cache where it is there. The frame then has
+                no points (`is_bare`).
+        """
         step = self._cursor.take()
         if step is None:
             return None
-        self._left.forget(self._kept)
-        self._before = self._mapper.snapshot()
-        self._snapshots.offer(step.index, self._before)
-        self._hurried = hurried
-        frame = self._map(step)
-        self._hurried = False
-        return frame
+        self._earlier.clear()
+        self._map.before = self._map.mapper.snapshot()
+        self._map.snapshots.offer(step.index, self._map.before)
+        return self._map_step(step, hurried=hurried)
 
     def map_again(self) -> Frame | None:
-        """Map the standing scan once more, from the state before it; None if there is none."""
+        """Map the current scan once more, from the state before it; returns None if there is none."""
         if self._step is None or self._broken:
             return None
-        self._mapper.restore(self._before)
-        return self._map(self._step)
+        self._map.mapper.restore(self._map.before)
+        return self._map_step(self._step)
 
     def map_with(self, sets: Sequence[Parameters]) -> list[Frame]:
-        """The standing scan as it comes out under each of other parameters; the run stays as it is.
+        """The current scan as mapped with each set of parameters; the run stays as it is.
 
         Raises:
             StemmapError: There is no scan to map, or a set cannot be mapped with.
         """
         if self._step is None or self._broken:
-            raise StemmapError("no scan stands here", remedy="Play, pause and ask again")
-        present, frames = self._mapper.parameters, []
+            raise StemmapError("no scan is mapped yet", remedy="Play, pause and ask again")
+        mapper, before = self._map.mapper, self._map.before
+        present, frames = mapper.parameters, []
         self._broken = True
         with self.stopwatch.aside():
             try:
                 for parameters in sets:
-                    self._mapper.restore(self._before)
-                    self._mapper.parameters = parameters
-                    frames.append(self._mapper.process(self._step))
+                    mapper.restore(before)
+                    mapper.parameters = parameters
+                    frames.append(mapper.process(self._step))
             finally:
-                # Mapped once more, because a mapper goes back along its past and not forward again.
-                self._mapper.restore(self._before)
-                self._mapper.parameters = present
-                self._mapper.process(self._step)
+                # The scan is mapped once more, because a mapper returns to its past only.
+                mapper.restore(before)
+                mapper.parameters = present
+                mapper.process(self._step)
                 self._broken = False
         return frames
 
-    def _map(self, step: Step) -> Frame:
-        wanted = self._parameters.at(step.index)
-        if self._mapper.parameters is not wanted:
-            self._mapper.parameters, self._key = wanted, look_key(wanted)
+    def _map_step(self, step: Step, *, hurried: bool = False) -> Frame:
+        mapper, wanted = self._map.mapper, self._map.parameters.at(step.index)
+        if mapper.parameters is not wanted:
+            mapper.parameters, self._cache = wanted, self._caches.of(wanted)
         self._broken = True
         with self.stopwatch.whole_scan():
-            self.frame = self._process(step)
+            self.frame = self._process(mapper, step, hurried=hurried)
         self._broken = False
         self._step, self.standing = step, step.index
         self._sample.offer(step)
-        self._told.record(self.frame, self.start_ns)
+        self._map.record.add(self.frame, self.start_ns)
         return self.frame
 
-    def _process(self, step: Step) -> Frame:
-        mapper = self._mapper
+    def _process(self, mapper: MapperLike, step: Step, *, hurried: bool) -> Frame:
         if not isinstance(mapper, Mapper):
             return mapper.process(step)
-        looked = self._kept.looked(step, self._key) if self._hurried else None
-        self.is_bare = looked is not None
-        looked = looked or mapper.segment(step)
-        self._kept.put(step, looked, self._key)
-        return mapper.process(step, looked)
+        cached = self._cache.read(step.index, step.scan.stamp_ns) if hurried else None
+        self.is_bare = cached is not None
+        scan = mapper.segment(step) if cached is None else cached[1]
+        self._cache.put(step, scan)
+        return mapper.process(step, scan)
 
     def remap(self, parameters: Parameters) -> None:
-        """Begin to map the run again from its first scan; what was begun before is given up. Nothing is begun
-        where it would give the same map."""
+        """Begin to map the run again from its first scan; an earlier beginning is given up. Nothing begins
+        where the map would be the same."""
         self.stay()
-        if self._parameters.were_always(parameters, _NO_PART_OF_THE_MAP):
+        if self._map.parameters.were_always(parameters, NOT_OF_THE_MAP):
             return
-        left = self._left.find(parameters, _NO_PART_OF_THE_MAP)
-        if left is not None:
-            self._returning = (left, parameters)
+        earlier = self._earlier.find(parameters)
+        if earlier is not None:
+            self._returning = (earlier, parameters)
         else:
             self._begin(parameters)
 
@@ -222,29 +191,19 @@ class Run:
         mapper = self._remake(parameters) if self._remake else None
         if not isinstance(mapper, Mapper):
             return
-        basis = self._basis()
-        self._rough = None if basis is None else self._roughly(basis, parameters, mapper)
-        rerun = Rerun(mapper, self._kept, self._reread, basis, looked_ahead)
-        if basis is None or not rerun.passed:
-            self._remapping = Remapping(rerun, self.start_ns)
-            return
-        time_s = (self._cursor.stamp_ns(rerun.passed) - self.start_ns) / _NS
-        told = self._told.before(rerun.passed, time_s)
-        self._remapping = Remapping(rerun, self.start_ns, told, self._snapshots.first(rerun.passed))
+        self._preview = self._preview_of(parameters, mapper)
+        self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
+        self._remapping = Remapping(Rerun(mapper, self._caches.of(parameters), self._reread), self.start_ns)
 
-    def _roughly(self, basis: Basis, parameters: Parameters, mapper: Mapper) -> Trees | None:
-        sample = None
-        if self._reread is not None and not basis.shows_as(parameters):
-            sample = self._sample.looked(mapper.segmenter(), len(basis.notes), looked_at_once)
-        return rough_trees(basis, self._kept.clusters, parameters, sample)
-
-    def _basis(self) -> Basis | None:
-        """What the scans so far were mapped to with one set of parameters."""
-        if not isinstance(self._mapper, Mapper) or self._broken:
+    def _preview_of(self, parameters: Parameters, mapper: Mapper) -> Trees | None:
+        frame, present = self.frame, self._map
+        if frame is None or self._broken:
             return None
-        return basis_of(
-            self._parameters, self.standing, self._mapper, self._before, self._snapshots, self._journal
-        )
+        known = KnownMap(present.parameters.at(0), present.record.clusters, self.path, frame.columns)
+        sample = None
+        if known.needs_sample(parameters) and self._reread is not None:
+            sample = self._sample.segmented(mapper.segmenter(), self.standing + 1)
+        return preview_trees(known, parameters, sample)
 
     def stay(self) -> None:
         """Give up what `remap` began; the map stays as it is."""
@@ -255,7 +214,7 @@ class Run:
 
     @property
     def remapped(self) -> float | None:
-        """How much of the run is mapped again, up to the standing scan; None when nothing is."""
+        """How much of the run is mapped again, up to the current scan, from 0 to 1; None when nothing is."""
         r = self._remapping
         if self._returning is not None and self.is_whole:
             return 1.0
@@ -264,78 +223,66 @@ class Run:
         return min(r.rerun.done / max(self.standing, 1), 1.0)
 
     @property
-    def rough(self) -> Trees | None:
-        """Where trees will be, roughly, once the run is mapped again; None where nobody knows."""
-        return None if self._remapping is None else self._rough
+    def preview(self) -> Trees | None:
+        """Where trees would stand once the run is mapped again; None where it is not known."""
+        return None if self._remapping is None else self._preview
 
     @property
-    def not_kept(self) -> str:
-        """Why the run cannot, or could not, be mapped again from what is kept; empty where it can."""
-        return "; ".join(filter(None, (self._kept.refusal, self._kept.told)))
+    def cache_notice(self) -> str:
+        """Why scans are not cached, or cached scans are not used; empty where they are."""
+        return "; ".join(filter(None, (self._cache.refusal, self._cache.notice)))
 
     def remap_on(self, scans: int) -> tuple[Frame, dict[int, float]] | None:
-        """Map again so many scans more. When all are, the run goes on with that map as if its parameters had
-        been in force from the start: gives the standing scan, and when each tree was confirmed [s].
+        """Map up to `scans` scans again. When all are, the run goes on with that map as if its parameters had
+        been in force from the start.
+
+        Returns:
+            The current scan in the new map, and when each tree was confirmed [s]; None while scans are left.
 
         Raises:
-            StemmapError: A scan cannot be looked at again. The map stays as it is.
+            StemmapError: A scan cannot be read again. The map stays as it is.
         """
         remapping = self._remapping
         if self._step is None or self._broken:  # on the way to another scan
             return None
         if self._returning is not None:
-            return self._returned(*self._returning)
+            return self._return_to(*self._returning)
         if remapping is None:
             return None
         try:
             with self.stopwatch.aside():
-                there = remapping.work(scans, self.standing)
-        except BaseException:  # a fault in the mapper too: who tries again and again would never stop
+                finished = remapping.work(scans, self.standing)
+        except BaseException:  # also a fault of the mapper, which another try would repeat
             self.stay()
             raise
-        if not there:
+        if not finished:
             return None
         self._remapping = None
-        new = Left.of(remapping, self.standing)
-        return self._take_over(new, new.parameters)
+        return self._take_over(remapping.finish())
 
-    def _returned(self, left: Left, parameters: Parameters) -> tuple[Frame, dict[int, float]] | None:
-        """The map that was left behind, if it still is of the standing scan; else that is mapped again."""
+    def _return_to(self, earlier: RunMap, parameters: Parameters) -> tuple[Frame, dict[int, float]] | None:
+        """Take an earlier map of the same scans again; where it is forgotten meanwhile, begin a rerun."""
         self._returning = None
-        if left not in self._left:
+        if earlier not in self._earlier:
             self._begin(parameters)
             return None
-        left.mapper.restore(left.before)
-        return self._take_over(left, parameters)
+        earlier.mapper.restore(earlier.before)
+        return self._take_over(replace(earlier, parameters=ParameterHistory(parameters)), earlier)
 
-    def _take_over(self, new: Left, parameters: Parameters) -> tuple[Frame, dict[int, float]]:
-        """Go on with another map of the scans before the standing one, and leave the present one behind."""
-        assert self._step is not None  # noqa: S101 - who asks has looked
-        old = self._present()
-        self._mapper, self._snapshots, self._before = new.mapper, new.snapshots, new.before
-        self._told, self._journal = new.told, new.journal
-        kept, self._kept = self._kept, new.kept
-        self._left.take(new, self._kept)
-        if old is not None:
-            self._left.add(old, self._kept)
-        self._left.close_unused(kept, self._kept)
-        self._parameters = ParameterHistory(parameters)
-        self._key = look_key(parameters)
-        return self._map(self._step), self._told.confirmed_s
-
-    def _present(self) -> Left | None:
-        """The map of the scans before the standing one; None where they were mapped with several sets."""
-        mapper, scans = self._mapper, self.standing
-        if not isinstance(mapper, Mapper) or not 0 < scans <= self._parameters.until(scans):
-            return None
-        return Left(
-            self._parameters.at(0), scans, mapper, self._before, self._snapshots, self._told, self._journal,
-            self._kept,
-        )  # fmt: skip
+    def _take_over(self, new: RunMap, earlier: RunMap | None = None) -> tuple[Frame, dict[int, float]]:
+        """Go on with another map of the scans before the current one, and keep the present one for undo."""
+        assert self._step is not None  # noqa: S101 - the callers have checked
+        old, self._map = self._map, new
+        if earlier is not None:
+            self._earlier.remove(earlier)
+        if isinstance(old.mapper, Mapper) and 0 < self.standing <= old.parameters.until(self.standing):
+            self._earlier.add(replace(old, parameters=ParameterHistory(old.parameters.at(0))))
+        self._cache = self._caches.of(new.parameters.at(self.standing))
+        return self._map_step(self._step), new.record.confirmed_s
 
     def parameters_at(self, index: int) -> Parameters:
-        """What a scan was or will be mapped with."""
-        return self._parameters.at(index)
+        """Parameters that a scan was or will be mapped with."""
+        return self._map.parameters.at(index)
 
     def prepare(self) -> None:
         """Map the first scan and forget it again: what is compiled at its first use is ready then.
@@ -347,10 +294,11 @@ class Run:
         if step is None:
             uri = self.source.description.uri
             raise SourceError("there is no scan in it", where=uri, remedy="Choose another source")
-        before = self._mapper.snapshot()
-        self._mapper.parameters = self._parameters.at(step.index)  # those of other methods compile other code
-        self._mapper.process(step)
-        self._mapper.restore(before)
+        mapper = self._map.mapper
+        before = mapper.snapshot()
+        mapper.parameters = self._map.parameters.at(step.index)  # other methods compile other code
+        mapper.process(step)
+        mapper.restore(before)
         self.stopwatch.clear()
 
     def index_at(self, stamp_ns: int) -> int | None:
@@ -372,27 +320,27 @@ class Run:
         return self._step is not None and not self._broken
 
     def approach(self, index: int) -> None:
-        """Stand so that mapping on leads to a scan by the shortest way; `standing` is before it
-        afterwards. `index` is at most one more than what was reached before, or is ahead."""
-        scans, state = self._snapshots.newest(min(index, self._cursor.known))
+        """Return to a state from which mapping on leads to a scan by the shortest way; `standing` is before
+        the scan afterwards. `index` is at most one more than the scans that were read, or is ahead."""
+        scans, state = self._map.snapshots.newest(min(index, self._cursor.known))
         if not self._broken and self.standing < index and scans <= self.standing + 1:
             return
-        self._left.forget(self._kept)
+        self._earlier.clear()
         self._broken = True  # until all of it has worked
         self._cursor.go_to(scans)
-        self._mapper.restore(state)
+        self._map.mapper.restore(state)
         self.standing, self._step, self._broken = scans - 1, None, False
 
     def use(self, parameters: Parameters, index: int) -> bool:
-        """From a scan on, map with other parameters. Returns whether that changes anything."""
-        changes = self._parameters.set_from(index, parameters)
+        """Map with other parameters from a scan onwards. Returns whether that changes anything."""
+        changes = self._map.parameters.set_from(index, parameters)
         if changes:
-            self._snapshots.forget_after(index)
+            self._map.snapshots.forget_after(index)
         return changes
 
     def close(self) -> None:
-        """Let go of the source."""
+        """Close the source and the scan caches."""
         self.stay()
-        self._left.forget(self._kept)
-        self._kept.close()
+        self._earlier.clear()
+        self._caches.close()
         self.source.close()

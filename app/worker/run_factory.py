@@ -1,42 +1,68 @@
-"""A run from a source that was opened: its odometry, its cursor and a fresh mapper."""
+"""A run of a source that was opened: its odometry, its cursor, its scan caches and a fresh mapper."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 from app.common.timers import Stopwatch
 from app.robot.source import LiveSource
 from app.sources.opening import with_odometry
-from app.worker.cursor import Cursor, Synchroniser
-from app.worker.live_cursor import LiveCursor
+from app.worker.cursor import Cursor, LiveCursor, Synchroniser
 from app.worker.run import MakeMapper, Run
-from app.worker.scan_cache import Keep
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
+from pipeline.remapping import ScanCaches
 
 MakeSynchroniser = Callable[[str], Synchroniser]
+OpenCaches = Callable[[Source | LiveSource, str, int], ScanCaches]
+
+_LARGE = Path("/var/tmp")  # noqa: S108 - the default may be in memory; the file has no name
+
+
+def unnamed_caches(_source: Source | LiveSource, _odometry: str, _seed: int) -> ScanCaches:
+    """Scan caches for as long as the run is open."""
+    return ScanCaches(_LARGE if _LARGE.is_dir() else None)
+
+
+def caches_in(folder: Path) -> OpenCaches:
+    """Opens scan caches that the next opening of a recording finds again.
+
+    A live source, and a source without a digest, get caches for as long as the run is open.
+
+    Args:
+        folder: Folder of all recordings; it is made when it is needed.
+    """
+
+    def open_caches(source: Source | LiveSource, odometry: str, seed: int) -> ScanCaches:
+        digest = source.description.digest
+        if not digest or isinstance(source, LiveSource):
+            return unnamed_caches(source, odometry, seed)
+        return ScanCaches(folder, f"{digest}\n{source.description.uri}\n{odometry}\n{seed}")
+
+    return open_caches
 
 
 @dataclass(frozen=True, slots=True)
-class Beginning:
+class RunFactory:
     """Makes runs.
 
     Attributes:
-        make_mapper: A fresh mapper for a source, from parameters, seed and a stopwatch.
-        make_synchroniser: From the choice of odometry.
-        keep: Where what the scans show is kept.
+        make_mapper: Returns a fresh mapper for a source, from parameters, seed and a stopwatch.
+        make_synchroniser: Returns the synchroniser for a choice of odometry.
+        open_caches: Opens the scan caches of a source, for its odometry and seed.
     """
 
     make_mapper: MakeMapper
     make_synchroniser: MakeSynchroniser
-    keep: Keep
+    open_caches: OpenCaches
 
     def __call__(
         self, source: Source | LiveSource, odometry: str, seed: int, parameters: Parameters
     ) -> tuple[Run, tuple[str, ...]]:
-        """A run at its beginning, and what is to be warned of.
+        """A run before its first scan, and warnings.
 
         Raises:
             SourceError: There is no such odometry; the source is closed.
@@ -59,6 +85,6 @@ class Beginning:
             chosen.words,
             remake=lambda parameters: self.make_mapper(moving, parameters, seed, stopwatch),
             reread=None if is_live else lambda: synchronise(moving.records(None)),
-            kept=self.keep(source, chosen.words, seed),
+            caches=self.open_caches(source, chosen.words, seed),
         )
         return run, (*source.description.warnings, *([chosen.warning] if chosen.warning else []))

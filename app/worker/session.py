@@ -18,12 +18,11 @@ from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
 from app.worker.internal_protocol import Opened
 from app.worker.protocol import LONGEST_S, State, Status
+from app.worker.remap import MapComparison
 from app.worker.run import MakeMapper, Run
-from app.worker.run_factory import Beginning, MakeSynchroniser
-from app.worker.scan_cache import Keep, keep_without_name
+from app.worker.run_factory import MakeSynchroniser, OpenCaches, RunFactory, unnamed_caches
 from app.worker.seek import Way
 from app.worker.session_status import Said, describe, opened_of
-from app.worker.whole_run import WholeRun
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import Source, SourceOptions
@@ -47,13 +46,13 @@ class Session:
         make_mapper: A fresh mapper for a source, from parameters, seed and a stopwatch.
         make_synchroniser: From the choice of odometry.
         parameters: In force at the beginning.
-        keep: Where what the scans show is kept.
+        open_caches: Opens the scan caches of a source.
         compile_ahead: Compiles what is not compiled on this machine yet, faster than the first scan would.
         warm_up: Loads the kernels, while a robot is already heard and recorded.
 
     Attributes:
-        on_rough: Is told a rough answer (see `Run.rough`) with the revision of the parameters, before any
-            scan is mapped with them.
+        on_preview: Receives the preview of a rerun (see `Run.preview`) and the revision of its parameters,
+            before any scan is mapped with them.
     """
 
     def __init__(
@@ -62,14 +61,14 @@ class Session:
         make_mapper: MakeMapper,
         make_synchroniser: MakeSynchroniser,
         parameters: Parameters,
-        keep: Keep = keep_without_name,
+        open_caches: OpenCaches = unnamed_caches,
         compile_ahead: Callable[[], None] = lambda: None,
         warm_up: Callable[[], None] = lambda: None,
     ) -> None:
         self._open_source = open_source
         self._warm_up = warm_up
         self._compile_ahead = compile_ahead
-        self._begun = Beginning(make_mapper, make_synchroniser, keep)
+        self._make_run = RunFactory(make_mapper, make_synchroniser, open_caches)
         self._parameters = parameters
         self._revision = 0
         self._asked: tuple[str, str, int] | None = None
@@ -79,9 +78,10 @@ class Session:
         self._state: State = "starting"
         self._detail = ""
         self._way = Way()
-        self._whole = WholeRun()
+        self._comparison = MapComparison()
+        self._remaps_on_arrival = False
         self._warnings: dict[str, None] = {}
-        self.on_rough: Callable[[int, Trees], None] = lambda _revision, _trees: None
+        self.on_preview: Callable[[int, Trees], None] = lambda _revision, _trees: None
 
     @property
     def pace(self) -> Pace:
@@ -168,7 +168,7 @@ class Session:
         return self._begin(self._robot, *self._asked[1:]) if is_heard else None
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
-        self._run, warnings = self._begun(source, odometry, seed, self._parameters)
+        self._run, warnings = self._make_run(source, odometry, seed, self._parameters)
         self._state, self._detail = "paused", ""
         self._warn(warnings)
         return opened_of(self._run)
@@ -262,13 +262,13 @@ class Session:
             The standing scan, mapped again, when the run stands still; else None.
         """
         self._parameters, self._revision = parameters, revision
-        self._whole.begin(step)
+        self._comparison.begin(step)
         run = self._run
         if run is None:
             return None
         run.stay()
         if self._way.sought:  # see `_arrive`
-            self._whole.wanted_there = whole
+            self._remaps_on_arrival = whole
             return None
         stands = self._state != "playing" and run.standing >= 0
         from_scan = run.standing + (0 if stands else 1)
@@ -277,7 +277,7 @@ class Session:
             self._robot.use_parameters(revision, from_scan, parameters)
         if whole and run.standing >= 0:
             run.remap(parameters)
-            self._tell_rough(run)
+            self._send_preview(run)
         return run.map_again() if stands and self._state != "failed" else None
 
     @property
@@ -288,16 +288,21 @@ class Session:
     def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
         """Map so many scans of the run again. Once all are, the map is another one: gives the standing scan
         with it, and what it changes."""
-        if self._run is None:
+        run, shown = self._run, self.frame
+        if run is None or shown is None:
             return None
         try:
-            done = self._whole.work(self._run, scans, self._revision, self.time_s)
+            done = run.remap_on(scans)
         except StemmapError as error:
             self._warn([f"the run was not mapped again, its map is as before: {error}"])
             return None
-        if done is not None and self._robot is not None:
-            self._robot.use_parameters(self._revision, 0, self._run.parameters_at(0))
-        return done
+        if done is None:
+            return None
+        frame, confirmed_s = done
+        changes = self._comparison.changes(shown, frame, self._revision, self.time_s, confirmed_s)
+        if self._robot is not None:
+            self._robot.use_parameters(self._revision, 0, run.parameters_at(0))
+        return frame, changes
 
     def cluster_story(self, frame: Frame, cluster: int) -> ClusterStory:
         """The story of a cluster of a frame of this run, which may have lost its raw points.
@@ -371,19 +376,22 @@ class Session:
         from this scan on, whenever on the way they came."""
         self._way.forget()
         changed = run.use(self._parameters, run.standing)
-        if self._whole.arrived(run, self._parameters):
-            self._tell_rough(run)
+        if self._remaps_on_arrival:
+            self._remaps_on_arrival = False
+            run.remap(self._parameters)
+            self._send_preview(run)
         return run.map_again() if changed or run.is_bare else run.frame
 
-    def _tell_rough(self, run: Run) -> None:
-        if run.rough is not None:
-            self.on_rough(self._revision, run.rough)
+    def _send_preview(self, run: Run) -> None:
+        if run.preview is not None:
+            self.on_preview(self._revision, run.preview)
 
     def _leave(self) -> None:
         owner = self._run or self._robot
         if owner is not None:
             owner.close()
-        self._run, self._robot, self._whole = None, None, WholeRun()
+        self._run, self._robot, self._comparison = None, None, MapComparison()
+        self._remaps_on_arrival = False
         self._warnings.clear()
         self._way.forget()
 

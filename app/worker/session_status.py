@@ -90,7 +90,7 @@ def _of_run(run: Run, said: Said) -> Status:
         trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
         distance_m=round(driven(run.path)[1], 3),
         health=health_word(frame),
-        warnings=[*said.warnings, *losses, *([run.not_kept] if run.not_kept else [])],
+        warnings=[*said.warnings, *losses, *([run.cache_notice] if run.cache_notice else [])],
         going_to=said.going_to,
         going_to_s=said.going_to_s,
         camera=has_camera(description),

@@ -1,26 +1,18 @@
-"""Rerun: the whole run again after a change, from what its scans showed and what was made of them."""
+"""Remapping: a run mapped again with other parameters, and the preview of its result."""
 
-from pipeline.remapping.cache_key import look_key
-from pipeline.remapping.journal import Journal
-from pipeline.remapping.named_cache import Name, name_of
-from pipeline.remapping.preview import rough_trees
-from pipeline.remapping.rerun import Reread, Rerun
-from pipeline.remapping.resume_point import Basis
-from pipeline.remapping.retracking import Recalled
-from pipeline.remapping.sample import Sample
-from pipeline.remapping.scan_cache import DamagedError, KeptScans
+from pipeline.remapping.preview import ClusterTable, KnownMap, Sample, preview_trees
+from pipeline.remapping.rerun import Reread, Rerun, segment_ahead
+from pipeline.remapping.scan_cache import ScanCache, ScanCaches, segmentation_key
 
 __all__ = [
-    "Basis",
-    "DamagedError",
-    "Journal",
-    "KeptScans",
-    "Name",
-    "Recalled",
+    "ClusterTable",
+    "KnownMap",
     "Reread",
     "Rerun",
     "Sample",
-    "look_key",
-    "name_of",
-    "rough_trees",
+    "ScanCache",
+    "ScanCaches",
+    "preview_trees",
+    "segment_ahead",
+    "segmentation_key",
 ]

@@ -1,156 +1,323 @@
-"""A first answer before the run is mapped again: the kept clusters judged anew, at the poses of before.
+"""Preview of a rerun: where trees would stand, in a fraction of a second.
 
-It knows of no gate, no miss and no merging, and holds each pose for true, as it is known behind all loops,
-but those of a robot that is lost or looks for a loop. Other parameters of SLAM may find others; the map that
-follows is exact.
+The known clusters of all scans get their verdicts again, at the known poses; clusters at one place are a
+tree. The preview knows no gate, no miss and no merging, and keeps the poses, so the rerun that follows may
+differ. Scans of a lost robot are left out.
 
-Where a scan would show other clusters, some scans are looked at again: what they find of a tree, as against
-what they found, tells how often the others would.
+Where the parameters change the clusters themselves, a sample of the scans is segmented again. How often a
+tree is found in the sample, before and after, gives an estimate for all scans.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.classification import judged
 from pipeline.config import Parameters
+from pipeline.config.stages import Detection
+from pipeline.detection.verdicts import classify_clusters
 from pipeline.front_end import SegmentedScan
 from pipeline.geometry.hash_grid import cells_for, nearest_in, per_metre, put_in, take_out
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.remapping.clusters import ClusterTable
-from pipeline.remapping.notes import Notes
-from pipeline.remapping.resume_point import Basis
-from pipeline.remapping.retracking import columns_of
+from pipeline.remapping.rerun import Segment, segment_all
+from pipeline.remapping.scan_cache import SEGMENTATION_STAGES
 from pipeline.tracking.track_classification import REACH, nearest_other, tree_columns
-from pipeline.types.records import Bool, Columns, Int, Trees, Verdict
+from pipeline.types.records import Bool, Clusters, Columns, Frame, Int, Path, Step, Trees, Verdict
 
 MOST_PLACES = 20_000
-LEAST = 2  # looks at a tree in the sample that tell anything of it
+LEAST_HITS = 2  # finds of a tree in the sample, below which the sample says nothing about it
+SAMPLE_SCANS, SAMPLE_BYTES = 56, 20 << 20  # at most, in the sample; the time of a preview grows with them
+TREE_SHARE = {"tree_share"}  # of the classification parameters, it only turns votes into verdicts
+COLUMN_STAGES, NOT_OF_COLUMNS = ("acquisition", "filters", "ground"), {"voxel_size"}
+JUDGED_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "hidden": ("?", ()),
+    "cut": ("?", ()),
+    "extent": ("<f8", (3,)),
+    "eccentricity": ("<f8", ()),
+    "radial_std": ("<f8", ()),
+    "radius": ("<f8", ()),
+    "arc": ("<f8", ()),
+    "centre": ("<f8", (2,)),
+}
+FIRST_ROWS = 4096
 
 
-def rough_trees(
-    basis: Basis,
-    clusters: ClusterTable,
-    parameters: Parameters,
-    sample: Mapping[int, SegmentedScan] | None = None,
+class ClusterTable:
+    """Clusters of all scans of a run, about 75 bytes each: what their verdicts need, and where they are.
+
+    Attributes:
+        start: First row of each scan, then the number of all rows.
+    """
+
+    def __init__(self) -> None:
+        self._columns = {
+            name: np.zeros((FIRST_ROWS, *shape), kind) for name, (kind, shape) in JUDGED_COLUMNS.items()
+        }
+        self.start: list[int] = [0]
+        self._offsets: list[Float] = []  # sensor in the base frame, x, y [m]
+        self._lost: list[bool] = []
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+    def put(self, index: int, clusters: Clusters, offset: Float, *, lost: bool = False) -> None:
+        """Store the clusters of a scan. Those of later scans are removed. A scan beyond the next is ignored.
+
+        Args:
+            index: Number of the scan.
+            clusters: Its clusters.
+            offset: Sensor in the base frame, shape (3,) [m].
+            lost: Whether the robot was lost, so that the pose is of no use.
+        """
+        if index > len(self):
+            return
+        del self.start[index + 1 :], self._offsets[index:], self._lost[index:]
+        first = self.start[index]
+        last = first + len(clusters.size)
+        for name, column in self._columns.items():
+            while last > len(column):
+                column = np.concatenate([column, np.zeros_like(column)])
+            column[first:last] = getattr(clusters, name)
+            self._columns[name] = column
+        self.start.append(last)
+        self._offsets.append(offset[:2].copy())
+        self._lost.append(lost)
+
+    def record(self, frame: Frame) -> None:
+        """Store the clusters of a mapped scan."""
+        lost = frame.estimate.health.state == "lost"
+        self.put(frame.index, frame.clusters, frame.sensor_offset, lost=lost)
+
+    def of(self, scans: Sequence[int]) -> ClusterTable:
+        """The table of some scans, in their order."""
+        rows = [np.arange(self.start[k], self.start[k + 1]) for k in scans]
+        part = ClusterTable()
+        part.start = np.cumsum([0, *map(len, rows)]).tolist()
+        every = np.concatenate([np.zeros(0, np.int64), *rows])
+        part._columns = {name: column[every] for name, column in self._columns.items()}
+        part._offsets, part._lost = [self._offsets[k] for k in scans], [self._lost[k] for k in scans]
+        return part
+
+    def verdicts(self, parameters: Detection) -> Int:
+        """Verdict of each cluster, shape (K,)."""
+        rows = self.start[-1]
+        columns: dict[str, Any] = {name: column[:rows] for name, column in self._columns.items()}
+        unused = np.zeros(rows)
+        clusters = Clusters(
+            **columns,
+            size=unused.astype(np.int64),
+            centroid=unused,
+            eigenvalues=unused,
+            covariance=unused,
+            radius_sigma=unused,
+            verdict=unused.astype(np.int32),
+        )
+        verdict: Int = classify_clusters(clusters, parameters).verdict.astype(np.int64)
+        return verdict
+
+    def places(self, path: Float, p: Parameters) -> tuple[Float, Int]:
+        """Where clusters that are trees lie together: x, y in the map, shape (T, 2) [m], and how many, (T,).
+
+        Args:
+            path: x, y [m], yaw [rad] of the base at each scan of the table, shape (N, 3).
+            p: Parameters of the verdicts, and of the distance between two trees.
+        """
+        rows, start = self.start[-1], np.array(self.start)
+        tree = self.verdicts(p.detection) == Verdict.TREE
+        tree &= ~np.repeat(np.array(self._lost, np.bool_), np.diff(start))
+        pose = np.concatenate([path, np.array(self._offsets).reshape(-1, 2)], axis=1)
+        return _grouped(self._columns["centre"][:rows], tree, start, pose, _reach(p), MOST_PLACES)
+
+
+class Sample:
+    """Every n-th scan of a run with its points. Where the sample is too large, n doubles."""
+
+    def __init__(self) -> None:
+        self._steps: dict[int, Step] = {}
+        self._spacing = 1
+
+    def __len__(self) -> int:
+        return len(self._steps)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the points."""
+        return sum(step.scan.points.nbytes for step in self._steps.values())
+
+    def offer(self, step: Step) -> None:
+        """Keep a scan if it is due."""
+        if step.index % self._spacing:
+            return
+        self._steps[step.index] = step
+        while len(self) > 1 and (len(self) > SAMPLE_SCANS or self.nbytes > SAMPLE_BYTES):
+            self._spacing *= 2
+            self._steps = {n: kept for n, kept in self._steps.items() if n % self._spacing == 0}
+
+    def segmented(
+        self,
+        segment: Segment,
+        scans: int,
+        each: Callable[[Segment, list[Step]], list[SegmentedScan]] = segment_all,
+    ) -> dict[int, SegmentedScan]:
+        """The segmented scans of the sample among the first ones, by their numbers, ascending."""
+        numbers = [n for n in sorted(self._steps) if n < scans]
+        return dict(zip(numbers, each(segment, [self._steps[n] for n in numbers]), strict=True))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownMap:
+    """A run as it is mapped.
+
+    Attributes:
+        parameters: Parameters that it was mapped with.
+        clusters: Its clusters.
+        path: Its path.
+        columns: Its voxel columns; None without any.
+    """
+
+    parameters: Parameters
+    clusters: ClusterTable
+    path: Path
+    columns: Columns | None
+
+    def needs_sample(self, parameters: Parameters) -> bool:
+        """Whether the parameters change the clusters."""
+        before = self.parameters
+        return any(getattr(before, stage) != getattr(parameters, stage) for stage in SEGMENTATION_STAGES)
+
+
+def preview_trees(
+    known: KnownMap, parameters: Parameters, sample: Mapping[int, SegmentedScan] | None = None
 ) -> Trees | None:
-    """Where trees will be, without diameters and with numbers that hold for nothing else.
+    """Where trees would stand with other parameters, without diameters; their numbers mean nothing.
 
     Args:
-        basis: The run before; clusters: of the same scans.
-        parameters: That are tried.
-        sample: What some of the scans show with these, by their numbers, ascending.
+        known: The run as it is mapped.
+        parameters: The other parameters.
+        sample: Some scans as these parameters segment them, by their numbers, ascending. Needed where
+            `KnownMap.needs_sample`.
 
     Returns:
-        None where the parameters gather in another way, or look at scans in another one without a sample.
+        The trees; None where the parameters classify columns in another way, or a sample is missing.
     """
-    scans = min(len(basis.notes), len(clusters))
-    if scans == 0 or not basis.gathers_as(parameters):
+    path = np.stack([known.path.x, known.path.y, known.path.yaw], axis=1)
+    scans = min(len(path), len(known.clusters))
+    if scans == 0 or not _classifies_alike(known.parameters, parameters):
         return None
-    if basis.shows_as(parameters):
-        return _trees(_known(basis, clusters, parameters, scans))
+    table, path = known.clusters.of(range(scans)), path[:scans]
+    if not known.needs_sample(parameters):
+        return _trees(_all_places(known, table, path, parameters))
     if not sample:
         return None
-    before = _known(basis, clusters, basis.looking_as_before(parameters), scans)
-    return _trees(_with_sample(before, basis, clusters, parameters, sample))
+    same = {stage: getattr(known.parameters, stage) for stage in SEGMENTATION_STAGES}
+    before = _all_places(known, table, path, parameters.model_copy(update=same))
+    return _trees(_with_sample(before, known, table, path, parameters, sample))
 
 
 class _Places(NamedTuple):
-    """Trees: where, by how many clusters, and whether what was gathered tells of them, shape (T, ...)."""
+    """Trees: place, number of clusters, and whether a voxel column is at the place, shape (T, ...)."""
 
     place: Float
     hits: Int
-    gathered: Bool
+    has_column: Bool
 
 
-def _known(basis: Basis, clusters: ClusterTable, p: Parameters, scans: int) -> _Places:
-    """Of what all scans have shown."""
-    notes = basis.notes.first(scans)
-    place, hits = _found(basis, range(scans), clusters, p)
-    return _judged(place, hits, hits >= p.tracking.hits_to_confirm, notes, p)
+def _classifies_alike(before: Parameters, now: Parameters) -> bool:
+    """Whether both classify the same columns with the same votes."""
+    a, b = (p.classification.model_dump(exclude=TREE_SHARE) for p in (before, now))
+    return bool(a == b)
 
 
-def _found(basis: Basis, scans: Sequence[int], clusters: ClusterTable, p: Parameters) -> tuple[Float, Int]:
-    """The places where the clusters of scans, which are those of the table in their order, show trees."""
-    rows = np.array(scans, np.int64)
-    offset, usual = basis.notes.offset[rows, :2], basis.notes.is_usual[rows]
-    start = np.array(clusters.start[: len(rows) + 1])
-    tree = clusters.verdicts(p.detection, len(rows)) == Verdict.TREE
-    tree &= np.repeat(usual, np.diff(start))
-    pose = np.concatenate([basis.path[rows], offset], axis=1)
-    return _gathered(clusters.centre(len(rows)), tree, start, pose, _reach(p), MOST_PLACES)
+def _has_same_columns(before: Parameters, now: Parameters) -> bool:
+    """Whether both integrate the same points into the columns."""
+    a, b = (
+        [getattr(p, stage).model_dump(exclude=NOT_OF_COLUMNS) for stage in COLUMN_STAGES]
+        for p in (before, now)
+    )
+    return a == b
 
 
 def _reach(p: Parameters) -> float:
     return max(p.tracking.proximity_radius, min(p.tracking.distance_max, REACH))
 
 
-def _judged(place: Float, hits: Int, confirmed: Bool, notes: Notes, p: Parameters) -> _Places:
-    """The trees among places: what was gathered decides wherever it tells anything."""
-    columns = _columns(notes, p)
+def _columns(known: KnownMap, p: Parameters) -> Columns | None:
+    """The voxel columns with the verdicts of other parameters."""
+    if known.columns is None or p.classification.method == "none":
+        return None
+    from dataclasses import replace
+
+    return replace(known.columns, verdict=judged(known.columns).verdict(p.classification.tree_share))
+
+
+def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters) -> _Places:
+    """The trees of all scans: where a voxel column is, it decides; elsewhere the number of clusters."""
+    place, hits = table.places(path, p)
+    confirmed = hits >= p.tracking.hits_to_confirm
+    columns = _columns(known, p)
     if columns is None:
         return _Places(place[confirmed], hits[confirmed], np.zeros(np.count_nonzero(confirmed), np.bool_))
-    trees = tree_columns(columns)
-    at = columns.axis[trees, :2].copy()
+    at = columns.axis[tree_columns(columns), :2].copy()
     track = nearest_other(at, place, REACH)
     seen = track >= 0
     at[seen] = place[track[seen]]
     free = confirmed & (nearest_other(place, columns.axis[:, :2].copy(), REACH) < 0)
     views = np.where(seen, hits[track] if len(hits) else 0, 0)
-    gathered = np.arange(len(at) + np.count_nonzero(free)) < len(at)
-    return _Places(np.concatenate([at, place[free]]), np.concatenate([views, hits[free]]), gathered)
-
-
-def _columns(notes: Notes, p: Parameters) -> Columns | None:
-    known = notes.newest_columns()
-    return (
-        None
-        if known is None or p.classification.method == "none"
-        else columns_of(known, p.classification.tree_share)
-    )
+    has_column = np.arange(len(at) + np.count_nonzero(free)) < len(at)
+    return _Places(np.concatenate([at, place[free]]), np.concatenate([views, hits[free]]), has_column)
 
 
 def _with_sample(
-    before: _Places, basis: Basis, clusters: ClusterTable, p: Parameters, sample: Mapping[int, SegmentedScan]
+    before: _Places,
+    known: KnownMap,
+    table: ClusterTable,
+    path: Float,
+    p: Parameters,
+    sample: Mapping[int, SegmentedScan],
 ) -> _Places:
-    """The trees as a sample of scans changes them: who is found less often there has fewer hits, and what is
-    found there, and was not, is a tree. What was gathered hangs on no clusters, and stays; but where
-    something else is gathered too, it stays as long as anything is found of it."""
-    scans = [k for k in sample if k < min(len(basis.notes), len(clusters))]
-    fresh = ClusterTable()
+    """The trees as a sample of scans changes them.
+
+    A tree that is found less often in the sample gets fewer hits, and what is found only now is a new tree.
+    A voxel column does not depend on clusters, so its tree stays; where the columns change too, it stays as
+    long as the sample finds it.
+    """
+    scans = [k for k in sample if k < len(table)]
+    part, fresh = table.of(scans), ClusterTable()
     for n, k in enumerate(scans):
-        fresh.put(n, sample[k].clusters)
-    old, old_hits = _found(basis, scans, clusters.of(scans), p)
-    new, new_hits = _found(basis, scans, fresh, p)
+        fresh.put(n, sample[k].clusters, sample[k].sensor_offset, lost=part._lost[n])
+    old, old_hits = part.places(path[scans], p)
+    new, new_hits = fresh.places(path[scans], p)
 
     was, now = (
         _sums(nearest_other(place, before.place, REACH), found, len(before.place))
         for place, found in ((old, old_hits), (new, new_hits))
     )
-    told = was >= LEAST
-    hits = np.where(told, before.hits * now // np.maximum(was, 1), before.hits)
-    gathered = before.gathered & (basis.gathers_the_same(p) | (now > 0))
-    stays = gathered | ~told | (hits >= p.tracking.hits_to_confirm)
+    is_known = was >= LEAST_HITS
+    hits = np.where(is_known, before.hits * now // np.maximum(was, 1), before.hits)
+    has_column = before.has_column & (_has_same_columns(known.parameters, p) | (now > 0))
+    stays = has_column | ~is_known | (hits >= p.tracking.hits_to_confirm)
 
-    alone = (new_hits >= LEAST) & (nearest_other(new, before.place, REACH) < 0)
-    alone &= nearest_other(new, old, REACH) < 0
-    columns = _columns(basis.notes, p)
+    is_new = (new_hits >= LEAST_HITS) & (nearest_other(new, before.place, REACH) < 0)
+    is_new &= nearest_other(new, old, REACH) < 0
+    columns = _columns(known, p)
     if columns is not None:
-        alone &= nearest_other(new, columns.axis[:, :2].copy(), REACH) < 0
+        is_new &= nearest_other(new, columns.axis[:, :2].copy(), REACH) < 0
     return _Places(
-        np.concatenate([before.place[stays], new[alone]]),
-        np.concatenate([hits[stays], new_hits[alone]]),
-        np.concatenate([before.gathered[stays], np.zeros(np.count_nonzero(alone), np.bool_)]),
+        np.concatenate([before.place[stays], new[is_new]]),
+        np.concatenate([hits[stays], new_hits[is_new]]),
+        np.concatenate([before.has_column[stays], np.zeros(np.count_nonzero(is_new), np.bool_)]),
     )
 
 
 def _sums(row: Int, hits: Int, rows: int) -> Int:
-    """Of the hits of each row; -1 is none."""
-    there = row >= 0
-    return np.bincount(row[there], hits[there], rows).astype(np.int64)
+    """Sum of the hits of each row; row -1 is left out."""
+    valid = row >= 0
+    return np.bincount(row[valid], hits[valid], rows).astype(np.int64)
 
 
 def _trees(known: _Places) -> Trees:
@@ -173,15 +340,18 @@ def _trees(known: _Places) -> Trees:
 
 
 @compiled
-def _gathered(
+def _grouped(
     centre: Float, tree: Bool, start: Int, pose: Float, reach: float, most: int
 ) -> tuple[Float, Int]:
-    """Means of the clusters that lie within reach of the first one of each place, and their number.
+    """Mean of the clusters within reach of the first one of each place, shape (T, 2), and their number, (T,).
 
     Args:
-        centre: Level sensor frame, shape (K, 2) [m]; tree: which of them are trees.
-        start: The first row of each scan, shape (N + 1,).
-        pose: x, y [m], yaw [rad] of the base in the map, and the sensor's x, y in its frame, shape (N, 5).
+        centre: Level sensor frame, shape (K, 2) [m].
+        tree: Which of them are trees, shape (K,).
+        start: First row of each scan, shape (N + 1,).
+        pose: x, y [m], yaw [rad] of the base in the map, then x, y of the sensor in the base frame, (N, 5).
+        reach: Distance [m].
+        most: Number of places at most.
     """
     place, hits, n = np.empty((most, 2)), np.zeros(most, np.int64), 0
     cells, scale = cells_for(most), per_metre(reach)

@@ -1,202 +1,283 @@
-"""What the scans of a run showed, kept on disk so that the run can be mapped again without them."""
+"""Scan cache: segmented scans on disk, so that a run can be mapped again without its points.
+
+There is one file for each source and each set of the parameters that decide the segmentation. A named file
+is found again when the recording is opened again. It begins with the identity of the source, of these
+parameters and of the code. Then follow the scans in any order, each with a row that holds its length and its
+checksum, so that a cut or damaged file is good up to that place.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import errno
+import hashlib
+import json
+import os
 import shutil
-import weakref
 import zlib
+from collections import OrderedDict
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
 from typing import Any
 
 import numpy as np
 
-from pipeline.errors import StemmapError
+import pipeline
+from pipeline.config import Parameters
 from pipeline.front_end import SegmentedScan
-from pipeline.remapping.clusters import ClusterTable
-from pipeline.remapping.named_cache import BEGIN, CUT, ROW, Name, open_named, sealed
-from pipeline.remapping.packing import TooLargeError, pack, unpack
+from pipeline.io.atomic_files import hold, is_held
+from pipeline.remapping.packing import HEAD, TooLargeError, pack, unpack
 from pipeline.types.records import Step
 
-_FIRST_ROWS = 1024
-MOST_BYTES = 4 << 30
-SPARE_BYTES = 2 << 30  # of the disk are left to others: recordings, and whoever else
-_LOOK_AT_ROOM = 50  # scans between two looks at the disk
-_File = Any  # with seek, write and readinto; on Windows it is another class
+MOST_BYTES = 4 << 30  # of one file
+MOST_IN_FOLDER = 8 << 30  # of all named files of a folder
+MOST_OPEN = 3  # files of one source
+SPARE_BYTES = 2 << 30  # of the disk are left to recordings and to other programs
+SCANS_BETWEEN_CHECKS = 50  # of the free space of the disk
+SUFFIX = ".scans"
+MAGIC = b"stemmap scans 3\n"
+ROW = np.dtype([("length", "<i8"), ("block_crc", "<u4"), ("head", HEAD), ("row_crc", "<u4")])
+
+SEGMENTATION_STAGES = ("acquisition", "filters", "ground", "clustering", "shape")
+SEGMENTATION_CLASSIFICATION = ("method", "every")  # they decide which scans have input for the columns
+DAMAGED = "the scan cache of this recording is damaged: {} scans are intact, the others are processed again"
+
+_File = Any  # binary, with seek, write and readinto; its class depends on the operating system
 
 
-class DamagedError(StemmapError):
-    """What is read is not what was kept."""
+def segmentation_key(parameters: Parameters) -> bytes:
+    """Sixteen bytes that differ where `pipeline.front_end.segment` may give another result."""
+    values = {
+        **{stage: getattr(parameters, stage).model_dump() for stage in SEGMENTATION_STAGES},
+        "classification": parameters.classification.model_dump(include=set(SEGMENTATION_CLASSIFICATION)),
+    }
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).digest()[:16]
 
 
-class KeptScans:
-    """The scans of a run from its first on, in a file that is found again, or in one without a name that goes
-    with the process.
+class ScanCache:
+    """Segmented scans of one source under one set of segmentation parameters.
 
     Args:
-        folder: Where there is room on disk; None, or where nobody may write there, the system's.
-        most: Bytes that may be kept; a scan for which there is no room is not kept, and none after it.
-        name: Of a file that is found again; where it cannot be had, one without a name is used.
+        file: An open file that holds the header, or is empty; None where no file can be had.
+        header: Header of the file.
+        folder: Folder of the file, of which the free space is checked.
+        most: Size that the file may reach. A scan that does not fit is not stored.
 
     Attributes:
-        clusters: Of the scans that were put, in memory.
-        told: What a person should know of what was kept before.
-        refusal: Why nothing is kept from some scan on, in words; empty where all is.
+        refusal: Why scans are not stored, for people; empty while they are.
+        notice: What is wrong with the file that was found, for people; empty where nothing is.
     """
 
-    def __init__(self, folder: Path | None = None, most: int = MOST_BYTES, name: Name | None = None) -> None:
-        self.folder = folder
-        self._begin = 0
-        self._rows = np.zeros(_FIRST_ROWS, ROW)
-        self._count = 0
-        self._most = most
-        self.clusters = ClusterTable()
-        self.refusal = self.told = ""
-        self._file: _File = None
+    def __init__(
+        self, file: _File, header: bytes, folder: Path | None = None, most: int = MOST_BYTES
+    ) -> None:
+        self._file: _File = file
+        self._folder, self._most = folder, most
+        self._rows: dict[int, tuple[int, Any]] = {}  # by scan: position of its block, and its row
+        self.refusal = self.notice = ""
+        self._end = len(header)
+        if file is None:
+            self._refuse("no folder can be written to")
+            return
         try:
-            self._file = (self._found_again(name) if name else None) or _without_name(folder)
-            weakref.finalize(self, self._file.close)
+            self._open(header)
         except OSError as error:
-            self._refuse(0, error.strerror or str(error))
+            self._refuse(error.strerror or str(error))
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._rows)
 
     @property
     def nbytes(self) -> int:
-        """Of the file."""
-        return self._end(self._count)
+        """Size of the file."""
+        return self._end
 
-    def put(self, step: Step, looked: SegmentedScan, key: bytes) -> None:
-        """Keep a scan, which is the next one or one that is there; those after it are forgotten. Where there
-        is no room, `refusal` says so.
+    def has_all(self, scans: int) -> bool:
+        """Whether all of the first scans are stored."""
+        return len(self._rows) >= scans and all(index in self._rows for index in range(scans))
 
-        Args:
-            key: Of the parameters that it was looked at with (see `look_key`).
-        """
-        if self._file is None or step.index > self._count:
-            return  # one before it was refused
-        if self.has(step.index, key) and self._rows["head"]["stamp_ns"][step.index] == step.scan.stamp_ns:
-            self.clusters.put(step.index, looked.clusters)
+    def put(self, step: Step, scan: SegmentedScan) -> None:
+        """Store a scan unless it is stored already. Where there is no room, `refusal` says so."""
+        if self._file is None or step.index in self._rows:
             return
         try:
-            head, block = pack(step, looked)
-        except TooLargeError as error:
-            self._refuse(step.index, str(error))
-            return
-        at = self._end(step.index) + ROW.itemsize
-        if at + len(block) > self._most:
-            self._refuse(step.index, f"more than {self._most / 1e9:.1f} GB would be kept")
-            return
-        try:
-            if step.index % _LOOK_AT_ROOM == 0 and room(self.folder) < SPARE_BYTES + len(block):
-                self._refuse(step.index, f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
+            head, block = pack(step, scan)
+            if self._end + ROW.itemsize + len(block) > self._most:
+                self._refuse(f"the cache is limited to {self._most / 1e9:.1f} GB")
                 return
-            row = np.array((at, len(block), zlib.crc32(block), np.void(key), head, 0), ROW)
-            if step.index < self._count:  # what follows is of other parameters
-                self._file.truncate(self._end(step.index))
-            _write(self._file, at - ROW.itemsize, sealed(row) + block)
-        except OSError as error:
-            self._refuse(step.index, error.strerror or str(error))
+            if step.index % SCANS_BETWEEN_CHECKS == 0 and free_space(self._folder) < SPARE_BYTES + len(block):
+                self._refuse(f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
+                return
+            row = np.array((len(block), zlib.crc32(block), head, 0), ROW)
+            row["row_crc"] = _checksum(row)
+            _write(self._file, self._end, row.tobytes() + block)
+        except TooLargeError as error:
+            self._refuse(str(error))
             return
-        self._count = step.index
-        if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-        self._rows[self._count] = row
-        self._count += 1
-        self.clusters.put(step.index, looked.clusters)
+        except OSError as error:
+            self._refuse(error.strerror or str(error))
+            return
+        self._rows[step.index] = (self._end + ROW.itemsize, row)
+        self._end += ROW.itemsize + len(block)
         self.refusal = ""
 
-    def has(self, index: int, key: bytes) -> bool:
-        """Whether a scan is kept that was looked at with these parameters."""
-        return index < self._count and self.key_of(index) == key
+    def read(self, index: int, stamp_ns: int | None = None) -> tuple[Step, SegmentedScan] | None:
+        """A scan without its raw points; None where it is not stored.
 
-    def looked(self, step: Step, key: bytes) -> SegmentedScan | None:
-        """What a scan showed, if it is kept and was looked at with these parameters."""
-        if not self.has(step.index, key):
-            return None
-        try:
-            known, looked = self.scan(step.index)
-        except DamagedError:
-            self.forget_from(step.index)
-            return None
-        return looked if known.scan.stamp_ns == step.scan.stamp_ns else None
+        Args:
+            index: Number of the scan.
+            stamp_ns: Time that it must have; None accepts any.
 
-    def holds(self, scans: int, key: bytes) -> bool:
-        """Whether all of the first scans are kept that were looked at with these parameters."""
-        return self._count >= scans and all(self.key_of(k) == key for k in range(scans))
-
-    def forget_from(self, index: int) -> None:
-        """Keep the scans before it alone."""
-        self._count = min(self._count, index)
-        if self._file is not None:
-            self.told = CUT.format(index)
-            with contextlib.suppress(OSError):
-                self._file.truncate(self._end(self._count))
-
-    def key_of(self, index: int) -> bytes:
-        """Of the parameters that a scan was looked at with."""
-        return bytes(self._rows["key"][index])
-
-    def scan(self, index: int) -> tuple[Step, SegmentedScan]:
-        """One scan.
-
-        Raises:
-            DamagedError: What is read is not what was kept.
+        A damaged scan is forgotten, so that it is stored again; `notice` says so.
         """
-        row = self._rows[index]
+        if index not in self._rows or self._file is None:
+            return None
+        at, row = self._rows[index]
         block = bytearray(int(row["length"]))
-        if self._file is None or _read(self._file, int(row["at"]), block) != int(row["crc"]):
-            raise DamagedError(
-                f"what was kept of scan {index} is damaged", remedy="Play the run from its start again"
-            )
         try:
-            return unpack(row["head"], block)
-        except (ValueError, KeyError, TypeError, RuntimeError) as error:
-            raise DamagedError(
-                f"what was kept of scan {index} cannot be read", remedy="Play the run from its start again"
-            ) from error
+            if _read(self._file, at, block) != int(row["block_crc"]):
+                raise ValueError("the checksum is wrong")
+            step, scan = unpack(row["head"], block)
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError):
+            del self._rows[index]
+            self.notice = DAMAGED.format(len(self._rows))
+            return None
+        return (step, scan) if stamp_ns in (None, step.scan.stamp_ns) else None
 
     def close(self) -> None:
-        """Give the disk's room back."""
+        """Close the file. A file without a name is deleted."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
-    def _end(self, scans: int) -> int:
-        if scans == 0:
-            return self._begin
-        last: Any = self._rows[scans - 1]
-        return int(last["at"] + last["length"])
+    def _open(self, header: bytes) -> None:
+        size = self._file.seek(0, os.SEEK_END)
+        start = bytearray(len(header))
+        if size < len(header) or _read(self._file, 0, start) < 0 or start != header:
+            self._file.truncate(0)
+            _write(self._file, 0, header)
+            return
+        while self._end + ROW.itemsize <= size:
+            data = bytearray(ROW.itemsize)
+            _read(self._file, self._end, data)
+            row: Any = np.frombuffer(data, ROW)[0]
+            length, at = int(row["length"]), self._end + ROW.itemsize
+            if row["row_crc"] != _checksum(row) or length < 0 or at + length > size:
+                break
+            self._rows[int(row["head"]["index"])] = (at, row)
+            self._end = at + length
+        if self._end < size:
+            self.notice = DAMAGED.format(len(self._rows))
+            self._file.truncate(self._end)
 
-    def _found_again(self, name: Name) -> _File:
-        """The file of this name; None where it cannot be had."""
-        try:
-            file, rows, self.told = open_named(name)
-        except OSError:
-            return None
-        self._begin, self._count = BEGIN, len(rows)
-        self._rows = np.concatenate([rows, np.zeros(_FIRST_ROWS, ROW)])
-        return file
-
-    def _refuse(self, index: int, why: str) -> None:
-        self._count = min(self._count, index)
-        self.refusal = f"from scan {index} on nothing is kept of the scans: {why}"
+    def _refuse(self, why: str) -> None:
+        self.refusal = f"from scan {len(self._rows)} on nothing is cached: {why}"
 
 
-def _without_name(folder: Path | None) -> _File:
-    """A file that goes with the process, in a folder or where the system has room for such files."""
+class ScanCaches:
+    """The caches of one source, one for each set of segmentation parameters; the last few used are open.
+
+    Args:
+        folder: Folder of the files; None uses the folder of the system for temporary files.
+        source: Identity of the source: digest of the recording, odometry and seed. Empty for a source that
+            cannot be found again: its files have no name, and are deleted when they are closed.
+        most: Size that a file may reach.
+    """
+
+    def __init__(self, folder: Path | None = None, source: str = "", most: int = MOST_BYTES) -> None:
+        self._folder, self._source, self._most = folder, source, most
+        self._open: OrderedDict[bytes, ScanCache] = OrderedDict()
+
+    def of(self, parameters: Parameters) -> ScanCache:
+        """The cache for scans that are segmented with these parameters."""
+        key = segmentation_key(parameters)
+        if key not in self._open:
+            while len(self._open) >= MOST_OPEN:
+                self._open.popitem(last=False)[1].close()
+            self._open[key] = self._opened(key)
+        self._open.move_to_end(key)
+        return self._open[key]
+
+    def close(self) -> None:
+        """Close all files."""
+        for each in self._open.values():
+            each.close()
+        self._open.clear()
+
+    def _opened(self, key: bytes) -> ScanCache:
+        identity = hashlib.sha256(self._source.encode() + key + _code_digest()).digest()
+        header = MAGIC + identity
+        file: _File = None
+        if self._source and self._folder is not None:
+            with contextlib.suppress(OSError):  # the disk refuses, or another process has the file
+                file = _named_file(self._folder, identity)
+        if file is None:
+            file = _unnamed_file(self._folder)
+        return ScanCache(file, header, self._folder, self._most)
+
+
+def free_space(folder: Path | None) -> int:
+    """Free bytes on the disk of a folder."""
+    return shutil.disk_usage(folder if folder is not None and folder.is_dir() else gettempdir()).free
+
+
+def _named_file(folder: Path, identity: bytes) -> _File:
+    """The file of this identity, held by this process.
+
+    Raises:
+        OSError: The disk refuses, or another process has it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / (identity[:16].hex() + SUFFIX)
+    _make_room(folder, path)
+    file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "r+b", buffering=0)
+    try:
+        hold(file)
+    except OSError:
+        file.close()
+        raise
+    path.touch()
+    return file
+
+
+def _unnamed_file(folder: Path | None) -> _File:
+    """A file without a name in the folder, or where the system has room; None where neither is possible."""
     for place in (folder, None):
         with contextlib.suppress(OSError):
             return TemporaryFile(dir=place, buffering=0)
-    raise OSError(errno.EACCES, "no folder can be written to")
+    return None
 
 
-def room(folder: Path | None) -> int:
-    """Bytes that are free on a disk."""
-    return shutil.disk_usage(folder if folder is not None and folder.is_dir() else gettempdir()).free
+def _make_room(folder: Path, keep: Path) -> None:
+    """Delete the files that were opened longest ago, where all together are too large."""
+    sizes: list[tuple[float, int, Path]] = []
+    for path in folder.glob(f"*{SUFFIX}"):
+        with contextlib.suppress(OSError):
+            known = path.stat()
+            sizes.append((known.st_mtime, known.st_size, path))
+    total = sum(size for _, size, _ in sizes)
+    for _, size, path in sorted(sizes):
+        if total <= MOST_IN_FOLDER:
+            return
+        if path != keep and not is_held(path):
+            path.unlink(missing_ok=True)
+            total -= size
+
+
+@cache
+def _code_digest() -> bytes:
+    """Digest of all sources of the pipeline: any of them may change what is found in a scan."""
+    folder = Path(pipeline.__file__).parent
+    state = hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        state.update(path.relative_to(folder).as_posix().encode())
+        state.update(path.read_bytes())
+    return state.digest()
+
+
+def _checksum(row: Any) -> int:  # noqa: ANN401 - of ROW
+    """Checksum of a row without its last field, which holds it."""
+    return zlib.crc32(row.tobytes()[:-4])
 
 
 def _write(file: _File, at: int, block: bytes) -> None:
@@ -207,7 +288,7 @@ def _write(file: _File, at: int, block: bytes) -> None:
 
 
 def _read(file: _File, at: int, into: bytearray) -> int:
-    """Fill the block; gives its sum, -1 where the file ends before."""
+    """Fill the block; returns its checksum, -1 where the file ends before."""
     file.seek(at)
     view = memoryview(into)
     while view:

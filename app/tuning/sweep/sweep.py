@@ -17,7 +17,7 @@ from app.tuning.sweep.workers import Done, Lost, Workers
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
-from pipeline.remapping import look_key
+from pipeline.remapping import segmentation_key
 
 MOST_LOSSES = 3  # a job that loses so many workers fails
 NOBODY_S = 120.0
@@ -249,4 +249,4 @@ class _Sweep:
 
 def _group(job: Job) -> bytes:
     """Equal for jobs that share the results of the front end."""
-    return msgspec.json.encode(job.run) + look_key(validated(job.parameters))
+    return msgspec.json.encode(job.run) + segmentation_key(validated(job.parameters))

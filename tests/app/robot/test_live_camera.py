@@ -185,7 +185,7 @@ def test_what_is_put_aside_is_bounded_and_counted(tmp_path: Path, monkeypatch: p
 
 def test_the_disk_keeps_its_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     free = [SPARE_BYTES + 10, SPARE_BYTES + 9]
-    monkeypatch.setattr("app.robot.kept_pictures.room", lambda _: free.pop(0))
+    monkeypatch.setattr("app.robot.kept_pictures.free_space", lambda _: free.pop(0))
     with closing(KeptPictures(tmp_path)) as kept:
         for stamp_ns in (1, 2):
             kept.add(Picture(stamp_ns, "", 0, 0, 0, bytes(10)), way([1]))

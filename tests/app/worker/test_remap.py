@@ -90,7 +90,7 @@ def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters)
     assert changes.revision == 1
     assert changes.scans == standing + 1
     assert session.status().remapped is None
-    assert not any(thread.name.startswith("look") for thread in threading.enumerate()), "none is left"
+    assert not any(thread.name.startswith("segment") for thread in threading.enumerate()), "none is left"
 
 
 @pytest.mark.parametrize("parameters", [FEWER, WIDER])
@@ -122,12 +122,12 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
             assert other.frame is not None
             assert other.run is not None
             since = told(other.run.confirmed_s(other.frame.trees))
-            assert marks[id(wanted)] == other.run._told.confirmed_s, "those that went again too"
+            assert marks[id(wanted)] == other.run._map.record.confirmed_s, "those that went again too"
             assert maps[id(wanted)] == (told(other.frame), told(other.path), since)
 
 
 def test_where_there_is_no_room_a_map_that_was_left_is_made_again(session, monkeypatch):
-    monkeypatch.setattr("app.worker.map_cache.MOST_BYTES", 1)
+    monkeypatch.setattr("app.worker.remap.MOST_BYTES", 1)
     standing = session.status().scan_index
     for revision, wanted in enumerate([FEWER, BASE]):
         session.set_parameters(wanted, revision, whole=True)
@@ -158,7 +158,7 @@ def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parame
 
 def test_a_rough_answer_is_there_before_the_exact_one_and_before_the_standing_scan(session, monkeypatch):
     heard: list[tuple[int, int]] = []
-    session.on_rough = lambda revision, trees: heard.append((revision, len(trees.number)))
+    session.on_preview = lambda revision, trees: heard.append((revision, len(trees.number)))
     again = session._run.map_again
 
     def mapped_again() -> object:
@@ -179,7 +179,7 @@ def test_a_rough_answer_is_there_before_the_exact_one_and_before_the_standing_sc
 @pytest.mark.parametrize("begun_before", [False, True])
 def test_where_the_scan_is_sought_first_it_comes_once_the_scan_is_there(session, begun_before):
     heard: list[int] = []
-    session.on_rough = lambda revision, _: heard.append(revision)
+    session.on_preview = lambda revision, _: heard.append(revision)
     if begun_before:
         session.set_parameters(WIDER, 1, whole=True)
         assert heard == [1]
@@ -291,7 +291,7 @@ def test_it_tells_which_trees_came_and_went_and_why():
         known = int(np.count_nonzero(frame.trees.confirmed))
         assert known >= 2
         assert session.run is not None
-        marked = dict(session.run._told.confirmed_s)
+        marked = dict(session.run._map.record.confirmed_s)
         # No column is ever a tree now; then all are back.
         session.set_parameters(BASE.replace({"classification.tree_share": 1.0}), 1, whole=True)
         _, none = remapped(session)
@@ -333,7 +333,7 @@ def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(session._run._remapping.rerun.mapper, "map", broken)
+    monkeypatch.setattr(session._run._remapping.rerun.mapper, "process", broken)
     with pytest.raises(ZeroDivisionError):
         session.remap(3)
     assert not session.is_remapping
@@ -375,6 +375,6 @@ def test_without_room_for_the_scans_they_are_read_once_more_and_that_is_said(mon
         session.advance(8)
         settle(session)
         session.set_parameters(FEWER, 1, whole=True)
-        assert any("from scan 0 on nothing is kept" in warning for warning in session.status().warnings)
+        assert any("from scan 0 on nothing is cached" in warning for warning in session.status().warnings)
         frame, _ = remapped(session)
         assert told(frame) == mapped_with(FEWER, frame.index)[0]

@@ -1,17 +1,15 @@
-"""FastSLAM at three sizes, in plain Python at the smallest, and many steps in one compiled loop."""
+"""FastSLAM at three sizes, in plain Python at the smallest."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from tests.benchmarks.table import Cell, Table, ratio, verdict
+from tests.benchmarks.table import Cell, Table, ratio
 from tests.benchmarks.timing import in_turns, middle, quantile
 
 if TYPE_CHECKING:
-    from pipeline.slam import FastSlam
-    from pipeline.slam.recorded import Recorded
     from pipeline.types.records import Detections, Float
 
 NAME = "slam"
@@ -20,7 +18,6 @@ LINE = "One step of FastSLAM with ten observations, at three numbers of particle
 SIZES = ((100, 30, 300), (100, 1_000, 300), (1_000, 1_000, 60))  # particles, landmarks, steps
 SAME_DENSITY = (100, 1_000, 10_000)  # landmarks on the same lattice, 100 particles
 GROWTH_STEPS = 200
-LOOP_STEPS, LOOP_SECONDS, LOOP_ROUNDS = 6_000, 0.6, 5  # asked for in so many seconds
 PEER_STEPS = 7
 OBSERVED = 10
 SPACING = 3.0  # m between landmarks on their lattice
@@ -42,7 +39,6 @@ def run() -> list[Table]:
             ("Every particle knows all landmarks; resampling is part of a step when it is needed.",),
         ),
         growth(),
-        loop(),
     ]
 
 
@@ -56,49 +52,6 @@ def growth() -> Table:
         ("trees", "median ms", "mean ms"),
         rows,
         ("CPU time; the mean has the steps in it that resample. Within 15 m stand about 75 trees.",),
-    )
-
-
-def loop(steps: int = LOOP_STEPS, rounds: int = LOOP_ROUNDS) -> Table:
-    """Recorded steps at the smallest size, one by one and in one compiled loop, in turns."""
-    particles, landmarks, _ = SIZES[0]
-    told: list[tuple[float, Float]] = []
-    driven = Driven(lambda _index, motion, seen: told.append((motion, seen)), landmarks)
-    while len(told) < steps:
-        driven()
-    recorded, outcome = _recorded(told[:steps]), dict[str, bytes]()
-
-    def one_by_one() -> None:
-        import numpy as np
-
-        slam = _filter(particles)
-        estimates = [
-            slam.process(t, motion, seen, recorded.clear_range).T_map_base.as_array()
-            for t, (motion, seen) in enumerate(single)
-        ]
-        outcome["one by one"] = np.array(estimates).tobytes()
-
-    def at_once() -> None:
-        from pipeline.slam.recorded import drive
-
-        outcome["one loop"] = drive(_filter(particles), 0, recorded).pose.tobytes()
-
-    from pipeline.geometry.poses import Pose2
-
-    single = [(Pose2(motion, 0.0, 0.0), detections_of(seen, SIGMA)) for motion, seen in told[:steps]]
-    sides: dict[str, Callable[[], object]] = {"one by one": one_by_one, "one loop": at_once}
-    times = in_turns(sides, rounds, clock=time.thread_time)
-    best = min(times["one loop"]) * 1e-3
-    return Table(
-        f"{steps:,} recorded steps, {particles} particles, {landmarks} landmarks, ten observations",
-        ("way", "median s", "least s", "least ms a step"),
-        tuple((way, 1e-3 * middle(t), 1e-3 * min(t), min(t) / steps) for way, t in times.items()),
-        (
-            f"CPU time in turns, {rounds} times. Same bytes of all poses: "
-            f"{'yes' if len(set(outcome.values())) == 1 else 'NO'}. Asked for: one loop in "
-            f"{LOOP_SECONDS:g} s: {verdict(best <= LOOP_SECONDS)} by the least, "
-            f"{verdict(middle(times['one loop']) * 1e-3 <= LOOP_SECONDS)} by the median.",
-        ),
     )
 
 
@@ -180,12 +133,14 @@ def _ours(particles: int, landmarks: int) -> Feed:
     of the lattice off, and the map would have many of them twice."""
     import numpy as np
 
+    from pipeline.config import Parameters
     from pipeline.detection.free_space import BINS
     from pipeline.geometry.poses import Pose2
+    from pipeline.slam import FastSlam
     from pipeline.slam.particle_maps import MapColumns
     from pipeline.slam.state import SlamState
 
-    slam = _filter(particles)
+    slam = FastSlam(Parameters().replace({"slam.particles": particles}).slam, 0)
     known = MapColumns(
         _lattice(landmarks),
         np.tile([SIGMA**2 / TIMES, 0.0, SIGMA**2 / TIMES], (landmarks, 1)),
@@ -200,29 +155,6 @@ def _ours(particles: int, landmarks: int) -> Feed:
         slam.process(index, Pose2(motion, 0.0, 0.0), detections_of(seen, SIGMA), nothing_missed)
 
     return feed
-
-
-def _filter(particles: int) -> FastSlam:
-    from pipeline.config import Parameters
-    from pipeline.slam import FastSlam
-
-    return FastSlam(Parameters().replace({"slam.particles": particles}).slam, 0)
-
-
-def _recorded(told: Sequence[tuple[float, Float]]) -> Recorded:
-    import numpy as np
-
-    from pipeline.detection.free_space import BINS
-    from pipeline.slam.recorded import Recorded
-
-    centre = np.concatenate([seen for _, seen in told])
-    return Recorded(
-        np.array([[motion, 0.0, 0.0] for motion, _ in told]),
-        centre,
-        np.tile([SIGMA**2, 0.0, SIGMA**2], (len(centre), 1)),
-        np.cumsum([0, *(len(seen) for _, seen in told)]),
-        np.zeros(BINS),
-    )
 
 
 def detections_of(seen: Float, sigma: float) -> Detections:

@@ -1,4 +1,4 @@
-"""The run of `mapped` with all that is kept of it."""
+"""The run of `mapped` as it is mapped with the preset."""
 
 from __future__ import annotations
 
@@ -7,24 +7,20 @@ from contextlib import closing
 
 import pytest
 
-from pipeline.remapping import Basis, Journal, KeptScans, look_key
-from tests.pipeline.remapping.mapped import BASE, SPACING, mapper, run
+from pipeline.remapping import ClusterTable, KnownMap, ScanCache, ScanCaches
+from tests.pipeline.remapping.mapped import BASE, mapper, run
 
 
 @pytest.fixture(scope="session")
-def known() -> Iterator[tuple[KeptScans, Basis]]:
-    """The run mapped with the preset, and what is kept of that."""
-    journal, states, whole = Journal(), {}, mapper(BASE)
-    whole.note = lambda noted: journal.note(noted, BASE.slam)
-    with closing(KeptScans()) as kept:
+def known() -> Iterator[tuple[ScanCache, KnownMap]]:
+    """The cache of all scans, and the map."""
+    m, clusters, frame = mapper(BASE), ClusterTable(), None
+    with closing(ScanCaches()) as caches:
+        cache = caches.of(BASE)
         for step in run()[0]:
-            if step.index % SPACING == 0:
-                states[step.index] = whole.snapshot()
-            looked = whole.segment(step)
-            kept.put(step, looked, look_key(BASE))
-            whole.process(step, looked)
-        states[len(kept)] = whole.snapshot()
-        path = whole.path
-        notes = journal.first(len(kept))
-        assert len(notes) == len(kept)
-        yield kept, Basis.of(BASE, notes, states, path, whole.motion)
+            scan = m.segment(step)
+            cache.put(step, scan)
+            frame = m.process(step, scan)
+            clusters.record(frame)
+        assert frame is not None
+        yield cache, KnownMap(BASE, clusters, m.path, frame.columns)

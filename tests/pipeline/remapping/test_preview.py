@@ -1,24 +1,22 @@
-"""The rough answer: the trees of the map that comes, from what was kept alone."""
+"""The preview shows the trees of the map that the rerun gives."""
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from app.worker.parallel import looked_at_once
 from pipeline.io.checkpoints import encode
-from pipeline.remapping import Rerun, Sample, rough_trees
-from pipeline.remapping.clusters import ClusterTable
-from pipeline.remapping.preview import MOST_PLACES, _gathered
-from pipeline.remapping.sample import MOST_SCANS
+from pipeline.remapping import ClusterTable, Rerun, Sample, ScanCaches, preview_trees
+from pipeline.remapping.preview import MOST_PLACES, SAMPLE_SCANS, _grouped
 from pipeline.types.records import Verdict
-from tests.pipeline.remapping.mapped import BASE, mapper, run, ungathered, with_odd
+from tests.pipeline.remapping.mapped import BASE, frames, mapper, run
 
 
 def share_within(place: np.ndarray, other: np.ndarray, distance: float) -> float:
-    """Of some places, those near to another one."""
+    """Share of some places that are near to another one."""
     apart = np.hypot(*(place[:, None] - other[None]).transpose(2, 0, 1))
     return float((apart.min(axis=1, initial=np.inf) < distance).mean())
 
@@ -27,48 +25,48 @@ def share_within(place: np.ndarray, other: np.ndarray, distance: float) -> float
     "change", [{}, {"classification.tree_share": 0.6}, {"detection.e_max": 5.0}, {"slam.particles": 40}]
 )
 def test_it_is_near_to_the_map_that_comes(change, known):
-    kept, basis = known
+    cache, before = known
     parameters = BASE.replace(change)
-    rough = rough_trees(basis, kept.clusters, parameters)
-    assert rough is not None
-    *_, frame = Rerun(mapper(parameters), kept).frames(len(kept))
+    preview = preview_trees(before, parameters)
+    assert preview is not None
+    frame = frames(Rerun(mapper(parameters), cache), len(cache))[-1]
     exact = frame.trees.position[frame.trees.confirmed]
     assert len(exact) > 3
-    assert share_within(exact, rough.position, 0.3) > 0.8
-    assert share_within(rough.position, exact, 0.3) > 0.8
+    assert share_within(exact, preview.position, 0.3) > 0.8
+    assert share_within(preview.position, exact, 0.3) > 0.8
 
 
-def test_without_votes_enough_nothing_that_was_gathered_is_a_tree(known):
-    kept, basis = known
-    columns = basis.notes.newest_columns()
-    assert columns is not None
-    assert (columns.verdict(0.4) == Verdict.TREE).any()
-    rough = rough_trees(basis, kept.clusters, BASE.replace({"classification.tree_share": 1.0}))
-    assert rough is not None
-    trees = columns.place[columns.verdict(0.4) == Verdict.TREE]
-    assert share_within(trees, rough.position, 0.1) < 0.5
+def test_a_column_without_enough_votes_is_not_a_tree(known):
+    columns = known[1].columns
+    trees = columns.axis[columns.verdict == Verdict.TREE, :2]
+    assert len(trees)
+    preview = preview_trees(known[1], BASE.replace({"classification.tree_share": 1.0}))
+    assert preview is not None
+    assert share_within(trees, preview.position, 0.1) < 0.5
 
 
 def test_hits_are_the_clusters_that_are_trees(known):
-    kept, basis = known
     parameters = BASE.replace({"tracking.hits_to_confirm": 1, "tracking.distance_max": 0.4})
-    bare = ungathered(basis)
-    rough = rough_trees(bare, kept.clusters, parameters)
-    assert rough is not None
-    assert basis.notes.is_usual.all()
-    found = sum(len(stretch.recorded.centre) for stretch in basis.notes.stretches)
-    assert int(rough.observations.sum()) == found
+    before = replace(known[1], columns=None)
+    preview = preview_trees(before, parameters)
+    assert preview is not None
+    found = np.count_nonzero(before.clusters.verdicts(BASE.detection) == Verdict.TREE)
+    assert int(preview.observations.sum()) == found
 
 
 @pytest.mark.parametrize("lost", [True, False])
-def test_what_was_seen_by_a_lost_robot_is_nowhere(lost, known):
-    kept, basis = known
-    odd, path = np.zeros(len(basis.notes), np.bool_), basis.path.copy()
-    odd[20:40], path[20:40] = lost, (500.0, 0.0, 0.0)
-    rough = rough_trees(replace(with_odd(basis, odd), path=path), kept.clusters, BASE)
-    assert rough is not None
-    assert (rough.position[:, 0] < 300.0).any()
-    assert (rough.position[:, 0] > 300.0).any() != lost
+def test_clusters_of_a_lost_robot_are_left_out(lost, known):
+    m, path = mapper(BASE), known[1].path
+    clusters = ClusterTable()
+    for step in run()[0]:
+        scan = m.segment(step)
+        clusters.put(step.index, scan.clusters, scan.sensor_offset, lost=lost and 20 <= step.index < 40)
+    away = path.x.copy()
+    away[20:40] = 500.0
+    preview = preview_trees(replace(known[1], clusters=clusters, path=replace(path, x=away)), BASE)
+    assert preview is not None
+    assert (preview.position[:, 0] < 300.0).any()
+    assert (preview.position[:, 0] > 300.0).any() != lost
 
 
 @pytest.mark.parametrize(
@@ -88,116 +86,107 @@ def test_clusters_join_the_nearest_of_all_places(seed, reach, most):
         elif len(place) < most:
             place.append(x)
             hits.append(1)
-    found, times = _gathered(centre, tree, np.array([0, 100, 300]), np.zeros((2, 5)), reach, most)
+    found, times = _grouped(centre, tree, np.array([0, 100, 300]), np.zeros((2, 5)), reach, most)
     assert times.tolist() == hits
     assert found == pytest.approx(np.array(place), abs=1e-9)
 
 
 @pytest.mark.parametrize("change", [{"clustering.eps": 0.2}, {"classification.every": 2}])
-def test_nothing_is_told_of_clusters_that_nobody_knows(change, known):
-    kept, basis = known
-    assert rough_trees(basis, kept.clusters, BASE.replace(change)) is None
+def test_without_a_needed_sample_there_is_no_preview(change, known):
+    assert preview_trees(known[1], BASE.replace(change)) is None
 
 
-LOOKS = [
+SEGMENTATIONS = [
     {"clustering.eps": 0.3},
     {"filters.voxel_size": 0.03},
-    {"clustering.min_points": 40},
     {"filters.x_max": 8.0, "filters.x_min": -8.0, "tracking.hits_to_confirm": 4},
 ]
 
 
 def sampled(parameters):
-    """What some scans of the run show with these parameters."""
+    """A sample of the run as segmented with these parameters."""
     sample = Sample()
     for step in run()[0]:
         sample.offer(step)
-    return sample.looked(mapper(parameters).segmenter(), len(run()[0]))
+    return sample.segmented(mapper(parameters).segmenter(), len(run()[0]))
 
 
 @pytest.mark.parametrize("method", ["columns", "none"])
-@pytest.mark.parametrize("change", LOOKS)
-def test_scans_that_are_looked_at_again_tell_of_other_clusters(change, method, known):
-    kept, basis = known
-    if method == "none":  # hits alone make a tree
-        basis = ungathered(basis)
+@pytest.mark.parametrize("change", SEGMENTATIONS)
+def test_a_sample_shows_the_effect_of_other_clusters(change, method, known):
+    before = known[1] if method == "columns" else replace(known[1], columns=None)
     parameters = BASE.replace(change)
-    rough = rough_trees(basis, kept.clusters, parameters, sampled(parameters))
-    assert rough is not None
+    preview = preview_trees(before, parameters, sampled(parameters))
+    assert preview is not None
     if method == "columns":
-        *_, frame = Rerun(mapper(parameters), kept, lambda: iter(run()[0])).frames(len(kept))
+        with closing(ScanCaches()) as caches:
+            rerun = Rerun(mapper(parameters), caches.of(parameters), lambda: iter(run()[0]))
+            frame = frames(rerun, len(run()[0]))[-1]
         exact = frame.trees.position[frame.trees.confirmed]
     else:
-        exact = by_hits(parameters, basis)
+        exact = by_hits(parameters, before)
     assert len(exact) > 1
-    assert share_within(exact, rough.position, 0.3) > 0.7
-    # How the votes on less of a trunk would turn out, nobody knows.
+    assert share_within(exact, preview.position, 0.3) > 0.7
+    # The votes for a column with fewer points are not known before the rerun.
     known_votes = method == "none" or "filters.x_max" not in change
-    assert share_within(rough.position, exact, 0.3) > (0.7 if known_votes else 0.4)
+    assert share_within(preview.position, exact, 0.3) > (0.7 if known_votes else 0.4)
 
 
-def by_hits(parameters, basis):
-    """Where the clusters of all scans, looked at again, show trees often enough."""
-    look = mapper(parameters).segmenter()
-    every = {step.index: look(step) for step in run()[0]}
-    table = ClusterTable()
-    for index, looked in every.items():
-        table.put(index, looked.clusters)
-    as_now = replace(basis, parameters=parameters)
-    rough = rough_trees(as_now, table, parameters)
-    assert rough is not None
-    return rough.position
+def by_hits(parameters, before):
+    """Places where the clusters of all scans, segmented again, are trees often enough."""
+    segment, table = mapper(parameters).segmenter(), ClusterTable()
+    for step in run()[0]:
+        scan = segment(step)
+        table.put(step.index, scan.clusters, scan.sensor_offset)
+    preview = preview_trees(replace(before, parameters=parameters, clusters=table), parameters)
+    assert preview is not None
+    return preview.position
 
 
-def test_a_sample_of_the_same_looks_changes_nothing(known):
-    kept, basis = known
-    other = replace(basis, parameters=BASE.replace({"clustering.eps": 0.3}))
-    wanted = rough_trees(basis, kept.clusters, BASE)
-    given = rough_trees(other, kept.clusters, BASE, sampled(BASE))
+def test_a_sample_with_the_same_segmentation_changes_nothing(known):
+    other = replace(known[1], parameters=BASE.replace({"clustering.eps": 0.3}))
+    wanted, given = preview_trees(known[1], BASE), preview_trees(other, BASE, sampled(BASE))
     assert wanted is not None
     assert given is not None
     assert given.position.tobytes() == wanted.position.tobytes()
     assert given.observations.tolist() == wanted.observations.tolist()
 
 
-def test_scans_that_show_nothing_leave_what_was_gathered_alone(known):
-    kept, basis = known
+def test_a_sample_without_clusters_leaves_the_trees_of_columns(known):
     parameters = BASE.replace({"clustering.min_points": 500})
-    rough = rough_trees(basis, kept.clusters, parameters, sampled(parameters))
-    wanted = rough_trees(basis, kept.clusters, BASE)
-    assert rough is not None
+    wanted, preview = preview_trees(known[1], BASE), preview_trees(known[1], parameters, sampled(parameters))
     assert wanted is not None
-    assert 0 < len(rough.position) <= len(wanted.position)
-    bare = ungathered(basis)
-    rough = rough_trees(bare, kept.clusters, parameters, sampled(parameters))
-    assert rough is not None
-    seen = np.hypot(*(wanted.position[:, None] - rough.position[None]).transpose(2, 0, 1)) < 0.3
-    assert seen.any(axis=1).mean() < 0.5
+    assert preview is not None
+    assert 0 < len(preview.position) <= len(wanted.position)
+    bare = preview_trees(replace(known[1], columns=None), parameters, sampled(parameters))
+    assert bare is not None
+    apart = np.hypot(*(wanted.position[:, None] - bare.position[None]).transpose(2, 0, 1))
+    assert (apart.min(axis=1, initial=np.inf) < 0.3).mean() < 0.5
 
 
-def test_scans_that_are_looked_at_on_two_cores_show_the_same():
+def test_two_threads_segment_a_sample_as_one_does():
     sample, parameters = Sample(), BASE.replace({"clustering.eps": 0.3})
     for step in run()[0][:20]:
         sample.offer(step)
-    one = sample.looked(mapper(parameters).segmenter(), 20)
-    two = sample.looked(mapper(parameters).segmenter(), 20, looked_at_once)
+    two = sample.segmented(mapper(parameters).segmenter(), 20)
+    one = sample.segmented(mapper(parameters).segmenter(), 20, lambda segment, all_: list(map(segment, all_)))
     assert list(one) == list(two) == list(range(20))
     assert encode(tuple(two.values())) == encode(tuple(one.values()))
 
 
 def test_a_sample_is_spread_over_the_run_and_bounded():
     step, sample = run()[0][0], Sample()
-    looked, asked = mapper(BASE).segment(step), []
+    scan, asked = mapper(BASE).segment(step), []
 
-    def look(step):
+    def segment(step):
         asked.append(step.index)
-        return looked
+        return scan
 
     for index in range(1000):
         sample.offer(replace(step, index=index))
-    held = list(sample.looked(look, 900))
+    held = list(sample.segmented(segment, 900, lambda segment, all_: list(map(segment, all_))))
     assert held == asked
-    assert MOST_SCANS // 2 <= len(sample) <= MOST_SCANS
+    assert SAMPLE_SCANS // 2 <= len(sample) <= SAMPLE_SCANS
     assert len(set(np.diff(held))) == 1
     assert held[0] == 0
     assert held[-1] < 900

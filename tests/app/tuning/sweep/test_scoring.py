@@ -13,7 +13,6 @@ from app.sources.request import SourceRequest
 from app.tuning.sweep.jobs import Answer, Job, PreparedRun, code_digest, prepare_run
 from app.tuning.sweep.scoring import Scorer, score_json
 from pipeline.config import preset
-from pipeline.errors import StemmapError
 
 RUN = "sim:paper?duration=1"
 LONGER = "sim:paper?duration=6"  # long enough for what is known of a run before to be gone on from
@@ -59,14 +58,10 @@ def test_what_was_kept_and_is_damaged_is_looked_at_again(monkeypatch):
     run, scorer = ready(RUN), Scorer()
     job = Job(run.run, preset("forest").model_dump(), code_digest())
     first = scorer.score(job)
-    monkeypatch.setattr("pipeline.remapping.scan_cache.KeptScans.scan", _damaged)
+    monkeypatch.setattr("pipeline.remapping.scan_cache.ScanCache.read", lambda *_: None)
     second = scorer.score(job)
     scorer.close()
     assert (second.scores, second.looked) == (first.scores, True)
-
-
-def _damaged(_kept: object, index: int) -> object:
-    raise StemmapError(f"what was kept of scan {index} is damaged")
 
 
 def test_a_worker_of_another_version_or_with_another_recording_says_so():

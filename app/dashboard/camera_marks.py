@@ -1,4 +1,4 @@
-"""Where the trees of the map and a scan's clusters stand in a picture, as parts of its width and height."""
+"""Trees and clusters in a picture of the camera, and how far the robot moved between scan and picture."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from app.dashboard.payload import clusters_payload
-from pipeline.geometry.poses import Pose2
+from pipeline.geometry.poses import Pose2, interpolate
 from pipeline.io.readers.camera import Camera
-from pipeline.types.records import Float, Frame
+from pipeline.types.records import Float, Frame, Path
 
 #: Trees farther away are a few pixels; so much of a stem is marked [m]; its width where no diameter is known.
 FARTHEST, NEAREST, FROM_Z, TO_Z, THIN = 25.0, 0.5, 0.0, 2.0, 0.2
@@ -82,3 +82,49 @@ def _box(camera: Camera, points: Float) -> dict[str, float] | None:
     low, high = np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
     left, top, width, height = (round(float(v), 4) for v in (*low, *(high - low)))
     return {"left": left, "top": top, "width": width, "height": height}
+
+
+#: Beyond the ends of a path the robot goes on as it did so long before [ns]: corrections of single poses
+#: would be taken for speed over a shorter time.
+_STEADY_NS = 500_000_000
+
+
+def motion(path: Path | None, from_ns: int, to_ns: int) -> Pose2:
+    """`T_from_to` of the base between two times, none where the path has fewer than two poses.
+
+    Within the path it is interpolated; before and after it the robot's velocities are held.
+    """
+    if path is None or len(path.stamp_ns) < 2:
+        return Pose2()
+    return _pose_at(path, from_ns).inverse() @ _pose_at(path, to_ns)
+
+
+def _pose_at(path: Path, stamp_ns: int) -> Pose2:
+    """`T_map_base` at a time."""
+    stamps = path.stamp_ns
+    first, last = 0, len(stamps) - 1
+    if stamp_ns <= stamps[first]:
+        last = max(1, int(np.searchsorted(stamps, stamps[first] + _STEADY_NS, side="right")) - 1)
+    elif stamp_ns >= stamps[last]:
+        first = min(last - 1, int(np.searchsorted(stamps, stamps[last] - _STEADY_NS)))
+    else:
+        last = int(np.searchsorted(stamps, stamp_ns))
+        first = last - 1
+    begin, end = (Pose2(*(float(axis[k]) for axis in (path.x, path.y, path.yaw))) for k in (first, last))
+    part = float(stamp_ns - stamps[first]) / float(max(1, stamps[last] - stamps[first]))
+    if part < 0.0 or part > 1.0:
+        return _held(begin, end, part)
+    return interpolate(begin, end, part)
+
+
+def _held(begin: Pose2, end: Pose2, part: float) -> Pose2:
+    """Before `begin` (part < 0) or beyond `end` (part > 1) with the motion between them held."""
+    moved = begin.inverse() @ end
+    rest = part if part < 0.0 else part - 1.0
+    turn = rest * moved.yaw
+    start = begin if part < 0.0 else end
+    # Half the turn is made halfway: the chord of the arc of constant velocities (midpoint rule).
+    along = Pose2(0.0, 0.0, 0.5 * turn - 0.5 * moved.yaw).apply(np.array([[rest * moved.x, rest * moved.y]]))[
+        0
+    ]
+    return start @ Pose2(float(along[0]), float(along[1]), turn)

@@ -1,0 +1,228 @@
+"""The scan cache gives back what it stores, is found again, and never returns damaged scans."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.front_end import SegmentedScan
+from pipeline.geometry.poses import Pose2
+from pipeline.io.checkpoints import encode
+from pipeline.remapping import Rerun, ScanCache, ScanCaches, scan_cache
+from pipeline.remapping.packing import HIGHEST
+from pipeline.remapping.scan_cache import SUFFIX
+from pipeline.types.records import PoseMeasurement, Scan, Step, Turn
+from tests.pipeline.remapping.mapped import BASE, fill, frames, mapper, run
+
+SCANS = 12
+WIDER = BASE.replace({"clustering.eps": 0.3})
+
+
+@pytest.fixture
+def cache() -> Iterator[ScanCache]:
+    """An empty cache without a name."""
+    with closing(ScanCaches()) as caches:
+        yield caches.of(BASE)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the cache of twelve scans of the recording "source"."""
+    with closing(ScanCaches(tmp_path / "kept", "source")) as caches:
+        fill(caches.of(BASE), BASE, run()[0][:SCANS])
+    return tmp_path / "kept"
+
+
+def file_of(folder: Path) -> Path:
+    """The only file of a folder."""
+    (path,) = folder.glob(f"*{SUFFIX}")
+    return path
+
+
+def stored(cache: ScanCache, index: int) -> tuple[Step, SegmentedScan]:
+    """A scan that must be in the cache."""
+    found = cache.read(index)
+    assert found is not None
+    return found
+
+
+def test_a_scan_comes_back_whole(cache):
+    parts = run()[0]
+    step = replace(
+        parts[5],
+        warnings=("the odometry jumped", "é"),
+        doubt="no odometry",
+        slack=(0.25, 0.5),
+        turn=Turn(0.1, 0.01),
+        measured=PoseMeasurement(
+            7, Pose2(1.0, 2.0, 0.1), np.eye(3) * 0.3, 25.0, np.arange(12.0).reshape(3, 4) / 99.0, 1
+        ),
+    )
+    for k in range(12):  # with and without input of the columns, with and without ground
+        scan = mapper(BASE).segment(replace(step, index=k))
+        if k == 3:
+            scan = replace(scan, heights=None, column_input=None)
+        cache.put(replace(step, index=k, T_odom_base=None if k == 4 else step.T_odom_base), scan)
+        again, found = stored(cache, k)
+        nothing, given = scan.raw[:0], scan.column_input
+        wanted = replace(scan, clearance=None, raw=nothing, filtered=nothing, labels=scan.labels[:0])
+        if given is not None:
+            low = (given.height > 0.0) & (given.height < HIGHEST)
+            flat = np.where([True, True, False], given.points, np.float32(0.0))
+            low_input = replace(given, points=flat[low], height=given.height[low])
+            wanted = replace(wanted, column_input=low_input)
+        assert encode(found) == encode(wanted)
+        wanted_step = replace(
+            step, index=k, scan=Scan(step.scan.stamp_ns, nothing), T_odom_base=again.T_odom_base,
+            roll=0.0, pitch=0.0, tilt_known=False, twist=(0.0, 0.0, 0.0), turn_rate=None, learnt=again.learnt,
+        )  # fmt: skip
+        assert encode(again) == encode(wanted_step)
+        assert (again.T_odom_base is None) == (k == 4)
+    assert cache.read(3, step.scan.stamp_ns) is not None
+    assert cache.read(3, step.scan.stamp_ns + 1) is None
+    assert cache.read(99) is None
+
+
+def test_an_empty_scan_is_stored_too(cache):
+    first = run()[0][0]
+    step = replace(first, scan=Scan(first.scan.stamp_ns, first.scan.points[:0]))
+    scan = mapper(BASE).segment(step)
+    cache.put(step, scan)
+    again = stored(cache, 0)[1]
+    assert len(scan.clusters.size) == 0
+    assert encode(again.clusters) == encode(scan.clusters)
+
+
+def test_each_set_of_segmentation_parameters_has_its_cache_and_the_last_few_are_open():
+    with closing(ScanCaches()) as caches:
+        first = caches.of(BASE)
+        assert caches.of(BASE.replace({"tracking.gate": 2.0})) is first
+        assert caches.of(WIDER) is not first
+        fill(first, BASE, run()[0][5:7])
+        assert [first.has_all(1), len(first)] == [False, 2]
+        for k in range(3):
+            caches.of(BASE.replace({"clustering.eps": 0.4 + 0.1 * k}))
+        assert first.read(5) is None
+
+
+def test_a_named_cache_is_found_again(folder):
+    with closing(ScanCaches(folder, "source")) as caches:
+        cache = caches.of(BASE)
+        assert (cache.has_all(SCANS), cache.notice, cache.refusal) == (True, "", "")
+        fill(cache, BASE, run()[0][: SCANS + 3])
+        assert len(cache) == SCANS + 3
+        assert len(caches.of(WIDER)) == 0
+    with closing(ScanCaches(folder, "another source")) as caches:
+        assert len(caches.of(BASE)) == 0
+
+
+def test_another_version_of_the_code_finds_nothing(folder, monkeypatch):
+    monkeypatch.setattr(scan_cache, "_code_digest", lambda: b"newer")
+    with closing(ScanCaches(folder, "source")) as caches:
+        assert len(caches.of(BASE)) == 0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_cut_and_damaged_scans_are_processed_again_and_a_notice_says_so(seed, folder):
+    path = file_of(folder)
+    rng, whole = np.random.default_rng(seed), path.read_bytes()
+    at = int(rng.integers(len(scan_cache.MAGIC) + 32, len(whole)))
+    damaged = whole[:at] if seed % 2 else whole[:at] + bytes([whole[at] ^ 0x41]) + whole[at + 1 :]
+    path.write_bytes(damaged)
+    with closing(ScanCaches(folder, "source")) as caches:
+        cache = caches.of(BASE)
+        rerun = Rerun(mapper(BASE), cache, lambda: iter(run()[0]))
+        trees = [encode(frame.trees) for frame in frames(rerun, SCANS)]
+        rerun.close()
+        assert "damaged" in cache.notice
+        assert rerun.was_read
+    first = mapper(BASE)
+    assert trees == [encode(first.process(step).trees) for step in run()[0][:SCANS]]
+
+
+@pytest.mark.parametrize("content", [b"", b"stemmap", b"\0" * 48, b"x" * 5000])
+def test_a_file_of_another_kind_is_replaced(content, folder):
+    file_of(folder).write_bytes(content)
+    for wanted in (0, 2):
+        with closing(ScanCaches(folder, "source")) as caches:
+            assert len(caches.of(BASE)) == wanted
+            fill(caches.of(BASE), BASE, run()[0][:2])
+
+
+def test_two_processes_do_not_disturb_one_another(folder):
+    with closing(ScanCaches(folder, "source")) as one, closing(ScanCaches(folder, "source")) as two:
+        assert len(one.of(BASE)) == SCANS
+        assert len(two.of(BASE)) == 0
+        fill(two.of(BASE), BASE, run()[0][:2])
+    with closing(ScanCaches(folder, "source")) as again:
+        assert len(again.of(BASE)) == SCANS
+
+
+def test_a_cache_that_is_too_large_refuses_scans_and_keeps_the_others():
+    with closing(ScanCaches(most=400_000)) as caches:
+        cache = fill(caches.of(BASE), BASE, run()[0])
+        assert 0 < len(cache) < len(run()[0])
+        assert cache.nbytes <= 400_000
+        assert "nothing is cached" in cache.refusal
+        assert all(stored(cache, k)[0].index == k for k in range(len(cache)))
+
+
+def test_a_full_disk_refuses_scans_and_keeps_the_others(folder):
+    with closing(ScanCaches(folder, "source")) as caches:
+        cache = caches.of(BASE)
+        real = os.dup(cache._file.fileno())
+        with open("/dev/full", "rb+", buffering=0) as full:  # noqa: PTH123
+            os.dup2(full.fileno(), cache._file.fileno())
+        fill(cache, BASE, run()[0][SCANS : SCANS + 1])
+        os.dup2(real, cache._file.fileno())
+        os.close(real)
+        assert "No space left" in cache.refusal
+        assert len(cache) == SCANS
+        stored(cache, SCANS - 1)
+
+
+def test_a_scan_that_is_too_large_is_not_stored(cache, monkeypatch):
+    fill(cache, BASE, run()[0][:2])
+    monkeypatch.setattr("pipeline.remapping.packing.LARGEST", 1 << 10)
+    fill(cache, BASE, run()[0][2:4])
+    assert len(cache) == 2
+    assert "takes more than" in cache.refusal
+
+
+def test_without_a_folder_to_write_to_nothing_is_stored_and_that_is_said(monkeypatch, tmp_path):
+    (tmp_path / "kept").write_text("a file")
+    with closing(ScanCaches(tmp_path / "kept", "source")) as caches:
+        assert len(fill(caches.of(BASE), BASE, run()[0][:2])) == 2
+
+    def refused(**_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr("pipeline.remapping.scan_cache.TemporaryFile", refused)
+    with closing(ScanCaches()) as caches:
+        assert len(fill(caches.of(BASE), BASE, run()[0][:2])) == 0
+        assert "no folder can be written to" in caches.of(BASE).refusal
+
+
+def test_the_files_opened_longest_ago_go_when_the_folder_is_full(folder, monkeypatch):
+    newest = file_of(folder)
+    older: list[Path] = []
+    for age in range(3):
+        with closing(ScanCaches(folder, f"other {age}")) as caches:
+            fill(caches.of(BASE), BASE, run()[0][:4])
+        (path,) = set(folder.iterdir()) - {newest, *older}
+        older.append(path)
+    held = ScanCaches(folder, "other 0")
+    held.of(BASE)
+    for age, path in enumerate(older):
+        os.utime(path, (1000 + age, 1000 + age))
+    most = newest.stat().st_size + older[2].stat().st_size + 1
+    monkeypatch.setattr(scan_cache, "MOST_IN_FOLDER", most)
+    with closing(held), closing(ScanCaches(folder, "source")) as caches:
+        assert len(caches.of(BASE)) == SCANS
+        assert [path.exists() for path in older] == [True, False, False]
