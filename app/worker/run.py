@@ -14,6 +14,7 @@ import numpy as np
 from app.common.timers import Stopwatch
 from app.explain.estimate_history import TreeHistory
 from app.worker.cursor import Cursor, LiveCursor
+from app.worker.parallel import segment_ahead, segment_all
 from app.worker.remap import NOT_OF_THE_MAP, EarlierMaps, MapperLike, Remapping, RunMap
 from app.worker.snapshots import ParameterHistory
 from pipeline.config import Parameters
@@ -193,7 +194,9 @@ class Run:
             return
         self._preview = self._preview_of(parameters, mapper)
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
-        self._remapping = Remapping(Rerun(mapper, self._caches.of(parameters), self._reread), self.start_ns)
+        self._remapping = Remapping(
+            Rerun(mapper, self._caches.of(parameters), self._reread, segment_ahead), self.start_ns
+        )
 
     def _preview_of(self, parameters: Parameters, mapper: Mapper) -> Trees | None:
         frame, present = self.frame, self._map
@@ -202,7 +205,7 @@ class Run:
         known = KnownMap(present.parameters.at(0), present.record.clusters, self.path, frame.columns)
         sample = None
         if known.needs_sample(parameters) and self._reread is not None:
-            sample = self._sample.segmented(mapper.segmenter(), self.standing + 1)
+            sample = self._sample.segmented(mapper.segmenter(), self.standing + 1, segment_all)
         return preview_trees(known, parameters, sample)
 
     def stay(self) -> None:

@@ -1,7 +1,7 @@
 """Remapping: a run mapped again with other parameters, and the preview of its result."""
 
 from pipeline.remapping.preview import ClusterTable, KnownMap, Sample, preview_trees
-from pipeline.remapping.rerun import Reread, Rerun, segment_ahead
+from pipeline.remapping.rerun import Reread, Rerun
 from pipeline.remapping.scan_cache import ScanCache, ScanCaches, segmentation_key
 
 __all__ = [
@@ -13,6 +13,5 @@ __all__ = [
     "ScanCache",
     "ScanCaches",
     "preview_trees",
-    "segment_ahead",
     "segmentation_key",
 ]

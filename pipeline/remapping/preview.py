@@ -10,7 +10,7 @@ tree is found in the sample, before and after, gives an estimate for all scans.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from pipeline.front_end import SegmentedScan
 from pipeline.geometry.hash_grid import cells_for, nearest_in, per_metre, put_in, take_out
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.remapping.rerun import Segment, segment_all
+from pipeline.remapping.rerun import Segment
 from pipeline.remapping.scan_cache import SEGMENTATION_STAGES
 from pipeline.tracking.track_classification import REACH, nearest_other, tree_columns
 from pipeline.types.records import Bool, Clusters, Columns, Frame, Int, Path, Step, Trees, Verdict
@@ -162,11 +162,17 @@ class Sample:
         self,
         segment: Segment,
         scans: int,
-        each: Callable[[Segment, list[Step]], list[SegmentedScan]] = segment_all,
+        segment_all: Callable[[Segment, list[Step]], Iterable[SegmentedScan]] = map,
     ) -> dict[int, SegmentedScan]:
-        """The segmented scans of the sample among the first ones, by their numbers, ascending."""
+        """The segmented scans of the sample among the first ones, by their numbers, ascending.
+
+        Args:
+            segment: Segments one scan.
+            scans: Number of the first scans.
+            segment_all: Segments a list of scans: in turn, or several at once.
+        """
         numbers = [n for n in sorted(self._steps) if n < scans]
-        return dict(zip(numbers, each(segment, [self._steps[n] for n in numbers]), strict=True))
+        return dict(zip(numbers, segment_all(segment, [self._steps[n] for n in numbers]), strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

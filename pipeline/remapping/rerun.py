@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import dropwhile
 
 from pipeline.errors import StemmapError
@@ -15,7 +13,12 @@ from pipeline.types.records import Frame, Step
 
 Reread = Callable[[], Iterator[Step]]
 Segment = Callable[[Step], SegmentedScan]
-AHEAD = 4  # scans that are segmented ahead of the mapping; more only take memory
+SegmentSteps = Callable[[Segment, Iterator[Step]], Iterator[tuple[Step, SegmentedScan]]]
+
+
+def segment_in_turn(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Step, SegmentedScan]]:
+    """Each step with its segmented scan, in order."""
+    return ((step, segment(step)) for step in steps)
 
 
 class Rerun:
@@ -25,17 +28,24 @@ class Rerun:
         mapper: A fresh mapper with the new parameters.
         cache: Cache for scans that are segmented with these parameters; missing scans are added to it.
         reread: Returns the steps of the run from its first scan; None for a live run.
+        segment_steps: Segments the scans that are read again: in turn, or ahead of the mapping.
 
     Attributes:
         done: Number of scans that are mapped.
         was_read: Whether the source was read again.
     """
 
-    def __init__(self, mapper: Mapper, cache: ScanCache, reread: Reread | None = None) -> None:
+    def __init__(
+        self,
+        mapper: Mapper,
+        cache: ScanCache,
+        reread: Reread | None = None,
+        segment_steps: SegmentSteps = segment_in_turn,
+    ) -> None:
         self.mapper = mapper
         self.done = 0
         self.was_read = False
-        self._cache, self._reread = cache, reread
+        self._cache, self._reread, self._segment_steps = cache, reread, segment_steps
         self._segmented: Iterator[tuple[Step, SegmentedScan]] | None = None
 
     def map_next(self) -> Frame:
@@ -66,36 +76,10 @@ class Rerun:
             )
         if self._segmented is None:
             rest = dropwhile(lambda step: step.index < index, self._reread())
-            self._segmented = segment_ahead(self.mapper.segmenter(), rest)
+            self._segmented = self._segment_steps(self.mapper.segmenter(), rest)
             self.was_read = True
         for step, scan in self._segmented:
             if step.index == index:
                 self._cache.put(step, scan)
                 return step, scan
         raise StemmapError(f"the source does not give scan {index} again", remedy="Open it again")
-
-
-def segment_ahead(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Step, SegmentedScan]]:
-    """Each step with its segmented scan, in order. An error is raised in the turn of its scan.
-
-    The caller reads the steps, so that the source is read by one thread only. Another thread segments up to
-    `AHEAD` scans ahead; its kernels release the interpreter lock.
-    """
-    waiting: deque[tuple[Step, Future[SegmentedScan]]] = deque()
-    pool = ThreadPoolExecutor(1, thread_name_prefix="segment")
-    try:
-        for step in steps:
-            waiting.append((step, pool.submit(segment, step)))
-            if len(waiting) > AHEAD:
-                first, scan = waiting.popleft()
-                yield first, scan.result()
-        for first, scan in waiting:
-            yield first, scan.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def segment_all(segment: Segment, steps: list[Step]) -> list[SegmentedScan]:
-    """Some segmented scans; two threads work at them."""
-    with ThreadPoolExecutor(2, thread_name_prefix="segment") as pool:
-        return list(pool.map(segment, steps))

@@ -119,6 +119,7 @@ def _rerun_s(
     source: Source, parameters: Parameters, caches: ScanCaches, scans: int, held: list[Step] | None
 ) -> float:
     """Seconds of a rerun; a short one before compiles the kernels."""
+    from app.worker.parallel import segment_ahead
     from pipeline.remapping import Rerun, ScanCaches
 
     spent, reread = 0.0, None if held is None else lambda: iter(held)
@@ -127,7 +128,7 @@ def _rerun_s(
         with closing(ScanCaches()) as fresh:
             cache = (caches if held is None else fresh).of(parameters)
             start = time.perf_counter()
-            with closing(Rerun(_mapper(source, parameters), cache, reread)) as rerun:
+            with closing(Rerun(_mapper(source, parameters), cache, reread, segment_ahead)) as rerun:
                 for _ in range(most):
                     rerun.map_next()
                 spent = time.perf_counter() - start
@@ -138,6 +139,7 @@ def _preview(
     words: str, known: KnownMap, parameters: Parameters, source: Source, sample: Sample | None
 ) -> tuple[Cell, ...]:
     """The preview; one before compiles the kernels."""
+    from app.worker.parallel import segment_all
     from pipeline.remapping import preview_trees
 
     trees, spent = None, 0.0
@@ -145,7 +147,9 @@ def _preview(
         start = time.perf_counter()
         segmented = None
         if sample is not None:
-            segmented = sample.segmented(_mapper(source, parameters).segmenter(), len(known.clusters))
+            segmented = sample.segmented(
+                _mapper(source, parameters).segmenter(), len(known.clusters), segment_all
+            )
         trees = preview_trees(known, parameters, segmented)
         spent = time.perf_counter() - start
     if trees is None:

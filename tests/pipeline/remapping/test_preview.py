@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.worker.parallel import segment_all
 from pipeline.io.checkpoints import encode
 from pipeline.remapping import ClusterTable, Rerun, Sample, ScanCaches, preview_trees
 from pipeline.remapping.preview import MOST_PLACES, SAMPLE_SCANS, _grouped
@@ -168,8 +169,8 @@ def test_two_threads_segment_a_sample_as_one_does():
     sample, parameters = Sample(), BASE.replace({"clustering.eps": 0.3})
     for step in run()[0][:20]:
         sample.offer(step)
-    two = sample.segmented(mapper(parameters).segmenter(), 20)
-    one = sample.segmented(mapper(parameters).segmenter(), 20, lambda segment, all_: list(map(segment, all_)))
+    two = sample.segmented(mapper(parameters).segmenter(), 20, segment_all)
+    one = sample.segmented(mapper(parameters).segmenter(), 20)
     assert list(one) == list(two) == list(range(20))
     assert encode(tuple(two.values())) == encode(tuple(one.values()))
 
@@ -184,7 +185,7 @@ def test_a_sample_is_spread_over_the_run_and_bounded():
 
     for index in range(1000):
         sample.offer(replace(step, index=index))
-    held = list(sample.segmented(segment, 900, lambda segment, all_: list(map(segment, all_))))
+    held = list(sample.segmented(segment, 900))
     assert held == asked
     assert SAMPLE_SCANS // 2 <= len(sample) <= SAMPLE_SCANS
     assert len(set(np.diff(held))) == 1

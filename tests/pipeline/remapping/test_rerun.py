@@ -10,13 +10,13 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from app.worker.parallel import AHEAD, segment_ahead
 from pipeline.config import FieldSpec, Parameters, field_specs, preset
 from pipeline.config.model import Value
 from pipeline.errors import StemmapError
 from pipeline.front_end import SegmentedScan
 from pipeline.io.checkpoints import encode
-from pipeline.remapping import Rerun, ScanCaches, segment_ahead, segmentation_key
-from pipeline.remapping.rerun import AHEAD
+from pipeline.remapping import Rerun, ScanCaches, segmentation_key
 from pipeline.remapping.scan_cache import SEGMENTATION_CLASSIFICATION, SEGMENTATION_STAGES
 from pipeline.types.records import Frame, Step
 from tests.pipeline.remapping.mapped import BASE, frames, mapper, run
