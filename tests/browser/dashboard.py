@@ -269,7 +269,7 @@ PRESET = """name => fetch('/api/parameters/preset', { method: 'POST', body: JSON
 # The scan at which the server stands, that of the page, and the points of its first two stages.
 SHOWN = """async () => {
   const [{ unpack }, { state }] = await Promise.all([
-    import('/static/js/points.js'), import('/static/js/state.js'),
+    import('/static/js/scene/points.js'), import('/static/js/core/store.js'),
   ]);
   const { index, arrays } = unpack(await (await fetch('/api/stages')).arrayBuffer());
   return [index, state.map?.index ?? -1, arrays.raw.length / 3, arrays.points.length / 3];

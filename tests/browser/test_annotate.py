@@ -48,7 +48,7 @@ def doubted(dashboard: Dashboard) -> list[dict[str, Any]]:
     """The found trees, the most doubted first, once the page asks for them in that order."""
     trees = {tree["number"]: tree for tree in dashboard.ask("/api/trees")["trees"]}
     told = [trees[each["tree"]] for each in dashboard.ask("/api/doubts")["trees"]]
-    numbers = "() => import('/static/js/annotate.js').then(it => it.unjudged().map(tree => tree.number))"
+    numbers = "() => import('/static/js/annotate/annotations.js').then(it => it.unjudged().map(tree => tree.number))"
     wanted = [tree["number"] for tree in told[:2]]
     dashboard.eventually(
         lambda: dashboard.page.evaluate(numbers)[:2] == wanted, lambda: dashboard.page.evaluate(numbers)
@@ -58,7 +58,7 @@ def doubted(dashboard: Dashboard) -> list[dict[str, Any]]:
 
 def place_of(dashboard: Dashboard, x: float, y: float) -> Position:
     """Where a place of the map [m] is seen on the canvas [pixels]."""
-    scale = "([x, y]) => import('/static/js/map.js').then(map => map.screenOf(x, y))"
+    scale = "([x, y]) => import('/static/js/map/map.js').then(map => map.screenOf(x, y))"
     px, py = dashboard.page.evaluate(scale, [x, y])
     return {"x": px, "y": py}
 
@@ -167,15 +167,15 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
 
 def test_whoever_clicks_next_goes_on_by_keys(person: Dashboard):
     page = person.page
-    page.evaluate("() => import('/static/js/live.js').then(({ select }) => select(null))")
-    nothing = "() => import('/static/js/state.js').then(({ state }) => state.selected === null)"
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    nothing = "() => import('/static/js/core/store.js').then(({ state }) => state.selected === null)"
     person.eventually(lambda: bool(page.evaluate(nothing)), lambda: "a tree of the test before is selected")
     first, second = doubted(person)[:2]
     hint = page.locator("#annotate-hint")
     page.locator("#tab-annotate").click()
     page.keyboard.press("Tab")
     expect(hint).to_contain_text(f"Tree {first['number']}, seen in")
-    page.evaluate("() => import('/static/js/live.js').then(({ select }) => select(null))")
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
     person.eventually(lambda: bool(page.evaluate(nothing)), lambda: "a tree is selected")
     page.locator("#annotate-next").click()
     expect(hint).to_contain_text(f"Tree {first['number']}, seen in")

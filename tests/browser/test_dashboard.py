@@ -153,7 +153,7 @@ def test_nothing_was_complained_about(dashboard: Dashboard):
 
 
 # Draws numbers of trees that stand close together with a pen that remembers where; [boxes, what is named].
-NUMBERS = """() => import('/static/js/map_labels.js').then(({ drawNumbers }) => {
+NUMBERS = """() => import('/static/js/map/draw.js').then(({ drawNumbers }) => {
   const boxes = [], radius = 6;
   const pen = { measureText: (text) => ({ width: 7 * text.length }), strokeText: () => {},
     fillText: (text, x, y) => boxes.push({ text, x, y: y - 9, width: 7 * text.length, height: 11 }) };

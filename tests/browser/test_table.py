@@ -170,7 +170,7 @@ def test_pairs_are_saved_as_a_picture_and_as_a_table(
     assert dashboard.errors == []
 
 
-TALL = """rows => import('/static/js/table_picture.js').then(async ({ pictureOf }) => {
+TALL = """rows => import('/static/js/trees/table.js').then(async ({ pictureOf }) => {
   const table = document.createElement('table');
   for (let k = 0; k <= rows; k += 1) for (const text of [k, 'a', 'b']) {
     (table.rows[k] ?? table.insertRow()).insertCell().textContent = text;
@@ -193,8 +193,8 @@ def test_a_picture_of_a_stand_of_any_size_is_made(dashboard: Dashboard):
 
 
 ASSUMED = """async number => {
-  const { state, changed } = await import('/static/js/state.js');
-  const { treeStory } = await import('/static/js/story_tree.js');
+  const { state, changed } = await import('/static/js/core/store.js');
+  const { treeStory } = await import('/static/js/explain/tree.js');
   const story = await (await fetch(`/api/story/tree/${number}`)).json();
   state.map.trees.find(tree => tree.number === number).observations = 0;
   changed('map');

@@ -83,7 +83,7 @@ def test_a_distance_is_measured_between_two_trees(dashboard: Dashboard):
 
 # The strip, the notice, the timeline's thumb and its time under another status, which is then taken back.
 UNDER = """async changes => {
-  const { state, changed } = await import('/static/js/state.js');
+  const { state, changed } = await import('/static/js/core/store.js');
   const text = selector => document.querySelector(selector).textContent;
   const before = state.status;
   const tell = async () => {

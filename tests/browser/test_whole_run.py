@@ -8,10 +8,10 @@ from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.dashboard import Dashboard
 
-STATE = "import('/static/js/state.js').then(({ state }) =>"
+STATE = "import('/static/js/core/store.js').then(({ state }) =>"
 
 
-ANEW = """() => import('/static/js/state.js').then(({ state, changed }) => {
+ANEW = """() => import('/static/js/core/store.js').then(({ state, changed }) => {
   state.status = { ...state.status, remapped: 0.431 };
   changed("status");
 })"""
@@ -133,7 +133,7 @@ def test_a_change_can_act_from_the_standing_scan_on(dashboard: Dashboard):
     dashboard.until_server("/api/trees", f"it.trees.length < {known}")
 
 
-POINTS = """() => import('/static/js/state.js').then(({ state, changed }) => {
+POINTS = """() => import('/static/js/core/store.js').then(({ state, changed }) => {
   const point = (value, f1) => ({
     value, f1, TA: 10 * f1, TA_of: 10, false: 1, position_rmse_m: 0.02, mean_pair_error_percent: null });
   const points = [point(0.4, 0.8), point(0, 0.5), point(1, 0), { value: 0.9, error: "it cannot be" }];

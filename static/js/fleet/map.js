@@ -1,6 +1,6 @@
 // Maps of the fleet on canvas: each robot's own, and one of all whose frames are known.
 
-import { letterOf } from "./card.js";
+import { letterOf } from "./main.js";
 
 // Okabe-Ito, without the green of trees; the letter stands beside.
 const COLOURS = ["#56B4E9", "#E69F00", "#CC79A7", "#F0E442", "#D55E00", "#0072B2", "#999933", "#bbbbbb"];

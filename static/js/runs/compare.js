@@ -1,13 +1,13 @@
 // Two runs beside one another: maps overlaid, trees that appeared, vanished or moved, scores and parameters.
 
-import { request } from "../api.js";
-import { el } from "../dom.js";
-import { saveCanvas, saveCsv } from "../download.js";
-import { count, figure, NONE } from "../format.js";
+import { request } from "../core/api.js";
+import { el } from "../core/dom.js";
+import { saveCanvas, saveCsv } from "../core/download.js";
+import { count, figure, NONE } from "../core/format.js";
 import { put, say, table } from "./detail.js";
 import { nearest, paintTwo, treeWords } from "./draw.js";
+import { FIGURES, SCORES, when } from "./figures.js";
 import { boundsOf, picture } from "./picture.js";
-import { FIGURES, SCORES, when } from "./words.js";
 
 export async function showTwo(a, b) {
   say("Comparing the two runs …");

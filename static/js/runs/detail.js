@@ -1,12 +1,12 @@
 // One run: its figures, its finished map, its parameters and who changed them.
 
-import { request } from "../api.js";
-import { byId, el, setText } from "../dom.js";
-import { saveCanvas, saveCsv } from "../download.js";
-import { clock, count, fixed, NONE } from "../format.js";
+import { request } from "../core/api.js";
+import { byId, el, setText } from "../core/dom.js";
+import { saveCanvas, saveCsv } from "../core/download.js";
+import { clock, count, fixed, NONE } from "../core/format.js";
 import { nearest, paintRun, treeWords } from "./draw.js";
+import { FIGURES, SCORES, shortSource, when } from "./figures.js";
 import { boundsOf, picture } from "./picture.js";
-import { FIGURES, SCORES, shortSource, when } from "./words.js";
 
 let shown = null; // the picture on the screen
 export const repaint = () => shown?.redraw();

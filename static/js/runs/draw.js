@@ -1,8 +1,7 @@
 // Paints one finished map, or two laid upon one another.
 
-import { figure, isAssumed } from "../format.js";
-import { drawLine, drawTree, drawTruth, symbolRadius } from "../map_draw.js";
-import { drawNumbers } from "../map_labels.js";
+import { figure, isAssumed } from "../core/format.js";
+import { drawLine, drawNumbers, drawTree, drawTruth, symbolRadius } from "../map/draw.js";
 
 export function paintRun(pen, view, { path, truth, trees }, colours) {
   drawLine(pen, view, path, colours.path, 2);

@@ -1,16 +1,15 @@
 // The page of all runs: the list, and beside it the chosen run or two of them compared.
 
-import { startAccess } from "../access.js";
-import { get, open, patch, post, request } from "../api.js";
-import { byId, el, setText } from "../dom.js";
-import { count, figure } from "../format.js";
-import { on } from "../state.js";
-import { startTheme } from "../theme.js";
-import { startUpload } from "../upload.js";
+import { get, open, patch, post, request } from "../core/api.js";
+import { byId, el, setText } from "../core/dom.js";
+import { count, figure } from "../core/format.js";
+import { startAccess } from "../core/permissions.js";
+import { on } from "../core/store.js";
+import { startTheme } from "../core/theme.js";
+import { startUpload } from "../open/upload.js";
 import { showTwo } from "./compare.js";
 import { repaint, say, showRun } from "./detail.js";
-import { unfinishedRows } from "./unfinished.js";
-import { scans, shortSource, when } from "./words.js";
+import { scans, shortSource, when } from "./figures.js";
 
 const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor"], ["trees", ""], ["F1", ""], ["preset", "minor"]];
 let known = { runs: [], folders: [], unfinished: [], open: null };
@@ -154,3 +153,25 @@ startTheme();
 startAccess();
 load();
 follow();
+
+// --- What killed runs left in the data folder: told, and taken away on request.
+
+const size = (bytes) => (bytes < 1e6 ? `${Math.ceil(bytes / 1000)} kB` : `${Math.round(bytes / 1e6)} MB`);
+const folderOf = (name) => name.split("/").slice(0, -1).join("/") || "the data folder";
+
+// Rows for the list; `done` is called with an error's words, or with nothing when one was deleted.
+function unfinishedRows(left, columns, done) {
+  const remove = async (name) => {
+    try {
+      await request(`/api/runs/unfinished?name=${encodeURIComponent(name)}`, { method: "DELETE" });
+      done("");
+    } catch (error) {
+      done(error.message);
+    }
+  };
+  return left.map(({ name, size: bytes, changed_s: changed, quiet }) => el("tr", { class: "unfinished", "data-unfinished": name },
+    el("td"), el("td", { colspan: columns - 2 }, el("b", { text: `Half a map in ${folderOf(name)}` }),
+      el("small", { text: `${size(bytes)}, last written ${when(changed)}. The run was ended before its map was whole: map its recording again.` })),
+    el("td", {}, el("button", { class: "small", "data-edit": true, text: "Delete", "aria-label": `Delete ${name}`, disabled: !quiet,
+      title: quiet ? "Take the half map away; nothing else is touched" : "It was written to within the last ten minutes, so its run may go on", onclick: () => remove(name) }))));
+}

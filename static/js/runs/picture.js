@@ -1,9 +1,9 @@
 // A map on a canvas that can be moved, zoomed and asked what lies under the pointer.
 
-import { el, setText } from "../dom.js";
-import { drawFrame } from "../map_draw.js";
-import { MapView } from "../map_view.js";
-import { colour } from "../theme.js";
+import { el, setText } from "../core/dom.js";
+import { colour } from "../core/theme.js";
+import { drawFrame } from "../map/draw.js";
+import { MapView } from "../map/map_view.js";
 
 const NAMES = ["tree", "pole", "person", "bush", "other", "uncertain", "truth", "path", "odometry", "robot", "selection", "text", "surface", "grid", "axis", "font", "warn"];
 

@@ -1,0 +1,77 @@
+// The tab Clusters: what became of the points and clusters of this scan, and why.
+
+import { byId, el } from "../core/dom.js";
+import { nothingYet } from "../core/empty_state.js";
+import { count, figure, fixed } from "../core/format.js";
+import { selectCluster } from "../core/live_feed.js";
+import { on, state } from "../core/store.js";
+import { verdictOf } from "../core/verdicts.js";
+import { openStory } from "../explain/story.js";
+import { visible } from "../shell/tabs.js";
+
+const EVERY = 400; // [ms] between two fillings; nobody reads faster
+const panel = () => byId("panel-clusters");
+let filledAt = 0, planned = 0;
+
+// Rows that are made anew under the pointer take no click: while a run plays the table changes rarely.
+function later() {
+  planned ||= setTimeout(() => { planned = 0; show(); }, Math.max(0, (state.status?.state === "playing" ? 2 : 0.2) * EVERY - (performance.now() - filledAt)));
+}
+
+function show() {
+  if (!visible("clusters")) return;
+  filledAt = performance.now();
+  if (!state.map) {
+    panel().replaceChildren(el("p", { class: "empty", text: nothingYet("No scan") }));
+    return;
+  }
+  const verdicts = Object.entries(state.map.verdicts ?? {}).sort((a, b) => (b[0] === "tree") - (a[0] === "tree") || b[1] - a[1]);
+  const clusters = verdicts.reduce((sum, [, number]) => sum + number, 0);
+  const lead = clusters
+    ? `Scan ${state.map.index}: ${count(clusters, "cluster")}, and what each was taken for.`
+    : `Scan ${state.map.index}: no cluster. Are the box and the height band where the stems are, and is Radius eps large enough?`;
+  panel().replaceChildren(el("p", { class: "lead", "data-scan": state.map.index, "data-clusters": clusters, text: lead }), bars(verdicts), clusterTable(), points());
+}
+
+function bars(verdicts) {
+  const most = Math.max(1, ...verdicts.map(([, number]) => number));
+  return el("ul", { class: "bars" }, ...verdicts.map(([label, number]) => {
+    const [letter, meaning, reason] = verdictOf(label);
+    const colour = `var(--${meaning})`;
+    return el("li", {},
+      el("span", { class: "letter", text: letter, style: { background: colour }, "aria-hidden": "true" }),
+      el("span", { text: label }),
+      el("span", { class: "bar", style: { background: colour, width: `${(100 * number) / most}%` } }),
+      el("span", { class: "count", text: String(number) }),
+      el("span", { class: "reason", text: reason }));
+  }));
+}
+
+// One row a cluster, the nearest first; a click tells its story.
+function clusterTable() {
+  const c = state.map.clusters;
+  if (!c?.x.length) return "";
+  const chosen = state.selectedCluster;
+  const order = c.x.map((_, k) => k).sort((a, b) => c.distance[a] - c.distance[b]);
+  const rows = order.map((k) => {
+    const tell = () => { openStory("cluster"); selectCluster(state.map.index, k); };
+    return el("tr", { tabindex: "0", "data-cluster": k, onclick: tell, onkeydown: (event) => event.key === "Enter" && tell(),
+      "aria-selected": String(chosen?.scan === state.map.index && chosen.cluster === k) },
+    ...[String(k + 1), c.verdict[k], String(c.size[k]), c.eccentricity[k] === null ? "∞" : figure(c.eccentricity[k]),
+      figure(c.radius_cm[k]), fixed(c.distance[k], 1)].map((text) => el("td", { text })));
+  });
+  const heads = [["cluster"], ["taken for"], ["points"], ["e", "Eccentricity λ1/λ2"], ["r cm", "Radius of the fitted circle"], ["m away", "Distance from the sensor"]];
+  return el("table", { id: "cluster-table", class: "plain" }, el("thead", {}, el("tr", {}, ...heads.map(([text, title]) => el("th", { scope: "col", text, title })))),
+    el("tbody", {}, ...rows));
+}
+
+function points() {
+  const rows = Object.entries(state.map.counts ?? {}).flatMap(([name, number]) =>
+    [el("dt", { text: name.replaceAll("_", " ") }), el("dd", { text: number.toLocaleString("en") })]);
+  return rows.length ? el("dl", { class: "list" }, ...rows) : "";
+}
+
+export function startClusters() {
+  on("map", later);
+  on("tab selection phase", show);
+}

@@ -1,0 +1,128 @@
+// The story of a cluster: its verdict with the figures that led to it, and its fit seen from above.
+
+import { el } from "../core/dom.js";
+import { clock, figure, NONE } from "../core/format.js";
+import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
+import { verdictOf } from "../core/verdicts.js";
+import { gathered } from "./columns.js";
+
+const SIZE = 250; // of the picture
+const WORDS = { eccentricity: "eccentricity λ1/λ2" };
+const named = (check) => WORDS[check.figure] ?? check.figure;
+
+function plain(value, unit) {
+  if (value === null) return NONE;
+  if (unit === "m" && Math.abs(value) < 3) return `${figure(100 * value)} cm`;
+  return `${figure(value)}${unit === "deg" ? "°" : unit && ` ${unit}`}`;
+}
+
+export function clusterStory(story) {
+  return [verdict(story), drawing(story), story.circle ? residuals(story) : "", checks(story),
+    gathered(story.gathered, "What all scans gathered at this place")];
+}
+
+// A stem of one scan is no tree where what all scans gathered says otherwise: then both are said, and the map's is shown.
+function verdict(story) {
+  const told = story.verdict === "tree" ? (story.gathered?.verdict ?? "tree") : story.verdict;
+  const [letter, meaning] = verdictOf(told);
+  const title = told === story.verdict ? told : `In this scan a stem; the map: ${told}, no tree`;
+  return el("div", { class: "verdict", "data-verdict": told },
+    el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" }),
+    el("div", {}, el("b", { text: title }), el("p", { text: why(story) || verdictOf(story.verdict)[2] })));
+}
+
+function why(story) {
+  if (!story.checks.length) return "Another program found it; it is taken as it is.";
+  const failed = story.checks.find((check) => check.fails);
+  if (!failed) return "It passed every check below, so it was taken as a stem and feeds SLAM.";
+  if (failed.verdict === "at border") return "It goes on beyond the box, the range or the side of the view, so a part of it is not seen.";
+  if (!failed.relation) return "Something nearer hides its edge, so its middle cannot be told.";
+  const side = failed.relation === "at most" ? "above" : "below";
+  return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${failed.title}, ${plain(failed.limit, failed.unit)}.`;
+}
+
+function drawing(story) {
+  const fit = story.circle;
+  const reach = 1.18 * Math.max(0.05, fit?.radius ?? 0, ...story.points.map(([x, y]) => Math.hypot(x, y)));
+  const scale = SIZE / 2 / reach, middle = SIZE / 2;
+  const at = ([x, y]) => [middle + scale * x, middle - scale * y];
+  const points = story.points.map((point) => circle(...at(point), 1.4, "point"));
+  const picturing = picture(SIZE, SIZE + 26, "The cluster seen from above, with the sensor below",
+    ...(fit ? ticks(story, at) : []), ...points, ...(fit ? fitted(fit, middle, scale) : axes(story, at)),
+    fit ? ellipse(middle, middle, scale * fit.ellipse[0], scale * fit.ellipse[1], fit.ellipse[2], "sigma") : null,
+    fit ? leaning(fit, middle, scale) : null,
+    scaleBar(8, SIZE - 6, reach / 2, scale),
+    svg("path", { d: `M${middle} ${SIZE + 2} l-6 10 h12z`, class: "sensor" }),
+    text(middle + 11, SIZE + 12, `sensor, ${figure(story.distance)} m`, "small"));
+  return el("div", { class: "story-fit" }, picturing, figures(story));
+}
+
+function fitted(fit, middle, scale) {
+  const radius = scale * fit.radius;
+  return [circle(middle, middle, radius, "circle"), arc(middle, middle, radius, fit.arc_start, fit.arc_end, "seen")];
+}
+
+// From the circle to each point: its residual at the scale of the picture.
+function ticks(story, at) {
+  const radius = story.circle.radius;
+  return story.points.map(([x, y]) => {
+    const size = Math.max(Math.hypot(x, y), 1e-6);
+    return line(...at([(radius * x) / size, (radius * y) / size]), ...at([x, y]), "tick");
+  });
+}
+
+function leaning(fit, middle, scale) {
+  const [dx, dy] = [scale * fit.lean[0], -scale * fit.lean[1]];
+  if (Math.hypot(dx, dy) < 3) return circle(middle, middle, 2, "axis");
+  return svg("g", {}, line(middle, middle, middle + dx, middle + dy, "axis"), circle(middle + dx, middle + dy, 3, "axis"));
+}
+
+function axes(story, at) {
+  return story.axes.map(([x, y]) => line(...at([-2 * x, -2 * y]), ...at([2 * x, 2 * y]), "axis"));
+}
+
+function figures(story) {
+  const fit = story.circle;
+  const rows = [["points", String(story.size)], ["λ1/λ2", story.eccentricity === null && story.size > 1 ? "∞" : figure(story.eccentricity)], ["from sensor", `${figure(story.distance)} m`]];
+  if (fit) {
+    rows.push(["radius", `${figure(100 * fit.radius)} ± ${figure(100 * fit.radius_sigma, 2)} cm`], ["diameter", `${figure(200 * fit.radius)} ± ${figure(200 * fit.radius_sigma, 2)} cm`], ["visible arc", `${figure(fit.arc_deg)}°`],
+      ["axis leans", `${figure(fit.lean_deg, 2)}°`], ["centre ±", `${figure(100 * fit.ellipse[0], 2)} × ${figure(100 * fit.ellipse[1], 2)} cm`]);
+  } else rows.push(["circle", "none fitted"]);
+  return el("dl", { class: "list" }, ...rows.flatMap(([title, value]) => [el("dt", { text: title }), el("dd", { text: value })]));
+}
+
+// Residuals over the angle around the stem; 0 degrees looks at the sensor.
+function residuals(story) {
+  const [width, height, left] = [400, 108, 34];
+  const sigma = 1000 * story.sensor_sigma;
+  const most = Math.max(3 * sigma, ...story.residual.map((r) => Math.min(1000 * Math.abs(r), 12 * sigma)));
+  const x = (angle) => left + ((angle + Math.PI) / (2 * Math.PI)) * (width - left - 18);
+  const y = (mm) => 48 - (40 * Math.max(-most, Math.min(most, mm))) / most;
+  const dots = story.points.map(([px, py], k) => circle(x(Math.atan2(px, -py)), y(1000 * story.residual[k]), 1.7, "point"));
+  const marks = [-180, -90, 0, 90, 180].map((degrees) => text(x((degrees * Math.PI) / 180), height - 3, `${degrees}°`, "small", "middle"));
+  const band = svg("rect", { x: left, width: width - left - 18, y: y(sigma), height: y(-sigma) - y(sigma), class: "band" });
+  return el("figure", {},
+    el("figcaption", { text: `How far each point lies outside (+) or inside (−) the circle, in mm, around the stem; 0° faces the sensor, the band is how much it errs (1 sigma, ${figure(sigma, 2)} mm)` }),
+    picture(width, height, "Residuals in millimetres over the angle around the stem", band, line(left, y(0), width - 18, y(0), "zero"),
+      text(left - 5, y(most) + 8, `+${figure(most, 2)}`, "small", "end"), text(left - 5, y(0) + 4, "0", "small", "end"),
+      text(left - 5, y(-most), `−${figure(most, 2)}`, "small", "end"), ...dots, ...marks));
+}
+
+function checks(story) {
+  if (!story.checks.length) return "";
+  let decided = false;
+  const rows = story.checks.map((check) => {
+    const decides = check.fails && !decided;
+    decided ||= check.fails;
+    const limit = check.relation ? `${check.relation} ${plain(check.limit, check.unit)}` : "no";
+    const value = check.relation ? plain(check.value, check.unit) : check.fails ? "yes" : "no";
+    return el("tr", { class: `${check.fails ? "fails" : ""} ${decides ? "decides" : ""}`.trim(), title: check.parameter ? `Limit: ${check.title} (${check.parameter})` : "" },
+      el("td", { text: check.fails ? "✕" : check.value === null ? "·" : "✓" }), el("td", { text: named(check) }), el("td", { text: value }),
+      el("td", { text: limit }), el("td", { text: check.fails ? check.verdict : "" }));
+  });
+  return el("figure", {}, el("figcaption", { text: "What it was asked, in the order that decides" }),
+    el("table", { class: "checks" }, el("tbody", {}, ...rows)));
+}
+
+export const clusterTitle = ({ scan, cluster, time_s }) =>
+  `Cluster ${cluster + 1} of scan ${scan}${time_s === undefined ? "" : `, ${clock(time_s)}`}`;

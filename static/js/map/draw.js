@@ -1,0 +1,309 @@
+// Paints the 2D map of Fig. 5: path grey, robot a red triangle, trees as circles with their number.
+
+import { isAssumed } from "../core/format.js";
+import { verdictOf } from "../core/verdicts.js";
+import { measuredText } from "./measure.js";
+
+const TURN = 2 * Math.PI;
+
+export const symbolRadius = (tree, scale) =>
+  Math.max(tree.dbh_cm === null ? 3.5 : 3 + 0.11 * tree.dbh_cm, tree.dbh_cm === null ? 0 : (tree.dbh_cm / 200) * scale);
+
+export function drawMap(pen, view, state, colours) {
+  pen.clearRect(0, 0, view.width, view.height);
+  drawGrid(pen, view, colours);
+  drawLine(pen, view, alignedOdometry(state), colours.odometry, 1.2);
+  drawLine(pen, view, state.path, colours.path, 2);
+  for (const truth of state.truth ?? []) drawTruth(pen, view, truth, colours);
+  if (state.ghost) drawGhost(pen, view, state.ghost, colours);
+  const trees = state.map?.trees ?? [];
+  drawClusters(pen, view, state.map?.clusters, colours);
+  for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected, colours);
+  state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0, colours));
+  const before = new Map((state.ghost?.renamed ?? []).filter(([old, now]) => old !== now).map(([old, now]) => [now, old]));
+  drawNumbers(pen, view, trees, state.selected, colours, {
+    radiusOf: symbolRadius, first: new Set(before.keys()), robot: state.map && view.toScreen(...state.map.pose),
+    words: ({ number }) => (before.has(number) ? `${number} (was ${before.get(number)})` : String(number)),
+  });
+  if (state.selectedCluster) drawRing(pen, view, state.selectedCluster, colours);
+  if (state.map) drawRobot(pen, view, state.map, colours);
+  if (state.measure?.to) drawMeasure(pen, view, state.measure, colours);
+  drawScaleBar(pen, view, colours);
+}
+
+// Grid and scale bar around what another picture paints.
+export function drawFrame(pen, view, colours, paint) {
+  pen.clearRect(0, 0, view.width, view.height);
+  drawGrid(pen, view, colours);
+  paint();
+  drawScaleBar(pen, view, colours);
+}
+
+function drawGrid(pen, view, colours) {
+  const step = view.step();
+  const [x0, y0] = view.toMap(0, view.height);
+  const [x1, y1] = view.toMap(view.width, 0);
+  const decimals = Math.max(0, -Math.floor(Math.log10(step)));
+  Object.assign(pen, { strokeStyle: colours.grid, lineWidth: 1, fillStyle: colours.axis, font: `10.5px ${colours.font}` });
+  pen.beginPath();
+  for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) {
+    const px = Math.round(view.toScreen(x, 0)[0]) + 0.5;
+    pen.moveTo(px, 0);
+    pen.lineTo(px, view.height);
+    pen.textAlign = "center";
+    if (px > 30 && px < view.width - 120) pen.fillText(x.toFixed(decimals), px, view.height - 6);
+  }
+  for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) {
+    const py = Math.round(view.toScreen(0, y)[1]) + 0.5;
+    pen.moveTo(0, py);
+    pen.lineTo(view.width, py);
+    pen.textAlign = "left";
+    if (py > 24 && py < view.height - 22) pen.fillText(y.toFixed(decimals), 5, py - 3);
+  }
+  pen.stroke();
+}
+
+export function drawLine(pen, view, points, colour, width) {
+  Object.assign(pen, { strokeStyle: colour, lineWidth: width, lineJoin: "round" });
+  pen.beginPath();
+  let last = null;
+  for (const point of points) {
+    if (!point) continue;
+    const [px, py] = view.toScreen(point[0], point[1]);
+    if (last === null) pen.moveTo(px, py);
+    else if (Math.abs(px - last[0]) + Math.abs(py - last[1]) < 1.5) continue; // closer than can be seen
+    else pen.lineTo(px, py);
+    last = [px, py];
+  }
+  pen.stroke();
+}
+
+// Odometry starts where the path starts, so that the eye sees what drifted since.
+function alignedOdometry({ odometry, path, map }) {
+  const first = odometry.findIndex(Boolean);
+  if (first < 0 || !map || first >= path.length) return [];
+  const [ox, oy] = odometry[first];
+  const later = Math.min(first + 10, path.length - 1);
+  const there = odometry[later];
+  let turn = 0;
+  if (there && Math.hypot(there[0] - ox, there[1] - oy) > 0.2) {
+    turn = Math.atan2(path[later][1] - path[first][1], path[later][0] - path[first][0]) - Math.atan2(there[1] - oy, there[0] - ox);
+  }
+  const [c, s] = [Math.cos(turn), Math.sin(turn)];
+  return odometry.slice(0, map.index + 1).map((p) =>
+    p && [path[first][0] + c * (p[0] - ox) - s * (p[1] - oy), path[first][1] + s * (p[0] - ox) + c * (p[1] - oy)]);
+}
+
+export function drawTruth(pen, view, truth, colours) {
+  const [px, py] = view.toScreen(truth.x, truth.y);
+  const radius = symbolRadius(truth, view.scale) + 3;
+  Object.assign(pen, { strokeStyle: colours.truth, lineWidth: 1.6 });
+  pen.beginPath();
+  if (truth.kind === "tree") pen.arc(px, py, radius, 0, TURN);
+  else { // a shape of its own: what is no tree is a diamond
+    pen.moveTo(px, py - 5);
+    for (const [dx, dy] of [[5, 0], [0, 5], [-5, 0], [0, -5]]) pen.lineTo(px + dx, py + dy);
+  }
+  pen.stroke();
+}
+
+// The map as it was before the run was mapped again: dashed where a tree stood, and a ring around what is not as it was.
+function drawGhost(pen, view, { ghost, changes }, colours) {
+  Object.assign(pen, { strokeStyle: colours.axis, lineWidth: 1.5 });
+  pen.setLineDash([3, 3]);
+  for (const [x, y, dbh] of ghost) {
+    pen.beginPath();
+    pen.arc(...view.toScreen(x, y), symbolRadius({ dbh_cm: dbh === null ? null : 100 * dbh }, view.scale) + 2, 0, TURN);
+    pen.stroke();
+  }
+  pen.setLineDash([]);
+  pen.lineWidth = 2;
+  for (const { kind, x, y } of changes) {
+    const [px, py] = view.toScreen(x, y);
+    pen.strokeStyle = kind === "vanished" ? colours.robot : colours.selection;
+    pen.beginPath();
+    pen.arc(px, py, 13, 0, TURN);
+    if (kind === "vanished") { // crossed out
+      pen.moveTo(px - 9, py - 9);
+      pen.lineTo(px + 9, py + 9);
+    }
+    pen.stroke();
+  }
+}
+
+// Small squares: what this scan took for something else than a tree.
+function drawClusters(pen, view, clusters, colours) {
+  for (let k = 0; k < (clusters?.x.length ?? 0); k += 1) {
+    if (clusters.verdict[k] === "tree") continue; // the tree itself is drawn, or will be
+    const [px, py] = view.toScreen(clusters.x[k], clusters.y[k]);
+    pen.fillStyle = colours[verdictOf(clusters.verdict[k])[1]];
+    pen.fillRect(px - 2.5, py - 2.5, 5, 5);
+  }
+}
+
+// What one of two compared sets takes for trees: half a disc, the left half for A and the right one for B.
+function drawHalves(pen, view, { x, y, verdict }, left, colours) {
+  Object.assign(pen, { fillStyle: colours[left ? "set-a" : "set-b"], strokeStyle: colours.surface, lineWidth: 1 });
+  for (let k = 0; k < x.length; k += 1) {
+    if (verdict[k] !== "tree") continue;
+    const [px, py] = view.toScreen(x[k], y[k]);
+    pen.beginPath();
+    pen.arc(px, py, 6, Math.PI / 2, (3 * Math.PI) / 2, !left);
+    pen.closePath();
+    pen.fill();
+    pen.stroke();
+  }
+}
+
+function drawRing(pen, view, { x, y }, colours) {
+  const [px, py] = view.toScreen(x, y);
+  Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });
+  pen.strokeRect(px - 8, py - 8, 16, 16);
+}
+
+export function drawTree(pen, view, tree, selected, colours) {
+  const [px, py] = view.toScreen(tree.x, tree.y);
+  pen.beginPath();
+  pen.arc(px, py, symbolRadius(tree, view.scale), 0, TURN);
+  if (tree.dbh_cm === null) { // never measured: hollow
+    Object.assign(pen, { strokeStyle: colours.tree, lineWidth: 2 });
+    pen.stroke();
+  } else {
+    pen.fillStyle = colours.tree;
+    pen.fill();
+  }
+  const [major, minor, angle] = tree.ellipse;
+  if (major * view.scale > 2) {
+    Object.assign(pen, { strokeStyle: colours.text, lineWidth: 1 });
+    pen.beginPath();
+    pen.ellipse(px, py, major * view.scale, Math.max(minor * view.scale, 0.5), -angle, 0, TURN);
+    pen.setLineDash(isAssumed(tree) ? [2, 3] : []);
+    pen.stroke();
+    pen.setLineDash([]);
+  }
+  if (selected) {
+    Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });
+    pen.beginPath();
+    pen.arc(px, py, symbolRadius(tree, view.scale) + 5, 0, TURN);
+    pen.stroke();
+  }
+}
+
+function drawRobot(pen, view, { pose: [x, y, yaw], sigma_xy: sigma }, colours) {
+  const [px, py] = view.toScreen(x, y);
+  if (sigma * view.scale > 4) {
+    pen.strokeStyle = colours.robot;
+    pen.beginPath();
+    pen.arc(px, py, sigma * view.scale, 0, TURN);
+    pen.stroke();
+  }
+  const corner = (turn, reach) => [px + reach * Math.cos(yaw + turn), py - reach * Math.sin(yaw + turn)];
+  Object.assign(pen, { fillStyle: colours.robot, strokeStyle: colours.surface, lineWidth: 1.5 });
+  pen.beginPath();
+  pen.moveTo(...corner(0, 12));
+  pen.lineTo(...corner(2.5, 9));
+  pen.lineTo(...corner(-2.5, 9));
+  pen.closePath();
+  pen.stroke();
+  pen.fill();
+}
+
+function drawMeasure(pen, view, measure, colours) {
+  const { from, to } = measure;
+  const [a, b] = [view.toScreen(from.x, from.y), view.toScreen(to.x, to.y)];
+  Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 2, font: `bold 13px ${colours.font}`, textAlign: "center" });
+  pen.beginPath();
+  pen.moveTo(...a);
+  pen.lineTo(...b);
+  for (const [x, y] of [a, b]) {
+    pen.moveTo(x + 4, y);
+    pen.arc(x, y, 4, 0, TURN);
+  }
+  pen.stroke();
+  const at = [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 8];
+  const text = measuredText(measure);
+  Object.assign(pen, { strokeStyle: colours.surface, fillStyle: colours.text, lineWidth: 4 });
+  pen.strokeText(text, ...at);
+  pen.fillText(text, ...at);
+}
+
+function drawScaleBar(pen, view, colours) {
+  const step = view.step();
+  const [x, y, length] = [view.width - 14, view.height - 10, step * view.scale];
+  Object.assign(pen, { strokeStyle: colours.text, fillStyle: colours.text, lineWidth: 2, textAlign: "right", font: `11px ${colours.font}` });
+  pen.beginPath();
+  pen.moveTo(x - length, y - 4);
+  pen.lineTo(x - length, y);
+  pen.lineTo(x, y);
+  pen.lineTo(x, y - 4);
+  pen.stroke();
+  pen.fillText(`${Number(step.toPrecision(2))} m`, x, y - 8);
+}
+
+// --- The numbers of trees on the map: each where it covers no other number and no symbol, or not at all; zooming brings it back.
+
+const CELL = 32; // pixels; a box is looked for in the cells that it touches
+const GAP = 2;
+const SMALL = 11, LARGE = 13; // of letters; the selected tree's are larger
+
+// Boxes [left, top, right, bottom] in pixels, found by where they are.
+class Boxes {
+  cells = new Map();
+
+  *keys([left, top, right, bottom]) {
+    for (let x = Math.floor(left / CELL); x <= Math.floor(right / CELL); x += 1) {
+      for (let y = Math.floor(top / CELL); y <= Math.floor(bottom / CELL); y += 1) yield x * 65536 + y;
+    }
+  }
+
+  add(box) {
+    for (const key of this.keys(box)) {
+      if (!this.cells.has(key)) this.cells.set(key, []);
+      this.cells.get(key).push(box);
+    }
+  }
+
+  isFree([left, top, right, bottom]) {
+    for (const key of this.keys([left, top, right, bottom])) {
+      for (const other of this.cells.get(key) ?? []) if (left < other[2] && right > other[0] && top < other[3] && bottom > other[1]) return false;
+    }
+    return true;
+  }
+}
+
+// Right of the symbol first, as people read; then left, above, below.
+function placesOf(x, y, radius, width, height) {
+  const reach = radius + GAP + 1;
+  return [[x + reach, y - height / 2], [x - reach - width, y - height / 2], [x - width / 2, y - reach - height], [x - width / 2, y + reach]];
+}
+
+// The selected tree comes first, then those that `first` names (of which a person said something), then what was seen most often.
+export function drawNumbers(pen, view, trees, selected, colours, { radiusOf, first = new Set(), words = ({ number }) => String(number), robot = null }) {
+  const taken = new Boxes();
+  const seen = [];
+  for (const tree of trees) {
+    const [x, y] = view.toScreen(tree.x, tree.y);
+    if (x < -40 || y < -40 || x > view.width + 40 || y > view.height + 40) continue;
+    const radius = radiusOf(tree, view.scale);
+    seen.push({ tree, x, y, radius });
+    taken.add([x - radius, y - radius, x + radius, y + radius]);
+  }
+  if (robot) taken.add([robot[0] - 9, robot[1] - 9, robot[0] + 9, robot[1] + 9]);
+  const rank = ({ number }) => (number === selected ? 0 : first.has(number) ? 1 : 2);
+  seen.sort((a, b) => rank(a.tree) - rank(b.tree) || (b.tree.observations ?? 0) - (a.tree.observations ?? 0) || a.tree.number - b.tree.number);
+  Object.assign(pen, { fillStyle: colours.text, strokeStyle: colours.surface, lineWidth: 3, textAlign: "left", lineJoin: "round" });
+  for (const { tree, x, y, radius } of seen) {
+    const chosen = tree.number === selected;
+    const size = chosen ? LARGE : SMALL;
+    pen.font = `${chosen ? "bold " : ""}${size}px ${colours.font}`;
+    const text = words(tree);
+    const [width, height] = [pen.measureText(text).width, size];
+    const places = placesOf(x, y, radius + (chosen ? 5 : 0), width, height);
+    const free = places.find(([left, top]) => taken.isFree([left, top, left + width, top + height]));
+    const at = free ?? (chosen ? places[0] : null); // what was chosen is named in any case
+    if (!at) continue;
+    taken.add([at[0] - GAP, at[1], at[0] + width + GAP, at[1] + height]);
+    pen.strokeText(text, at[0], at[1] + 0.86 * height);
+    pen.fillText(text, at[0], at[1] + 0.86 * height);
+  }
+}

@@ -1,7 +1,0 @@
-// What stands where there is nothing yet: what to do, or that nothing needs to be done.
-import { state } from "./state.js";
-
-export const nothingYet = (what = "Nothing mapped") => state.status?.state === "starting"
-  ? "stemmap gets ready; this fills with the first scan."
-  : state.status?.state === "playing" ? `${what} yet; this fills with the next scan.`
-  : `${what} yet. Press play, or open a run.`;

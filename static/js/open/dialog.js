@@ -1,0 +1,86 @@
+// The dialog that opens another run.
+
+import { get, open } from "../core/api.js";
+import { byId, el, setText } from "../core/dom.js";
+import { on, state } from "../core/store.js";
+import { chosenFor, startInside } from "./source_options.js";
+import { startUpload } from "./upload.js";
+
+const dialog = byId("source-dialog");
+let asked = null; // the address that was asked for and is not there yet
+let left = null; // the status that stood before
+
+// `begin` is what an address begins with, for who has to type the rest.
+export async function openSources(begin = "") {
+  say("");
+  if (!dialog.open) dialog.showModal();
+  const address = byId("source-uri");
+  if (typeof begin === "string" && begin) address.value = begin;
+  address.focus();
+  try {
+    list(await get("/api/sources"));
+  } catch (error) {
+    say(error.message);
+  }
+}
+
+function list({ scenarios = [], recordings = [] }) {
+  const simulated = scenarios.map(({ uri, doc }) => entry(uri, uri, doc));
+  const recorded = recordings.map((each) => {
+    const uri = each.uri ?? each;
+    return entry(uri, each.name ?? uri.split("/").pop(), each.doc ?? "");
+  });
+  byId("source-list").replaceChildren(
+    ...(recorded.length ? [el("h3", { text: "Recordings in the data folder" }), ...recorded] : []),
+    ...(simulated.length ? [el("h3", { text: "Simulated, with ground truth" }), ...simulated] : []));
+}
+
+const entry = (uri, title, doc) =>
+  el("button", { type: "button", onclick: () => ask(uri) }, el("b", { text: title }), el("span", { text: doc }));
+
+export async function ask(uri) {
+  if (!uri) {
+    say("Type a path or an address first, for example sim:stand.");
+    return;
+  }
+  asked = uri;
+  left = state.status;
+  say("");
+  setText(byId("source-open"), "Opening…");
+  try {
+    await open(uri, byId("source-odometry").value, chosenFor(uri));
+  } catch (error) {
+    finish(error.message);
+  }
+}
+
+function finish(message) {
+  asked = null;
+  setText(byId("source-open"), "Open");
+  if (message) say(message);
+  else dialog.close();
+}
+
+function follow({ status }) {
+  if (asked === null || status === left) return;
+  if (status.state === "failed") finish(status.detail || `${asked} could not be opened.`);
+  else if (status.source === asked && status.scan_index >= 0) finish("");
+}
+
+function say(text) {
+  const error = byId("source-error");
+  setText(error, text.charAt(0).toUpperCase() + text.slice(1));
+  error.hidden = !text;
+}
+
+export function startSources() {
+  for (const id of ["source-button", "notice-open"]) byId(id).addEventListener("click", () => openSources());
+  byId("source-close").addEventListener("click", () => { asked = null; dialog.close(); setText(byId("source-open"), "Open"); });
+  byId("source-form").addEventListener("submit", (event) => {
+    event.preventDefault();
+    ask(byId("source-uri").value.trim());
+  });
+  startInside();
+  on("status", follow);
+  startUpload(async ({ uri }) => { if (!dialog.open) await openSources(); ask(uri); });
+}

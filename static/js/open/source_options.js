@@ -1,0 +1,89 @@
+// What is in a source before it is opened: topics by role with their counts and rates, and where the LiDAR stands.
+
+import { post } from "../core/api.js";
+import { byId, el } from "../core/dom.js";
+
+const ROLES = { scan: "LiDAR", odometry: "Odometry", imu: "IMU", gnss: "GNSS", pose: "Other SLAM", camera: "Camera" };
+const MOUNT = [["x", "m"], ["y", "m"], ["z", "m"], ["roll", "°"], ["pitch", "°"], ["yaw", "°"]];
+let looked = null; // {uri, mount} of what is shown
+let asked = ""; // what is being looked into
+
+const body = () => byId("inside-body");
+const uri = () => byId("source-uri").value.trim();
+const figures = ({ messages, rate_hz: rate, seconds }) => [messages === null ? "" : `${messages.toLocaleString("en")} messages${seconds ? ` in ${seconds} s` : ""}`, rate === null ? "" : `${rate} Hz`].filter(Boolean).join(", ");
+
+// What was chosen for an address; {} where nobody looked into it or changed anything.
+export function chosenFor(address) {
+  if (looked?.uri !== address) return {};
+  const chosen = {};
+  const topics = Object.fromEntries([...body().querySelectorAll("select")].filter(({ value }) => value).map(({ name, value }) => [name, value]));
+  if (Object.keys(topics).length) chosen.topics = topics;
+  const mount = [...body().querySelectorAll(".inside-mount input")].map(({ valueAsNumber }) => valueAsNumber);
+  const known = looked.mount ?? mount.map(() => NaN);
+  if (mount.some((value, k) => Number.isFinite(value) && value !== known[k])) chosen.mount = mount.map((value, k) => (Number.isFinite(value) ? value : known[k] || 0));
+  return chosen;
+}
+
+async function look() {
+  const address = uri();
+  if (!byId("source-inside").open || address === looked?.uri || (address && address === asked)) return;
+  looked = null;
+  if (!address) {
+    body().replaceChildren(el("p", { text: "Type a path or an address first; its topics are listed here to choose from." }));
+    return;
+  }
+  asked = address;
+  body().replaceChildren(el("p", { text: "Looking inside …" }));
+  try {
+    const found = await post("/api/inside", { uri: address });
+    if (uri() === address) show(address, found);
+  } catch (error) {
+    if (uri() === address) body().replaceChildren(el("p", { class: "error", text: error.message }));
+  } finally {
+    asked = "";
+    if (uri() !== address) look();
+  }
+}
+
+function show(address, { topics, mount, warnings }) {
+  looked = { uri: address, mount };
+  const notes = warnings.map((text) => el("p", { text }));
+  if (!topics.length) {
+    body().replaceChildren(...notes, el("p", { text: "There are no topics to choose from." }));
+    return;
+  }
+  body().replaceChildren(...notes, roles(topics), mounting(mount), table(topics));
+}
+
+function roles(topics) {
+  const rows = Object.entries(ROLES).map(([role, title]) => {
+    const fitting = topics.filter(({ fits, messages, seconds, read_as: as }) => (fits === role || (role === "pose" && fits === "odometry" && as === "")) && (messages !== 0 || seconds));
+    if (!fitting.length) return [];
+    const read = fitting.find(({ read_as: as }) => as === role);
+    const list = el("select", { name: role, id: `inside-${role}` },
+      el("option", { value: "", text: read ? `${read.name} (found by type)` : "found by type" }),
+      ...fitting.filter((topic) => topic !== read).map((topic) => el("option", { value: topic.name, text: [topic.name, figures(topic)].filter(Boolean).join(", ") })));
+    return [el("label", { for: `inside-${role}`, text: title }), list];
+  });
+  return el("div", { class: "inside-roles" }, ...rows.flat());
+}
+
+function mounting(mount) {
+  const inputs = MOUNT.map(([name, unit], k) => {
+    const input = el("input", { type: "number", step: k < 3 ? "0.01" : "0.1", min: k < 3 ? "-100" : "-360", max: k < 3 ? "100" : "360", name, placeholder: "from TF" });
+    if (mount) input.value = String(mount[k]);
+    return el("label", {}, `${name} ${unit}`, input);
+  });
+  return el("fieldset", { class: "inside-mount" }, el("legend", { text: "Where the LiDAR stands on the robot: x ahead, y left, z up" }), ...inputs);
+}
+
+function table(topics) {
+  const rows = topics.map((topic) => el("tr", {}, el("th", { scope: "row", text: topic.name }), el("td", { text: topic.type.split("/").pop() }),
+    el("td", { text: figures(topic) }), el("td", { text: topic.read_as ? `read as ${topic.read_as}` : topic.why_not })));
+  return el("div", { class: "inside-topics" }, el("table", {}, el("tbody", {}, ...rows)));
+}
+
+export function startInside() {
+  byId("source-inside").addEventListener("toggle", look);
+  byId("source-uri").addEventListener("change", look);
+}

@@ -1,0 +1,30 @@
+// What a person sees at the first visit, once.
+
+import { byId, recall, remember, setText } from "../core/dom.js";
+import { on } from "../core/store.js";
+import { openSources } from "./dialog.js";
+
+const WORDS = {
+  playing: ["A robot is mapping a stand of trees", "Keep watching"],
+  finished: ["A robot has mapped a stand of trees", "Look at its map"],
+  starting: ["A robot is about to map a stand of trees", "Wait for it"],
+};
+const ROBOT = "zenoh:tcp/"; // the router's address follows
+
+export function startWelcome() {
+  const card = byId("welcome");
+  card.addEventListener("close", () => remember("welcomed", "yes"));
+  byId("welcome-open").addEventListener("click", () => card.addEventListener("close", () => openSources(), { once: true }));
+  byId("welcome-robot").addEventListener("click", () => card.addEventListener("close", () => openSources(ROBOT), { once: true }));
+  let asked = false;
+  on("status", ({ status }) => {
+    const first = !asked && recall("welcomed") === null;
+    asked = true;
+    if (!card.open && !first) return;
+    if (!status.source.startsWith("sim:")) return; // who opens a recording knows what this is
+    const [title, on] = WORDS[status.scan_index >= 0 && status.state === "starting" ? "playing" : status.state] ?? WORDS.playing;
+    setText(byId("welcome-title"), title); // it follows the run while the card stands there
+    setText(byId("welcome-on"), on);
+    if (!card.open) card.showModal();
+  });
+}

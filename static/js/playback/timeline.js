@@ -1,0 +1,104 @@
+// Play, step, seek and speed.
+
+import { command } from "../core/api.js";
+import { byId, el, setText } from "../core/dom.js";
+import { clock, count } from "../core/format.js";
+import { on, state } from "../core/store.js";
+
+const ICONS = { play: "M5 3l12 7-12 7z", pause: "M5 3h4v14H5zM12 3h4v14h-4z" };
+let dragging = false, wanted = null, seeking = false;
+
+export const playing = () => ["playing", "waiting"].includes(state.status?.state);
+const ready = () => playing() || ["paused", "finished"].includes(state.status?.state);
+export const togglePlay = () => ready() && send(playing() ? "pause" : "play");
+export const advance = (scans) => ready() && send("advance", { scans });
+
+async function send(type, fields) {
+  try {
+    await command(type, fields);
+  } catch (error) {
+    byId("notice").hidden = false;
+    setText(byId("notice").querySelector("span"), error.message);
+  }
+}
+
+// While the thumb is dragged only the newest place is asked for.
+async function seek(time) {
+  wanted = time;
+  if (seeking) return;
+  seeking = true;
+  while (wanted !== null) {
+    const next = wanted;
+    wanted = null;
+    await send("seek", { time_s: next });
+  }
+  seeking = false;
+}
+
+function show() {
+  const status = state.status;
+  if (!status) return;
+  const button = byId("play");
+  const name = playing() ? "pause" : "play";
+  if (button.dataset.shows !== name) {
+    button.dataset.shows = name;
+    button.setAttribute("aria-label", name === "pause" ? "Pause" : "Play");
+    button.querySelector("path").setAttribute("d", ICONS[name]);
+  }
+  for (const each of document.querySelectorAll(".buttons button")) each.disabled = !ready() || (status.live && each !== button);
+  const line = byId("timeline");
+  line.disabled = !(status.end_s > 0);
+  if (!dragging && !seeking) {
+    const end = status.end_s || 1;
+    line.max = String(end);
+    line.step = String(end / Math.max(1000, Math.ceil(10 * end))); // its last step is the end, of a run of any length
+    line.value = String(status.going_to_s ?? status.time_s); // it waits where it was put, and does not creep there
+    setText(byId("time-now"), clock(status.time_s));
+  }
+  line.setAttribute("aria-valuetext", clock(Number(line.value)));
+  setText(byId("time-end"), status.live ? "live" : status.end_s === null && status.scan_index >= 0 ? "open end" : clock(status.end_s));
+  const speed = byId("speed");
+  if (document.activeElement !== speed) speed.value = String(status.speed);
+  showWarnings(status.warnings ?? []);
+}
+
+function showWarnings(warnings) {
+  const button = byId("warnings-button");
+  button.hidden = !warnings.length;
+  if (!warnings.length) byId("warnings").hidden = true;
+  setText(button, `⚠ ${count(warnings.length, "warning")}`);
+  const list = byId("warnings");
+  if (list.dataset.shown === warnings.join("\n")) return;
+  list.dataset.shown = warnings.join("\n");
+  list.replaceChildren(...warnings.map((text) => el("li", { text })));
+}
+
+function showPreset() {
+  const { preset, changed } = state.parameters;
+  setText(byId("preset"), changed.length ? `● ${preset}, ${changed.length} changed` : preset);
+}
+
+export function startTimeline() {
+  byId("play").addEventListener("click", togglePlay);
+  for (const [id, scans] of [["back10", -10], ["back1", -1], ["on1", 1], ["on10", 10]]) {
+    byId(id).addEventListener("click", () => advance(scans));
+  }
+  const line = byId("timeline");
+  line.addEventListener("input", () => {
+    dragging = true;
+    setText(byId("time-now"), clock(Number(line.value)));
+    seek(Number(line.value));
+  });
+  line.addEventListener("change", () => { dragging = false; });
+  byId("speed").addEventListener("change", (event) => {
+    send("set_speed", { factor: Number(event.target.value) });
+    event.target.blur();
+  });
+  byId("warnings-button").addEventListener("click", (event) => {
+    const list = byId("warnings");
+    list.hidden = !list.hidden;
+    event.currentTarget.setAttribute("aria-expanded", String(!list.hidden));
+  });
+  on("status", show);
+  on("parameters", showPreset);
+}

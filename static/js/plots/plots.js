@@ -1,0 +1,153 @@
+// Figures 6 and 7 of the paper, and how the run goes. Plotly is loaded when it is first needed.
+
+import { get } from "../core/api.js";
+import { byId, el, setText } from "../core/dom.js";
+import { saveCsv } from "../core/download.js";
+import { select } from "../core/live_feed.js";
+import { on, state } from "../core/store.js";
+import { colour } from "../core/theme.js";
+import { visible } from "../shell/tabs.js";
+
+const EVERY = 2000; // [ms] between two drawings
+const LONGEST = 1200; // samples kept of each curve
+const none = () => ({ time: [], n_eff: [], sigma: [], yaw: [], stages: {}, stageTime: [] });
+const history = none();
+let plotly = null, busy = false;
+
+function load() {
+  plotly ??= new Promise((resolve, reject) => {
+    document.head.append(el("script", { src: "/static/plotly.min.js", onload: () => resolve(window.Plotly),
+      onerror: () => reject(new Error("The plotting library could not be loaded.")) }));
+  });
+  return plotly;
+}
+
+function layout(extra = {}) {
+  const axis = { gridcolor: colour("line"), zerolinecolor: colour("line"), linecolor: colour("line"), ticks: "" };
+  return {
+    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: colour("text"), size: 11, family: colour("font") },
+    margin: { l: 46, r: 14, t: 8, b: 40 }, uirevision: "keep", xaxis: { ...axis }, yaxis: { ...axis }, ...extra,
+  };
+}
+
+const SCALES = {
+  distance: { colorscale: "Viridis", unit: "m" },
+  error: { colorscale: "Cividis", unit: "%" },
+};
+
+async function matrix(kind) {
+  const pairs = await get("/api/pairs");
+  const z = kind === "distance" ? pairs?.distance_m : pairs?.error_percent;
+  if (!z || z.length < 2) {
+    return kind === "distance" ? "Distances need two trees or more. Let the run play on."
+      : "The error needs ground truth and two trees that are matched to it. The simulated runs bring theirs.";
+  }
+  const labels = pairs.numbers.map(String);
+  const { colorscale, unit } = SCALES[kind];
+  const figure = layout();
+  Object.assign(figure.xaxis, { type: "category", title: { text: "tree" } });
+  Object.assign(figure.yaxis, { type: "category", title: { text: "tree" }, autorange: "reversed" });
+  return [[{ type: "heatmap", x: labels, y: labels, z, colorscale, colorbar: { title: { text: unit }, thickness: 12 }, xgap: 1, ygap: 1,
+    hovertemplate: `tree %{y} to tree %{x}<br>%{z:.3~r} ${unit}<extra></extra>` }], figure];
+}
+
+function curve(kind) {
+  if (history.time.length < 2) return "Nothing to draw yet. Press play.";
+  const figure = layout({ showlegend: kind !== "n_eff", legend: { orientation: "h", y: 1.02, yanchor: "bottom" } });
+  if (kind === "time") figure.margin.t = 74;
+  if (kind === "sigma") return pose(figure);
+  figure.xaxis.title = { text: "time in the run, s" };
+  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: kind === "time" ? "ms a scan" : "effective particles" } });
+  if (kind === "n_eff") return [[line(history.time, history.n_eff, "N_eff")], figure];
+  return [Object.entries(history.stages).map(([name, values]) => ({ ...line(history.stageTime, values, name), stackgroup: "one" })), figure];
+}
+
+// Position on the left axis, heading on the right one.
+function pose(figure) {
+  const right = { ...figure.yaxis, overlaying: "y", side: "right", rangemode: "tozero", showgrid: false, title: { text: "heading, °" } };
+  Object.assign(figure, { yaxis2: right });
+  Object.assign(figure.margin, { t: 30, r: 46 });
+  Object.assign(figure.xaxis, { title: { text: "time in the run, s" } });
+  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "position, cm" } });
+  return [[line(history.time, history.sigma, "position, cm"), { ...line(history.time, history.yaw, "heading, °"), yaxis: "y2" }], figure];
+}
+
+const line = (x, y, name) => ({ type: "scatter", mode: "lines", x, y, name, line: { width: 1.5 }, hovertemplate: `%{y:.3~r}<extra>${name}</extra>` });
+
+async function draw() {
+  if (!visible("plots") || busy) return;
+  busy = true;
+  try {
+    const kind = byId("plot-choice").value;
+    const [Plotly, drawing] = await Promise.all([load(), kind in SCALES ? matrix(kind) : curve(kind)]);
+    const said = typeof drawing === "string";
+    byId("plot").hidden = said;
+    byId("plot-empty").hidden = !said;
+    setText(byId("plot-empty"), said ? drawing : "");
+    if (!said) await show(Plotly, kind, ...drawing);
+  } catch (error) {
+    byId("plot-empty").hidden = false;
+    setText(byId("plot-empty"), error.message);
+  } finally {
+    busy = false;
+  }
+}
+
+async function show(Plotly, kind, traces, figure) {
+  const plot = byId("plot");
+  if (plot.data && plot.dataset.kind !== kind) Plotly.purge(plot); // an axis of one figure is not that of another
+  plot.dataset.kind = kind;
+  const fresh = !plot.data;
+  await Plotly.react(plot, traces, figure, { displayModeBar: false, responsive: true });
+  if (fresh) plot.on("plotly_click", ({ points }) => points[0].data.type === "heatmap" && select(Number(points[0].y)));
+}
+
+function push(list, value) {
+  list.push(value);
+  if (list.length > LONGEST) list.shift();
+}
+
+function recordMap({ map }) {
+  if (!map) return clearHistory();
+  if (history.time.length && map.time_s < history.time.at(-1)) clearHistory();
+  push(history.time, map.time_s);
+  push(history.n_eff, map.n_eff);
+  push(history.sigma, 100 * (map.health?.sigma_xy_m ?? map.sigma_xy));
+  push(history.yaw, map.health?.sigma_yaw_deg ?? null);
+}
+
+function recordStatus({ status }) {
+  if (status.scan_index < 0 || status.time_s === history.stageTime.at(-1)) return;
+  push(history.stageTime, status.time_s);
+  for (const [name, milliseconds] of Object.entries(status.stage_ms ?? {})) push((history.stages[name] ??= []), milliseconds);
+}
+
+function clearHistory() {
+  Object.assign(history, none());
+}
+
+async function savePng() {
+  const plot = byId("plot");
+  if (plot.hidden || !plot.data) return;
+  await (await load()).downloadImage(plot, { format: "png", scale: 2, width: 900, height: 700, filename: plot.dataset.kind });
+}
+
+// A matrix as a table with the numbers of the trees at its sides; curves one under the other.
+function saveTable() {
+  const plot = byId("plot");
+  if (plot.hidden || !plot.data) return;
+  const [first] = plot.data;
+  const rows = first.type === "heatmap" ? [["tree", ...first.x], ...first.z.map((row, k) => [first.y[k], ...row])]
+    : [["time_s", "curve", "value"], ...plot.data.flatMap(({ x, y, name }) => x.map((time, k) => [time, name, y[k]]))];
+  saveCsv(`${plot.dataset.kind}.csv`, rows);
+}
+
+export function startPlots() {
+  byId("plot-png").addEventListener("click", savePng);
+  byId("plot-csv").addEventListener("click", saveTable);
+  on("map", recordMap);
+  on("status", recordStatus);
+  on("tab theme", draw);
+  byId("plot-choice").addEventListener("change", draw);
+  setInterval(() => state.status?.state !== "failed" && draw(), EVERY);
+}

@@ -1,0 +1,67 @@
+// What is seen in the 3D scene: layers with switch, count and colour, labels, colours and cameras.
+
+import { patch } from "../core/api.js";
+import { byId, el, setText } from "../core/dom.js";
+import { on, state } from "../core/store.js";
+import { pressInScene } from "./scene.js";
+
+const EVERY = 500; // [ms] between two fillings of the counts
+const TITLES = { colour_by: "Colour by", label_by: "Labels" };
+const counts = {};
+let countedAt = 0;
+const newest = {}; // counts by layer, as the scan or a choice told them last
+
+export const chooseView = (name, value) => patch("/api/view", { name, value }).catch(() => {});
+
+// Keys 1 to 9 and 0 switch the layers in their order.
+export function toggleLayer(place) {
+  const layer = state.view?.layers[place];
+  if (layer) chooseView(layer.name, !layer.on);
+}
+
+export const toggleFollow = () => chooseView("follow", !state.view?.follow);
+
+function show() {
+  const view = state.view;
+  if (!view) return;
+  byId("follow").setAttribute("aria-pressed", String(view.follow));
+  const rows = view.layers.map(({ name, title, on: seen, colour }, place) => {
+    const box = el("input", { type: "checkbox", "data-layer": name, onchange: (event) => chooseView(name, event.target.checked) });
+    box.checked = seen;
+    counts[name] = el("span", { class: "count" });
+    const key = place < 10 ? String((place + 1) % 10) : "";
+    return el("label", { title: key && `Key ${key}` }, box,
+      el("i", { style: { background: colour ?? "linear-gradient(90deg, var(--tree), var(--pole), var(--selection))" } }), el("span", { text: title }), counts[name]);
+  });
+  const choices = Object.entries(TITLES).map(([name, title]) => {
+    const list = el("select", { "data-choice": name, onchange: (event) => chooseView(name, event.target.value) },
+      ...view[name].of.map((text) => el("option", { value: text, text })));
+    list.value = view[name].value;
+    return el("label", { class: "choice" }, el("span", { text: title }), list);
+  });
+  byId("layer-list").replaceChildren(...rows, ...choices);
+  count();
+}
+
+function count() {
+  countedAt = performance.now();
+  const known = { ...newest, labels: undefined, path: state.path.length, odometry: state.odometry.filter(Boolean).length, truth: state.truth?.length ?? 0 };
+  for (const [name, cell] of Object.entries(counts)) setText(cell, known[name] === undefined ? "" : known[name].toLocaleString("en"));
+}
+
+function open(shown) {
+  byId("layer-list").hidden = !shown;
+  byId("layers-button").setAttribute("aria-expanded", String(shown));
+  if (shown) count();
+}
+
+export function startLayers() {
+  byId("layers-button").addEventListener("click", () => open(byId("layer-list").hidden));
+  byId("layer-list").addEventListener("keydown", (event) => { if (event.key === "Escape") { open(false); byId("layers-button").focus(); event.stopPropagation(); } });
+  byId("look-top").addEventListener("click", () => pressInScene("t"));
+  byId("look-behind").addEventListener("click", () => pressInScene("b"));
+  byId("follow").addEventListener("click", toggleFollow);
+  on("view", () => { Object.assign(newest, state.view?.counts); show(); });
+  on("map", () => Object.assign(newest, state.map?.layers));
+  on("map truth", () => !byId("layer-list").hidden && performance.now() - countedAt > EVERY && count());
+}

@@ -1,0 +1,77 @@
+// Everything that can be done with the dashboard, in one table: the keys, their sheet and the palette come from it.
+
+import { annotating, draft, judge, next, redo as redoEdit, toggleAdding, undo as undoEdit } from "../annotate/annotations.js";
+import { byId } from "../core/dom.js";
+import { select } from "../core/live_feed.js";
+import { edits } from "../core/permissions.js";
+import { stopMeasuring, toggleMeasure } from "../map/measure.js";
+import { openSources } from "../open/dialog.js";
+import { setLoop } from "../playback/event_marks.js";
+import { advance, togglePlay } from "../playback/timeline.js";
+import { toggleFollow } from "../scene/layers.js";
+import { closeOver, openOver } from "../scene/overlay.js";
+import { pressInScene } from "../scene/scene.js";
+import { openSearch } from "../tune/panel.js";
+import { redo, reset, undo } from "../tune/parameters.js";
+import { openTab } from "./tabs.js";
+
+const click = (id) => () => byId(id).click();
+export const openDrawer = () => byId("side").classList.add("open");
+export const toTab = (name) => () => { openDrawer(); openTab(name); byId(`tab-${name}`).focus(); };
+const inAnnotate = (run) => edits(() => { if (!annotating()) toTab("annotate")(); run(); });
+
+export function showSheet() {
+  byId("keys-dialog").showModal();
+}
+
+function findTree() {
+  openDrawer();
+  openTab("trees");
+  byId("find").focus();
+}
+
+function leave() {
+  if (closeOver()) return;
+  stopMeasuring();
+  select(null);
+}
+
+// title, keys as the sheet shows them, key of the event ("" where it has none of its own), what it does
+export const ACTIONS = [
+  ["Play or pause", "space", " ", edits(togglePlay)],
+  ["One scan back", "←", "", edits(() => advance(-1))], ["One scan forward", "→", "", edits(() => advance(1))],
+  ["Ten scans back", "shift ←", "", edits(() => advance(-10))], ["Ten scans forward", "shift →", "", edits(() => advance(10))],
+  ["Loop: set its beginning, then its end; leave it", "l", "l", edits(setLoop)],
+  ["Follow the robot in the scene, or stop following", "f", "", edits(toggleFollow)],
+  ["Look at the robot from above", "t", "", edits(() => pressInScene("t"))], ["Look at the robot from behind", "b", "", edits(() => pressInScene("b"))],
+  ["Measure a distance on the map", "m", "m", toggleMeasure],
+  ["Show the whole map", "", "", click("map-fit")],
+  ["Stages: raw, filtered, clusters and trunks side by side", "s", "s", () => openOver("stages")],
+  ["Compare two sets of parameters on this scan (A | B)", "c", "c", () => openOver("compare")],
+  ["Camera: trees and clusters in the picture of this scan", "v", "v", () => openOver("camera")],
+  ["Find a tree", "/", "/", findTree],
+  ["Find a parameter", "p", "p", () => { openDrawer(); openSearch(); }],
+  ["Undo a change of a parameter", "ctrl+z", "", edits(undo), "in the tab Tune: undo a change of a parameter"],
+  ["Redo a change of a parameter", "ctrl+shift+z", "", edits(redo), "in the tab Tune: do it again"],
+  ["Reset all parameters to the preset", "", "", edits(() => reset([]))],
+  ["Save the parameters as a set", "", "", edits(() => { toTab("tune")(); byId("tune-save").click(); })],
+  ["Download the parameters as a file", "", "", click("tune-download")],
+  ["Take parameters from a file", "", "", edits(() => { toTab("tune")(); byId("tune-upload").click(); })],
+  ["Layers of the scene", "", "", edits(click("layers-button"))],
+  ["Light or dark", "", "", click("theme-button")],
+  ["Open another run", "", "", edits(openSources)],
+  ["All runs: look at them, compare two, play one again", "", "", click("runs-link")],
+  ["Share: links to this moment, and for looking only", "", "", click("share-button")],
+  ["Save the map as a picture (PNG)", "", "", click("map-png")], ["Save the map as a table (CSV)", "", "", click("map-csv")],
+  ["Save the table of trees as a picture (PNG)", "", "", () => { toTab("trees")(); byId("trees-png").click(); }],
+  ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv")],
+  ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],
+  ["Annotate: add trees by clicks on the map", "", "", inAnnotate(() => toggleAdding(true))],
+  ["Annotate: next tree that nobody judged", "", "", inAnnotate(next)],
+  ["Annotate: the selected tree is one", "", "", inAnnotate(() => judge("tree"))],
+  ["Annotate: the selected tree is none", "", "", inAnnotate(() => judge(draft.kind))],
+  ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: do it again", "", "", inAnnotate(redoEdit)],
+  ["Annotate: import trees from CSV", "", "", inAnnotate(click("annotate-import"))],
+  ["Select nothing; close what lies over the scene", "esc", "Escape", leave],
+  ["Keyboard shortcuts", "?", "?", showSheet],
+];

@@ -1,0 +1,63 @@
+// Keyboard shortcuts, also while the scene has the focus.
+
+import { ANNOTATE_KEYS, annotateKey } from "../annotate/panel.js";
+import { byId, el } from "../core/dom.js";
+import { edits, looksOnly } from "../core/permissions.js";
+import { advance } from "../playback/timeline.js";
+import { toggleLayer } from "../scene/layers.js";
+import { onSceneLoad, pressInScene } from "../scene/scene.js";
+import { tuneKey } from "../tune/parameters.js";
+import { ACTIONS, showSheet } from "./actions.js";
+import { openPalette } from "./palette.js";
+
+const TYPES = "input:not([type=range]), textarea, select, [contenteditable], [role=slider], [role=combobox], [role=option]";
+const PRESSED = "button, a, summary, [role=tab], [role=checkbox], input[type=checkbox], input[type=range]";
+
+const actions = {
+  ...Object.fromEntries(ACTIONS.filter(([, , key]) => key).map(([, , key, run]) => [key, run])),
+  ...Object.fromEntries([..."1234567890"].map((key, place) => [key, edits(() => toggleLayer(place))])),
+  ArrowLeft: edits((event) => advance(event.shiftKey ? -10 : -1)),
+  ArrowRight: edits((event) => advance(event.shiftKey ? 10 : 1)),
+};
+
+function act(event, inScene) {
+  const take = () => {
+    event.preventDefault();
+    event.stopImmediatePropagation(); // or the arrows would turn the camera too
+  };
+  if (document.querySelector("dialog[open]")) return;
+  if ((event.ctrlKey || event.metaKey) && !event.altKey && event.key.toLowerCase() === "k") {
+    take();
+    openPalette();
+    return;
+  }
+  const target = event.target;
+  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event, inScene) || tuneKey(event))) {
+    take();
+    return;
+  }
+  if (event.ctrlKey || event.metaKey || event.altKey) return;
+  if (target.matches?.(TYPES) || (event.key === " " && target.matches?.(PRESSED))) return;
+  if (target.matches?.("input[type=range]") && event.key.startsWith("Arrow")) return;
+  if (!inScene && ["f", "t", "b"].includes(event.key)) {
+    if (!looksOnly()) pressInScene(event.key); // viser listens to these itself when it has the focus
+    return;
+  }
+  const action = actions[event.key];
+  if (!action) return;
+  take();
+  action(event);
+}
+
+function sheet() {
+  const own = ACTIONS.filter(([, keys]) => keys).map(([title, keys, , , told]) => [keys, told ?? title]);
+  return [["ctrl+k", "find anything that can be done"], ...own, ["1 … 0", "show or hide a layer of the scene"], ...ANNOTATE_KEYS];
+}
+
+export function startKeys() {
+  document.addEventListener("keydown", (event) => act(event, false));
+  onSceneLoad((inner) => inner.addEventListener("keydown", (event) => act(event, true), { capture: true }));
+  byId("keys-button").addEventListener("click", showSheet);
+  byId("keys-list").replaceChildren(...sheet().map(([keys, text]) =>
+    el("div", {}, el("dt", {}, ...keys.split(" ").map((key) => el("kbd", { text: key }))), el("dd", { text: text[0].toUpperCase() + text.slice(1) }))));
+}

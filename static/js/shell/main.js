@@ -1,0 +1,35 @@
+// Starts every part of the page, then connects.
+
+import { startAnnotating } from "../annotate/annotations.js";
+import { startAnnotatePanel } from "../annotate/panel.js";
+import { startAnnotateScene } from "../annotate/pointer.js";
+import { startClusters } from "../clusters/clusters.js";
+import { connect } from "../core/live_feed.js";
+import { startTheme } from "../core/theme.js";
+import { startStory } from "../explain/story.js";
+import { startMap } from "../map/map.js";
+import { startMeasure } from "../map/measure.js";
+import { startSources } from "../open/dialog.js";
+import { startWelcome } from "../open/welcome.js";
+import { startMarks } from "../playback/event_marks.js";
+import { startTimeline } from "../playback/timeline.js";
+import { startPlots } from "../plots/plots.js";
+import { startCamera } from "../scene/camera.js";
+import { startLayers } from "../scene/layers.js";
+import { startOverlay } from "../scene/overlay.js";
+import { startScene } from "../scene/scene.js";
+import { startStages } from "../scene/stages.js";
+import { startScores } from "../scores/scores.js";
+import { startTable } from "../trees/table.js";
+import { startCompare } from "../tune/compare.js";
+import { startTunePanel } from "../tune/panel.js";
+import { startTuning } from "../tune/parameters.js";
+import { startKeys } from "./keys.js";
+import { startPalette } from "./palette.js";
+import { startShare } from "./share.js";
+import { startStatus } from "./status.js";
+import { startDrawer, startTabs } from "./tabs.js";
+
+for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startAnnotateScene, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
+  startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startPalette, startDrawer, startWelcome, startShare]) start();
+connect();

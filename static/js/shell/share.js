@@ -1,0 +1,106 @@
+// Links for others: one for looking only, and one that brings back the run, the time and the camera.
+
+import { command, open } from "../core/api.js";
+import { byId, el, setText } from "../core/dom.js";
+import { clock } from "../core/format.js";
+import { access, looksOnly, startAccess } from "../core/permissions.js";
+import { on, state } from "../core/store.js";
+
+const PATIENCE = 120_000; // [ms] for a run to open
+const frame = byId("scene");
+const controls = () => {
+  try {
+    return frame.contentWindow?.__viserMutable?.cameraControl ?? null;
+  } catch {
+    return null; // the scene could not be loaded: what stands in its frame is the browser's own page
+  }
+};
+const rounded = (values) => values.map((value) => value.toFixed(2)).join(",");
+
+function camera() {
+  const control = controls();
+  if (!control) return null;
+  const from = control.getPosition(control.camera.position.clone()), to = control.getTarget(from.clone());
+  return rounded([...from.toArray(), ...to.toArray()]);
+}
+
+// Rounded up, or the seek would end at the scan before.
+const seconds = () => (Math.ceil(1000 * (state.status?.time_s ?? 0)) / 1000).toFixed(3);
+
+function hereLink() {
+  const query = new URLSearchParams({ run: state.status?.source ?? "", t: seconds() });
+  const seen = camera();
+  if (seen) query.set("camera", seen);
+  return `${location.origin}/?${query}`;
+}
+
+function row(id, label, hint, value) {
+  const box = el("input", { id, type: "text", readonly: true, value, onfocus: () => box.select() });
+  const copy = el("button", { type: "button", text: "Copy", "aria-label": `Copy: ${label}`, onclick: async () => {
+    box.select();
+    try {
+      await navigator.clipboard.writeText(box.value);
+      setText(copy, "Copied");
+    } catch {
+      setText(copy, "Press Ctrl+C"); // a page without a certificate may not write to the clipboard
+    }
+  } });
+  return el("div", {}, el("label", { for: id, text: label }), el("div", { class: "row" }, box, copy), el("p", { class: "dim", text: hint }));
+}
+
+function show() {
+  const dialog = byId("share-dialog");
+  dialog.replaceChildren(el("h2", { id: "share-title", text: "Share" }),
+    row("share-here", "This run, at this time, from this camera", `${state.status?.source ?? ""} at ${clock(state.status?.time_s)}. Whoever opens it needs access to this dashboard.`, hereLink()),
+    ...(access.viewer_link ? [row("share-viewer", "Link for looking only", "Whoever has it sees all and changes nothing. In one browser the link that was opened last counts: open it in another, or in a private window.", `${location.origin}${access.viewer_link}`)] : []),
+    el("form", { method: "dialog", class: "row end" }, el("button", { text: "Close" })));
+  dialog.showModal();
+}
+
+// What the address asks for is done once, and then taken out of it, so that a reload stays where the run is.
+async function follow() {
+  const asked = new URLSearchParams(location.search);
+  if (!asked.has("run") && !asked.has("camera")) return;
+  const [run, time, seen] = [asked.get("run"), Number(asked.get("t")), asked.get("camera")];
+  for (const name of ["run", "t", "camera"]) asked.delete(name);
+  history.replaceState(null, "", `${location.pathname}${asked.size ? `?${asked}` : ""}`);
+  if (seen) lookFrom(seen.split(",").map(Number));
+  if (!run || looksOnly()) return;
+  try {
+    if (state.status?.source !== run) await open(run, "auto");
+    if (!await until(() => state.status?.source === run && state.status.scan_index >= 0)) return;
+    if (!Number.isFinite(time)) return;
+    await command("pause");
+    await command("seek", { time_s: Math.max(0, time) });
+  } catch (error) {
+    byId("notice").hidden = false;
+    setText(byId("notice").querySelector("span"), error.message);
+  }
+}
+
+async function lookFrom(values) {
+  if (values.length !== 6 || !values.every(Number.isFinite)) return;
+  // The scene takes its own first camera some frames after it has begun, so ours must have stood for a while.
+  for (let stood = 0; stood < 4;) {
+    await new Promise((resolve) => setTimeout(resolve, 300));
+    const standing = frame.contentWindow?.__viserSceneTree?.getState()["/world/robot/scan/raw"] ? camera() : null;
+    if (standing === null) continue;
+    stood = standing === rounded(values) ? stood + 1 : 0;
+    if (!stood) controls().setLookAt(...values, false);
+  }
+}
+
+// Whether it came to hold; after PATIENCE nobody waits for the moment any more.
+const until = (holds) => new Promise((resolve) => {
+  const end = performance.now() + PATIENCE;
+  const look = () => (holds() || performance.now() > end ? resolve(holds()) : setTimeout(look, 200));
+  look();
+});
+
+export async function startShare() {
+  byId("share-button").addEventListener("click", show);
+  await startAccess();
+  let begun = false;
+  on("status", () => { if (!begun) { begun = true; follow(); } });
+  if (state.status) { begun = true; follow(); }
+}

@@ -1,0 +1,207 @@
+// The strip that is read from two metres, and the notice below it.
+
+import { byId, el, setText } from "../core/dom.js";
+import { clock, figure, NONE } from "../core/format.js";
+import { changed, on, state } from "../core/store.js";
+import { titleOf } from "../open/run_title.js";
+
+const WORDS = {
+  starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
+};
+const NO_FIGURES = ["starting", "failed"];
+const OLD_AFTER = 3000; // [ms] without a word while a run plays
+const COMPILED_FOR = 20_000; // [ms] in which what was just compiled is loaded, and the first scans take longer
+
+// name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
+const FIGURES = {
+  trees: ["trees", "", (s) => [String(s.trees), ...anew(s)]],
+  health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health] ?? "soon", reason(s)]],
+  rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
+  mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `mapping, of ${figure(budget(s))} ms`], "minor"],
+  behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
+  driven: ["driven", "m", (s) => [figure(s.distance_m)]],
+  sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
+  f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
+};
+const cells = {};
+
+// While the run is mapped again its map is still that of the values before.
+function anew({ remapped }) {
+  return remapped === null || remapped === undefined ? [] : ["anew", `trees; mapped anew, ${Math.floor(100 * remapped)} %`];
+}
+
+// Time from scan to scan [ms]: mapping that takes longer falls behind.
+function budget({ scans, end_s: end }) {
+  return scans > 1 && end > 0 ? (1000 * end) / (scans - 1) : 100;
+}
+
+// What the standing scan took for trees, against the truth: it moves with a slider, before the map follows.
+function ofScan() {
+  if (state.evaluation?.warning) return "F1: is it this truth? see Scores";
+  const { right, wrong } = state.map ?? {};
+  return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan: ${right} of ${right + wrong} right`;
+}
+
+// Why nothing is said of the map yet.
+const SOON = { "no trees yet": "SLAM: by odometry alone", "just begun": "SLAM: in its first scans" };
+
+function reason({ health }) {
+  if (SOON[health]) return SOON[health];
+  const told = state.map?.health;
+  return told && told.state === health && told.reason ? told.reason : "SLAM health";
+}
+
+function healthFigures() {
+  const h = state.map?.health;
+  if (!h) return "";
+  return [h.reason && `${h.state}: ${h.reason}`, `N_eff ${figure(h.n_eff)}, ${h.ancestors} ancestors`,
+    `${h.detections} detections, ${figure(h.recognised)} of them known, ${figure(h.ambiguous)} ambiguous`,
+    `innovation ${figure(h.innovation)} (1 is as expected)`, `pose sigma ${figure(100 * h.sigma_xy_m)} cm, ${figure(h.sigma_yaw_deg)}°`,
+    `moved ${figure(h.odometry_sigmas)} sigma away from the odometry`].filter(Boolean).join("\n");
+}
+
+function build() {
+  const list = byId("figures");
+  for (const [name, [title, unit, , rank]] of Object.entries(FIGURES)) {
+    const value = el("span", { text: NONE });
+    const label = el("dt", { text: title });
+    const cell = el("div", { class: rank ?? "", "data-figure": name }, label,
+      el("dd", {}, value, unit ? el("small", { text: unit }) : ""));
+    cells[name] = { cell, value, label, title, rank: rank ?? "" };
+    list.append(cell);
+  }
+}
+
+function show() {
+  const status = state.status;
+  if (!status) return;
+  for (const [name, [, , read]] of Object.entries(FIGURES)) {
+    const [text, meaning, title] = NO_FIGURES.includes(status.state) ? [NONE] : read(status);
+    setText(cells[name].value, text);
+    setText(cells[name].label, title ?? cells[name].title);
+    cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
+  }
+  cells.health.cell.title = healthFigures();
+  cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
+  cells.f1.cell.title = state.evaluation?.warning || "F1 of the map against the truth; clusters of the standing scan that were taken for trees, and how many of them stand at true ones";
+  cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
+  const title = titleOf(status.source, show);
+  showName(title || NONE);
+  byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
+  document.title = `${title} · stemmap`;
+}
+
+// Of folder/number the folder is cut where there is no room: the number tells one run from the next.
+function showName(title) {
+  const name = byId("source-name"), cut = title.lastIndexOf("/");
+  name.classList.toggle("numbered", cut > 0);
+  if (cut <= 0) setText(name, title);
+  else if (name.textContent !== title) name.replaceChildren(el("span", { text: title.slice(0, cut) }), el("i", { text: title.slice(cut) }));
+}
+
+// On a long way to a scan that was sought nothing plays, and nothing stands.
+const isGoing = (status) => Boolean(status?.going_far);
+
+// "Live robot1": a robot is heard now; its name stands in every state but the failed one.
+function stateWord(status) {
+  if (isGoing(status)) return "Seeking";
+  const word = status.live && status.state === "playing" ? "Live" : (WORDS[status.state] ?? status.state);
+  return status.live && status.robot && status.state !== "failed" ? `${word} ${status.robot}` : word;
+}
+
+function robotsTitle(status) {
+  return status?.live && status.robots.length ? `Robots that send scans: ${status.robots.map((name) => name || "(no namespace)").join(", ")}` : "";
+}
+
+function showState() {
+  const box = byId("state");
+  const name = state.connected ? (state.status?.state ?? "starting") : "lost";
+  if (box.dataset.state !== name) {
+    box.dataset.state = name;
+    changed("phase");
+  }
+  box.classList.toggle("going", state.connected && isGoing(state.status));
+  setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.lostAt ? "No connection" : "Connecting");
+  box.title = robotsTitle(state.status);
+  const recording = state.status?.recording ?? "";
+  byId("recording").hidden = !recording;
+  byId("recording").classList.toggle("bad", recording.startsWith("not"));
+  setText(byId("recording"), `${recording.startsWith("not") ? "⚠" : "●"} ${recording.split(",")[0].split(":")[0]}`);
+  byId("recording").title = recording;
+  document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
+  const quiet = state.status?.state === "playing" && performance.now() - state.heardAt > (performance.now() - compiledAt < COMPILED_FOR ? 4 : 1) * OLD_AFTER;
+  byId("figures").classList.toggle("old", quiet);
+  showNotice(quiet);
+}
+
+// What stands in the robot's way, below the strip so that nothing moves for it. A screen reader says the zone when it
+// changes, not every distance.
+const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "? The sensor does not see the way ahead" };
+
+function showWay() {
+  const clearance = state.map?.clearance;
+  // A run that is over drives nowhere: that nobody sees the way there is no news.
+  const quiet = NO_FIGURES.includes(state.status?.state) || (state.status?.state === "finished" && clearance?.zone === "unknown");
+  const text = clearance && !quiet && WAY[clearance.zone];
+  byId("way").hidden = !text;
+  byId("way").dataset.zone = clearance?.zone ?? "";
+  if (text) setText(byId("way-zone"), text);
+  setText(byId("way-distance"), clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
+}
+
+let ahead = null; // of this machine's clock is the server's [ms], null while that is not asked for
+let compiledAt = -Infinity; // when it was last seen to compile [ms]
+
+function compilingFor({ compiling_since_s: since }) {
+  if (!since) return "";
+  compiledAt = performance.now();
+  if (ahead === null) askClock();
+  const passed = Math.floor((Date.now() + ahead) / 1000 - since);
+  return passed >= 10 ? ` ${passed} s so far; a machine that is busy or small takes longer.` : "";
+}
+
+// What counts on while the notice stands: to be seen, but not to be read out again and again.
+function progressOf(status) {
+  if (!state.connected || !status?.detail) return "";
+  return isGoing(status) ? ` Mapped up to ${clock(status.time_s)}.` : compilingFor(status);
+}
+
+// Of two machines each may have a clock of its own: an answer says the server's.
+async function askClock() {
+  ahead = 0;
+  try {
+    const date = Date.parse((await fetch("/api/status")).headers.get("date"));
+    if (Number.isFinite(date)) ahead = date - Date.now();
+  } catch {
+    ahead = null; // no answer: it is asked again while it compiles
+  }
+}
+
+function showNotice(quiet) {
+  const notice = byId("notice");
+  const status = state.status;
+  const text = !state.connected && state.lostAt
+    ? `No connection for ${seconds(state.lostAt)} s. This is the last picture; it goes on by itself when stemmap answers again.`
+    : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
+    : status?.detail ?? "";
+  notice.hidden = !text;
+  const failed = state.connected && status?.state === "failed";
+  notice.classList.toggle("failed", failed);
+  notice.classList.toggle("wait", !failed);
+  notice.classList.toggle("starting", status?.state === "starting");
+  document.body.classList.toggle("failed", failed);
+  setText(notice.querySelector("span"), sentence(text));
+  setText(byId("notice-progress"), text && text === status?.detail ? progressOf(status) : "");
+  byId("notice-open").hidden = !failed;
+}
+
+const sentence = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+const seconds = (since) => Math.floor((performance.now() - since) / 1000);
+
+export function startStatus() {
+  build();
+  on("status map evaluation", show);
+  on("status map", showWay);
+  on("status connection", showState);
+  setInterval(showState, 1000);
+}

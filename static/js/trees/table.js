@@ -1,0 +1,172 @@
+// The table of trees (Table 2): sorted by any column, sifted by what is typed above it.
+
+import { byId, el, setText } from "../core/dom.js";
+import { saveCanvas } from "../core/download.js";
+import { nothingYet } from "../core/empty_state.js";
+import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
+import { select } from "../core/live_feed.js";
+import { on, state } from "../core/store.js";
+import { colour } from "../core/theme.js";
+import { openStory } from "../explain/story.js";
+import { visible } from "../shell/tabs.js";
+import { filterOf, HELP, sigma } from "./filter.js";
+
+const EVERY = 400; // [ms] between two fillings; nobody reads faster
+
+// key, title, tooltip, text, what it is sorted by
+const COLUMNS = [
+  ["number", "tree", "Number of the tree", (t) => String(t.number), (t) => t.number],
+  ["x", "x m", "Along the first heading, from the start", (t) => fixed(t.x, 2), (t) => t.x],
+  ["y", "y m", "To the left of the first heading, from the start", (t) => fixed(t.y, 2), (t) => t.y],
+  ["sigma", "± cm", "Standard deviation of the position; ≈: assumed, for no single scan measured it", sigmaText, sigma],
+  ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm ?? -1],
+  ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity],
+  ["seen", "seen", "Number of scans that detected it; 0: found only in what the scans gathered together", (t) => String(t.observations), (t) => t.observations],
+];
+const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
+const rows = new Map();
+let order = { key: "number", descending: false };
+let filledAt = 0, planned = 0;
+
+function dbh(tree) {
+  if (tree.dbh_cm === null) return NONE;
+  return tree.sigma_dbh_cm === null ? figure(tree.dbh_cm) : `${figure(tree.dbh_cm)} ± ${figure(tree.sigma_dbh_cm, 2)}`;
+}
+
+function sigmaText(tree) {
+  return (isAssumed(tree) ? "≈ " : "") + figure(sigma(tree), 2);
+}
+
+function head() {
+  const cells = COLUMNS.map(([key, title, hint]) => el("th", { scope: "col", "data-key": key },
+    el("button", { text: title, title: hint, onclick: () => sortBy(key) })));
+  byId("trees").tHead.replaceChildren(el("tr", {}, ...cells));
+  markOrder();
+}
+
+function sortBy(key) {
+  order = { key, descending: order.key === key && !order.descending };
+  markOrder();
+  fill();
+}
+
+function markOrder() {
+  for (const cell of byId("trees").tHead.querySelectorAll("th")) {
+    const mine = cell.dataset.key === order.key;
+    cell.setAttribute("aria-sort", mine ? (order.descending ? "descending" : "ascending") : "none");
+  }
+}
+
+function sorted(trees) {
+  const of = COLUMNS.find(([key]) => key === order.key)[4];
+  const sign = order.descending ? -1 : 1;
+  return [...trees].sort((a, b) => sign * (of(a) - of(b)) || a.number - b.number);
+}
+
+function rowOf(tree) {
+  if (!rows.has(tree.number)) {
+    const row = el("tr", { tabindex: "0", "data-tree": tree.number, onclick: () => toggle(tree.number),
+      onkeydown: (event) => event.key === "Enter" && toggle(tree.number) }, ...COLUMNS.map(() => el("td")));
+    rows.set(tree.number, row);
+  }
+  const row = rows.get(tree.number);
+  COLUMNS.forEach(([, , , text], place) => setText(row.cells[place], text(tree)));
+  row.cells[SIGMA].title = isAssumed(tree) ? "Assumed, not measured: no single scan detected this tree, all together did" : "";
+  row.setAttribute("aria-selected", String(tree.number === state.selected));
+  return row;
+}
+
+function toggle(number) {
+  if (number !== state.selected) openStory("tree");
+  select(number === state.selected ? null : number);
+}
+
+function fill() {
+  planned = 0;
+  filledAt = performance.now();
+  if (!visible("trees")) return;
+  const all = state.map?.trees ?? [];
+  const wanted = byId("find").value.trim();
+  const { holds, refused } = filterOf(wanted);
+  const trees = sorted(all.filter(holds));
+  const body = byId("trees").tBodies[0];
+  trees.forEach((tree, place) => {
+    const row = rowOf(tree);
+    if (body.rows[place] !== row) body.insertBefore(row, body.rows[place] ?? null);
+  });
+  while (body.rows.length > trees.length) body.lastChild.remove();
+  setText(byId("tree-count"), wanted ? `${trees.length} of ${all.length}` : count(all.length, "tree"));
+  byId("trees").hidden = !trees.length;
+  byId("trees-png").disabled = !trees.length;
+  offerCsv(all.length);
+  byId("find").setAttribute("aria-invalid", String(Boolean(refused)));
+  setText(byId("trees-empty"), trees.length ? "" : emptyText(all.length, wanted, refused));
+}
+
+const csv = byId("trees-csv"), csvTitle = csv.title;
+
+// A link takes no "disabled": without an address it is none.
+function offerCsv(any) {
+  if (any) csv.setAttribute("href", "/api/trees.csv");
+  else csv.removeAttribute("href");
+  csv.setAttribute("aria-disabled", String(!any));
+  csv.title = any ? csvTitle : "No tree yet";
+}
+
+function emptyText(all, wanted, refused) {
+  if (all && refused) return `“${refused}” is not understood. ${HELP}`;
+  if (all) return `No tree fits “${wanted}”.`;
+  return state.map ? "No tree yet. A tree is listed when it was seen in enough scans; the tab Clusters tells what became of the clusters."
+    : nothingYet();
+}
+
+function later() {
+  planned ||= setTimeout(fill, Math.max(0, EVERY - (performance.now() - filledAt)));
+}
+
+export function startTable() {
+  head();
+  byId("find").addEventListener("input", fill);
+  byId("find").title = HELP;
+  byId("trees-png").addEventListener("click", () => saveCanvas("trees.png", pictureOf(byId("trees"))));
+  on("map truth annotations phase", later);
+  on("tab", fill);
+  on("selection", () => {
+    for (const [number, row] of rows) row.setAttribute("aria-selected", String(number === state.selected));
+    fill();
+    if (visible("trees")) rows.get(state.selected)?.scrollIntoView({ block: "nearest" });
+  });
+  fill();
+}
+
+// --- A table of the page as a picture.
+
+const ROW = 24, PAD = 12, SCALE = 2;
+const MOST_ROWS = 600, TALLEST = 16_000; // [px]; of a taller canvas some browsers make no picture at all
+
+// A canvas with the heads and the rows of a table as they stand, in the colours of the page.
+export function pictureOf(table) {
+  const lines = [...table.rows].slice(0, MOST_ROWS).map((row) => [...row.cells].map((cell) => cell.textContent));
+  const more = table.rows.length - lines.length;
+  if (more) lines.push(lines[0].map((_, k) => (k ? "" : `+ ${more} in the CSV`)));
+  const scale = Math.min(SCALE, TALLEST / (ROW * lines.length));
+  const canvas = document.createElement("canvas");
+  const pen = canvas.getContext("2d");
+  const font = `13px ${colour("font")}`;
+  pen.font = font;
+  const widths = lines[0].map((_, k) => Math.ceil(Math.max(...lines.map((cells) => pen.measureText(cells[k]).width))) + 2 * PAD);
+  const width = widths.reduce((sum, each) => sum + each, 0);
+  Object.assign(canvas, { width: Math.floor(scale * width), height: Math.floor(scale * ROW * lines.length) });
+  pen.scale(scale, scale);
+  pen.fillStyle = colour("surface");
+  pen.fillRect(0, 0, width, ROW * lines.length);
+  Object.assign(pen, { font, textAlign: "right", textBaseline: "middle" });
+  lines.forEach((cells, row) => {
+    pen.fillStyle = colour(row ? "text" : "dim");
+    let right = 0;
+    cells.forEach((text, k) => pen.fillText(text, (right += widths[k]) - PAD, ROW * (row + 0.5)));
+    pen.fillStyle = colour("line");
+    pen.fillRect(0, ROW * (row + 1) - 1, width, row ? 0.5 : 1);
+  });
+  return canvas;
+}

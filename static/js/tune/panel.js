@@ -1,0 +1,254 @@
+// The tab Tune: sets, undo and redo, what a change did to the clusters, and every parameter by stage.
+
+import { byId, el, setText } from "../core/dom.js";
+import { nothingYet } from "../core/empty_state.js";
+import { count } from "../core/format.js";
+import { on, state } from "../core/store.js";
+import { counted, verdictOf } from "../core/verdicts.js";
+import { openTab } from "../shell/tabs.js";
+import { forget, isChanged, isTuning, redo, refuse, reset, save, savedSets, specOf, takeFile, tuning, undo, use } from "./parameters.js";
+import { startWholeRun, wholeRun } from "./remap_status.js";
+import { rowOf } from "./row.js";
+import { searchPart, startSearch } from "./search.js";
+import { matterButton, startSensitivity } from "./sensitivity.js";
+
+const LARGEST_FILE = 100_000;
+const SET_NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .+-]{0,39}$/u;
+const OPEN_FIRST = ["Clustering", "Detection"];
+const rows = new Map(); // by the parameter's name
+const groups = new Map(); // by the stage
+let presetValues = {};
+
+const button = (id, text, title, onclick) => el("button", { id, class: "small", text, title, onclick });
+const counts = el("section", { id: "tune-counts", "aria-label": "What the last change did to the clusters of this scan" });
+
+function build() {
+  const file = el("input", { id: "tune-file", type: "file", accept: ".toml,application/toml,text/plain", hidden: true, "aria-label": "File of parameters", onchange: async () => {
+    const [chosen] = file.files;
+    file.value = "";
+    if (!chosen) return;
+    if (chosen.size > LARGEST_FILE) refuse(`${chosen.name} is larger than ${LARGEST_FILE / 1000} kB; a file of parameters is not.`);
+    else await takeFile(chosen.name, await chosen.text());
+  } });
+  const find = el("input", { id: "tune-find", type: "search", placeholder: "Find a parameter", "aria-label": "Find a parameter by name, stage or meaning", autocomplete: "off", oninput: sift });
+  const only = el("input", { id: "tune-only", type: "checkbox", onchange: sift });
+  const stages = [...new Set(tuning.specs.map((spec) => spec.stage))].map(stageOf);
+  byId("panel-tune").replaceChildren(
+    el("div", { class: "tune-head" },
+      el("select", { id: "tune-set", "aria-label": "Preset or saved set", onchange: (event) => use(event.target.value) }),
+      button("tune-undo", "Undo", "Undo the last change of a parameter (Ctrl+Z in this tab)", undo), button("tune-redo", "Redo", "Do it again (Ctrl+Shift+Z)", redo),
+      button("tune-compare", "A | B", "Compare two sets on this scan (c)", () => byId("compare-button").click())),
+    el("div", { class: "tune-files" },
+      button("tune-save", "Save as …", "Keep these values on the server under a name", askName), button("tune-delete", "Delete", "Delete the saved set", dropSet),
+      el("a", { class: "small", id: "tune-download", href: "/api/parameters.toml", download: "parameters.toml", text: "Download", title: "These values as a TOML file; the command line takes it with --config" }),
+      button("tune-upload", "Upload", "Take the values of a TOML file", () => file.click()), file, el("span", { class: "grow" }), button("tune-reset", "Reset all", "Back to the values of the preset", () => reset([]))),
+    el("form", { id: "tune-name-form", class: "tune-files", hidden: true, onsubmit: saveSet },
+      el("input", { id: "tune-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && closeName() }),
+      el("button", { class: "small primary", text: "Save" }), el("button", { class: "small", type: "button", text: "Cancel", onclick: closeName })),
+    el("p", { id: "tune-error", class: "error", role: "alert", hidden: true }),
+    counts, wholeRun, searchPart,
+    el("p", { id: "tune-summary", class: "note dim" }),
+    el("div", { class: "tune-files" }, find, el("label", { class: "tune-only" }, only, " changed only")),
+    el("div", { id: "tune-rows" }, ...stages),
+    el("p", { id: "tune-none", class: "empty", hidden: true }));
+  show();
+}
+
+function stageOf(stage) {
+  const specs = tuning.specs.filter((spec) => spec.stage === stage);
+  for (const spec of specs) rows.set(spec.name, rowOf(spec, ...(spec.kind === "name" ? [] : [matterButton(spec)])));
+  const told = el("small");
+  const group = el("details", { "data-stage": stage }, el("summary", {}, stage, told), ...specs.map(({ name }) => rows.get(name).node));
+  group.open = OPEN_FIRST.includes(stage);
+  groups.set(stage, { group, told, specs, open: group.open });
+  group.addEventListener("toggle", () => { if (!sifting()) groups.get(stage).open = group.open; });
+  return group;
+}
+
+const sifting = () => Boolean(byId("tune-find").value.trim() || byId("tune-only").checked);
+
+// Shows what is searched for, what begins with it first, and opens the stages where it is.
+function sift() {
+  const words = byId("tune-find").value.trim().toLowerCase().split(/\s+/).filter(Boolean);
+  const only = byId("tune-only").checked;
+  let found = 0;
+  const stages = [];
+  for (const { group, specs, open } of groups.values()) {
+    let here = 0;
+    const ranked = [];
+    for (const spec of specs) {
+      const { node } = rows.get(spec.name);
+      node.hidden = !words.every((word) => node.dataset.words.includes(word)) || (only && !isChanged(spec.name));
+      here += node.hidden ? 0 : 1;
+      ranked.push({ node, rank: node.hidden || !words.length ? 0 : rankOf(spec, words) });
+    }
+    arrange(group, ranked);
+    stages.push({ node: group, rank: here ? Math.min(...ranked.filter(({ node }) => !node.hidden).map(({ rank }) => rank)) : 0 });
+    group.hidden = !here;
+    group.open = sifting() ? here > 0 : open;
+    found += here;
+  }
+  arrange(byId("tune-rows"), stages);
+  byId("tune-none").hidden = found > 0;
+  setText(byId("tune-none"), only && !words.length ? "Nothing differs from the preset. Move a slider, and it is listed here." : "No parameter has these words. Clear the search to see all.");
+}
+
+function show() {
+  if (!rows.size || !state.parameters) return;
+  const { changed, preset, undo: steps, redo: undone } = state.parameters;
+  for (const [name, row] of rows) row.show(presetValues[name] ?? specOf(name)?.default);
+  for (const { told, specs } of groups.values()) {
+    const number = specs.filter(({ name }) => changed.includes(name)).length;
+    setText(told, number ? ` ● ${number} changed` : "");
+  }
+  byId("tune-undo").disabled = !steps;
+  byId("tune-redo").disabled = !undone;
+  byId("tune-reset").disabled = !changed.length;
+  setText(byId("tune-summary"), changed.length ? `● ${changed.length} of ${rows.size} values differ from ${preset}: ${changed.slice(0, 3).map((name) => specOf(name)?.title).join(", ")}${changed.length > 3 ? " …" : ""}.` : `All values as in ${preset}: ${tuning.presets.find(({ name }) => name === preset)?.doc ?? ""}.`);
+  if (byId("tune-only").checked) sift();
+  showSets();
+  showCounts();
+}
+
+function showSets() {
+  const list = byId("tune-set");
+  const inForce = state.parameters.set || (state.parameters.changed.length ? "" : state.parameters.preset);
+  const told = [...tuning.presets.map(({ name, doc }) => [name, doc]), ...savedSets().map(({ name, who }) => [name, who])];
+  const key = JSON.stringify([told, state.parameters.preset]);
+  if (list.dataset.shown !== key) {
+    list.dataset.shown = key;
+    const option = ([name, title]) => el("option", { value: name, text: name, title });
+    list.replaceChildren(el("option", { value: "", text: `${state.parameters.preset}, changed`, hidden: true }),
+      el("optgroup", { label: "Presets" }, ...told.slice(0, tuning.presets.length).map(option)),
+      ...(savedSets().length ? [el("optgroup", { label: "Saved sets" }, ...told.slice(tuning.presets.length).map(option))] : []));
+  }
+  if (list.value !== inForce) list.value = inForce;
+  byId("tune-delete").hidden = !state.parameters.set;
+}
+
+function showCounts() {
+  if (isTuning()) counts.replaceChildren(...countsBeforeAfter());
+}
+
+function showError() {
+  const line = byId("tune-error");
+  if (!line) return;
+  line.hidden = !tuning.error;
+  setText(line, tuning.error);
+  show(); // what was refused goes back
+}
+
+function askName() {
+  byId("tune-name-form").hidden = false;
+  byId("tune-name").value = state.parameters.set;
+  byId("tune-name").focus();
+}
+
+function closeName() {
+  byId("tune-name-form").hidden = true;
+  byId("tune-save").focus();
+}
+
+async function saveSet(event) {
+  event.preventDefault();
+  const name = byId("tune-name").value.trim();
+  if (!SET_NAME.test(name)) refuse("A name begins with a letter or digit; letters, digits, space and . + - _ follow.");
+  else if (await save(name)) closeName();
+}
+
+// Deleted at once, because saving it again brings it back: its values stay in force.
+async function dropSet() {
+  if (await forget(state.parameters.set)) byId("tune-set").focus();
+}
+
+// From the palette: the row of a parameter, with the cursor in its value.
+export function openParameter(name) {
+  openTab("tune");
+  byId("side").classList.add("open");
+  byId("tune-find").value = "";
+  byId("tune-only").checked = false;
+  sift();
+  const { node } = rows.get(name);
+  node.closest("details").open = true;
+  node.scrollIntoView({ block: "center" });
+  byId(`tune-${name}`).focus();
+}
+
+export const openSearch = () => { openTab("tune"); byId("tune-find")?.focus(); };
+
+export function startTunePanel() {
+  startWholeRun();
+  startSensitivity();
+  startSearch();
+  on("specs", build);
+  on("parameters sets", () => isTuning() && show());
+  on("tuning", showError);
+  on("tab", () => isTuning() && show());
+  on("map status parameters", showCounts);
+}
+
+// --- How many clusters of the standing scan ended with each verdict, before the last change and now.
+
+const signed = (number) => (number > 0 ? `+${number}` : number < 0 ? `−${-number}` : "=");
+
+function countsBeforeAfter() {
+  if (!state.map) return [el("p", { class: "empty", text: `${nothingYet("No scan")} Then every change shows here what it does.` })];
+  const { verdicts: now = {}, before, index, right, wrong } = state.map;
+  const then = before?.verdicts;
+  const names = [...new Set(["tree", ...Object.keys(now), ...Object.keys(then ?? {})])].filter((name) => now[name] || then?.[name] || name === "tree");
+  names.sort((a, b) => (b === "tree") - (a === "tree") || (now[b] ?? 0) - (now[a] ?? 0));
+  const total = (of) => Object.values(of).reduce((sum, number) => sum + number, 0);
+  const pending = state.status?.revision < state.parameters?.revision;
+  const lead = pending ? `Scan ${index} is looked at with the new values …`
+    : then ? `Scan ${index}: ${total(then)} → ${count(total(now), "cluster")} by the last change`
+    : `Scan ${index}: ${count(total(now), "cluster")}. ${state.status?.state === "playing" ? "Pause to see before and after." : "Change something, and before and after stand here."}`;
+  const same = names.filter((name) => then && name !== "tree" && (now[name] ?? 0) === (then[name] ?? 0));
+  return [el("p", { class: "note dim", text: lead }),
+    el("ul", { class: "chips" }, ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
+      same.length ? el("li", { class: "same", text: `as before: ${same.map((name) => counted(now[name], name)).join(", ")}` }) : "")];
+}
+
+function chip(name, then, now) {
+  const [letter, meaning] = verdictOf(name);
+  return change(name, then, now, el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" }));
+}
+
+function truthChips(right, wrong, before) {
+  if (right === null || right === undefined) return [];
+  const ring = () => el("span", { class: "letter ring", "aria-hidden": "true" });
+  return [change("at a true tree", before?.right ?? null, right, ring()), change("elsewhere", before?.wrong ?? null, wrong, ring())];
+}
+
+function change(name, then, now, sign) {
+  const differs = then !== null && then !== now;
+  return el("li", { "data-chip": name, class: differs ? "differs" : "" }, sign, el("span", { text: name }), el("b", { text: then === null ? String(now) : `${then} → ${now}` }),
+    then === null ? "" : el("small", { text: signed(now - then) }));
+}
+
+// --- In which order what was found stands: the nearer to the name of a parameter, the earlier.
+
+// 0: the name or the title begins with the text; 1: words of these begin with the words; 2: words of its meaning or stage
+// do; 3: the words stand somewhere inside.
+function rankOf({ name, title, doc, stage }, words) {
+  const text = words.join(" ");
+  const own = [title, name, name.split(".").pop()].map((each) => each.toLowerCase());
+  if (own.some((each) => each.startsWith(text))) return 0;
+  if (allBegin(own.join(" "), words)) return 1;
+  return allBegin(`${own.join(" ")} ${doc} ${stage}`.toLowerCase(), words) ? 2 : 3;
+}
+
+function allBegin(text, words) {
+  const parts = text.split(/[^\p{L}\p{N}]+/u);
+  return words.every((word) => text.startsWith(word) || parts.some((part) => part.startsWith(word)) || text.includes(` ${word}`));
+}
+
+// Puts nodes into the order of their ranks, and only where they do not stand so already: what is open or scrolled stays.
+function arrange(parent, entries) {
+  const order = entries.map((entry, place) => ({ ...entry, place })).sort((a, b) => a.rank - b.rank || a.place - b.place);
+  const now = entries.map(({ node }) => node).sort((a, b) => (a.compareDocumentPosition(b) & Node.DOCUMENT_POSITION_FOLLOWING ? -1 : 1));
+  if (order.every(({ node }, k) => node === now[k])) return;
+  for (const { node } of order) {
+    const below = node.nextElementSibling?.matches(".sensitivity") ? [node.nextElementSibling] : [];
+    parent.append(node, ...below);
+  }
+}

@@ -1,0 +1,112 @@
+// One parameter: slider, value typed in, and back to the preset.
+
+import { el } from "../core/dom.js";
+import { isChanged, isMoving, newGesture, redo, refuse, reset, setValue, shown, undo, valueOf } from "./parameters.js";
+
+export const FINE = 1000; // places of a slider
+const BENT = 3; // how a slider is bent whose usual values lie near its lower end
+
+// Sliders are bent where a straight one would have the useful values within a few pixels.
+const power = ({ minimum, maximum, default: usual }) => (minimum >= 0 && usual - minimum < 0.2 * (maximum - minimum) ? BENT : 1);
+
+export function toPlace(spec, value) {
+  const part = (value - spec.minimum) / (spec.maximum - spec.minimum);
+  return Math.round(FINE * Math.min(1, Math.max(0, part)) ** (1 / power(spec)));
+}
+
+export function fromPlace(spec, place) {
+  return rounded(spec, spec.minimum + (spec.maximum - spec.minimum) * (place / FINE) ** power(spec));
+}
+
+function rounded(spec, value) {
+  const step = spec.step || 1;
+  const steps = Math.round((value - spec.minimum) / step);
+  return Math.min(spec.maximum, Math.max(spec.minimum, Number((spec.minimum + steps * step).toFixed(9))));
+}
+
+// `further` stands beside the name. Returns {node, show}; `show` brings it in step with what the server holds.
+export function rowOf(spec, ...further) {
+  const id = `tune-${spec.name}`;
+  const back = el("button", { class: "quiet icon back", "aria-label": `Reset ${spec.title}`, text: "↺", onclick: () => reset([spec.name]) });
+  const label = el("label", { for: id, title: `${spec.doc} (${spec.name})` }, el("i", { class: "mark-changed", "aria-hidden": "true", text: "●" }), spec.title,
+    spec.unit ? el("small", { text: ` ${spec.unit}` }) : "");
+  const [inputs, fill] = spec.kind === "bool" ? box(spec, id) : spec.kind === "choice" ? list(spec, id) : spec.kind === "name" ? word(spec, id) : number(spec, id);
+  const node = el("div", { class: "tune-row", "data-parameter": spec.name, "data-words": `${spec.name} ${spec.title} ${spec.doc} ${spec.stage}`.toLowerCase() },
+    el("span", { class: "tune-name" }, label, ...further), ...inputs, back);
+  const show = (wanted) => {
+    const different = isChanged(spec.name);
+    node.classList.toggle("changed", different);
+    back.hidden = !different;
+    back.title = `Back to ${shown(wanted, spec)}, the value of the preset`;
+    if (!isMoving(spec.name)) fill(valueOf(spec.name));
+  };
+  return { node, show };
+}
+
+function box(spec, id) {
+  const input = el("input", { id, type: "checkbox", onchange: () => setValue(spec.name, input.checked) });
+  return [[el("span", { class: "wide" }, input)], (value) => { input.checked = value; }];
+}
+
+function list(spec, id) {
+  const input = el("select", { id, class: "wide", onchange: () => setValue(spec.name, input.value) },
+    ...spec.choices.map((value) => el("option", { value, text: value })));
+  return [[input], (value) => { input.value = value; }];
+}
+
+function word(spec, id) {
+  const input = el("input", { id, class: "wide", type: "text", maxlength: "60", autocomplete: "off", spellcheck: "false", onchange: () => setValue(spec.name, input.value.trim()) });
+  return [[input], (value) => { if (document.activeElement !== input) input.value = value; }];
+}
+
+function number(spec, id) {
+  const typed = el("input", { id, type: "text", inputmode: "decimal", autocomplete: "off", spellcheck: "false" });
+  const slider = el("input", { type: "range", min: "0", max: String(FINE), step: "1", "aria-label": `${spec.title}, slider` });
+  let known = "";
+  const fill = (value) => {
+    known = String(value);
+    if (document.activeElement !== typed || !typed.classList.contains("dirty")) typed.value = known;
+    slider.value = String(toPlace(spec, value));
+    slider.setAttribute("aria-valuetext", shown(value, spec));
+  };
+  let gesture = "";
+  const send = (value) => {
+    typed.value = String(value);
+    setValue(spec.name, value, gesture);
+  };
+  slider.addEventListener("pointerdown", () => { gesture = newGesture(); });
+  slider.addEventListener("input", () => send(fromPlace(spec, Number(slider.value))));
+  slider.addEventListener("change", () => { gesture = ""; }); // it was let go
+  slider.addEventListener("keydown", (event) => {
+    gesture = "";
+    const step = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10 }[event.key];
+    if (!step || event.ctrlKey || event.metaKey) return;
+    event.preventDefault(); // by the step of the parameter, not by that of the picture
+    send(rounded(spec, Number(typed.value) + step * (spec.step || 1)));
+    slider.value = String(toPlace(spec, Number(typed.value)));
+  });
+  const take = async () => {
+    if (!typed.classList.replace("dirty", "clean")) return;
+    typed.classList.remove("clean");
+    const text = typed.value.trim().replace(",", ".");
+    const value = Number(text);
+    if (text === "" || !Number.isFinite(value)) {
+      refuse(`${spec.title}: “${typed.value.trim().slice(0, 30)}” is no number.`);
+      typed.value = known;
+    } else if (text !== known) await setValue(spec.name, value);
+  };
+  typed.addEventListener("input", () => typed.classList.add("dirty"));
+  typed.addEventListener("change", take);
+  typed.addEventListener("keydown", (event) => {
+    if (event.key === "Enter") take();
+    else if (event.key === "Escape") {
+      typed.classList.remove("dirty");
+      typed.value = known;
+    } else if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !typed.classList.contains("dirty")) {
+      event.preventDefault(); // nothing typed stands to be undone: the parameters do
+      if (event.shiftKey) redo();
+      else undo();
+    }
+  });
+  return [[slider, typed], fill];
+}
