@@ -1,30 +1,34 @@
-// What a person says of the trees: goes to the server one edit after the other, and comes back to all browsers.
+// Annotations: what a person states about trees. Edits go to the server one at a time and come back to all browsers.
 
 import { get, put, request } from "../core/api.js";
 import { recall, remember } from "../core/dom.js";
-import { percent } from "../core/format.js";
+import { count, percent } from "../core/format.js";
 import { select } from "../core/live_feed.js";
-import { changed, on, state } from "../core/store.js";
+import { distance, nearest } from "../core/nearest.js";
+import { attempted } from "../core/problem.js";
+import { changed, on, selectedTree, state, trees } from "../core/store.js";
+import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
 
 const NUDGE_WAIT = 400; // [ms] of quiet after which nudges become one edit
-const PATIENCE = 3000; // [ms] until what was done must have come back
+const PATIENCE = 3000; // [ms] until an accepted edit must have come back
+const VOTES_EVERY = 2000; // [ms] between two requests for the votes
 export const KINDS = ["tree", "pole", "person", "bush", "other"];
 export const NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .@-]{0,39}$/u;
 
 export const draft = {
-  chosen: null, // id of the annotation that keys act on
-  adding: false, // the next click on the map adds one
-  place: null, // {x, y, tree} where it would stand
-  moved: null, // {id, x, y} while one is dragged or nudged
-  kind: "other", // what `n` says that a found tree is
+  chosen: null, // id of the annotation that the keys act on
+  adding: false, // whether the next click on the map adds an annotation
+  place: null, // {x, y, on} where it would be placed
+  moved: null, // {id, row, x, y} while an annotation is dragged or nudged
+  kind: "other", // class of a rejected tree
   error: "",
   undo: 0,
   redo: 0,
 };
-const DOUBTS_EVERY = 2000; // [ms]
-const doubts = { of: new Map(), needed: 0, asking: false, again: 0 }; // what the decision trees are unsure of, by the tree's number
-const versions = new Map(); // "id:version" of what was seen to the version that our own edit made of it
+let votes = { needed: 0, of: new Map() }; // of the decision trees for each found tree, by its number
+let skipped = []; // numbers of skipped trees, the one skipped last at the end
+const versions = new Map(); // "id:version" of a row as it was shown, to the version that an own edit made of it
 let last = Promise.resolve(), nudging = 0;
 
 export const annotating = () => visible("annotate");
@@ -42,7 +46,7 @@ function browser() {
 const me = browser();
 export const myName = () => recall("who") ?? `browser ${me.slice(0, 4)}`;
 
-// The server writes beside each change of a parameter who made it.
+// The server records with each change of a parameter who made it.
 function signAs(name) {
   document.cookie = `stemmap_name=${encodeURIComponent(name)}; SameSite=Strict; Path=/`;
 }
@@ -55,13 +59,13 @@ export function callMe(name) {
 const call = (method, where, fields = {}) => request(`/api/annotations${where}`, { method, headers: { "Content-Type": "application/json" },
   body: JSON.stringify({ run: state.annotations?.run, browser: me, who: myName(), ...fields }) });
 
-// Edits go one after the other; each has come back before the next one goes.
+// Edits are sent one at a time; each has come back before the next one is sent.
 function edit(work) {
   last = last.then(async () => {
     try {
       const done = await work();
       Object.assign(draft, { undo: done.undo, redo: done.redo, error: "" });
-      await seen(done.serial);
+      await arrived(done.serial);
       return done;
     } catch (error) {
       draft.error = error.message;
@@ -73,7 +77,7 @@ function edit(work) {
   return last;
 }
 
-function seen(serial) {
+function arrived(serial) {
   return new Promise((resolve) => {
     const ends = performance.now() + PATIENCE;
     const look = () => ((state.annotations?.serial ?? 0) >= serial || performance.now() > ends ? resolve() : setTimeout(look, 20));
@@ -89,7 +93,7 @@ export function add(content) {
   });
 }
 
-// The version is that of the row as the person saw it, unless it was their own edit that made it another.
+// The version of a row as the person saw it, or a later one if only their own edits came between.
 function latest({ id, version }) {
   let now = version;
   while (versions.has(`${id}:${now}`)) now = versions.get(`${id}:${now}`);
@@ -101,7 +105,7 @@ export function change(row, fields) {
     const version = latest(row);
     const { x, y, kind, dbh_cm } = { ...row, ...(version === row.version ? {} : rowOf(row.id)), ...fields };
     const done = await call("PATCH", `/${row.id}`, { version, x, y, kind, dbh_cm });
-    await seen(done.serial);
+    await arrived(done.serial);
     const now = rowOf(row.id)?.version ?? version;
     if (now !== version) versions.set(`${row.id}:${version}`, now);
     return done;
@@ -117,66 +121,59 @@ export const undo = () => settle().then(() => edit(() => call("POST", "/undo")))
 export const redo = () => settle().then(() => edit(() => call("POST", "/redo")));
 export const importTable = (table, unit) => edit(() => call("POST", "/import", { table, dbh_unit: unit || null }));
 
-// --- found trees, and what was said of them -----------------------------------------------------------------
+// --- review of the found trees -------------------------------------------------------------------------------
 
-function nearestRow({ x, y }) {
-  const near = state.annotations?.same_thing_m ?? 0.5;
-  let best = null, least = near;
-  for (const row of rows()) {
-    const gap = Math.hypot(row.x - x, row.y - y);
-    if (gap <= least) [best, least] = [row, gap];
-  }
-  return best;
-}
+const annotationOf = (tree) => nearest(rows(), (row) => distance(row, tree), state.annotations?.same_thing_m ?? 0.5);
 
-// The one whose votes lie nearest to what makes a tree comes first; of those without votes the one seen least often.
-export const unjudged = () => (state.map?.trees ?? []).filter((tree) => !nearestRow(tree))
-  .sort((a, b) => margin(a) - margin(b) || a.observations - b.observations || a.number - b.number);
-
-const NEVER = 9; // wider than any margin of votes
+// How far the votes for a tree are from the share that is needed; the smaller, the more doubtful is the tree.
 function margin({ number }) {
-  const votes = doubts.of.get(number)?.votes ?? null;
-  return votes === null ? NEVER : Math.abs(votes - doubts.needed);
+  const share = votes.of.get(number)?.votes ?? null;
+  return share === null ? Infinity : Math.abs(share - votes.needed);
 }
 
-export function doubtInWords({ number }) {
-  const doubt = doubts.of.get(number);
-  if (!doubt || doubt.votes === null) return "";
-  return `, votes: tree ${percent(doubt.votes)} (${percent(doubts.needed)} are needed), ${doubt.next} ${percent(doubt.next_votes)}`;
+const compared = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
+
+// Found trees without annotation: those skipped last, else the most doubtful first, then the least often observed.
+export const unreviewed = () => trees().filter((tree) => !annotationOf(tree)).sort((a, b) =>
+  skipped.indexOf(a.number) - skipped.indexOf(b.number) || compared(margin(a), margin(b)) || a.observations - b.observations || a.number - b.number);
+
+export const isReviewed = (tree) => annotationOf(tree) !== null;
+
+export function votesText({ number }) {
+  const of = votes.of.get(number);
+  if (!of || of.votes === null) return "";
+  return `, votes: tree ${percent(of.votes)} (${percent(votes.needed)} needed), ${of.next} ${percent(of.next_votes)}`;
 }
 
-async function askDoubts() {
-  if (doubts.asking || performance.now() < doubts.again || !annotating()) return;
-  doubts.asking = true;
-  const told = await get("/api/doubts").catch(() => null);
-  Object.assign(doubts, { asking: false, again: performance.now() + DOUBTS_EVERY });
-  if (!told) return;
-  doubts.needed = told.needed;
-  doubts.of = new Map(told.trees.map((doubt) => [doubt.tree, doubt]));
+const updateVotes = throttled(async () => {
+  if (!annotating()) return;
+  const answer = await attempted(() => get("/api/doubts"));
+  if (!answer) return;
+  votes = { needed: answer.needed, of: new Map(answer.trees.map((each) => [each.tree, each])) };
   news();
-}
+}, VOTES_EVERY);
 
-// The selected tree is one, or is something else; then to the next, unless another was selected meanwhile.
-export async function judge(kind) {
-  const tree = state.map?.trees.find(({ number }) => number === state.selected);
+// Annotates the selected tree, then goes to the next one unless another tree was selected meanwhile.
+export async function review(kind) {
+  const tree = selectedTree();
   if (!tree) {
-    draft.error = "Select a found tree first: click it on the map, or press Tab for the next one.";
+    draft.error = "Select a found tree first: click it on the map, or press S for the next one.";
     return news();
   }
-  const row = nearestRow(tree);
+  const row = annotationOf(tree);
   if (row) await change(row, { kind });
   else await add({ x: tree.x, y: tree.y, kind });
   if (!draft.error && state.selected === tree.number) next();
 }
 
-// The one that is doubted most first; after it the next.
+// Selects the most doubtful tree without annotation other than the selected one, which counts as skipped.
 export function next() {
-  const left = unjudged();
-  const place = left.findIndex(({ number }) => number === state.selected);
-  const tree = left[(place + 1) % Math.max(left.length, 1)];
+  const left = unreviewed();
+  if (left.some(({ number }) => number === state.selected)) skipped = [...skipped.filter((number) => number !== state.selected), state.selected];
+  const [tree = null] = unreviewed().filter(({ number }) => number !== state.selected || left.length === 1);
   draft.chosen = null;
   if (tree) select(tree.number);
-  draft.look = tree ?? null;
+  draft.look = tree;
   news();
 }
 
@@ -203,7 +200,7 @@ export function nudge(dx, dy) {
   news();
 }
 
-// What was moved stays there.
+// Sends the moved annotation.
 export async function settle() {
   clearTimeout(nudging);
   const moved = draft.moved;
@@ -213,27 +210,26 @@ export async function settle() {
   news();
 }
 
-export function truthInWords() {
+export function truthText() {
   const number = rows().length;
   return {
-    source: `Scored against the truth that this run brings${number ? "; annotations do not count" : ""}.`,
-    annotations: "Scored against what was annotated. A found tree that nobody has judged counts as wrong until somebody does.",
-    both: `Scored against the truth that this run brings, with ${number} ${number === 1 ? "annotation" : "annotations"} laid over it.`,
+    source: `Scored against the ground truth of this run${number ? "; annotations do not count" : ""}.`,
+    annotations: "Scored against the annotations. A found tree without annotation counts as wrong.",
+    both: `Scored against the ground truth of this run, corrected by ${count(number, "annotation")}.`,
   }[state.annotations?.used] ?? "";
 }
 
-// Where a run brings its own truth, annotations stand beside it: who says otherwise is told so, and chooses what counts.
-export function warnedInWords() {
+export function contradictionText() {
   const { contradicting = 0, used } = state.annotations ?? {};
   if (!contradicting || used !== "both") return "";
-  return `${contradicting === 1 ? "One annotation says" : `${contradicting} annotations say`} otherwise than the truth that this run brings, and ${contradicting === 1 ? "counts" : "count"} in its place.`;
+  return `${count(contradicting, "annotation")} ${contradicting === 1 ? "contradicts" : "contradict"} the ground truth of this run and ${contradicting === 1 ? "replaces" : "replace"} it there.`;
 }
 
-export const scoreAgainst = (against) => put("/api/annotations/against", { against }).catch((error) => { draft.error = error.message; news(); });
+export const scoreAgainst = (against) => attempted(() => put("/api/annotations/against", { against }));
 
-async function count() {
-  const told = await request(`/api/annotations?browser=${me}`).catch(() => null);
-  if (told) Object.assign(draft, { undo: told.undo, redo: told.redo });
+async function updateUndo() {
+  const answer = await attempted(() => get(`/api/annotations?browser=${me}`));
+  if (answer) Object.assign(draft, { undo: answer.undo, redo: answer.redo });
   news();
 }
 
@@ -246,10 +242,12 @@ export function startAnnotating() {
       run = state.annotations.run;
       Object.assign(draft, { moved: null, error: "" });
       versions.clear();
-      count();
+      skipped = [];
+      updateUndo();
     }
     news();
   });
-  on("map tab", askDoubts);
+  on("remapped", () => { skipped = []; }); // numbers may belong to other trees now
+  on("map tab", updateVotes);
   on("tab", () => annotating() || !draft.adding || toggleAdding(false));
 }

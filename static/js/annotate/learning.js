@@ -1,27 +1,28 @@
-// "Learn" in the tab Annotate: how much there is to learn from, new decision trees beside the old ones, and which are used.
+// "Learn" in the tab Annotate: trains decision trees from the annotations, compares them with those in use, and switches.
 
-import { get, post, request } from "../core/api.js";
-import { byId, el, setText } from "../core/dom.js";
-import { count } from "../core/format.js";
+import { get, post, remove } from "../core/api.js";
+import { button, byId, el, setText } from "../core/dom.js";
+import { capital, count, percent } from "../core/format.js";
 import { looksOnly } from "../core/permissions.js";
+import { attempted } from "../core/problem.js";
 import { on, state } from "../core/store.js";
+import { throttled } from "../core/timing.js";
 import { counted } from "../core/verdicts.js";
 import { visible } from "../shell/tabs.js";
 
-// In the order and words of the tab Scores; here it is what was annotated that is judged, and not a map.
+// As in the tab Scores, but on the annotated objects instead of a map.
 const RATES = [
-  ["TA", "TA  trees found. True acceptance: annotated trees that are taken for trees"],
-  ["FR", "FR  trees missed. False rejection: annotated trees that are not taken for trees"],
-  ["TR", "TR  others left out. True rejection: annotated poles, persons, bushes and other things that are not taken for trees"],
-  ["FA", "FA  others taken for trees. False acceptance: annotated other things that are taken for trees"],
+  ["TA", "TA  trees found. True acceptance: annotated trees that are classified as trees"],
+  ["FR", "FR  trees missed. False rejection: annotated trees that are not classified as trees"],
+  ["TR", "TR  others rejected. True rejection: annotated poles, persons, bushes and other objects that are not classified as trees"],
+  ["FA", "FA  others accepted. False acceptance: annotated other objects that are classified as trees"],
 ];
 const PACKAGE = "package";
-const ASK_AGAIN = 300; // [ms] after an edit until what there is to learn from is asked for
-let known = null, asked = 0, error = "";
+const EVERY = 300; // [ms] between two requests while annotations change
+let known = null, error = "";
 
-const inWords = (things) => Object.entries(things).map(([kind, n]) => counted(n, kind === "other" ? "other thing" : kind)).join(", ");
+const inWords = (things) => Object.entries(things).map(([kind, n]) => counted(n, kind === "other" ? "other object" : kind)).join(", ");
 const inForce = () => state.parameters?.values["classification.forest"] ?? PACKAGE;
-const button = (id, text, title, onclick) => el("button", { id, class: "small", type: "button", text, title, onclick });
 
 async function doing(work) {
   try {
@@ -34,7 +35,7 @@ async function doing(work) {
 }
 
 const grow = () => doing(() => post("/api/learning", {}));
-const forget = () => doing(() => request("/api/learning", { method: "DELETE" }));
+const forget = () => doing(() => remove("/api/learning"));
 const use = () => doing(() => post("/api/learning/use", {}));
 const backToPackage = () => doing(() => post("/api/parameters/reset", { names: ["classification.forest"] }));
 
@@ -49,9 +50,9 @@ function knownInWords() {
   const { annotations, needed, runs } = known;
   const trees = annotations.tree ?? 0, others = Object.values(annotations).reduce((sum, n) => sum + n, 0) - trees;
   const lacking = trees < needed.trees || others < needed.others;
-  const rest = lacking ? ` To learn from, ${needed.trees} trees and ${needed.others} other things are needed.` : "";
-  const how = others < needed.others ? " Other things: press n on a found tree that is none, or add a pole or a bush with a and its class." : "";
-  return `${runs ? `Annotated in ${count(runs, "run")}: ${inWords(annotations)}.` : "Nothing is annotated yet."}${rest}${how}`;
+  const rest = lacking ? ` Learning needs ${needed.trees} trees and ${needed.others} other objects.` : "";
+  const how = others < needed.others ? " Other objects: answer No (N) for a found tree that is not a tree, or add a pole or a bush with A and set its class." : "";
+  return `${runs ? `Annotated in ${count(runs, "run")}: ${inWords(annotations)}.` : "Nothing annotated yet."}${rest}${how}`;
 }
 
 const enough = () => known && (known.annotations.tree ?? 0) >= known.needed.trees
@@ -64,77 +65,74 @@ function fill() {
   byId("learn-now").replaceChildren(...(parts[learning.state] ?? parts.idle)(learning));
   const problem = error || (learning.state === "failed" ? learning.words : "");
   byId("learn-error").hidden = !problem;
-  setText(byId("learn-error"), problem ? problem[0].toUpperCase() + problem.slice(1) : "");
+  setText(byId("learn-error"), capital(problem));
 }
 
 const parts = {
   idle: () => [el("div", { class: "annotate-tools" }, growButton(), ...nowUsed())],
   failed: () => parts.idle(),
-  working: ({ words }) => [el("div", { class: "annotate-tools" }, el("progress", { "aria-label": "Growing decision trees" }),
-    el("span", { class: "note dim", text: words }), button("learn-stop", "Stop", "Stop it; nothing was changed", forget))],
+  working: ({ words }) => [el("div", { class: "annotate-tools" }, el("progress", { "aria-label": "Training decision trees" }),
+    el("span", { class: "note dim", text: words }), button("learn-stop", "Stop", "Stop the training; the decision trees in use stay", forget))],
   done: ({ learned }) => [...learned.tables.map(table),
-    ...(learned.tables.every(noBetter) ? [el("p", { id: "learn-no-better", class: "note", text: noBetterInWords(learned) })] : []),
-    el("p", { class: "note dim", text: saidOf(learned) }),
+    ...(learned.tables.every(noBetter) ? [el("p", { id: "learn-no-better", class: "note", text: noBetterText(learned) })] : []),
+    el("p", { class: "note dim", text: methodText(learned) }),
     ...learned.warnings.map((text) => el("p", { class: "note", text })),
     el("div", { class: "annotate-tools" }, ...choices(learned))],
 };
 
 function growButton() {
-  const node = button("learn-grow", "Grow a new decision tree", "Learn from all annotations, and show what old and new are worth; nothing uses the new one before you say so", grow);
+  const node = button("learn-grow", "Train decision trees", "Train new decision trees from all annotations and compare them with those in use. Nothing changes until you choose to use them", grow);
   node.disabled = !enough() || looksOnly();
   return node;
 }
 
 function nowUsed() {
   if (inForce() === PACKAGE) return [];
-  return [inUse(inForce()), button("learn-package", "Back to the package's", "Let the decision trees of the package vote again", backToPackage)];
+  return [inUse(inForce()), button("learn-package", "Use the built-in ones", "Classify with the built-in decision trees again", backToPackage)];
 }
 
-// When they were grown and from what; their name, which is a digest, only for who has to tell two of one day apart.
+// When the decision trees were trained and from what. Their name, a digest, tells two of the same day apart.
 function inUse(name) {
   const from = known?.in_use?.name === name ? known.in_use : null;
-  const words = from ? `In use: grown ${from.date.replace(/:\d\d UTC$/, " UTC")} from ${inWords(from.things)} in ${count(from.runs, "run")}` : "In use: learned decision trees";
+  const words = from ? `In use: trained ${from.date.replace(/:\d\d UTC$/, " UTC")} from ${inWords(from.things)} in ${count(from.runs, "run")}` : "In use: trained decision trees";
   return el("p", { id: "learn-used", class: "learn-used" }, words, el("small", { class: "dim", text: name, title: "Name of these decision trees (classification.forest)" }));
 }
 
 function choices(learned) {
-  if (inForce() === learned.name) return [inUse(learned.name), button("learn-package", "Back to the package's", "Let the decision trees of the package vote again", backToPackage), button("learn-forget", "Close", "Close the table; the new one stays in use", forget)];
-  return [button("learn-use", "Use it", "Let the new decision trees vote; the whole run is mapped again", use), button("learn-forget", "Keep the old one", "Change nothing; the file of the new one stays in the data folder", forget)];
+  if (inForce() === learned.name) return [inUse(learned.name), button("learn-package", "Use the built-in ones", "Classify with the built-in decision trees again", backToPackage), button("learn-forget", "Close", "Close the table; the new decision trees stay in use", forget)];
+  return [button("learn-use", "Use the new ones", "Classify with the new decision trees; the whole run is mapped again", use), button("learn-forget", "Keep the old ones", "Change nothing; the file of the new decision trees stays in the data folder", forget)];
 }
 
-function saidOf({ things, tables, old_saw }) {
-  const parted = tables.map(({ by, folds }) => `${folds} parts, no ${by} in two of them`).join("; ");
-  return `Learned from ${inWords(things)}. Each part was judged by trees that learned from the others (${parted}).${old_saw ? " The old one has learned from these runs, so its figures flatter it." : ""}`;
+function methodText({ things, tables, old_saw: oldSaw }) {
+  const parts = tables.map(({ by, folds }) => `${folds} parts, split by ${by}`).join("; ");
+  return `Trained on ${inWords(things)}. Cross-validated: each part is classified by trees trained on the others (${parts}).${oldSaw ? " The scores of the old ones are optimistic: they were trained on these runs." : ""}`;
 }
 
 const noBetter = ({ old, new: grown }) => grown.TA.count <= old.TA.count && grown.FA.count >= old.FA.count;
 
-function noBetterInWords({ tables, old_saw }) {
+function noBetterText({ tables, old_saw: oldSaw }) {
   const same = tables.every(({ old, new: grown }) => grown.TA.count === old.TA.count && grown.FA.count === old.FA.count);
-  const on = old_saw ? "on these things, from which the old ones have learned" : "on what neither learned from";
-  return same ? `No better than the old ones ${on}: the same figures.` : `No better than the old ones ${on}.`;
+  const on = oldSaw ? "on these objects, on which the old ones were trained" : "on objects that neither was trained on";
+  return `No better than the old ones ${on}${same ? ": the same scores" : ""}.`;
 }
 
 function table({ kind, old, new: grown }) {
   const row = (name, rates) => el("tr", {}, el("th", { scope: "row", text: name }), ...RATES.map(([rate]) => cell(rates[rate])));
-  return el("table", { class: "plain learn-table" }, el("caption", { text: `Sensors that see ${kind}` }),
+  return el("table", { class: "plain learn-table" }, el("caption", { text: `Sensors with ${kind}` }),
     el("thead", {}, el("tr", {}, el("td"), ...RATES.map(([rate, title]) => el("th", { scope: "col", text: rate, title })))),
     el("tbody", {}, row("old", old), row("new", grown)));
 }
 
-const cell = ({ count: n, of }) => el("td", {}, `${n} of ${of}`, el("small", { class: "dim", text: of ? `${Math.round((1000 * n) / of) / 10} %` : "" }));
+const cell = ({ count: n, of }) => el("td", {}, `${n} of ${of}`, el("small", { class: "dim", text: of ? percent(n / of) : "" }));
 
-function askLater() {
+const update = throttled(async () => {
   if (!visible("annotate")) return;
-  clearTimeout(asked);
-  asked = setTimeout(async () => {
-    known = await get("/api/learning").catch(() => known);
-    fill();
-  }, ASK_AGAIN);
-}
+  known = (await attempted(() => get("/api/learning"))) ?? known;
+  fill();
+}, EVERY);
 
 export function startLearning() {
-  on("tab annotations", askLater);
+  on("tab annotations", update);
   on("learning parameters tab", fill);
-  on("parameters", () => inForce() !== PACKAGE && known?.in_use?.name !== inForce() && askLater());
+  on("parameters", () => inForce() !== PACKAGE && known?.in_use?.name !== inForce() && update());
 }

@@ -1,40 +1,30 @@
-// Annotating on the 2D map: click to add or choose, drag to move, a ring where the stem would stand.
+// Annotating by pointer: on the 2D map a click adds or chooses and dragging moves; in the 3D scene Shift+click adds.
 
 import { select } from "../core/live_feed.js";
-import { state } from "../core/store.js";
+import { distance, nearest } from "../core/nearest.js";
+import { clusters, trees } from "../core/store.js";
+import { colours } from "../core/theme.js";
+import { drawCircle, drawText } from "../map/draw.js";
 import { onSceneLoad } from "../scene/scene.js";
 import { add, annotating, choose, draft, news, rowOf, rows, settle } from "./annotations.js";
 
 const SNAP = 0.7; // [m]
-const REACH = 11; // [pixels]
-const TURN = 2 * Math.PI;
+const REACH = 11; // [px] around an annotation
 
 const placeOf = (row) => (draft.moved?.id === row.id ? draft.moved : row);
 
-function rowAt([px, py], view) {
-  let best = null, least = REACH;
-  for (const row of rows()) {
-    const [x, y] = view.toScreen(placeOf(row).x, placeOf(row).y);
-    const gap = Math.hypot(px - x, py - y);
-    if (gap < least) [best, least] = [row, gap];
-  }
-  return best;
+const rowAt = ([px, py], view) => nearest(rows(), (row) => {
+  const [x, y] = view.toScreen(placeOf(row).x, placeOf(row).y);
+  return Math.hypot(px - x, py - y);
+}, REACH);
+
+// {x, y, on}: the centre of the nearest tree or cluster within SNAP, else the place itself [m].
+function snap(x, y) {
+  const places = [...clusters().map((cluster) => ({ ...cluster, on: "cluster" })), ...trees().map((tree) => ({ x: tree.x, y: tree.y, on: `tree ${tree.number}` }))];
+  return nearest(places, (place) => distance(place, { x, y }), SNAP) ?? { x, y, on: "" };
 }
 
-// The middle of the tree or cluster that is nearest, if it is near; else the place itself [m].
-export function snap(x, y) {
-  let best = { x, y, on: "" }, least = SNAP;
-  const offer = (cx, cy, on) => {
-    const gap = Math.hypot(cx - x, cy - y);
-    if (gap < least) [best, least] = [{ x: cx, y: cy, on }, gap];
-  };
-  const { x: xs = [], y: ys = [] } = state.map?.clusters ?? {};
-  for (let k = 0; k < xs.length; k += 1) offer(xs[k], ys[k], "cluster");
-  for (const tree of state.map?.trees ?? []) offer(tree.x, tree.y, `tree ${tree.number}`);
-  return best;
-}
-
-// --- what the pointer does; true where it was meant for an annotation ------------------------------------------
+// --- on the map; the functions return true where the event belonged to an annotation -----------------
 
 export function grab(at, view) {
   const row = annotating() && !draft.adding ? rowAt(at, view) : null;
@@ -80,58 +70,47 @@ export function clickAt(at, view, tree) {
   return true;
 }
 
-// --- what is drawn over the map -------------------------------------------------------------------------------
-
-export function drawAnnotations(pen, view, colours) {
+export function drawAnnotations(pen, view) {
   if (!annotating()) return;
   for (const row of rows()) {
     const { x, y } = placeOf(row);
-    const [px, py] = view.toScreen(x, y);
     Object.assign(pen, { fillStyle: colours.truth, strokeStyle: colours.surface, lineWidth: 1.5 });
-    circle(pen, px, py, 4);
+    drawCircle(pen, ...view.toScreen(x, y), 4);
     pen.fill();
     pen.stroke();
   }
   const chosen = rowOf(draft.chosen);
   if (chosen) {
-    const [px, py] = view.toScreen(placeOf(chosen).x, placeOf(chosen).y);
     Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });
-    circle(pen, px, py, 10);
+    drawCircle(pen, ...view.toScreen(placeOf(chosen).x, placeOf(chosen).y), 10);
     pen.stroke();
   }
-  if (draft.adding && draft.place) drawPlace(pen, view, draft.place, colours);
+  if (draft.adding && draft.place) drawPlace(pen, view, draft.place);
 }
 
-function drawPlace(pen, view, { x, y, on, at }, colours) {
+// The ring where a new annotation would be placed, joined to the cursor.
+function drawPlace(pen, view, { x, y, on, at }) {
   const [px, py] = view.toScreen(x, y);
   Object.assign(pen, { strokeStyle: colours.selection, lineWidth: on ? 2.5 : 1.5 });
   if (!on) pen.setLineDash([4, 3]);
-  circle(pen, px, py, 9);
+  drawCircle(pen, px, py, 9);
   pen.stroke();
   pen.setLineDash([]);
   pen.beginPath();
   pen.moveTo(...at);
   pen.lineTo(px, py);
   pen.stroke();
-  const text = on ? `stands at ${on}` : `${x.toFixed(2)}, ${y.toFixed(2)} m`;
-  Object.assign(pen, { font: `12px ${colours.font}`, textAlign: px > view.width - 120 ? "right" : "left", strokeStyle: colours.surface, fillStyle: colours.text, lineWidth: 4 });
-  const shift = pen.textAlign === "right" ? -14 : 14;
-  pen.strokeText(text, px + shift, py - 10);
-  pen.fillText(text, px + shift, py - 10);
+  const left = px > view.width - 120;
+  drawText(pen, on ? `snaps to ${on}` : `${x.toFixed(2)}, ${y.toFixed(2)} m`, px + (left ? -14 : 14), py - 10, { font: "12px", align: left ? "right" : "left" });
 }
 
-function circle(pen, x, y, radius) {
-  pen.beginPath();
-  pen.arc(x, y, radius, 0, TURN);
-}
+// --- in the scene ------------------------------------------------------------------------------------
 
-// --- Shift-click in the 3D scene adds a tree: at the stem that was meant, else where the ground is.
+const AXIS_REACH = 0.35; // [m] between the ray of a click and the axis of a stem
+const STEM_HEIGHT = 2.5; // [m] of a stem that takes clicks
+const STILL = 5; // [px]; a longer way between press and release turns the camera
 
-const NEAR = 0.35; // [m] beside a stem's axis still means the stem
-const HEIGHT = 2.5; // [m] of a stem that is seen
-const STILL = 5; // [pixels]; farther is no click, but a turn of the camera
-
-// The ray through a place of the window, in the frame of the map.
+// The ray through a point of the window as two points in the frame of the map.
 function rayAt(inner, x, y) {
   const { camera, canvas, nodeRefFromName } = inner.__viserMutable ?? {};
   const world = nodeRefFromName?.["/world"];
@@ -143,31 +122,27 @@ function rayAt(inner, x, y) {
   return [from.applyMatrix4(toMap), to.applyMatrix4(toMap)];
 }
 
-// How far along the ray it passes an upright stem, in lengths of the ray; null where it misses it.
+// Where along the ray, in lengths of the ray, it passes an upright stem; Infinity if it misses the stem.
 function passes([from, to], { x, y }) {
   const [dx, dy, dz] = [to.x - from.x, to.y - from.y, to.z - from.z];
   const flat = dx * dx + dy * dy;
-  if (flat === 0) return null;
+  if (flat === 0) return Infinity;
   const t = ((x - from.x) * dx + (y - from.y) * dy) / flat;
-  const beside = Math.hypot(from.x + t * dx - x, from.y + t * dy - y);
+  const gap = Math.hypot(from.x + t * dx - x, from.y + t * dy - y);
   const height = from.z + t * dz;
-  return t > 0 && beside < NEAR && height > 0 && height < HEIGHT ? t : null;
+  return t > 0 && gap < AXIS_REACH && height > 0 && height < STEM_HEIGHT ? t : Infinity;
 }
 
-export function meant(ray) {
-  const { x = [], y = [] } = state.map?.clusters ?? {};
-  let [best, least] = [null, Infinity];
-  for (const stem of [...(state.map?.trees ?? []), ...x.map((_, k) => ({ x: x[k], y: y[k] }))]) {
-    const t = passes(ray, stem);
-    if (t !== null && t < least) [best, least] = [stem, t];
-  }
-  if (best) return { x: best.x, y: best.y };
+// The place that a click in the scene means: the first stem on its ray, else the ground.
+function placeOnRay(ray) {
+  const stem = nearest([...trees(), ...clusters()], (each) => passes(ray, each), Infinity);
+  if (stem) return stem;
   const [from, to] = ray;
   const t = from.z / (from.z - to.z);
   return t > 0 && Number.isFinite(t) ? snap(from.x + t * (to.x - from.x), from.y + t * (to.y - from.y)) : null;
 }
 
-export function startAnnotateScene() {
+export function startSceneAnnotating() {
   onSceneLoad((inner) => {
     let down = null;
     inner.addEventListener("pointerdown", (event) => { down = [event.clientX, event.clientY]; }, { capture: true });
@@ -175,7 +150,7 @@ export function startAnnotateScene() {
       if (!annotating() || !event.shiftKey || event.button !== 0 || event.target.tagName !== "CANVAS" || !down) return;
       if (Math.hypot(event.clientX - down[0], event.clientY - down[1]) > STILL) return;
       const ray = rayAt(inner, event.clientX, event.clientY);
-      const place = ray && meant(ray);
+      const place = ray && placeOnRay(ray);
       if (place) add({ x: Math.round(place.x * 1e4) / 1e4, y: Math.round(place.y * 1e4) / 1e4 });
     }, { capture: true });
   });

@@ -1,26 +1,19 @@
-// The tab Clusters: what became of the points and clusters of this scan, and why.
+// The tab Clusters: the verdicts on the clusters of the current scan, and the number of points after each stage.
 
 import { byId, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed } from "../core/format.js";
 import { selectCluster } from "../core/live_feed.js";
-import { on, state } from "../core/store.js";
+import { isPlaying, on, state } from "../core/store.js";
+import { throttled } from "../core/timing.js";
 import { verdictOf } from "../core/verdicts.js";
 import { openStory } from "../explain/story.js";
 import { visible } from "../shell/tabs.js";
 
-const EVERY = 400; // [ms] between two fillings; nobody reads faster
+const EVERY = 80, EVERY_PLAYING = 800; // [ms] between two updates; a row that is replaced under the pointer takes no click
 const panel = () => byId("panel-clusters");
-let filledAt = 0, planned = 0;
-
-// Rows that are made anew under the pointer take no click: while a run plays the table changes rarely.
-function later() {
-  planned ||= setTimeout(() => { planned = 0; show(); }, Math.max(0, (state.status?.state === "playing" ? 2 : 0.2) * EVERY - (performance.now() - filledAt)));
-}
-
 function show() {
   if (!visible("clusters")) return;
-  filledAt = performance.now();
   if (!state.map) {
     panel().replaceChildren(el("p", { class: "empty", text: nothingYet("No scan") }));
     return;
@@ -28,8 +21,8 @@ function show() {
   const verdicts = Object.entries(state.map.verdicts ?? {}).sort((a, b) => (b[0] === "tree") - (a[0] === "tree") || b[1] - a[1]);
   const clusters = verdicts.reduce((sum, [, number]) => sum + number, 0);
   const lead = clusters
-    ? `Scan ${state.map.index}: ${count(clusters, "cluster")}, and what each was taken for.`
-    : `Scan ${state.map.index}: no cluster. Are the box and the height band where the stems are, and is Radius eps large enough?`;
+    ? `Scan ${state.map.index}: ${count(clusters, "cluster")}, with these verdicts.`
+    : `Scan ${state.map.index}: no cluster. Check that the pass-through box and the height band contain the stems, and that Radius eps is large enough.`;
   panel().replaceChildren(el("p", { class: "lead", "data-scan": state.map.index, "data-clusters": clusters, text: lead }), bars(verdicts), clusterTable(), points());
 }
 
@@ -47,7 +40,7 @@ function bars(verdicts) {
   }));
 }
 
-// One row a cluster, the nearest first; a click tells its story.
+// One row per cluster, the nearest first; a click opens its story.
 function clusterTable() {
   const c = state.map.clusters;
   if (!c?.x.length) return "";
@@ -60,7 +53,7 @@ function clusterTable() {
     ...[String(k + 1), c.verdict[k], String(c.size[k]), c.eccentricity[k] === null ? "∞" : figure(c.eccentricity[k]),
       figure(c.radius_cm[k]), fixed(c.distance[k], 1)].map((text) => el("td", { text })));
   });
-  const heads = [["cluster"], ["taken for"], ["points"], ["e", "Eccentricity λ1/λ2"], ["r cm", "Radius of the fitted circle"], ["m away", "Distance from the sensor"]];
+  const heads = [["cluster"], ["verdict"], ["points"], ["e", "Eccentricity λ1/λ2"], ["r cm", "Radius of the fitted circle"], ["m away", "Distance from the sensor"]];
   return el("table", { id: "cluster-table", class: "plain" }, el("thead", {}, el("tr", {}, ...heads.map(([text, title]) => el("th", { scope: "col", text, title })))),
     el("tbody", {}, ...rows));
 }
@@ -72,6 +65,6 @@ function points() {
 }
 
 export function startClusters() {
-  on("map", later);
+  on("map", throttled(show, () => (isPlaying() ? EVERY_PLAYING : EVERY)));
   on("tab selection phase", show);
 }

@@ -1,4 +1,7 @@
-// Requests to the server. A refusal becomes an Error whose message is for people.
+// Requests to the server. A refused or failed request throws an Error whose message is shown to people.
+
+const headers = { "Content-Type": "application/json" };
+const send = (method) => (path, body) => request(path, { method, headers, body: JSON.stringify(body) });
 
 export const request = async (path, options = {}) => (await answered(path, options)).json().catch(() => null);
 
@@ -7,7 +10,7 @@ async function answered(path, options) {
   try {
     answer = await fetch(path, { credentials: "same-origin", ...options });
   } catch {
-    throw new Error("The server does not answer. Is stemmap still running?");
+    throw new Error("The server does not answer. Check that stemmap is still running.");
   }
   if (!answer.ok) throw new Error(wording(await answer.json().catch(() => null), answer.status));
   return answer;
@@ -15,29 +18,25 @@ async function answered(path, options) {
 
 function wording(body, status) {
   const error = body?.error;
-  if (!error?.what) return `The server answered ${status}.`;
+  if (!error?.what) return `The server answered with status ${status}. Try again, or see its log.`;
   const place = error.where ? ` (${error.where})` : "";
   return `${error.what}${place}. ${error.remedy ?? ""}`.trim();
 }
 
-export const post = (path, body) =>
-  request(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+export const get = (path) => request(path);
+export const post = send("POST");
+export const patch = send("PATCH");
+export const put = send("PUT");
+export const remove = (path) => request(path, { method: "DELETE" });
 
-export const patch = (path, body) =>
-  request(path, { method: "PATCH", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
-
-export const put = (path, body) =>
-  request(path, { method: "PUT", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
-
-// Bytes instead of JSON.
+// Answers as bytes.
 export const block = async (path, options = {}) => (await answered(path, options)).arrayBuffer();
 export const blockFor = (path, body) =>
-  block(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+  block(path, { method: "POST", headers, body: JSON.stringify(body) });
 
-export const get = (path) => request(path);
 export const open = (uri, odometry, chosen = {}) => post("/api/open", { uri, odometry, seed: 0, ...chosen });
 
-// Commands go one after the other, so that two quick steps are two steps.
+// Commands are sent one at a time, so that two quick steps are two steps.
 let last = Promise.resolve();
 export function command(type, fields = {}) {
   last = last.catch(() => {}).then(() => post("/api/command", { type, ...fields }));

@@ -1,4 +1,4 @@
-// Small words for the document. Text from outside only ever becomes textContent.
+// Helpers for the document. Text from outside only ever becomes textContent.
 
 export const byId = (id) => document.getElementById(id);
 
@@ -15,6 +15,15 @@ export function el(tag, attributes = {}, ...children) {
   return node;
 }
 
+// A small button; `kind` are its classes.
+export const button = (id, text, title, onclick, kind = "small") => el("button", { id, type: "button", class: kind, text, title, onclick });
+
+// The letter of a verdict on its colour.
+export const letterOf = ([letter, meaning]) => el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" });
+
+// A list of titles with their values: [[title, value], ...].
+export const definitions = (rows) => el("dl", { class: "list" }, ...rows.flatMap(([title, value]) => [el("dt", { text: title }), el("dd", { text: value })]));
+
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
@@ -22,7 +31,7 @@ export function setText(node, text) {
 export function remember(key, value) {
   try {
     localStorage.setItem(`stemmap.${key}`, value);
-  } catch { /* a private window remembers nothing, and works all the same */ }
+  } catch { /* a private window stores nothing */ }
 }
 
 export function recall(key) {

@@ -1,4 +1,4 @@
-// What is on the screen, saved as a file by the browser.
+// Saves pictures and tables of the page as files.
 
 import { el } from "./dom.js";
 

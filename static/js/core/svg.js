@@ -1,4 +1,4 @@
-// Small words for pictures. Sizes are of the picture's own units.
+// Helpers for SVG pictures. Sizes are in units of the viewBox.
 
 const SPACE = "http://www.w3.org/2000/svg";
 
@@ -19,7 +19,7 @@ export const line = (x1, y1, x2, y2, cls) => svg("line", { x1, y1, x2, y2, class
 export const text = (x, y, content, cls = "", anchor = "start") => svg("text", { x, y, class: cls, "text-anchor": anchor, text: content });
 export const circle = (cx, cy, r, cls) => svg("circle", { cx, cy, r, class: cls });
 
-// Angles counter-clockwise from the right, as in mathematics; y of the picture grows downwards.
+// Angles counter-clockwise from the right, as in mathematics; y of the picture points down.
 export function arc(cx, cy, r, from, to, cls) {
   const [a, b] = [[cx + r * Math.cos(from), cy - r * Math.sin(from)], [cx + r * Math.cos(to), cy - r * Math.sin(to)]];
   if (to - from >= 2 * Math.PI - 1e-3) return circle(cx, cy, r, cls);
@@ -29,7 +29,7 @@ export function arc(cx, cy, r, from, to, cls) {
 export const ellipse = (cx, cy, major, minor, angle, cls) =>
   svg("ellipse", { cx, cy, rx: Math.max(major, 0.4), ry: Math.max(minor, 0.4), transform: `rotate(${(-180 * angle) / Math.PI} ${cx} ${cy})`, class: cls });
 
-// A round length [m] of about a third of what is seen.
+// The largest of 1, 2 or 5 times a power of ten that is at most `reach` [m].
 function roundLength(reach) {
   const power = 10 ** Math.floor(Math.log10(reach));
   return [1, 2, 5].map((k) => k * power).filter((length) => length <= reach).pop() ?? power;

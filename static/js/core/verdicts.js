@@ -1,27 +1,27 @@
-// Verdicts by colour, letter and reason: never by colour alone.
+// Letter, colour and explanation of each verdict.
 
 const VERDICTS = {
-  tree: ["T", "tree", "Taken as a stem; it feeds SLAM and the map."],
-  pole: ["P", "pole", "A thin straight thing."],
+  tree: ["T", "tree", "A stem: it is used by SLAM and the map."],
+  pole: ["P", "pole", "A thin straight object."],
   person: ["H", "person", "A person."],
-  bush: ["B", "bush", "Scattered points, no stem."],
-  wall: ["W", "other", "A flat thing."],
-  other: ["O", "other", "Nothing that is known."],
-  "too few points": ["F", "uncertain", "Not enough points to judge it."],
+  bush: ["B", "bush", "Scattered points without a stem."],
+  wall: ["W", "other", "A flat object."],
+  other: ["O", "other", "An object of no known class."],
+  "too few points": ["F", "uncertain", "Fewer points than a verdict needs."],
   "too round": ["R", "other", "λ1/λ2 is below Eccentricity min."],
   "too long": ["L", "other", "λ1/λ2 is above Eccentricity max."],
-  "not round": ["S", "bush", "Distances to the axis scatter more than Radial deviation max."],
-  "too thin": ["N", "pole", "The circle is below Radius min."],
-  "too thick": ["K", "other", "The circle is above Radius max, or the cluster is wider than Width max."],
-  "too low": ["D", "other", "It reaches over less than Visible height min."],
-  "no arc": ["A", "uncertain", "Less of the circle is seen than Visible arc min."],
-  "at border": ["E", "uncertain", "The pass-through box or the field of view cuts it."],
-  moving: ["M", "person", "It moves."],
-  hidden: ["X", "uncertain", "Something nearer hides its edge."],
+  "not round": ["S", "bush", "The radial deviation of its points is above Radial deviation max."],
+  "too thin": ["N", "pole", "The radius of the fitted circle is below Radius min."],
+  "too thick": ["K", "other", "The radius of the fitted circle is above Radius max, or the cluster is wider than Width max."],
+  "too low": ["D", "other", "Its visible height is below Visible height min."],
+  "no arc": ["A", "uncertain", "The visible arc of the circle is below Visible arc min."],
+  "at border": ["E", "uncertain", "It is cut by the pass-through box or the field of view."],
+  moving: ["M", "person", "It moves or has moved away."],
+  hidden: ["X", "uncertain", "Its edge is occluded by a nearer object."],
 };
 
-// Of what is counted; what is not named here is no noun and stays as it is ("3 too few points").
-const MANY = { tree: "trees", pole: "poles", person: "persons", bush: "bushes", wall: "walls", "other thing": "other things" };
+// Plurals; a label that is missing here is not a noun and stays as it is ("3 too few points").
+const MANY = { tree: "trees", pole: "poles", person: "persons", bush: "bushes", wall: "walls", "other object": "other objects" };
 
 // "1 bush", "33 bushes".
 export const counted = (number, label) => `${number} ${number === 1 ? label : (MANY[label] ?? label)}`;

@@ -1,14 +1,14 @@
-// The story of a cluster: its verdict with the figures that led to it, and its fit seen from above.
+// The story of a cluster: its verdict, the checks that led to it, and its fit seen from above.
 
-import { el } from "../core/dom.js";
+import { definitions, el, letterOf } from "../core/dom.js";
 import { clock, figure, NONE } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
-import { gathered } from "./columns.js";
+import { columnFigure } from "./columns.js";
 
 const SIZE = 250; // of the picture
-const WORDS = { eccentricity: "eccentricity λ1/λ2" };
-const named = (check) => WORDS[check.figure] ?? check.figure;
+const NAMES = { eccentricity: "eccentricity λ1/λ2" };
+const named = (check) => NAMES[check.figure] ?? check.figure;
 
 function plain(value, unit) {
   if (value === null) return NONE;
@@ -18,25 +18,23 @@ function plain(value, unit) {
 
 export function clusterStory(story) {
   return [verdict(story), drawing(story), story.circle ? residuals(story) : "", checks(story),
-    gathered(story.gathered, "What all scans gathered at this place")];
+    columnFigure(story.gathered, "Accumulated scans at this place")];
 }
 
-// A stem of one scan is no tree where what all scans gathered says otherwise: then both are said, and the map's is shown.
+// Where the accumulated scans reject a stem of this scan, both verdicts are named and that of the map counts.
 function verdict(story) {
-  const told = story.verdict === "tree" ? (story.gathered?.verdict ?? "tree") : story.verdict;
-  const [letter, meaning] = verdictOf(told);
-  const title = told === story.verdict ? told : `In this scan a stem; the map: ${told}, no tree`;
-  return el("div", { class: "verdict", "data-verdict": told },
-    el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" }),
+  const ofMap = story.verdict === "tree" ? (story.gathered?.verdict ?? "tree") : story.verdict;
+  const title = ofMap === story.verdict ? ofMap : `A stem in this scan; not a tree in the map: ${ofMap}`;
+  return el("div", { class: "verdict", "data-verdict": ofMap }, letterOf(verdictOf(ofMap)),
     el("div", {}, el("b", { text: title }), el("p", { text: why(story) || verdictOf(story.verdict)[2] })));
 }
 
 function why(story) {
-  if (!story.checks.length) return "Another program found it; it is taken as it is.";
+  if (!story.checks.length) return "It was found by another program and is used without checks.";
   const failed = story.checks.find((check) => check.fails);
-  if (!failed) return "It passed every check below, so it was taken as a stem and feeds SLAM.";
-  if (failed.verdict === "at border") return "It goes on beyond the box, the range or the side of the view, so a part of it is not seen.";
-  if (!failed.relation) return "Something nearer hides its edge, so its middle cannot be told.";
+  if (!failed) return "It passed all checks below, so it is a stem and is used by SLAM.";
+  if (failed.verdict === "at border") return "It extends beyond the pass-through box, the range or the field of view, so a part of it is not visible.";
+  if (!failed.relation) return "Its edge is occluded by a nearer object, so its centre is unknown.";
   const side = failed.relation === "at most" ? "above" : "below";
   return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${failed.title}, ${plain(failed.limit, failed.unit)}.`;
 }
@@ -86,12 +84,12 @@ function figures(story) {
   const rows = [["points", String(story.size)], ["λ1/λ2", story.eccentricity === null && story.size > 1 ? "∞" : figure(story.eccentricity)], ["from sensor", `${figure(story.distance)} m`]];
   if (fit) {
     rows.push(["radius", `${figure(100 * fit.radius)} ± ${figure(100 * fit.radius_sigma, 2)} cm`], ["diameter", `${figure(200 * fit.radius)} ± ${figure(200 * fit.radius_sigma, 2)} cm`], ["visible arc", `${figure(fit.arc_deg)}°`],
-      ["axis leans", `${figure(fit.lean_deg, 2)}°`], ["centre ±", `${figure(100 * fit.ellipse[0], 2)} × ${figure(100 * fit.ellipse[1], 2)} cm`]);
+      ["tilt of the axis", `${figure(fit.lean_deg, 2)}°`], ["centre ±", `${figure(100 * fit.ellipse[0], 2)} × ${figure(100 * fit.ellipse[1], 2)} cm`]);
   } else rows.push(["circle", "none fitted"]);
-  return el("dl", { class: "list" }, ...rows.flatMap(([title, value]) => [el("dt", { text: title }), el("dd", { text: value })]));
+  return definitions(rows);
 }
 
-// Residuals over the angle around the stem; 0 degrees looks at the sensor.
+// Residuals over the angle around the stem; 0 degrees faces the sensor.
 function residuals(story) {
   const [width, height, left] = [400, 108, 34];
   const sigma = 1000 * story.sensor_sigma;
@@ -102,7 +100,7 @@ function residuals(story) {
   const marks = [-180, -90, 0, 90, 180].map((degrees) => text(x((degrees * Math.PI) / 180), height - 3, `${degrees}°`, "small", "middle"));
   const band = svg("rect", { x: left, width: width - left - 18, y: y(sigma), height: y(-sigma) - y(sigma), class: "band" });
   return el("figure", {},
-    el("figcaption", { text: `How far each point lies outside (+) or inside (−) the circle, in mm, around the stem; 0° faces the sensor, the band is how much it errs (1 sigma, ${figure(sigma, 2)} mm)` }),
+    el("figcaption", { text: `Residual of each point outside (+) or inside (−) the circle [mm] over the angle around the stem; 0° faces the sensor, the band is its range noise (1 sigma, ${figure(sigma, 2)} mm)` }),
     picture(width, height, "Residuals in millimetres over the angle around the stem", band, line(left, y(0), width - 18, y(0), "zero"),
       text(left - 5, y(most) + 8, `+${figure(most, 2)}`, "small", "end"), text(left - 5, y(0) + 4, "0", "small", "end"),
       text(left - 5, y(-most), `−${figure(most, 2)}`, "small", "end"), ...dots, ...marks));
@@ -120,7 +118,7 @@ function checks(story) {
       el("td", { text: check.fails ? "✕" : check.value === null ? "·" : "✓" }), el("td", { text: named(check) }), el("td", { text: value }),
       el("td", { text: limit }), el("td", { text: check.fails ? check.verdict : "" }));
   });
-  return el("figure", {}, el("figcaption", { text: "What it was asked, in the order that decides" }),
+  return el("figure", {}, el("figcaption", { text: "Checks; the first one that fails decides" }),
     el("table", { class: "checks" }, el("tbody", {}, ...rows)));
 }
 

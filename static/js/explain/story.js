@@ -1,89 +1,113 @@
-// The tab Story: fetched when it is looked at. A cluster is a picture of its scan and stands; a tree goes on.
+// The tab Story: why a cluster or a tree has its verdict. The story of a cluster belongs to its scan; that of a tree is updated.
 
 import { get } from "../core/api.js";
 import { byId, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
+import { capital } from "../core/format.js";
 import { selectCluster } from "../core/live_feed.js";
 import { on, state } from "../core/store.js";
+import { throttled } from "../core/timing.js";
 import { onSceneLoad } from "../scene/scene.js";
 import { openTab, visible } from "../shell/tabs.js";
 import { clusterStory, clusterTitle } from "./cluster.js";
 import { treeStory } from "./tree.js";
 
-const EVERY = 1000; // [ms] between two tellings of a tree while the run plays
-const AGAIN = 3000; // [ms] after which a story that could not be told is asked for once more
-const CLICK = 6000; // [ms] after a click in the scene in which a selection is the answer to it
+const EVERY = 1000; // [ms] between two updates of a tree while the run plays
+const RETRY = 3000; // [ms] after a failed request
+const CLICK = 6000; // [ms] after a click in the scene in which a selection counts as its result
 const panel = () => byId("panel-story");
-let wants = "cluster"; // which of the two is read when both are selected
-let shown = "", busy = false, again = false, askedAt = 0, clickedAt = -CLICK;
+const body = () => panel().querySelector(".story-body");
+let prefers = "cluster"; // which of the two is shown when both are selected
+let shown = "", busy = false, again = false, clickedAt = -CLICK;
 
-const wanted = () => (state.selectedCluster && (wants === "cluster" || state.selected === null) ? "cluster" : state.selected !== null ? "tree" : null);
+// {kind, title, name, version, path}: the story to show; null if nothing is selected. `name` identifies the subject.
+function wanted() {
+  const { scan, cluster } = state.selectedCluster ?? {};
+  if (state.selectedCluster && (prefers === "cluster" || state.selected === null)) {
+    return { kind: "cluster", title: clusterTitle(state.selectedCluster), name: `cluster ${scan} ${cluster}`, version: "", path: `/api/story/cluster/${cluster}?scan=${scan}` };
+  }
+  if (state.selected === null) return null;
+  return { kind: "tree", title: `Tree ${state.selected}`, name: `tree ${state.selected}`, version: `${state.map?.index} ${state.parameters?.revision}`, path: `/api/story/tree/${state.selected}` };
+}
 
 async function show() {
   if (!visible("story")) return;
-  const kind = wanted();
-  head(kind);
-  if (!kind) return empty();
-  const { scan, cluster } = state.selectedCluster ?? {};
-  const key = kind === "cluster" ? `cluster ${scan} ${cluster}` : `tree ${state.selected} ${state.map?.index} ${state.parameters?.revision}`;
-  if (key === shown) return;
+  const subject = wanted();
+  showHead(subject?.kind);
+  if (!subject) return showEmpty();
+  markOld(subject);
+  if (`${subject.name} ${subject.version}` === shown) return;
   if (busy) { again = true; return; }
   busy = true;
-  askedAt = performance.now();
   try {
-    const story = await get(kind === "cluster" ? `/api/story/cluster/${cluster}?scan=${scan}` : `/api/story/tree/${state.selected}`);
-    if (kind === wanted()) fill(kind, story, key);
+    const story = await get(subject.path);
+    if (subject.name === wanted()?.name) fill(subject, story);
   } catch (error) {
-    shown = "";
-    body().replaceChildren(el("p", { class: "empty", text: capital(error.message) }));
-    setTimeout(show, AGAIN);
+    if (subject.name === wanted()?.name) showFailure(subject, error.message);
+    setTimeout(show, RETRY);
   } finally {
     busy = false;
     if (again) { again = false; show(); }
   }
 }
 
-function fill(kind, story, key) {
-  const before = panel().dataset.story, top = panel().scrollTop;
-  shown = key;
-  panel().dataset.story = kind === "cluster" ? `cluster ${story.scan} ${story.cluster}` : `tree ${story.tree}`;
-  panel().dataset.scan = story.scan;
-  body().replaceChildren(...(kind === "cluster" ? clusterStory(story) : treeStory(story, chooseCluster)).filter(Boolean));
-  panel().scrollTop = before === panel().dataset.story ? top : 0;
+// The story of another subject stays visible but dimmed, under a line that names the new one, until its story arrives.
+function markOld({ name, title }) {
+  const old = panel().dataset.story !== name;
+  body().classList.toggle("old", old);
+  body().setAttribute("aria-busy", String(old));
+  const line = panel().querySelector(".story-wait");
+  line.hidden = !old;
+  line.textContent = old ? `Loading the story of ${title[0].toLowerCase()}${title.slice(1)} …` : "";
 }
 
-const body = () => panel().querySelector(".story-body");
-const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
-
-function chooseCluster(scan, cluster) {
-  wants = "cluster";
-  selectCluster(scan, cluster);
+function fill(subject, story) {
+  const sameSubject = panel().dataset.story === subject.name, top = panel().scrollTop;
+  shown = `${subject.name} ${subject.version}`;
+  Object.assign(panel().dataset, { story: subject.name, scan: story.scan });
+  body().replaceChildren(...(subject.kind === "cluster" ? clusterStory(story) : treeStory(story, chooseCluster)).filter(Boolean));
+  markOld(subject);
+  panel().scrollTop = sameSubject ? top : 0;
 }
 
-function head(kind) {
-  const choices = [["cluster", state.selectedCluster && clusterTitle(state.selectedCluster)], ["tree", state.selected !== null && `Tree ${state.selected}`]];
-  const buttons = choices.filter(([, title]) => title).map(([name, title]) =>
-    el("button", { class: "small", "aria-pressed": String(name === kind), text: title, onclick: () => { wants = name; show(); } }));
-  panel().querySelector(".story-head").replaceChildren(...buttons);
+function showFailure(subject, message) {
+  shown = "";
+  panel().dataset.story = subject.name;
+  body().replaceChildren(el("p", { class: "empty", text: capital(message) }));
+  markOld(subject);
 }
 
-function empty() {
+function showEmpty() {
   shown = "";
   delete panel().dataset.story;
+  body().classList.remove("old");
+  panel().querySelector(".story-wait").hidden = true;
   body().replaceChildren(el("p", { class: "empty", text: state.map
-    ? "Nothing is selected. Click a cluster or a tree in the 3D scene, on the map or in a table, and it tells why it was taken for what it is."
+    ? "Nothing selected. Click a cluster or a tree in the 3D scene, on the map or in a table to see why it has its verdict."
     : nothingYet() }));
 }
 
-// A person here has chosen something: read about it, wherever it was chosen.
+function chooseCluster(scan, cluster) {
+  prefers = "cluster";
+  selectCluster(scan, cluster);
+}
+
+function showHead(kind) {
+  const choices = [["cluster", state.selectedCluster && clusterTitle(state.selectedCluster)], ["tree", state.selected !== null && `Tree ${state.selected}`]];
+  const buttons = choices.filter(([, title]) => title).map(([name, title]) =>
+    el("button", { class: "small", "aria-pressed": String(name === kind), text: title, onclick: () => { prefers = name; show(); } }));
+  panel().querySelector(".story-head").replaceChildren(...buttons);
+}
+
+// Opens the tab after a person has selected something, wherever that was.
 export function openStory(kind) {
-  wants = kind;
+  prefers = kind;
   openTab("story");
   byId("side").classList.add("open");
   byId("drawer-button").setAttribute("aria-expanded", "true");
 }
 
-function selected() {
+function onSelection() {
   if (performance.now() - clickedAt < CLICK && (state.selected !== null || state.selectedCluster)) {
     clickedAt = -CLICK;
     openStory(state.selectedCluster ? "cluster" : "tree");
@@ -92,22 +116,21 @@ function selected() {
   show();
 }
 
-function later() {
-  if (wanted() === "tree" && performance.now() - askedAt >= EVERY) show();
-}
+const update = throttled(() => { if (wanted()?.kind === "tree") show(); }, EVERY);
 
-function missing({ missing: { detail, scan, cluster } = {} }) {
-  if (detail && visible("story") && wants === "cluster") {
-    body().replaceChildren(el("p", { class: "empty", text: `${capital(detail)}. (cluster ${cluster + 1} of scan ${scan})` }));
+// The cluster of a click is not known any more.
+function onMissing({ missing: { detail, scan, cluster } = {} }) {
+  if (detail && visible("story") && prefers === "cluster") {
+    body().replaceChildren(el("p", { class: "empty", text: `${capital(detail)} (cluster ${cluster + 1} of scan ${scan}).` }));
   }
 }
 
 export function startStory() {
-  panel().append(el("div", { class: "story-head" }), el("div", { class: "story-body" }));
-  on("selection", selected);
-  on("map", later);
-  on("status", () => state.status?.state !== "playing" && later());
+  panel().append(el("div", { class: "story-head" }), el("p", { class: "story-wait note dim", role: "status", hidden: true }), el("div", { class: "story-body" }));
+  on("selection", onSelection);
+  on("map", update);
+  on("status", () => { if (state.status?.state !== "playing") update(); });
   on("tab", () => show());
-  on("missing", missing);
+  on("missing", onMissing);
   onSceneLoad((inner) => inner.addEventListener("pointerdown", () => { clickedAt = performance.now(); }, { capture: true }));
 }

@@ -1,29 +1,27 @@
-// The story of a tree: what it is and why, how thick, from which sides it was seen, and where it was thought to be.
+// The story of a tree: verdict, diameter, observed sides, and the history of its position.
 
-import { el } from "../core/dom.js";
-import { clock, figure, isAssumed, NONE } from "../core/format.js";
+import { definitions, el, letterOf } from "../core/dom.js";
+import { clock, count, figure, isAssumed, NONE } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
-import { gathered } from "./columns.js";
+import { columnFigure } from "./columns.js";
 
 const TURN = 2 * Math.PI;
 
 export function treeStory(story, showCluster) {
-  return [verdict(story), overview(story, showCluster), positions(story), gathered(story.gathered, "Verdict on what all scans gathered")];
+  return [verdict(story), overview(story, showCluster), positions(story), columnFigure(story.gathered, "Verdict on the accumulated scans")];
 }
 
 function verdict(story) {
   const label = story.gathered?.verdict ?? (story.confirmed ? "tree" : "other");
-  const [letter, meaning] = verdictOf(label);
-  return el("div", { class: "verdict", "data-verdict": label },
-    el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" }),
+  return el("div", { class: "verdict", "data-verdict": label }, letterOf(verdictOf(label)),
     el("div", {}, el("b", { text: story.confirmed ? "tree" : `not in the map: ${label}` }),
       el("p", { text: seen(story) })));
 }
 
 function seen(story) {
-  if (isAssumed(story)) return "No single scan detected it, all scans together did: its place is where their returns stand, and how well that is known is assumed, not measured.";
-  return `Seen in ${story.observations} scans, first at ${clock(story.first_seen_s)}, last at ${clock(story.last_seen_s)}.`;
+  if (isAssumed(story)) return "No single scan detected it, only the accumulated scans did: its position is that of their returns, and the uncertainty is assumed, not measured.";
+  return `Detected in ${count(story.observations, "scan")}, first at ${clock(story.first_seen_s)}, last at ${clock(story.last_seen_s)}.`;
 }
 
 function overview(story, showCluster) {
@@ -31,25 +29,25 @@ function overview(story, showCluster) {
   const rows = [["DBH", dbh], ["covered", `${figure(story.coverage_deg)}° of 360°`], ["x, y", `${story.position[0].toFixed(2)}, ${story.position[1].toFixed(2)} m`],
     ["position ±", isAssumed(story) ? `≈ ${figure(100 * story.ellipse[0], 2)} cm, assumed` : `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["mean λ1/λ2", figure(story.eccentricity)]];
   return el("div", { class: "story-fit" }, covered(story), el("div", {},
-    el("dl", { class: "list" }, ...rows.flatMap(([title, value]) => [el("dt", { text: title }), el("dd", { text: value })])),
-    story.dbh === null ? el("p", { class: "dim note", text: `A DBH is told from ${figure(story.dbh_arc_deg)}° on.` }) : "",
+    definitions(rows),
+    story.dbh === null ? el("p", { class: "dim note", text: `The DBH needs ${figure(story.dbh_arc_deg)}° of the circumference.` }) : "",
     story.cluster === null ? "" : el("button", { class: "small", text: `Its cluster in scan ${story.scan}`, onclick: () => showCluster(story.scan, story.cluster) })));
 }
 
-// The sides that were seen, as an arc around the trunk; x of the map to the right.
+// The observed sides as arcs around the trunk; x of the map to the right.
 function covered(story) {
   const size = 200, middle = size / 2, radius = 66;
   const step = TURN / Math.max(story.sides.length, 1);
   const seen = story.sides.flatMap((is, k) => (is ? [arc(middle, middle, radius, k * step, (k + 1) * step, "side")] : []));
   return picture(size, size, `Covered ${figure(story.coverage_deg)} degrees of the trunk`, circle(middle, middle, radius, "circle"), ...seen,
     text(middle, middle + 2, story.dbh === null ? "no DBH yet" : `${figure(100 * story.dbh)} cm`, story.dbh === null ? "" : "big", "middle"),
-    text(middle, middle + 20, `${figure(story.coverage_deg)}° seen`, "small", "middle"),
+    text(middle, middle + 20, `${figure(story.coverage_deg)}° covered`, "small", "middle"),
     ...[["x", middle + radius + 18, middle + 4], ["y", middle, middle - radius - 12]].map(([name, x, y]) => text(x, y, name, "small", "middle")));
 }
 
 function positions({ history, ellipse: now }) {
   const n = history.x.length;
-  if (n < 2) return el("p", { class: "dim note", text: "Its position has no history yet: no scan measured it twice." });
+  if (n < 2) return el("p", { class: "dim note", text: "No history of its position yet: fewer than two scans have detected it." });
   const [width, height] = [400, 190], scaleTo = 0.62 * 190;
   const last = [history.x.at(-1), history.y.at(-1)];
   const reach = Math.max(0.01, ...history.x.map((x, k) => Math.max(Math.abs(x - last[0]) + 0.7 * history.major[k], Math.abs(history.y[k] - last[1]) + 0.7 * history.major[k])));
@@ -63,7 +61,7 @@ function positions({ history, ellipse: now }) {
   });
   const path = svg("polyline", { points: history.x.map((_, k) => at(k).join(",")).join(" "), class: "track" });
   return el("figure", {},
-    el("figcaption", { text: `Where it was thought to be: sigma ellipses from ${clock(history.time_s[0])} to ${clock(history.time_s[n - 1])}, ${figure(100 * history.major[0], 2)} cm down to ${figure(100 * now[0], 2)} cm` }),
+    el("figcaption", { text: `Estimated positions with sigma ellipses from ${clock(history.time_s[0])} to ${clock(history.time_s[n - 1])}, ${figure(100 * history.major[0], 2)} cm down to ${figure(100 * now[0], 2)} cm` }),
     picture(width, height, "History of the position with its sigma ellipses, and sigma over time", path, ...rings, circle(...at(n - 1), 2.5, "axis"),
       scaleBar(8, height - 8, reach / 2, scale), ...shrinking(history, width, height)));
 }

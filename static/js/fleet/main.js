@@ -1,18 +1,17 @@
-// The page of all robots: what the server tells of each, a card each and one map.
+// The page of all robots: one card per robot, and one map of all robots whose frames are known.
 
 import { byId, el, setText } from "../core/dom.js";
-import { figure, NONE } from "../core/format.js";
+import { count, figure, NONE } from "../core/format.js";
+import { connectTo } from "../core/socket.js";
 import { on } from "../core/store.js";
 import { startTheme } from "../core/theme.js";
-import { colourOf, drawCommon, drawOwn } from "./map.js";
+import { colourOf, commonMap, letterOf, ownMap } from "./map.js";
 
-const FIRST_WAIT = 500, LONGEST_WAIT = 5000;
-const cards = new Map(); // by the robot's name
-const places = new Map(); // colour and letter of a name, which stay its own when others leave
+const cards = new Map(); // by the name of the robot
+const places = new Map(); // colour and letter by name; a robot keeps them when others leave
 let maps = {};
 let members = [];
-let wait = FIRST_WAIT;
-let lostAt = 0;
+let lostAt = 0; // when the connection was lost [ms], 0 while it is open
 
 function showMembers(message) {
   members = message.members;
@@ -22,7 +21,7 @@ function showMembers(message) {
     setText(notice, message.notice);
   }
   const live = members.filter(({ state }) => state === "playing").length;
-  setText(byId("fleet-count"), members.length ? `${members.length} of them, ${live} mapping now` : "");
+  setText(byId("fleet-count"), members.length ? `${count(members.length, "robot")}, ${live} mapping now` : "");
   const there = new Set(members.map(({ name }) => name));
   for (const [name, { node }] of cards) {
     if (there.has(name)) continue;
@@ -37,7 +36,7 @@ function showMembers(message) {
     fillCard(cards.get(member.name), member);
   }
   byId("cards").querySelector(".empty")?.remove();
-  if (!members.length) byId("cards").append(el("p", { class: "empty", text: "No robot yet. Each one that sends scans gets a card here as soon as it is heard." }));
+  if (!members.length) byId("cards").append(el("p", { class: "empty", text: "No robot yet. A robot appears here as soon as its first scan arrives." }));
 }
 
 function placeOf(name) {
@@ -50,53 +49,21 @@ function showMaps(message) {
   repaint();
 }
 
+const shared = () => members.map(({ name }) => ({ name, k: placeOf(name), map: maps[name] })).filter(({ map }) => map?.common);
+const common = commonMap(byId("common-map"), shared);
+
 function repaint() {
-  for (const { name } of members) drawOwn(cards.get(name)?.canvas, maps[name], placeOf(name));
-  const shared = members.map(({ name }) => ({ name, k: placeOf(name), map: maps[name] })).filter(({ map }) => map?.common);
-  drawCommon(byId("common-map"), shared);
+  for (const { map } of cards.values()) map.redraw();
+  common.redraw();
+  const [, ...others] = shared();
   const apart = members.filter(({ name }) => maps[name] && !maps[name].common);
-  const words = [];
-  if (shared.length > 1) words.push(shared.slice(1).map(({ name, map }) => `${name}: ${map.how}`).join("; "));
-  if (apart.length) words.push(`Not on this map: ${apart.map(({ name }) => `${name} (${maps[name].how})`).join("; ")}`);
-  setText(byId("common-words"), words.join(". "));
+  const texts = [];
+  if (others.length) texts.push(others.map(({ name, map }) => `${name}: ${map.how}`).join("; "));
+  if (apart.length) texts.push(`Not on this map: ${apart.map(({ name }) => `${name} (${maps[name].how})`).join("; ")}`);
+  setText(byId("common-words"), texts.join(". "));
 }
 
-const takers = { fleet: showMembers, maps: showMaps };
-
-function connect() {
-  const scheme = location.protocol === "https:" ? "wss" : "ws";
-  const socket = new WebSocket(`${scheme}://${location.host}/api/fleet`);
-  socket.onopen = () => {
-    wait = FIRST_WAIT;
-    lostAt = 0;
-    document.body.classList.remove("lost");
-    byId("fleet-notice").classList.remove("bad");
-  };
-  socket.onmessage = (event) => {
-    const message = JSON.parse(event.data);
-    takers[message.type]?.(message);
-  };
-  socket.onclose = () => {
-    lostAt ||= performance.now();
-    document.body.classList.add("lost");
-    setTimeout(connect, wait);
-    wait = Math.min(2 * wait, LONGEST_WAIT);
-  };
-}
-
-setInterval(() => {
-  if (!lostAt) return;
-  const notice = byId("fleet-notice");
-  notice.hidden = false;
-  notice.classList.add("bad");
-  setText(notice, `No connection for ${Math.floor((performance.now() - lostAt) / 1000)} s. This is the last picture; it goes on by itself when stemmap answers again.`);
-}, 1000);
-addEventListener("resize", repaint);
-on("theme", repaint);
-startTheme();
-connect();
-
-// --- A robot's card: state, figures, what is wrong, and the way to its own dashboard.
+// --- the card of a robot -----------------------------------------------------------------------------
 
 const WORDS = { starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed" };
 const FIGURES = {
@@ -106,7 +73,7 @@ const FIGURES = {
   behind: ["behind", (m) => [m.behind === null ? NONE : String(m.behind), m.behind > 20 ? "warn" : ""]],
   driven: ["m driven", (m) => [figure(m.distance_m)]],
 };
-const QUIET = ["starting", "failed"];
+const NO_FIGURES = ["starting", "failed"];
 
 function card(name, place, remote) {
   const cells = {};
@@ -125,22 +92,19 @@ function card(name, place, remote) {
     el("h2", {}, el("i", { "aria-hidden": "true", text: letterOf(place) }), name), canvas, state, el("small", { class: "source" }), list, words,
     el("div", { class: "foot" }, foot, link));
   node.style.setProperty("--robot-colour", colourOf(place));
-  return { node, canvas, state, cells, words, foot, link, source: node.querySelector(".source") };
+  return { node, map: ownMap(canvas, () => maps[name], place), state, cells, words, foot, link, source: node.querySelector(".source") };
 }
-
-// Never colour alone: the letter stands on the map too.
-export const letterOf = (place) => String.fromCharCode(65 + (place % 26));
 
 function fillCard(made, member) {
   made.state.dataset.state = member.state;
   setText(made.state.querySelector("b"), member.live && member.state === "playing" ? "Live" : (WORDS[member.state] ?? member.state));
   setText(made.source, member.source);
   for (const [key, [, read]] of Object.entries(FIGURES)) {
-    const [text, meaning] = QUIET.includes(member.state) ? [NONE] : read(member);
+    const [text, meaning] = NO_FIGURES.includes(member.state) ? [NONE] : read(member);
     setText(made.cells[key].value, text);
     made.cells[key].cell.className = meaning ?? "";
   }
-  made.link.hidden = !member.remote && !member.answers; // a link to what does not answer yet would only hang
+  made.link.hidden = !member.remote && !member.answers; // the dashboard of a robot that does not answer yet cannot be opened
   setText(made.words, wordsOf(member));
   made.words.classList.toggle("bad", member.state === "failed");
   const lost = member.recording.startsWith("not");
@@ -153,3 +117,27 @@ function wordsOf({ detail, clearance, state }) {
   if (state !== "playing" || !clearance) return "";
   return { slow: `▲ Slow: obstacle ${figure(clearance.ahead_m)} m ahead`, stop: `■ Stop: obstacle ${figure(clearance.ahead_m)} m ahead` }[clearance.zone] ?? "";
 }
+
+const receivers = { fleet: showMembers, maps: showMaps };
+
+connectTo("/api/fleet", {
+  onMessage: (message) => receivers[message.type]?.(message),
+  onOpen() {
+    lostAt = 0;
+    document.body.classList.remove("lost");
+    byId("fleet-notice").classList.remove("bad");
+  },
+  onClose() {
+    lostAt ||= performance.now();
+    document.body.classList.add("lost");
+  },
+});
+setInterval(() => {
+  if (!lostAt) return;
+  const notice = byId("fleet-notice");
+  notice.hidden = false;
+  notice.classList.add("bad");
+  setText(notice, `No connection for ${Math.floor((performance.now() - lostAt) / 1000)} s. The last state is shown; the page reconnects by itself.`);
+}, 1000);
+on("theme", repaint);
+startTheme();

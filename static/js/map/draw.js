@@ -1,6 +1,8 @@
-// Paints the 2D map of Fig. 5: path grey, robot a red triangle, trees as circles with their number.
+// Paints 2D maps as in Fig. 5 of the paper: path grey, robot a red triangle, trees as circles with their numbers.
 
 import { isAssumed } from "../core/format.js";
+import { nearest } from "../core/nearest.js";
+import { colours } from "../core/theme.js";
 import { verdictOf } from "../core/verdicts.js";
 import { measuredText } from "./measure.js";
 
@@ -9,37 +11,55 @@ const TURN = 2 * Math.PI;
 export const symbolRadius = (tree, scale) =>
   Math.max(tree.dbh_cm === null ? 3.5 : 3 + 0.11 * tree.dbh_cm, tree.dbh_cm === null ? 0 : (tree.dbh_cm / 200) * scale);
 
-export function drawMap(pen, view, state, colours) {
-  pen.clearRect(0, 0, view.width, view.height);
-  drawGrid(pen, view, colours);
+const TREE_REACH = 14; // [px] around the symbol of a tree
+
+// The tree at a point of the canvas [px], or null.
+export const treeAt = (trees, [px, py], view) => nearest(trees, (tree) => {
+  const [x, y] = view.toScreen(tree.x, tree.y);
+  return Math.hypot(px - x, py - y) - symbolRadius(tree, view.scale);
+}, TREE_REACH);
+
+// Grid and scale bar around what `paint` draws.
+export function drawFrame(pen, view, paint) {
+  drawGrid(pen, view);
+  paint();
+  drawScaleBar(pen, view);
+}
+
+export const drawMap = (pen, view, state) => drawFrame(pen, view, () => drawContent(pen, view, state));
+
+function drawContent(pen, view, state) {
   drawLine(pen, view, alignedOdometry(state), colours.odometry, 1.2);
   drawLine(pen, view, state.path, colours.path, 2);
-  for (const truth of state.truth ?? []) drawTruth(pen, view, truth, colours);
-  if (state.ghost) drawGhost(pen, view, state.ghost, colours);
+  for (const truth of state.truth ?? []) drawTruth(pen, view, truth);
+  if (state.ghost) drawGhost(pen, view, state.ghost);
   const trees = state.map?.trees ?? [];
-  drawClusters(pen, view, state.map?.clusters, colours);
-  for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected, colours);
-  state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0, colours));
+  drawClusters(pen, view, state.map?.clusters);
+  for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected);
+  state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0));
   const before = new Map((state.ghost?.renamed ?? []).filter(([old, now]) => old !== now).map(([old, now]) => [now, old]));
-  drawNumbers(pen, view, trees, state.selected, colours, {
-    radiusOf: symbolRadius, first: new Set(before.keys()), robot: state.map && view.toScreen(...state.map.pose),
+  drawNumbers(pen, view, trees, state.selected, {
+    first: new Set(before.keys()), robot: state.map && view.toScreen(...state.map.pose),
     words: ({ number }) => (before.has(number) ? `${number} (was ${before.get(number)})` : String(number)),
   });
-  if (state.selectedCluster) drawRing(pen, view, state.selectedCluster, colours);
-  if (state.map) drawRobot(pen, view, state.map, colours);
-  if (state.measure?.to) drawMeasure(pen, view, state.measure, colours);
-  drawScaleBar(pen, view, colours);
+  if (state.selectedCluster) drawRing(pen, view, state.selectedCluster);
+  if (state.map) drawRobot(pen, view, state.map);
+  if (state.measure?.to) drawMeasure(pen, view, state.measure);
 }
 
-// Grid and scale bar around what another picture paints.
-export function drawFrame(pen, view, colours, paint) {
-  pen.clearRect(0, 0, view.width, view.height);
-  drawGrid(pen, view, colours);
-  paint();
-  drawScaleBar(pen, view, colours);
+export function drawCircle(pen, x, y, radius) {
+  pen.beginPath();
+  pen.arc(x, y, radius, 0, TURN);
 }
 
-function drawGrid(pen, view, colours) {
+// Text with a margin in the colour of the surface, readable on any ground.
+export function drawText(pen, text, x, y, { font, align = "center", margin = 4 }) {
+  Object.assign(pen, { font: `${font} ${colours.font}`, textAlign: align, lineJoin: "round", strokeStyle: colours.surface, fillStyle: colours.text, lineWidth: margin });
+  pen.strokeText(text, x, y);
+  pen.fillText(text, x, y);
+}
+
+function drawGrid(pen, view) {
   const step = view.step();
   const [x0, y0] = view.toMap(0, view.height);
   const [x1, y1] = view.toMap(view.width, 0);
@@ -71,14 +91,14 @@ export function drawLine(pen, view, points, colour, width) {
     if (!point) continue;
     const [px, py] = view.toScreen(point[0], point[1]);
     if (last === null) pen.moveTo(px, py);
-    else if (Math.abs(px - last[0]) + Math.abs(py - last[1]) < 1.5) continue; // closer than can be seen
+    else if (Math.abs(px - last[0]) + Math.abs(py - last[1]) < 1.5) continue; // closer than a pixel and a half
     else pen.lineTo(px, py);
     last = [px, py];
   }
   pen.stroke();
 }
 
-// Odometry starts where the path starts, so that the eye sees what drifted since.
+// The odometry moved to the start of the path, so that its drift since then is visible.
 function alignedOdometry({ odometry, path, map }) {
   const first = odometry.findIndex(Boolean);
   if (first < 0 || !map || first >= path.length) return [];
@@ -94,26 +114,25 @@ function alignedOdometry({ odometry, path, map }) {
     p && [path[first][0] + c * (p[0] - ox) - s * (p[1] - oy), path[first][1] + s * (p[0] - ox) + c * (p[1] - oy)]);
 }
 
-export function drawTruth(pen, view, truth, colours) {
+export function drawTruth(pen, view, truth) {
   const [px, py] = view.toScreen(truth.x, truth.y);
   const radius = symbolRadius(truth, view.scale) + 3;
   Object.assign(pen, { strokeStyle: colours.truth, lineWidth: 1.6 });
   pen.beginPath();
   if (truth.kind === "tree") pen.arc(px, py, radius, 0, TURN);
-  else { // a shape of its own: what is no tree is a diamond
+  else { // other things are diamonds: never colour only
     pen.moveTo(px, py - 5);
     for (const [dx, dy] of [[5, 0], [0, 5], [-5, 0], [0, -5]]) pen.lineTo(px + dx, py + dy);
   }
   pen.stroke();
 }
 
-// The map as it was before the run was mapped again: dashed where a tree stood, and a ring around what is not as it was.
-function drawGhost(pen, view, { ghost, changes }, colours) {
+// The previous map, or a preview of the next one: dashed circles for its trees, and a ring around each difference.
+function drawGhost(pen, view, { ghost, changes }) {
   Object.assign(pen, { strokeStyle: colours.axis, lineWidth: 1.5 });
   pen.setLineDash([3, 3]);
   for (const [x, y, dbh] of ghost) {
-    pen.beginPath();
-    pen.arc(...view.toScreen(x, y), symbolRadius({ dbh_cm: dbh === null ? null : 100 * dbh }, view.scale) + 2, 0, TURN);
+    drawCircle(pen, ...view.toScreen(x, y), symbolRadius({ dbh_cm: dbh === null ? null : 100 * dbh }, view.scale) + 2);
     pen.stroke();
   }
   pen.setLineDash([]);
@@ -121,8 +140,7 @@ function drawGhost(pen, view, { ghost, changes }, colours) {
   for (const { kind, x, y } of changes) {
     const [px, py] = view.toScreen(x, y);
     pen.strokeStyle = kind === "vanished" ? colours.robot : colours.selection;
-    pen.beginPath();
-    pen.arc(px, py, 13, 0, TURN);
+    drawCircle(pen, px, py, 13);
     if (kind === "vanished") { // crossed out
       pen.moveTo(px - 9, py - 9);
       pen.lineTo(px + 9, py + 9);
@@ -131,18 +149,18 @@ function drawGhost(pen, view, { ghost, changes }, colours) {
   }
 }
 
-// Small squares: what this scan took for something else than a tree.
-function drawClusters(pen, view, clusters, colours) {
+// Small squares: clusters of the current scan that were rejected as trees.
+function drawClusters(pen, view, clusters) {
   for (let k = 0; k < (clusters?.x.length ?? 0); k += 1) {
-    if (clusters.verdict[k] === "tree") continue; // the tree itself is drawn, or will be
+    if (clusters.verdict[k] === "tree") continue; // drawn as a tree of the map
     const [px, py] = view.toScreen(clusters.x[k], clusters.y[k]);
     pen.fillStyle = colours[verdictOf(clusters.verdict[k])[1]];
     pen.fillRect(px - 2.5, py - 2.5, 5, 5);
   }
 }
 
-// What one of two compared sets takes for trees: half a disc, the left half for A and the right one for B.
-function drawHalves(pen, view, { x, y, verdict }, left, colours) {
+// Trees of one of two compared parameter sets: half discs, left for A and right for B.
+function drawHalves(pen, view, { x, y, verdict }, left) {
   Object.assign(pen, { fillStyle: colours[left ? "set-a" : "set-b"], strokeStyle: colours.surface, lineWidth: 1 });
   for (let k = 0; k < x.length; k += 1) {
     if (verdict[k] !== "tree") continue;
@@ -155,17 +173,16 @@ function drawHalves(pen, view, { x, y, verdict }, left, colours) {
   }
 }
 
-function drawRing(pen, view, { x, y }, colours) {
+function drawRing(pen, view, { x, y }) {
   const [px, py] = view.toScreen(x, y);
   Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });
   pen.strokeRect(px - 8, py - 8, 16, 16);
 }
 
-export function drawTree(pen, view, tree, selected, colours) {
+export function drawTree(pen, view, tree, selected) {
   const [px, py] = view.toScreen(tree.x, tree.y);
-  pen.beginPath();
-  pen.arc(px, py, symbolRadius(tree, view.scale), 0, TURN);
-  if (tree.dbh_cm === null) { // never measured: hollow
+  drawCircle(pen, px, py, symbolRadius(tree, view.scale));
+  if (tree.dbh_cm === null) { // DBH not measured: hollow
     Object.assign(pen, { strokeStyle: colours.tree, lineWidth: 2 });
     pen.stroke();
   } else {
@@ -183,35 +200,38 @@ export function drawTree(pen, view, tree, selected, colours) {
   }
   if (selected) {
     Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });
-    pen.beginPath();
-    pen.arc(px, py, symbolRadius(tree, view.scale) + 5, 0, TURN);
+    drawCircle(pen, px, py, symbolRadius(tree, view.scale) + 5);
     pen.stroke();
   }
 }
 
-function drawRobot(pen, view, { pose: [x, y, yaw], sigma_xy: sigma }, colours) {
+function drawRobot(pen, view, { pose: [x, y, yaw], sigma_xy: sigma }) {
   const [px, py] = view.toScreen(x, y);
   if (sigma * view.scale > 4) {
     pen.strokeStyle = colours.robot;
-    pen.beginPath();
-    pen.arc(px, py, sigma * view.scale, 0, TURN);
+    drawCircle(pen, px, py, sigma * view.scale);
     pen.stroke();
   }
+  drawTriangle(pen, px, py, yaw, 12, colours.robot);
+}
+
+// A robot at a point of the canvas that looks along `yaw` [rad].
+export function drawTriangle(pen, px, py, yaw, size, colour) {
   const corner = (turn, reach) => [px + reach * Math.cos(yaw + turn), py - reach * Math.sin(yaw + turn)];
-  Object.assign(pen, { fillStyle: colours.robot, strokeStyle: colours.surface, lineWidth: 1.5 });
+  Object.assign(pen, { fillStyle: colour, strokeStyle: colours.surface, lineWidth: 1.5 });
   pen.beginPath();
-  pen.moveTo(...corner(0, 12));
-  pen.lineTo(...corner(2.5, 9));
-  pen.lineTo(...corner(-2.5, 9));
+  pen.moveTo(...corner(0, size));
+  pen.lineTo(...corner(2.5, 0.75 * size));
+  pen.lineTo(...corner(-2.5, 0.75 * size));
   pen.closePath();
   pen.stroke();
   pen.fill();
 }
 
-function drawMeasure(pen, view, measure, colours) {
+function drawMeasure(pen, view, measure) {
   const { from, to } = measure;
   const [a, b] = [view.toScreen(from.x, from.y), view.toScreen(to.x, to.y)];
-  Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 2, font: `bold 13px ${colours.font}`, textAlign: "center" });
+  Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 2 });
   pen.beginPath();
   pen.moveTo(...a);
   pen.lineTo(...b);
@@ -220,14 +240,10 @@ function drawMeasure(pen, view, measure, colours) {
     pen.arc(x, y, 4, 0, TURN);
   }
   pen.stroke();
-  const at = [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 8];
-  const text = measuredText(measure);
-  Object.assign(pen, { strokeStyle: colours.surface, fillStyle: colours.text, lineWidth: 4 });
-  pen.strokeText(text, ...at);
-  pen.fillText(text, ...at);
+  drawText(pen, measuredText(measure), (a[0] + b[0]) / 2, (a[1] + b[1]) / 2 - 8, { font: "bold 13px" });
 }
 
-function drawScaleBar(pen, view, colours) {
+function drawScaleBar(pen, view) {
   const step = view.step();
   const [x, y, length] = [view.width - 14, view.height - 10, step * view.scale];
   Object.assign(pen, { strokeStyle: colours.text, fillStyle: colours.text, lineWidth: 2, textAlign: "right", font: `11px ${colours.font}` });
@@ -240,13 +256,13 @@ function drawScaleBar(pen, view, colours) {
   pen.fillText(`${Number(step.toPrecision(2))} m`, x, y - 8);
 }
 
-// --- The numbers of trees on the map: each where it covers no other number and no symbol, or not at all; zooming brings it back.
+// --- numbers of the trees: drawn where they cover no other number and no symbol ------------------------
 
-const CELL = 32; // pixels; a box is looked for in the cells that it touches
-const GAP = 2;
-const SMALL = 11, LARGE = 13; // of letters; the selected tree's are larger
+const CELL = 32; // [px]; a box is searched for in the cells that it touches
+const GAP = 2; // [px]
+const SMALL = 11, LARGE = 13; // [px] font size of a number and of the selected one
 
-// Boxes [left, top, right, bottom] in pixels, found by where they are.
+// Boxes [left, top, right, bottom] [px] in a hash grid.
 class Boxes {
   cells = new Map();
 
@@ -271,14 +287,14 @@ class Boxes {
   }
 }
 
-// Right of the symbol first, as people read; then left, above, below.
+// Positions of a number in order of preference: right of the symbol, left, above, below.
 function placesOf(x, y, radius, width, height) {
   const reach = radius + GAP + 1;
   return [[x + reach, y - height / 2], [x - reach - width, y - height / 2], [x - width / 2, y - reach - height], [x - width / 2, y + reach]];
 }
 
-// The selected tree comes first, then those that `first` names (of which a person said something), then what was seen most often.
-export function drawNumbers(pen, view, trees, selected, colours, { radiusOf, first = new Set(), words = ({ number }) => String(number), robot = null }) {
+// The selected tree has priority, then the numbers in `first`, then the trees with the most observations.
+export function drawNumbers(pen, view, trees, selected, { radiusOf = symbolRadius, first = new Set(), words = ({ number }) => String(number), robot = null } = {}) {
   const taken = new Boxes();
   const seen = [];
   for (const tree of trees) {
@@ -291,19 +307,18 @@ export function drawNumbers(pen, view, trees, selected, colours, { radiusOf, fir
   if (robot) taken.add([robot[0] - 9, robot[1] - 9, robot[0] + 9, robot[1] + 9]);
   const rank = ({ number }) => (number === selected ? 0 : first.has(number) ? 1 : 2);
   seen.sort((a, b) => rank(a.tree) - rank(b.tree) || (b.tree.observations ?? 0) - (a.tree.observations ?? 0) || a.tree.number - b.tree.number);
-  Object.assign(pen, { fillStyle: colours.text, strokeStyle: colours.surface, lineWidth: 3, textAlign: "left", lineJoin: "round" });
   for (const { tree, x, y, radius } of seen) {
     const chosen = tree.number === selected;
     const size = chosen ? LARGE : SMALL;
-    pen.font = `${chosen ? "bold " : ""}${size}px ${colours.font}`;
+    const font = `${chosen ? "bold " : ""}${size}px`;
+    pen.font = `${font} ${colours.font}`; // for the width
     const text = words(tree);
     const [width, height] = [pen.measureText(text).width, size];
     const places = placesOf(x, y, radius + (chosen ? 5 : 0), width, height);
     const free = places.find(([left, top]) => taken.isFree([left, top, left + width, top + height]));
-    const at = free ?? (chosen ? places[0] : null); // what was chosen is named in any case
+    const at = free ?? (chosen ? places[0] : null); // the selected tree always has its number
     if (!at) continue;
     taken.add([at[0] - GAP, at[1], at[0] + width + GAP, at[1] + height]);
-    pen.strokeText(text, at[0], at[1] + 0.86 * height);
-    pen.fillText(text, at[0], at[1] + 0.86 * height);
+    drawText(pen, text, at[0], at[1] + 0.86 * height, { font, align: "left", margin: 3 });
   }
 }

@@ -1,4 +1,4 @@
-// A distance on the map: from one place to another, each the middle of a tree if one is near.
+// Measuring a distance on the map between two places, which snap to the centres of trees.
 
 import { byId } from "../core/dom.js";
 import { changed, state } from "../core/store.js";
@@ -13,7 +13,7 @@ export function toggleMeasure() {
 
 export const stopMeasuring = () => measuring() && toggleMeasure();
 
-// The first click sets the beginning, the second the end, a third begins anew.
+// The first click sets the start, the second the end, a third starts again.
 export function measureAt(place) {
   const { from, fixed } = state.measure;
   state.measure = from === null || fixed ? { from: place, to: null, fixed: false } : { from, to: place, fixed: true };

@@ -1,16 +1,17 @@
-// The dialog that opens another run.
+// The dialog to open a run.
 
 import { get, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
+import { capital } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { chosenFor, startInside } from "./source_options.js";
 import { startUpload } from "./upload.js";
 
 const dialog = byId("source-dialog");
-let asked = null; // the address that was asked for and is not there yet
-let left = null; // the status that stood before
+let asked = null; // address that is being opened
+let left = null; // status before that
 
-// `begin` is what an address begins with, for who has to type the rest.
+// `begin` is the beginning of an address that a person completes.
 export async function openSources(begin = "") {
   say("");
   if (!dialog.open) dialog.showModal();
@@ -40,7 +41,7 @@ const entry = (uri, title, doc) =>
 
 export async function ask(uri) {
   if (!uri) {
-    say("Type a path or an address first, for example sim:stand.");
+    say("Enter a path or an address, for example sim:stand.");
     return;
   }
   asked = uri;
@@ -69,7 +70,7 @@ function follow({ status }) {
 
 function say(text) {
   const error = byId("source-error");
-  setText(error, text.charAt(0).toUpperCase() + text.slice(1));
+  setText(error, capital(text));
   error.hidden = !text;
 }
 

@@ -1,12 +1,12 @@
-// What a run is called: the end of its address, but an upload by the name that its file had.
+// The title of a run: the end of its address; for an upload the name of its file.
 
 import { get } from "../core/api.js";
 
-const MADE_UP = /^upload-\d{8}-\d{6}-/; // what the server calls an uploaded file
-const NUMBER = /^\d+(\.\w+)?$/; // as folders and files of data sets are called: says something after its folder alone
-const uploads = new Map(); // the name of each by its address, the made-up one while that is asked for
+const MADE_UP = /^upload-\d{8}-\d{6}-/; // prefix that the server gives to uploaded files
+const NUMBER = /^\d+(\.\w+)?$/; // a number needs the name of its folder
+const uploads = new Map(); // titles by address
 
-// `renew` is called once the name of an upload is known.
+// `renew` is called when the name of an upload has arrived.
 export function titleOf(uri, renew = () => {}) {
   const parts = (uri ?? "").split("?")[0].split("/").filter(Boolean);
   const last = parts.pop() ?? "";
@@ -25,6 +25,6 @@ async function ask(uri, last, renew) {
     uploads.set(uri, known.name);
     renew();
   } catch {
-    // It keeps its made-up name.
+    // The list of recordings may be forbidden for this link: the title stays the name on the server.
   }
 }

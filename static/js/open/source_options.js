@@ -1,18 +1,18 @@
-// What is in a source before it is opened: topics by role with their counts and rates, and where the LiDAR stands.
+// Options of a source before it is opened: topics by role with counts and rates, and the pose of the LiDAR on the robot.
 
 import { post } from "../core/api.js";
 import { byId, el } from "../core/dom.js";
 
 const ROLES = { scan: "LiDAR", odometry: "Odometry", imu: "IMU", gnss: "GNSS", pose: "Other SLAM", camera: "Camera" };
 const MOUNT = [["x", "m"], ["y", "m"], ["z", "m"], ["roll", "°"], ["pitch", "°"], ["yaw", "°"]];
-let looked = null; // {uri, mount} of what is shown
-let asked = ""; // what is being looked into
+let looked = null; // {uri, mount} of the shown source
+let asked = ""; // address that is being inspected
 
 const body = () => byId("inside-body");
 const uri = () => byId("source-uri").value.trim();
 const figures = ({ messages, rate_hz: rate, seconds }) => [messages === null ? "" : `${messages.toLocaleString("en")} messages${seconds ? ` in ${seconds} s` : ""}`, rate === null ? "" : `${rate} Hz`].filter(Boolean).join(", ");
 
-// What was chosen for an address; {} where nobody looked into it or changed anything.
+// The options chosen for an address; {} if none were changed.
 export function chosenFor(address) {
   if (looked?.uri !== address) return {};
   const chosen = {};
@@ -29,11 +29,11 @@ async function look() {
   if (!byId("source-inside").open || address === looked?.uri || (address && address === asked)) return;
   looked = null;
   if (!address) {
-    body().replaceChildren(el("p", { text: "Type a path or an address first; its topics are listed here to choose from." }));
+    body().replaceChildren(el("p", { text: "Enter a path or an address first; its topics are listed here." }));
     return;
   }
   asked = address;
-  body().replaceChildren(el("p", { text: "Looking inside …" }));
+  body().replaceChildren(el("p", { text: "Reading the source …" }));
   try {
     const found = await post("/api/inside", { uri: address });
     if (uri() === address) show(address, found);
@@ -49,7 +49,7 @@ function show(address, { topics, mount, warnings }) {
   looked = { uri: address, mount };
   const notes = warnings.map((text) => el("p", { text }));
   if (!topics.length) {
-    body().replaceChildren(...notes, el("p", { text: "There are no topics to choose from." }));
+    body().replaceChildren(...notes, el("p", { text: "This source has no topics to choose from." }));
     return;
   }
   body().replaceChildren(...notes, roles(topics), mounting(mount), table(topics));
@@ -74,12 +74,12 @@ function mounting(mount) {
     if (mount) input.value = String(mount[k]);
     return el("label", {}, `${name} ${unit}`, input);
   });
-  return el("fieldset", { class: "inside-mount" }, el("legend", { text: "Where the LiDAR stands on the robot: x ahead, y left, z up" }), ...inputs);
+  return el("fieldset", { class: "inside-mount" }, el("legend", { text: "Pose of the LiDAR on the robot: x forward, y left, z up" }), ...inputs);
 }
 
 function table(topics) {
   const rows = topics.map((topic) => el("tr", {}, el("th", { scope: "row", text: topic.name }), el("td", { text: topic.type.split("/").pop() }),
-    el("td", { text: figures(topic) }), el("td", { text: topic.read_as ? `read as ${topic.read_as}` : topic.why_not })));
+    el("td", { text: figures(topic) }), el("td", { text: topic.read_as ? `used as ${topic.read_as}` : topic.why_not })));
   return el("div", { class: "inside-topics" }, el("table", {}, el("tbody", {}, ...rows)));
 }
 

@@ -1,20 +1,21 @@
-// A recording that is dropped on the page, or chosen: sent to the server with its progress, then opened.
+// Uploads a recording that is dropped on the page or chosen, shows the progress, then opens it.
 
 import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { count } from "../core/format.js";
+import { capital, count } from "../core/format.js";
 
-let sending = null; // the request that is under way
+const SHOWN_FOR = 8000; // [ms] of the message after an upload
+let sending = null; // request in progress
 const size = (bytes) => (bytes >= 1e9 ? `${(bytes / 1e9).toFixed(2)} GB` : bytes >= 1e6 ? `${(bytes / 1e6).toFixed(1)} MB` : `${Math.ceil(bytes / 1e3)} kB`);
 
-// done(answer) is called with {uri, name, kind, bytes} once the recording lies on the server.
+// done(answer) is called with {uri, name, kind, bytes} after the upload.
 export function startUpload(done) {
   const file = el("input", { type: "file", id: "upload-file", hidden: true, "aria-label": "Recording to upload", onchange: () => {
     const [chosen] = file.files;
     if (chosen) send(chosen, done);
     file.value = "";
   } });
-  // Into the dialog, where there is one: what stands outside cannot be reached while it is open.
+  // Inside the dialog if there is one: nothing outside of an open dialog can be used.
   (byId("source-form") ?? document.body).append(file);
   byId("upload-choose").addEventListener("click", () => file.click());
   listenForDrops(done);
@@ -23,7 +24,7 @@ export function startUpload(done) {
 function listenForDrops(done) {
   const here = el("div", { class: "drop-here", text: "Drop the recording to upload it", hidden: true });
   document.body.append(here);
-  let depth = 0; // of elements that were entered and not left
+  let depth = 0; // elements entered and not left by the dragged file
   const holdsFile = (event) => [...(event.dataTransfer?.types ?? [])].includes("Files");
   addEventListener("dragenter", (event) => { if (holdsFile(event)) { depth += 1; here.hidden = Boolean(document.body.classList.contains("viewer")); } });
   addEventListener("dragleave", () => { depth = Math.max(0, depth - 1); here.hidden = depth === 0; });
@@ -36,8 +37,8 @@ function listenForDrops(done) {
     if (document.body.classList.contains("viewer")) return;
     const entries = [...event.dataTransfer.items].map((each) => each.webkitGetAsEntry?.());
     const files = [...event.dataTransfer.files];
-    if (entries.some((entry) => entry?.isDirectory)) say("A folder cannot be uploaded: copy it to the machine where stemmap runs, and open it by its path.");
-    else if (files.length > 1) say(`These are ${count(files.length, "file")}. Drop one recording at a time.`);
+    if (entries.some((entry) => entry?.isDirectory)) say("A folder cannot be uploaded. Copy it to the machine where stemmap runs and open it by its path.");
+    else if (files.length > 1) say(`${count(files.length, "file")} were dropped. Drop one recording at a time.`);
     else if (files.length) send(files[0], done);
   });
 }
@@ -45,7 +46,7 @@ function listenForDrops(done) {
 function box() {
   byId("upload")?.remove();
   const made = el("section", { id: "upload", class: "upload", "aria-label": "Upload" });
-  // An open dialog lies above all else, so the box goes into it.
+  // An open dialog covers everything outside of it.
   (document.querySelector("dialog[open]") ?? document.body).append(made);
   return made;
 }
@@ -57,10 +58,10 @@ function say(text, error = true) {
 }
 
 async function send(file, done) {
-  if (sending) return say("An upload is under way. Wait until it is done, or cancel it.");
+  if (sending) return say("Another upload is in progress. Wait until it ends, or cancel it.");
   try {
     const { room } = await get("/api/uploads");
-    if (file.size > room) return say(`${file.name} has ${size(file.size)}; the server takes ${size(room)} now. Free some space there, or copy the recording to it and open it by its path.`);
+    if (file.size > room) return say(`${file.name} is too large: ${size(file.size)}, and the server has room for ${size(room)}. Free some space there, or copy the recording to the server and open it by its path.`);
   } catch (error) {
     return say(error.message);
   }
@@ -73,7 +74,7 @@ async function send(file, done) {
   sending = request;
   request.upload.onprogress = ({ loaded }) => {
     bar.value = loaded;
-    setText(told, loaded < file.size ? `${size(loaded)} of ${size(file.size)}` : "Looking what it is …");
+    setText(told, loaded < file.size ? `${size(loaded)} of ${size(file.size)}` : "Detecting the format …");
   };
   request.onloadend = () => { sending = null; finish(request, file, made, done); };
   request.open("POST", `/api/uploads?name=${encodeURIComponent(file.name)}`);
@@ -85,22 +86,23 @@ async function finish(request, file, made, done) {
   made.remove();
   if (request.status === 201) {
     const answer = JSON.parse(request.responseText);
-    say(`${answer.name} was uploaded: ${answer.kind}.`, false);
+    say(`${answer.name} was uploaded (${answer.kind}).`, false);
+    setTimeout(() => byId("upload")?.querySelector("[role=status]") && byId("upload").remove(), SHOWN_FOR);
     try {
       await done(answer);
     } catch (error) {
       say(error.message);
     }
   } else if (request.status) say(wording(request));
-  else if (request.readyState === XMLHttpRequest.UNSENT) say(`The upload of ${file.name} was cancelled; nothing of it is kept.`, false);
-  else say(`The connection was lost while ${file.name} was uploaded; nothing of it is kept. Try again.`);
+  else if (request.readyState === XMLHttpRequest.UNSENT) say(`The upload of ${file.name} was cancelled.`, false);
+  else say(`The connection was lost during the upload of ${file.name}. Try again.`);
 }
 
 function wording(request) {
   try {
     const { what, where, remedy } = JSON.parse(request.responseText).error;
-    return `${what.charAt(0).toUpperCase()}${what.slice(1)}${where ? ` (${where})` : ""}. ${remedy ?? ""}`.trim();
+    return `${capital(what)}${where ? ` (${where})` : ""}. ${remedy ?? ""}`.trim();
   } catch {
-    return `The server answered ${request.status}.`;
+    return `The server answered with status ${request.status}. Try again, or see its log.`;
   }
 }

@@ -1,4 +1,4 @@
-// What a person sees at the first visit, once.
+// The welcome card of the first visit.
 
 import { byId, recall, remember, setText } from "../core/dom.js";
 import { on } from "../core/store.js";
@@ -6,10 +6,10 @@ import { openSources } from "./dialog.js";
 
 const WORDS = {
   playing: ["A robot is mapping a stand of trees", "Keep watching"],
-  finished: ["A robot has mapped a stand of trees", "Look at its map"],
-  starting: ["A robot is about to map a stand of trees", "Wait for it"],
+  finished: ["A robot has mapped a stand of trees", "Show its map"],
+  starting: ["A robot is about to map a stand of trees", "Keep watching"],
 };
-const ROBOT = "zenoh:tcp/"; // the router's address follows
+const ROBOT = "zenoh:tcp/"; // the address of the router follows
 
 export function startWelcome() {
   const card = byId("welcome");
@@ -21,9 +21,9 @@ export function startWelcome() {
     const first = !asked && recall("welcomed") === null;
     asked = true;
     if (!card.open && !first) return;
-    if (!status.source.startsWith("sim:")) return; // who opens a recording knows what this is
+    if (!status.source.startsWith("sim:")) return; // the card explains the simulated run
     const [title, on] = WORDS[status.scan_index >= 0 && status.state === "starting" ? "playing" : status.state] ?? WORDS.playing;
-    setText(byId("welcome-title"), title); // it follows the run while the card stands there
+    setText(byId("welcome-title"), title); // the title follows the state of the run while the card is open
     setText(byId("welcome-on"), on);
     if (!card.open) card.showModal();
   });

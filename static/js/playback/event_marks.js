@@ -1,12 +1,13 @@
-// Marks of events below the timeline, and the part that is played again and again.
+// Marks of events below the timeline, and the loop: a part of the run that is played repeatedly.
 
 import { command, post } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { clock } from "../core/format.js";
+import { attempted, showProblem } from "../core/problem.js";
 import { on, state } from "../core/store.js";
 
 const NAMES = { tree: "tree confirmed", warning: "warning", change: "parameters changed", health: "SLAM health", annotation: "annotated" };
-let start = null; // of a loop whose end is not set yet [s]
+let start = null; // start of a loop whose end is not set yet [s]
 
 function showMarks() {
   const end = state.status?.end_s;
@@ -16,8 +17,8 @@ function showMarks() {
   if (lane.dataset.shown === key) return;
   lane.dataset.shown = key;
   lane.replaceChildren(...(end > 0 ? [loopBar()] : []), ...events.map(({ t, kind, text, before }) => el("button", {
-    class: `mark ${kind}${before ? " before" : ""}`, tabindex: "-1", title: `${clock(t)} ${NAMES[kind]}: ${text}${before ? " (before the change; it comes anew when the run gets there)" : ""}`, "aria-label": `${clock(t)} ${text}`,
-    style: { left: `${(100 * t) / end}%` }, onclick: () => command("seek", { time_s: t }).catch(() => {}),
+    class: `mark ${kind}${before ? " before" : ""}`, tabindex: "-1", title: `${clock(t)} ${NAMES[kind]}: ${text}${before ? " (before the last change; it is replaced when the run gets there)" : ""}`, "aria-label": `${clock(t)} ${text}`,
+    style: { left: `${(100 * t) / end}%` }, onclick: () => attempted(() => command("seek", { time_s: t })),
   })));
 }
 
@@ -52,8 +53,7 @@ export async function setLoop() {
     }
   } catch (error) {
     start = null;
-    setText(byId("loop"), error.message);
-    return;
+    showProblem(error);
   }
   showLoop();
 }

@@ -3,10 +3,12 @@
 import { command } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { clock, count } from "../core/format.js";
+import { attempted } from "../core/problem.js";
 import { on, state } from "../core/store.js";
+import { newestFirst } from "../core/timing.js";
 
 const ICONS = { play: "M5 3l12 7-12 7z", pause: "M5 3h4v14H5zM12 3h4v14h-4z" };
-let dragging = false, wanted = null, seeking = false;
+let dragging = false;
 
 export const playing = () => ["playing", "waiting"].includes(state.status?.state);
 const ready = () => playing() || ["paused", "finished"].includes(state.status?.state);
@@ -14,26 +16,11 @@ export const togglePlay = () => ready() && send(playing() ? "pause" : "play");
 export const advance = (scans) => ready() && send("advance", { scans });
 
 async function send(type, fields) {
-  try {
-    await command(type, fields);
-  } catch (error) {
-    byId("notice").hidden = false;
-    setText(byId("notice").querySelector("span"), error.message);
-  }
+  await attempted(() => command(type, fields));
 }
 
-// While the thumb is dragged only the newest place is asked for.
-async function seek(time) {
-  wanted = time;
-  if (seeking) return;
-  seeking = true;
-  while (wanted !== null) {
-    const next = wanted;
-    wanted = null;
-    await send("seek", { time_s: next });
-  }
-  seeking = false;
-}
+// While the thumb is dragged only the newest position is sent.
+const seek = newestFirst((time) => send("seek", { time_s: time }));
 
 function show() {
   const status = state.status;
@@ -48,11 +35,11 @@ function show() {
   for (const each of document.querySelectorAll(".buttons button")) each.disabled = !ready() || (status.live && each !== button);
   const line = byId("timeline");
   line.disabled = !(status.end_s > 0);
-  if (!dragging && !seeking) {
+  if (!dragging && !seek.isBusy()) {
     const end = status.end_s || 1;
     line.max = String(end);
-    line.step = String(end / Math.max(1000, Math.ceil(10 * end))); // its last step is the end, of a run of any length
-    line.value = String(status.going_to_s ?? status.time_s); // it waits where it was put, and does not creep there
+    line.step = String(end / Math.max(1000, Math.ceil(10 * end))); // so that the last step is the end of the run
+    line.value = String(status.going_to_s ?? status.time_s); // the thumb stays where it was put while the run seeks
     setText(byId("time-now"), clock(status.time_s));
   }
   line.setAttribute("aria-valuetext", clock(Number(line.value)));

@@ -1,4 +1,4 @@
-// Figures 6 and 7 of the paper, and how the run goes. Plotly is loaded when it is first needed.
+// The tab Plots: figures 6 and 7 of the paper, and the course of the run. Plotly is loaded when it is first needed.
 
 import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
@@ -8,7 +8,7 @@ import { on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
 import { visible } from "../shell/tabs.js";
 
-const EVERY = 2000; // [ms] between two drawings
+const EVERY = 2000; // [ms] between two updates
 const LONGEST = 1200; // samples kept of each curve
 const none = () => ({ time: [], n_eff: [], sigma: [], yaw: [], stages: {}, stageTime: [] });
 const history = none();
@@ -17,7 +17,7 @@ let plotly = null, busy = false;
 function load() {
   plotly ??= new Promise((resolve, reject) => {
     document.head.append(el("script", { src: "/static/plotly.min.js", onload: () => resolve(window.Plotly),
-      onerror: () => reject(new Error("The plotting library could not be loaded.")) }));
+      onerror: () => reject(new Error("The plotting library could not be loaded. Reload the page.")) }));
   });
   return plotly;
 }
@@ -39,8 +39,8 @@ async function matrix(kind) {
   const pairs = await get("/api/pairs");
   const z = kind === "distance" ? pairs?.distance_m : pairs?.error_percent;
   if (!z || z.length < 2) {
-    return kind === "distance" ? "Distances need two trees or more. Let the run play on."
-      : "The error needs ground truth and two trees that are matched to it. The simulated runs bring theirs.";
+    return kind === "distance" ? "Distances need at least two trees. Let the run play on."
+      : "The error needs at least two trees that match the ground truth. Simulated runs have ground truth.";
   }
   const labels = pairs.numbers.map(String);
   const { colorscale, unit } = SCALES[kind];
@@ -52,12 +52,12 @@ async function matrix(kind) {
 }
 
 function curve(kind) {
-  if (history.time.length < 2) return "Nothing to draw yet. Press play.";
+  if (history.time.length < 2) return "Nothing to plot yet. Press play.";
   const figure = layout({ showlegend: kind !== "n_eff", legend: { orientation: "h", y: 1.02, yanchor: "bottom" } });
   if (kind === "time") figure.margin.t = 74;
   if (kind === "sigma") return pose(figure);
   figure.xaxis.title = { text: "time in the run, s" };
-  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: kind === "time" ? "ms a scan" : "effective particles" } });
+  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: kind === "time" ? "ms per scan" : "effective particles" } });
   if (kind === "n_eff") return [[line(history.time, history.n_eff, "N_eff")], figure];
   return [Object.entries(history.stages).map(([name, values]) => ({ ...line(history.stageTime, values, name), stackgroup: "one" })), figure];
 }
@@ -80,11 +80,11 @@ async function draw() {
   try {
     const kind = byId("plot-choice").value;
     const [Plotly, drawing] = await Promise.all([load(), kind in SCALES ? matrix(kind) : curve(kind)]);
-    const said = typeof drawing === "string";
-    byId("plot").hidden = said;
-    byId("plot-empty").hidden = !said;
-    setText(byId("plot-empty"), said ? drawing : "");
-    if (!said) await show(Plotly, kind, ...drawing);
+    const isText = typeof drawing === "string"; // why there is no plot
+    byId("plot").hidden = isText;
+    byId("plot-empty").hidden = !isText;
+    setText(byId("plot-empty"), isText ? drawing : "");
+    if (!isText) await show(Plotly, kind, ...drawing);
   } catch (error) {
     byId("plot-empty").hidden = false;
     setText(byId("plot-empty"), error.message);
@@ -95,7 +95,7 @@ async function draw() {
 
 async function show(Plotly, kind, traces, figure) {
   const plot = byId("plot");
-  if (plot.data && plot.dataset.kind !== kind) Plotly.purge(plot); // an axis of one figure is not that of another
+  if (plot.data && plot.dataset.kind !== kind) Plotly.purge(plot); // axes of another figure must not be reused
   plot.dataset.kind = kind;
   const fresh = !plot.data;
   await Plotly.react(plot, traces, figure, { displayModeBar: false, responsive: true });
@@ -132,7 +132,7 @@ async function savePng() {
   await (await load()).downloadImage(plot, { format: "png", scale: 2, width: 900, height: 700, filename: plot.dataset.kind });
 }
 
-// A matrix as a table with the numbers of the trees at its sides; curves one under the other.
+// A matrix as a table with tree numbers in the first row and column; curves as rows of time, curve and value.
 function saveTable() {
   const plot = byId("plot");
   if (plot.hidden || !plot.data) return;

@@ -1,12 +1,13 @@
-// One run: its figures, its finished map, its parameters and who changed them.
+// One run: figures, map, parameters and their changes.
 
-import { request } from "../core/api.js";
+import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { saveCanvas, saveCsv } from "../core/download.js";
 import { clock, count, fixed, NONE } from "../core/format.js";
-import { nearest, paintRun, treeWords } from "./draw.js";
+import { treeAt } from "../map/draw.js";
+import { boundsOf } from "../map/map_canvas.js";
+import { mapPicture, paintRun, treeText } from "./draw.js";
 import { FIGURES, SCORES, shortSource, when } from "./figures.js";
-import { boundsOf, picture } from "./picture.js";
 
 let shown = null; // the picture on the screen
 export const repaint = () => shown?.redraw();
@@ -21,7 +22,7 @@ export function put(newest, ...nodes) {
   byId("run-detail").replaceChildren(...nodes);
 }
 
-// A table of a finished page: heads, and rows of texts; `figures` are the columns with numbers.
+// A table of heads and rows of texts; `figures` are the places of columns with numbers.
 export function table(heads, rows, figures = []) {
   const cls = (k) => (figures.includes(k) ? "figure" : "");
   return el("div", { class: "scroll" }, el("table", {},
@@ -30,21 +31,21 @@ export function table(heads, rows, figures = []) {
 }
 
 export async function showRun(key, actions) {
-  say("Reading the run …");
+  say("Loading the run …");
   let run;
   try {
-    run = await request(`/api/runs/${encodeURIComponent(key)}`);
+    run = await get(`/api/runs/${encodeURIComponent(key)}`);
   } catch (error) {
     say(error.message);
     return;
   }
   const { trees, path, truth } = run.map;
-  const map = picture({
+  const map = mapPicture({
     label: `Map of ${run.name}: ${trees.length} trees`,
     legend: [["tree", "tree, size by DBH"], ["path", "path"], ...(truth ? [["truth", "ground truth"]] : [])],
-    paint: (pen, view, colours) => paintRun(pen, view, run.map, colours),
+    paint: (pen, view) => paintRun(pen, view, run.map),
     bounds: () => boundsOf(trees, path),
-    describe: (px, py, view) => { const tree = nearest(trees, px, py, view); return tree ? treeWords(tree) : ""; },
+    describe: (at, view) => { const tree = treeAt(trees, at, view); return tree ? treeText(tree) : ""; },
   });
   put(map, head(run, actions), figures(run), map.box, more(run, map));
 }
@@ -60,12 +61,12 @@ function head(run, { replay, rename, remove }) {
     }
   };
   const title = el("h2", { text: run.name });
-  const own = run.id !== undefined; // a folder is renamed and deleted where it lies
+  const own = run.id !== undefined; // folders are renamed and deleted outside of stemmap
   return el("div", { class: "run-head" }, title,
-    el("button", { class: "primary", id: "run-replay", "data-edit": true, text: "Replay", title: "Open the recording again, with the parameters of this run", onclick: guarded(() => replay(run)) }),
+    el("button", { class: "primary", id: "run-replay", "data-edit": true, text: "Replay", title: "Open the recording with the parameters of this run", onclick: guarded(() => replay(run)) }),
     ...(own ? [
       el("button", { id: "run-rename", "data-edit": true, text: "Rename", onclick: () => edit(title, run, guarded, rename) }),
-      el("button", { id: "run-delete", "data-edit": true, text: "Delete", title: "It can be undone", onclick: guarded(() => remove(run)) })] : []),
+      el("button", { id: "run-delete", "data-edit": true, text: "Delete", title: "Delete this run; it can be restored", onclick: guarded(() => remove(run)) })] : []),
     el("p", { class: "dim", text: `${run.uri} · ${run.kind}${run.begun_s ? ` · ${when(run.begun_s)}` : ""}` }), error);
 }
 
@@ -96,10 +97,10 @@ function more(run, map) {
 }
 
 function changes({ revisions }) {
-  if (!revisions.length) return [el("p", { class: "note", text: "None: the run kept the parameters that it began with." })];
+  if (!revisions.length) return [el("p", { class: "note", text: "None: the parameters were not changed during the run." })];
   const rows = revisions.map((each) => [each.who, when(each.at_s), clock(each.time_s),
     Object.entries(each.changes).slice(0, 4).map(([name, [before, after]]) => `${name}: ${before} → ${after}`).join(", ") + (Object.keys(each.changes).length > 4 ? `, ${count(Object.keys(each.changes).length - 4, "more", "more")}` : "")]);
-  return [table(["who", "when", "in the run", "what"], rows)];
+  return [table(["by", "when", "time in the run", "change"], rows)];
 }
 
 const COLUMNS = ["tree", "x_m", "y_m", "sigma_m", "dbh_cm", "sigma_dbh_cm", "eccentricity", "observations"];

@@ -1,41 +1,53 @@
-// Paints one finished map, or two laid upon one another.
+// Pictures of one finished map, and of two maps compared.
 
-import { figure, isAssumed } from "../core/format.js";
-import { drawLine, drawNumbers, drawTree, drawTruth, symbolRadius } from "../map/draw.js";
+import { el } from "../core/dom.js";
+import { dbhText, seenText } from "../core/format.js";
+import { colours } from "../core/theme.js";
+import { drawFrame, drawLine, drawNumbers, drawTree, drawTruth, symbolRadius } from "../map/draw.js";
+import { MapCanvas } from "../map/map_canvas.js";
 
-export function paintRun(pen, view, { path, truth, trees }, colours) {
-  drawLine(pen, view, path, colours.path, 2);
-  for (const each of truth ?? []) drawTruth(pen, view, each, colours);
-  for (const tree of trees) drawTree(pen, view, tree, false, colours);
-  drawNumbers(pen, view, trees, null, colours, { radiusOf: symbolRadius });
+// A map with its legend: {box, canvas, redraw}. `legend` is [[class, text]]; `paint`, `bounds` and `describe` are those of MapCanvas.
+export function mapPicture({ label, legend, paint, bounds, describe }) {
+  const canvas = el("canvas", { tabindex: "0", role: "img", "aria-label": label });
+  const tip = el("div", { class: "tip", hidden: true });
+  const frame = el("div", { class: "map-frame" }, canvas, tip,
+    el("div", { class: "map-buttons" }, el("button", { class: "small", text: "Fit", title: "Show the whole map", onclick: () => map.fit() })));
+  const map = new MapCanvas(canvas, { tip, bounds, describe, paint: (pen, view) => drawFrame(pen, view, () => paint(pen, view)) });
+  const box = el("div", { class: "run-map" }, frame, el("ul", { class: "legend", "aria-label": "Legend" }, ...legend.map(([name, text]) => el("li", { class: name, text }))));
+  return { box, canvas, redraw: map.redraw };
 }
 
-export function paintTwo(pen, view, told, colours) {
-  const { a, b_trees: trees, b_path: path, pairs } = told;
+export function paintRun(pen, view, { path, truth, trees }) {
+  drawLine(pen, view, path, colours.path, 2);
+  for (const each of truth ?? []) drawTruth(pen, view, each);
+  for (const tree of trees) drawTree(pen, view, tree, false);
+  drawNumbers(pen, view, trees, null);
+}
+
+export function paintTwo(pen, view, { a, b_trees: trees, b_path: path, pairs, only_a: onlyA, only_b: onlyB }) {
   drawLine(pen, view, a.map.path, colours.path, 2);
   pen.setLineDash([6, 5]);
   drawLine(pen, view, path, colours.selection, 1.4);
   pen.setLineDash([]);
-  const [of_a, of_b] = [byNumber(a.map.trees), byNumber(trees)];
+  const [ofA, ofB] = [byNumber(a.map.trees), byNumber(trees)];
   for (const pair of pairs) {
-    drawTree(pen, view, of_a.get(pair.a), false, colours);
-    if (pair.moved) arrow(pen, view, of_a.get(pair.a), of_b.get(pair.b), colours.warn);
+    drawTree(pen, view, ofA.get(pair.a), false);
+    if (pair.moved) drawArrow(pen, view, ofA.get(pair.a), ofB.get(pair.b));
   }
-  for (const number of told.only_a) sign(pen, view, of_a.get(number), "×", colours.pole, colours);
-  for (const number of told.only_b) sign(pen, view, of_b.get(number), "+", colours.selection, colours);
-  drawNumbers(pen, view, a.map.trees, null, colours, { radiusOf: symbolRadius });
+  for (const number of onlyA) drawSign(pen, view, ofA.get(number), [[-1, -1, 1, 1], [-1, 1, 1, -1]], colours.pole); // ×
+  for (const number of onlyB) drawSign(pen, view, ofB.get(number), [[-1, 0, 1, 0], [0, -1, 0, 1]], colours.selection); // +
+  drawNumbers(pen, view, a.map.trees, null);
 }
 
 const byNumber = (trees) => new Map(trees.map((tree) => [tree.number, tree]));
 
-function sign(pen, view, tree, letter, ink, colours) {
+function drawSign(pen, view, tree, strokes, colour) {
   const [px, py] = view.toScreen(tree.x, tree.y);
   const reach = Math.max(5, symbolRadius(tree, view.scale) * 0.8);
-  const ends = letter === "×" ? [[-1, -1, 1, 1], [-1, 1, 1, -1]] : [[-1, 0, 1, 0], [0, -1, 0, 1]];
-  for (const [style, width] of [[colours.surface, 6], [ink, 3]]) {
+  for (const [style, width] of [[colours.surface, 6], [colour, 3]]) {
     Object.assign(pen, { strokeStyle: style, lineWidth: width, lineCap: "round" });
     pen.beginPath();
-    for (const [x0, y0, x1, y1] of ends) {
+    for (const [x0, y0, x1, y1] of strokes) {
       pen.moveTo(px + reach * x0, py + reach * y0);
       pen.lineTo(px + reach * x1, py + reach * y1);
     }
@@ -44,15 +56,15 @@ function sign(pen, view, tree, letter, ink, colours) {
   pen.lineCap = "butt";
 }
 
-// From where a tree stood to where it stands; short ways are drawn longer, so that the eye finds them.
-function arrow(pen, view, from, to, ink) {
+// An arrow from a tree's former place to its present one, at least 16 pixels long so that it is visible.
+function drawArrow(pen, view, from, to) {
   const [x0, y0] = view.toScreen(from.x, from.y);
   const [x1, y1] = view.toScreen(to.x, to.y);
   const length = Math.hypot(x1 - x0, y1 - y0) || 1;
-  const seen = Math.max(length, 16);
+  const drawn = Math.max(length, 16);
   const [dx, dy] = [(x1 - x0) / length, (y1 - y0) / length];
-  const tip = [x0 + seen * dx, y0 + seen * dy];
-  Object.assign(pen, { strokeStyle: ink, lineWidth: 2.5 });
+  const tip = [x0 + drawn * dx, y0 + drawn * dy];
+  Object.assign(pen, { strokeStyle: colours.warn, lineWidth: 2.5 });
   pen.beginPath();
   pen.moveTo(x0, y0);
   pen.lineTo(...tip);
@@ -62,17 +74,4 @@ function arrow(pen, view, from, to, ink) {
   pen.stroke();
 }
 
-export function nearest(trees, px, py, view) {
-  let best = null, least = 14;
-  for (const tree of trees) {
-    const [x, y] = view.toScreen(tree.x, tree.y);
-    const gap = Math.hypot(px - x, py - y) - symbolRadius(tree, view.scale);
-    if (gap < least) [best, least] = [tree, gap];
-  }
-  return best;
-}
-
-export function treeWords(tree) {
-  const dbh = tree.dbh_cm === null ? "DBH not measured" : `DBH ${figure(tree.dbh_cm)} cm`;
-  return `Tree ${tree.number}, ${dbh}\n${isAssumed(tree) ? "seen in no single scan, in all together" : `seen in ${tree.observations} scans`}`;
-}
+export const treeText = (tree) => `Tree ${tree.number}, ${dbhText(tree)}\n${seenText(tree)}`;

@@ -1,4 +1,4 @@
-// Figures of a run in words, the same in the list, the detail and the comparison.
+// Texts of the figures of a run, for the list, the detail and the comparison.
 
 import { figure, NONE, percent } from "../core/format.js";
 
@@ -20,8 +20,8 @@ export const FIGURES = [
 export const SCORES = [
   ["TA, trees found", (s) => rate(s.TA)],
   ["FR, trees missed", (s) => rate(s.FR)],
-  ["TR, others left out", (s) => rate(s.TR)],
-  ["FA, others taken for trees", (s) => rate(s.FA)],
+  ["TR, others rejected", (s) => rate(s.TR)],
+  ["FA, others accepted", (s) => rate(s.FA)],
   ["completeness", (s) => percent(s.completeness)],
   ["correctness", (s) => percent(s.correctness)],
   ["F1", (s) => figure(s.f1)],

@@ -1,6 +1,6 @@
-// The page of all runs: the list, and beside it the chosen run or two of them compared.
+// The page of runs: a list, and next to it the chosen run or two runs compared.
 
-import { get, open, patch, post, request } from "../core/api.js";
+import { get, open, patch, post, remove as removeAt } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { count, figure } from "../core/format.js";
 import { startAccess } from "../core/permissions.js";
@@ -37,21 +37,21 @@ function fill() {
   byId("runs").hidden = !byId("runs").tBodies[0].rows.length;
   const empty = byId("runs-empty");
   empty.hidden = runs.length + folders.length > 0;
-  setText(empty, all ? `No run is called “${wanted}”.` : "No run yet. A run is kept here as soon as the dashboard has mapped something of it: go to the dashboard and press play, or open a recording.");
+  setText(empty, all ? `No run matches “${wanted}”.` : "No run yet. A run is listed here after its first mapped scans: go to the dashboard and press play, or open a recording.");
   markTicked();
 }
 
-// A folder may be called as its owner likes: a+b, north & south.
+// Names of folders may hold any character.
 const addressOf = ({ key }) => `run=${encodeURIComponent(key)}`;
 const group = (text) => el("tr", { class: "group" }, el("td", { colspan: HEADS.length, text }));
 
 function unfinishedGroup(wanted) {
   const left = known.unfinished.filter(({ name }) => name.toLowerCase().includes(wanted));
-  const told = async (problem) => {
+  const reload = async (problem) => {
     await load();
     if (problem) showError(problem);
   };
-  return left.length ? [group("Ended before the map was whole"), ...unfinishedRows(left, HEADS.length, told)] : [];
+  return left.length ? [group("Incomplete maps"), ...unfinishedRows(left, HEADS.length, reload)] : [];
 }
 
 function showError(words) {
@@ -70,7 +70,7 @@ function row(run) {
     name, ...texts.map((text, k) => el("td", { class: HEADS[k + 2][1], text })));
 }
 
-// Of three ticks the oldest goes: two can be compared.
+// At most two runs are ticked; a third one replaces the oldest.
 function tick(key, yes) {
   if (yes) ticked.add(key);
   else ticked.delete(key);
@@ -84,7 +84,7 @@ function markTicked() {
   for (const each of byId("runs").querySelectorAll("tr[data-run]")) each.setAttribute("aria-selected", String(each.dataset.run === run));
 }
 
-// What is chosen stands in the address, so that a link brings it back.
+// The choice is part of the address, so that a link restores it.
 function chosen() {
   const given = new URLSearchParams(location.hash.slice(1));
   return { run: given.get("run"), compare: given.getAll("compare") };
@@ -100,7 +100,7 @@ function follow() {
   markTicked();
   if (compare.length === 2) showTwo(...compare);
   else if (run) showRun(run, { replay, rename, remove });
-  else say("Choose a run to see its finished map, or tick two to compare them.");
+  else say("Choose a run to see its map, or tick two runs to compare them.");
 }
 
 async function replay(run) {
@@ -115,9 +115,9 @@ async function rename(run, name) {
 }
 
 async function remove(run) {
-  await request(`/api/runs/${run.id}`, { method: "DELETE" });
+  await removeAt(`/api/runs/${run.id}`);
   deleted = run;
-  setText(byId("toast").querySelector("span"), `“${run.name}” was deleted.`);
+  setText(byId("toast").querySelector("span"), `Deleted “${run.name}”.`);
   byId("toast").hidden = false;
   history.replaceState(null, "", location.pathname);
   ticked.delete(run.key);
@@ -154,24 +154,24 @@ startAccess();
 load();
 follow();
 
-// --- What killed runs left in the data folder: told, and taken away on request.
+// --- incomplete outputs of runs that were killed ---------------------------------------------------------
 
 const size = (bytes) => (bytes < 1e6 ? `${Math.ceil(bytes / 1000)} kB` : `${Math.round(bytes / 1e6)} MB`);
 const folderOf = (name) => name.split("/").slice(0, -1).join("/") || "the data folder";
 
-// Rows for the list; `done` is called with an error's words, or with nothing when one was deleted.
+// Rows of the list; `done` is called with the message of an error, or with "" after a deletion.
 function unfinishedRows(left, columns, done) {
   const remove = async (name) => {
     try {
-      await request(`/api/runs/unfinished?name=${encodeURIComponent(name)}`, { method: "DELETE" });
+      await removeAt(`/api/runs/unfinished?name=${encodeURIComponent(name)}`);
       done("");
     } catch (error) {
       done(error.message);
     }
   };
   return left.map(({ name, size: bytes, changed_s: changed, quiet }) => el("tr", { class: "unfinished", "data-unfinished": name },
-    el("td"), el("td", { colspan: columns - 2 }, el("b", { text: `Half a map in ${folderOf(name)}` }),
-      el("small", { text: `${size(bytes)}, last written ${when(changed)}. The run was ended before its map was whole: map its recording again.` })),
+    el("td"), el("td", { colspan: columns - 2 }, el("b", { text: `Incomplete map in ${folderOf(name)}` }),
+      el("small", { text: `${size(bytes)}, last written ${when(changed)}. The run ended before its map was written: map its recording again.` })),
     el("td", {}, el("button", { class: "small", "data-edit": true, text: "Delete", "aria-label": `Delete ${name}`, disabled: !quiet,
-      title: quiet ? "Take the half map away; nothing else is touched" : "It was written to within the last ten minutes, so its run may go on", onclick: () => remove(name) }))));
+      title: quiet ? "Delete the incomplete map only" : "Written to within the last ten minutes, so the run may still be active", onclick: () => remove(name) }))));
 }

@@ -1,18 +1,20 @@
-// What the camera saw at the time of the standing scan, with the trees of the map and the scan's clusters in it.
+// The camera picture at the time of the current scan, with the trees of the map and the clusters of the scan marked.
 
 import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
+import { capital } from "../core/format.js";
 import { nothingYet } from "../core/empty_state.js";
 import { select, selectCluster } from "../core/live_feed.js";
 import { on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
+import { keepFresh } from "../core/timing.js";
 import { verdictOf } from "../core/verdicts.js";
 import { openStory } from "../explain/story.js";
-import { keepFresh, shownOver } from "./overlay.js";
+import { shownOver } from "./overlay.js";
 
 const EVERY = 500; // [ms] between two pictures
-const AGAIN = 3000; // [ms] after which a picture that could not be had is asked for once more
-const LATE = 50; // [ms] beside the scan from which on it is said
+const AGAIN = 3000; // [ms] until a failed request is repeated
+const LATE = 50; // [ms] between picture and scan that are mentioned
 const SECOND = 1000; // [ms]
 let seen = null, marks = [], shown = "";
 
@@ -26,7 +28,7 @@ const refresh = keepFresh(async () => {
   }
   try {
     seen = await get("/api/camera");
-    const address = `/api/camera/${seen.stamp_ns}.jpg?of=${seen.of}`; // another run may have a picture of the same time
+    const address = `/api/camera/${seen.stamp_ns}.jpg?of=${seen.of}`; // another run may have a picture with the same time stamp
     if (address !== shown) {
       await load(address);
       shown = address;
@@ -38,7 +40,7 @@ const refresh = keepFresh(async () => {
   }
 }, EVERY);
 
-// The marks belong to the picture: they are drawn when it is there.
+// Loads the picture before its marks are drawn.
 function load(address) {
   return new Promise((resolve, reject) => {
     const next = new Image();
@@ -47,7 +49,7 @@ function load(address) {
       byId("camera-frame").style.setProperty("--ratio", String(next.naturalWidth / next.naturalHeight));
       resolve();
     };
-    next.onerror = () => reject(new Error("The picture did not arrive."));
+    next.onerror = () => reject(new Error("The camera picture could not be loaded. It is requested again."));
     next.src = address;
   });
 }
@@ -58,7 +60,7 @@ function empty(message) {
   byId("over-camera").dataset.scan = "";
   setText(byId("camera-lead"), "");
   setText(byId("camera-told"), "");
-  setText(byId("camera-empty"), message.charAt(0).toUpperCase() + message.slice(1));
+  setText(byId("camera-empty"), capital(message));
   byId("camera-empty").hidden = false;
 }
 
@@ -68,10 +70,10 @@ function draw() {
   marks = seen.marks;
   byId("camera-marks").replaceChildren(...marks.map(button));
   const off = Math.abs(seen.later_ms);
-  const late = off < LATE ? "" : `; its picture was taken ${(off / SECOND).toFixed(2)} s ${seen.later_ms > 0 ? "after" : "before"} it`;
+  const late = off < LATE ? "" : `; picture taken ${(off / SECOND).toFixed(2)} s ${seen.later_ms > 0 ? "later" : "earlier"}`;
   const trees = marks.filter(({ kind }) => kind === "tree").length;
-  setText(byId("camera-lead"), seen.why ? `Scan ${seen.index}${late}. Nothing can be marked: ${seen.why}.`
-    : `Scan ${seen.index}${late}. Trees of the map in view: ${trees}; clusters: ${marks.length - trees}. Click one to read why.`);
+  setText(byId("camera-lead"), seen.why ? `Scan ${seen.index}${late}. No marks: ${seen.why}.`
+    : `Scan ${seen.index}${late}. Trees of the map in view: ${trees}; clusters: ${marks.length - trees}. Click one for its story.`);
   setText(byId("camera-told"), seen.told && `Live: ${seen.told}.`);
   byId("over-camera").dataset.scan = String(seen.index);
   choose();
@@ -83,11 +85,11 @@ function button(mark) {
   const name = isTree ? `Tree ${mark.number}` : `Cluster, ${mark.verdict}`;
   const place = Object.fromEntries(["left", "top", "width", "height"].map((side) => [side, `${100 * mark[side]}%`]));
   return el("button", { class: `seen ${mark.kind}`, "data-number": mark.number, "aria-label": `${name}, ${mark.distance_m.toFixed(1)} m`,
-    title: `${name}, ${mark.distance_m.toFixed(1)} m`, style: { ...place, borderColor: colour(isTree ? "tree" : hue) }, onclick: () => tell(mark) },
+    title: `${name}, ${mark.distance_m.toFixed(1)} m`, style: { ...place, borderColor: colour(isTree ? "tree" : hue) }, onclick: () => open(mark) },
   mark.verdict === "tree" && !isTree ? "" : el("span", { style: { background: colour(isTree ? "tree" : hue) }, text: isTree ? mark.number : letter }));
 }
 
-function tell({ kind, number }) {
+function open({ kind, number }) {
   openStory(kind);
   if (kind === "tree") select(number);
   else selectCluster(seen.index, number);

@@ -1,19 +1,20 @@
-// What is seen in the 3D scene: layers with switch, count and colour, labels, colours and cameras.
+// Layers of the 3D scene with switch, count and colour; choice of labels and colours; cameras.
 
 import { patch } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
+import { attempted } from "../core/problem.js";
 import { on, state } from "../core/store.js";
+import { throttled } from "../core/timing.js";
 import { pressInScene } from "./scene.js";
 
-const EVERY = 500; // [ms] between two fillings of the counts
+const EVERY = 500; // [ms] between two updates of the counts
 const TITLES = { colour_by: "Colour by", label_by: "Labels" };
 const counts = {};
-let countedAt = 0;
-const newest = {}; // counts by layer, as the scan or a choice told them last
+const newest = {}; // newest counts by layer
 
-export const chooseView = (name, value) => patch("/api/view", { name, value }).catch(() => {});
+export const chooseView = (name, value) => attempted(() => patch("/api/view", { name, value }));
 
-// Keys 1 to 9 and 0 switch the layers in their order.
+// Switches a layer by its place in the list: keys 1 to 9 and 0.
 export function toggleLayer(place) {
   const layer = state.view?.layers[place];
   if (layer) chooseView(layer.name, !layer.on);
@@ -44,7 +45,7 @@ function show() {
 }
 
 function count() {
-  countedAt = performance.now();
+  if (byId("layer-list").hidden) return;
   const known = { ...newest, labels: undefined, path: state.path.length, odometry: state.odometry.filter(Boolean).length, truth: state.truth?.length ?? 0 };
   for (const [name, cell] of Object.entries(counts)) setText(cell, known[name] === undefined ? "" : known[name].toLocaleString("en"));
 }
@@ -63,5 +64,5 @@ export function startLayers() {
   byId("follow").addEventListener("click", toggleFollow);
   on("view", () => { Object.assign(newest, state.view?.counts); show(); });
   on("map", () => Object.assign(newest, state.map?.layers));
-  on("map truth", () => !byId("layer-list").hidden && performance.now() - countedAt > EVERY && count());
+  on("map truth", throttled(count, EVERY));
 }

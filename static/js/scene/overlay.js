@@ -1,4 +1,4 @@
-// What lies over the scene when it is asked for: one at a time, closed by Esc or its button.
+// Overlays of the scene (stages, comparison, camera): one at a time, closed by Esc or their button.
 
 import { byId } from "../core/dom.js";
 import { changed } from "../core/store.js";
@@ -19,29 +19,13 @@ export function openOver(name) {
   changed("over");
 }
 
-// Returns whether there was anything to close.
+// Returns whether an overlay was open.
 export function closeOver() {
   if (!current) return false;
   const button = byId(`${current}-button`);
   openOver(current);
   button.focus();
   return true;
-}
-
-// Calls `work` now and after each change, one call at a time, and not more often than `pause` [ms].
-export function keepFresh(work, pause) {
-  let busy = false, wanted = false;
-  return async function fresh() {
-    wanted = true;
-    if (busy) return;
-    busy = true;
-    while (wanted) {
-      wanted = false;
-      await work();
-      await new Promise((resolve) => setTimeout(resolve, pause));
-    }
-    busy = false;
-  };
 }
 
 export function startOverlay() {

@@ -1,10 +1,10 @@
-// Draws points as seen by an eye far away, which several pictures share: dragged to turn, wheel to zoom.
+// Point clouds on a canvas in parallel projection. Several pictures share one view: drag to turn, wheel to zoom.
 
-const TILT = 1.5; // [rad] from above, at most: almost along the ground
+const TILT = 1.5; // [rad] largest tilt from the vertical
 
 export const newEye = () => ({ yaw: Math.PI / 2, tilt: 0.95, scale: 12, x: 0, y: 0 });
 
-// The block of `app/dashboard/picture_payload.py`: its header, with the arrays by name.
+// Decodes the block of `app/dashboard/picture_payload.py`: its header with the arrays by name.
 export function unpack(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -112,7 +112,7 @@ export class PointPicture {
   }
 }
 
-// "#rrggbb" as the number that a pixel of an ImageData is.
+// "#rrggbb" as a pixel of an ImageData.
 export function pixel(hex) {
   const n = parseInt(hex.slice(1), 16);
   return (0xff000000 | ((n & 255) << 16) | (n & 0xff00) | (n >> 16)) >>> 0;

@@ -1,4 +1,4 @@
-// The frame with the 3D scene. It is of the same origin, so keys and reconnecting can be shared.
+// The frame with viser's 3D scene. It has the same origin as the page, which shares keys and reconnects it.
 
 import { byId } from "../core/dom.js";
 import { on } from "../core/store.js";
@@ -21,19 +21,19 @@ function load() {
   frame.src = address();
 }
 
-// In light or dark without loading it anew, which would lose the camera: viser has its colours from this attribute, and
-// sets its ground once.
+// Switches light and dark without a reload, which would lose the camera: viser reads its colours from this attribute and
+// sets its background once.
 function paint() {
   const inner = frame.contentDocument;
-  if (!inner) return; // a page of an error, which is not ours to paint
+  if (!inner) return; // an error page of the browser
   inner.documentElement.dataset.mantineColorScheme = isDark() ? "dark" : "light";
   let node = inner.querySelector("canvas");
   while (node && !node.style.backgroundColor) node = node.parentElement;
   if (node) node.style.backgroundColor = isDark() ? "var(--mantine-color-dark-9)" : "#fff";
 }
 
-// viser's client reconnects only while it has the focus. Taking the focus from a person who types is
-// worse than a lost scene, so the frame is told that it has it.
+// viser's client reconnects only while it has the focus. Moving the focus would interrupt typing, so the frame reports that
+// it has the focus.
 function keepReconnecting() {
   frame.contentDocument.hasFocus = () => true;
   frame.contentWindow.dispatchEvent(new Event("focus"));
@@ -50,7 +50,7 @@ export function pressInScene(key) {
 export function startScene() {
   frame.addEventListener("load", () => {
     if (!frame.src || !frame.contentDocument) return;
-    // It was loaded in the other theme, or loads itself anew as it was at first.
+    // It was loaded with the other theme, or reloads itself with its first address.
     if (frame.contentWindow.location.search.includes("darkMode") !== isDark()) return void load();
     keepReconnecting();
     for (const listener of loaders) listener(frame.contentWindow);

@@ -1,4 +1,4 @@
-// The four stages of the paper's Fig. 3 side by side: raw scan, filtered, clusters, trunks.
+// The four stages of Fig. 3 of the paper side by side: raw scan, filtered, clusters, trunks.
 
 import { block } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
@@ -6,8 +6,9 @@ import { nothingYet } from "../core/empty_state.js";
 import { count } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
+import { keepFresh, oncePerFrame } from "../core/timing.js";
 import { verdictOf } from "../core/verdicts.js";
-import { keepFresh, shownOver } from "./overlay.js";
+import { shownOver } from "./overlay.js";
 import { newEye, pixel, PointPicture, unpack } from "./points.js";
 
 const EVERY = 400; // [ms] between two pictures
@@ -20,7 +21,7 @@ const STAGES = {
   trunks: ["d", "Trunks", (d) => `${d.verdicts.tree ?? 0} of ${d.clusters.x.length}`],
 };
 const pictures = {};
-let data = null, planned = false;
+let data = null;
 
 function build() {
   byId("stages-grid").replaceChildren(...Object.entries(STAGES).map(([name, [letter, title]]) => {
@@ -32,11 +33,7 @@ function build() {
   new ResizeObserver(redraw).observe(byId("stages-grid"));
 }
 
-function redraw() {
-  if (planned) return;
-  planned = true;
-  requestAnimationFrame(() => { planned = false; if (data && shownOver("stages")) draw(); });
-}
+const redraw = oncePerFrame(() => { if (data && shownOver("stages")) draw(); });
 
 function draw() {
   const { raw, points, labels, circles } = data.arrays;
@@ -64,7 +61,7 @@ const refresh = keepFresh(async () => {
   if (!shownOver("stages")) return;
   try {
     data = state.map ? unpack(await block("/api/stages")) : null;
-    setText(byId("stages-lead"), data ? `Scan ${data.index}. Drag to turn, shift and drag to move, wheel to zoom; all four move together.` : nothingYet("No scan"));
+    setText(byId("stages-lead"), data ? `Scan ${data.index}. Drag to turn, Shift+drag to move, wheel to zoom; all four pictures move together.` : nothingYet("No scan"));
     byId("over-stages").dataset.scan = data ? String(data.index) : "";
   } catch (error) {
     setText(byId("stages-lead"), error.message);

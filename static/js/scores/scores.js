@@ -1,18 +1,18 @@
-// The map against the ground truth: rates never without their counts.
+// The tab Scores: the map against the ground truth. Each rate is shown with its counts.
 
-import { scoreAgainst, truthInWords, warnedInWords } from "../annotate/annotations.js";
-import { byId, el } from "../core/dom.js";
+import { contradictionText, scoreAgainst, truthText } from "../annotate/annotations.js";
+import { byId, definitions, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
-import { figure, NONE, percent } from "../core/format.js";
+import { capital, figure, NONE, percent } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { openSources } from "../open/dialog.js";
 import { visible } from "../shell/tabs.js";
 
 const RATES = {
-  TA: ["TA  trees found", "True acceptance: trees of the ground truth that the map has too"],
-  FR: ["FR  trees missed", "False rejection: trees of the ground truth that the map has not"],
-  TR: ["TR  others left out", "True rejection: poles, persons, bushes and other things of the ground truth that the map has not"],
-  FA: ["FA  others taken for trees", "False acceptance: other things of the ground truth that the map has as trees"],
+  TA: ["TA  trees found", "True acceptance: trees of the ground truth that are in the map"],
+  FR: ["FR  trees missed", "False rejection: trees of the ground truth that are missing in the map"],
+  TR: ["TR  others rejected", "True rejection: poles, persons, bushes and other objects of the ground truth that are not in the map"],
+  FA: ["FA  others accepted", "False acceptance: other objects of the ground truth that are in the map as trees"],
 };
 const centimetres = (value) => (value === null ? NONE : `${figure(value)} cm`);
 const inCentimetres = (metres) => (metres === null ? NONE : centimetres(100 * metres));
@@ -22,7 +22,7 @@ const LINES = [
   ["completeness", (s) => percent(s.completeness)],
   ["correctness", (s) => percent(s.correctness)],
   ["F1", (s) => figure(s.f1)],
-  ["trees where nothing stands", (s) => String(s.spurious)],
+  ["trees without counterpart", (s) => String(s.spurious)],
   ["position RMSE", (s) => inCentimetres(s.position_rmse_m)],
   ["position bias", (s) => inCentimetres(s.position_bias_m)],
   ["DBH RMSE", (s) => centimetres(s.dbh_rmse_cm)],
@@ -34,12 +34,12 @@ const LINES = [
 function show() {
   if (!visible("scores")) return;
   const score = state.evaluation;
-  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthInWords(), warnedInWords()].filter(Boolean).join(" ") }), doubt(score), rates(score), lines(score)] : [nothing()]));
+  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthText(), contradictionText()].filter(Boolean).join(" ") }), doubt(score), rates(score), lines(score)] : [nothing()]));
 }
 
-// So few trees match that the truth may be of another forest.
+// A warning that so few trees match that the ground truth may belong to another place.
 function doubt({ warning }) {
-  return el("p", { class: "note", id: "truth-doubt", role: "status", hidden: !warning, text: warning ? `▲ ${warning.charAt(0).toUpperCase()}${warning.slice(1)}` : "" });
+  return el("p", { class: "note", id: "truth-doubt", role: "status", hidden: !warning, text: warning ? `▲ ${capital(warning)}` : "" });
 }
 
 function rates(score) {
@@ -51,17 +51,17 @@ function rates(score) {
 }
 
 function lines(score) {
-  return el("dl", { class: "list" }, ...LINES.flatMap(([title, text]) => [el("dt", { text: title }), el("dd", { text: text(score) })]));
+  return definitions(LINES.map(([title, text]) => [title, text(score)]));
 }
 
 function nothing() {
   if (!state.map) return el("p", { class: "empty", text: nothingYet() });
   return el("div", { class: "empty" },
     el("p", { text: state.annotations?.own == null
-      ? "This run brings no ground truth, so there is nothing to score the map against. Annotate the trees, or open a simulated run."
-      : "Nothing is annotated yet, and annotations alone were chosen to score against. Annotate the trees, or let the run's own truth count." }),
+      ? "This run has no ground truth to score the map against. Annotate trees, or open a simulated run."
+      : "The map is to be scored against annotations only, and there are none. Annotate trees, or score against the ground truth of the run." }),
     state.annotations?.own == null ? el("button", { text: "Open a simulated run", onclick: openSources })
-      : el("button", { text: "Score against its truth and annotations", onclick: () => scoreAgainst("both") }));
+      : el("button", { text: "Score against ground truth and annotations", onclick: () => scoreAgainst("both") }));
 }
 
 export function startScores() {

@@ -1,6 +1,6 @@
-// Everything that can be done with the dashboard, in one table: the keys, their sheet and the palette come from it.
+// All actions of the dashboard in one table; the keys, the list of shortcuts and the palette are made from it.
 
-import { annotating, draft, judge, next, redo as redoEdit, toggleAdding, undo as undoEdit } from "../annotate/annotations.js";
+import { annotating, draft, next, redo as redoEdit, toggleAdding, review, undo as undoEdit } from "../annotate/annotations.js";
 import { byId } from "../core/dom.js";
 import { select } from "../core/live_feed.js";
 import { edits } from "../core/permissions.js";
@@ -36,14 +36,14 @@ function leave() {
   select(null);
 }
 
-// title, keys as the sheet shows them, key of the event ("" where it has none of its own), what it does
+// title, keys as shown, key of the event ("" if it has none of its own), action, title in the list of shortcuts
 export const ACTIONS = [
   ["Play or pause", "space", " ", edits(togglePlay)],
   ["One scan back", "←", "", edits(() => advance(-1))], ["One scan forward", "→", "", edits(() => advance(1))],
   ["Ten scans back", "shift ←", "", edits(() => advance(-10))], ["Ten scans forward", "shift →", "", edits(() => advance(10))],
-  ["Loop: set its beginning, then its end; leave it", "l", "l", edits(setLoop)],
+  ["Loop: set its start, then its end, then remove it", "l", "l", edits(setLoop)],
   ["Follow the robot in the scene, or stop following", "f", "", edits(toggleFollow)],
-  ["Look at the robot from above", "t", "", edits(() => pressInScene("t"))], ["Look at the robot from behind", "b", "", edits(() => pressInScene("b"))],
+  ["View the robot from above", "t", "", edits(() => pressInScene("t"))], ["View the robot from behind", "b", "", edits(() => pressInScene("b"))],
   ["Measure a distance on the map", "m", "m", toggleMeasure],
   ["Show the whole map", "", "", click("map-fit")],
   ["Stages: raw, filtered, clusters and trunks side by side", "s", "s", () => openOver("stages")],
@@ -51,27 +51,27 @@ export const ACTIONS = [
   ["Camera: trees and clusters in the picture of this scan", "v", "v", () => openOver("camera")],
   ["Find a tree", "/", "/", findTree],
   ["Find a parameter", "p", "p", () => { openDrawer(); openSearch(); }],
-  ["Undo a change of a parameter", "ctrl+z", "", edits(undo), "in the tab Tune: undo a change of a parameter"],
-  ["Redo a change of a parameter", "ctrl+shift+z", "", edits(redo), "in the tab Tune: do it again"],
+  ["Undo a parameter change", "ctrl+z", "", edits(undo), "in the tab Tune: undo a parameter change"],
+  ["Redo a parameter change", "ctrl+shift+z", "", edits(redo), "in the tab Tune: redo a parameter change"],
   ["Reset all parameters to the preset", "", "", edits(() => reset([]))],
   ["Save the parameters as a set", "", "", edits(() => { toTab("tune")(); byId("tune-save").click(); })],
   ["Download the parameters as a file", "", "", click("tune-download")],
-  ["Take parameters from a file", "", "", edits(() => { toTab("tune")(); byId("tune-upload").click(); })],
+  ["Upload parameters from a file", "", "", edits(() => { toTab("tune")(); byId("tune-upload").click(); })],
   ["Layers of the scene", "", "", edits(click("layers-button"))],
-  ["Light or dark", "", "", click("theme-button")],
+  ["Light or dark theme", "", "", click("theme-button")],
   ["Open another run", "", "", edits(openSources)],
-  ["All runs: look at them, compare two, play one again", "", "", click("runs-link")],
-  ["Share: links to this moment, and for looking only", "", "", click("share-button")],
+  ["All runs: show, compare or replay them", "", "", click("runs-link")],
+  ["Share: link to this moment, view-only link", "", "", click("share-button")],
   ["Save the map as a picture (PNG)", "", "", click("map-png")], ["Save the map as a table (CSV)", "", "", click("map-csv")],
   ["Save the table of trees as a picture (PNG)", "", "", () => { toTab("trees")(); byId("trees-png").click(); }],
   ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv")],
   ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],
   ["Annotate: add trees by clicks on the map", "", "", inAnnotate(() => toggleAdding(true))],
-  ["Annotate: next tree that nobody judged", "", "", inAnnotate(next)],
-  ["Annotate: the selected tree is one", "", "", inAnnotate(() => judge("tree"))],
-  ["Annotate: the selected tree is none", "", "", inAnnotate(() => judge(draft.kind))],
-  ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: do it again", "", "", inAnnotate(redoEdit)],
+  ["Annotate: next tree to review", "", "", inAnnotate(next)],
+  ["Annotate: the selected tree is a tree", "", "", inAnnotate(() => review("tree"))],
+  ["Annotate: the selected tree is not a tree", "", "", inAnnotate(() => review(draft.kind))],
+  ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: redo your last edit", "", "", inAnnotate(redoEdit)],
   ["Annotate: import trees from CSV", "", "", inAnnotate(click("annotate-import"))],
-  ["Select nothing; close what lies over the scene", "esc", "Escape", leave],
+  ["Clear the selection; close the overlay of the scene", "esc", "Escape", leave],
   ["Keyboard shortcuts", "?", "?", showSheet],
 ];

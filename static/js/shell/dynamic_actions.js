@@ -1,26 +1,27 @@
-// What can be done beside the table of actions: what hangs on the run that is open, and what stands in the panels.
+// Actions that depend on the open run, and buttons of the panels.
 
 import { scoreAgainst } from "../annotate/annotations.js";
-import { post, put } from "../core/api.js";
+import { command, put } from "../core/api.js";
 import { byId } from "../core/dom.js";
+import { capital } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { edits } from "../core/permissions.js";
-import { state } from "../core/store.js";
+import { attempted } from "../core/problem.js";
+import { state, trees } from "../core/store.js";
 import { openStory } from "../explain/story.js";
 import { openSources } from "../open/dialog.js";
 import { chooseView, toggleLayer } from "../scene/layers.js";
 import { openParameter } from "../tune/panel.js";
 import { attempt, isChanged, savedSets, shown, specOf, tuning, use } from "../tune/parameters.js";
-import { askHowMuch } from "../tune/sensitivity.js";
+import { requestSensitivity } from "../tune/sensitivity.js";
 import { openDrawer, toTab } from "./actions.js";
 import { NAMES as TABS } from "./tabs.js";
 
-const AGAINST = [["both", "the run's truth and annotations"], ["own", "the run's truth alone"], ["annotations", "annotations alone"]];
+const AGAINST = [["both", "ground truth and annotations"], ["own", "ground truth only"], ["annotations", "annotations only"]];
 const CHOICES = { colour_by: "Colour the scene by", label_by: "Label the scene with" };
-const named = (name) => name[0].toUpperCase() + name.slice(1);
 
-// Whether a button stands there; that its panel is closed does not count.
-function stands(id) {
+// Whether a button exists and is not hidden, apart from its panel being closed.
+function exists(id) {
   for (let at = byId(id); at; at = at.parentElement) {
     if (at.matches("[role=tabpanel], dialog, body")) return true;
     if (at.hidden) return false;
@@ -28,7 +29,7 @@ function stands(id) {
   return false;
 }
 
-// Opens the panel and presses the button there once it is filled; one that cannot be pressed is shown with what is said beside it.
+// Opens the panel and presses its button; a disabled button is only shown.
 const pressIn = (tab, id) => () => {
   toTab(tab)();
   requestAnimationFrame(() => {
@@ -38,26 +39,26 @@ const pressIn = (tab, id) => () => {
   });
 };
 
-// Buttons of the panels: title, tab, id. Those that do not stand there now are left out.
+// Buttons of the panels: title, tab, id. Those that do not exist now are left out.
 const BUTTONS = [
   ["Tune for me: search for the parameters with the best score", "tune", "search-open"], ["Tune for me: search again", "tune", "search-again"],
   ["Stop the search for parameters", "tune", "search-stop"], ["Use the parameters that were found", "tune", "search-use"], ["Save the parameters that were found as a set", "tune", "search-save"],
   ["Delete the saved set of parameters", "tune", "tune-delete"],
   ["Learn: use the new decision trees", "annotate", "learn-use"], ["Learn: keep the old decision trees", "annotate", "learn-forget"],
-  ["Learn: stop growing", "annotate", "learn-stop"], ["Learn: back to the decision trees of the package", "annotate", "learn-package"],
+  ["Learn: stop the training", "annotate", "learn-stop"], ["Learn: use the built-in decision trees", "annotate", "learn-package"],
 ];
 
 const panels = () => [
-  ...BUTTONS.filter(([, , id]) => stands(id)).map(([title, tab, id]) => [title, "", edits(pressIn(tab, id))]),
-  ["Learn: grow a new decision tree from the annotations", "", edits(pressIn("annotate", "learn-grow"))],
-  [`Map the whole run again after a change: switch ${state.parameters?.whole ?? true ? "off" : "on"}`, "", edits(() => { toTab("tune")(); attempt(() => put("/api/parameters/reach", { whole: !(state.parameters?.whole ?? true) })); })],
+  ...BUTTONS.filter(([, , id]) => exists(id)).map(([title, tab, id]) => [title, "", edits(pressIn(tab, id))]),
+  ["Learn: train decision trees from the annotations", "", edits(pressIn("annotate", "learn-grow"))],
+  [`Re-map the whole run after a change: switch ${state.parameters?.whole ?? true ? "off" : "on"}`, "", edits(() => { toTab("tune")(); attempt(() => put("/api/parameters/reach", { whole: !(state.parameters?.whole ?? true) })); })],
   ["Download the annotations as CSV", "", () => location.assign("/api/annotations.csv")], ["Download the annotations as GeoJSON", "", () => location.assign("/api/annotations.geojson")],
   ["Annotate: your name", "", edits(() => { toTab("annotate")(); byId("annotate-name").focus(); })],
   ...(state.annotations?.own == null ? [] : AGAINST.map(([value, words]) => [`Score against ${words}`, "", edits(() => { toTab("scores")(); scoreAgainst(value); })])),
   ["Upload a recording", "", edits(async () => { await openSources(); byId("upload-choose").focus(); })],
   ["Topics and mounting of a recording or robot", "", edits(async () => { await openSources(); byId("source-uri").value ||= state.status?.source ?? ""; byId("source-inside").open = true; })],
-  ...(byId("robots-link") ? [["All robots: a card each, and one map", "", () => byId("robots-link").click()]] : []),
-  ...(byId("warnings-button").hidden ? [] : [["Read the warnings", "", () => byId("warnings-button").click()]]),
+  ...(byId("robots-link") ? [["All robots: one card each, and one common map", "", () => byId("robots-link").click()]] : []),
+  ...(byId("warnings-button").hidden ? [] : [["Show the warnings", "", () => byId("warnings-button").click()]]),
 ];
 
 const plots = () => [...byId("plot-choice").options].map(({ value, text }) => [`Plot: ${text}`, "", () => {
@@ -68,17 +69,17 @@ const plots = () => [...byId("plot-choice").options].map(({ value, text }) => [`
 
 const views = () => Object.entries(CHOICES).flatMap(([name, words]) => (state.view?.[name]?.of ?? []).map((value) => [`${words} ${value}`, "", edits(() => chooseView(name, value))]));
 
-// As [title, keys, what it does, further words by which it is found].
+// [[title, keys, action, keywords], ...]
 export function presentActions() {
   const layers = (state.view?.layers ?? []).map(({ title, on: seen }, place) =>
     [`Layer ${title}: ${seen ? "hide" : "show"}`, place < 10 ? String((place + 1) % 10) : "", edits(() => toggleLayer(place))]);
-  const tabs = TABS.map((name) => [`Tab ${named(name)}`, "", toTab(name)]);
+  const tabs = TABS.map((name) => [`Tab ${capital(name)}`, "", toTab(name)]);
   const sets = [...tuning.presets.map(({ name }) => [`Use the preset ${name}`, "", edits(() => use(name))]), ...savedSets().map(({ name }) => [`Use the saved set ${name}`, "", edits(() => use(name))])];
-  const speeds = [...byId("speed").options].map(({ value, text }) => [`Speed ${text}`, "", edits(() => post("/api/command", { type: "set_speed", factor: Number(value) }))]);
+  const speeds = [...byId("speed").options].map(({ value, text }) => [`Speed ${text}`, "", edits(() => attempted(() => command("set_speed", { factor: Number(value) })))]);
   const parameters = tuning.specs.map(({ name, stage, title, doc }) =>
     [`${stage}: ${title} (${shown(state.parameters?.values[name], specOf(name))}${isChanged(name) ? ", changed" : ""})`, "", () => openParameter(name), `${name} ${doc}`]);
-  const matter = tuning.specs.filter(({ kind }) => kind !== "name").map((spec) =>
-    [`How much does ${spec.title} matter? (${spec.stage})`, "", edits(() => { openParameter(spec.name); askHowMuch(spec); }), `${spec.name} sensitivity ∿`]);
-  const trees = (state.map?.trees ?? []).map(({ number }) => [`Tree ${number}`, "", () => { openDrawer(); openStory("tree"); select(number); }]);
-  return [...tabs, ...panels(), ...plots(), ...layers, ...views(), ...sets, ...speeds, ...parameters, ...trees, ...matter];
+  const sensitivities = tuning.specs.filter(({ kind }) => kind !== "name").map((spec) =>
+    [`Sensitivity of ${spec.title} (${spec.stage})`, "", edits(() => { openParameter(spec.name); requestSensitivity(spec); }), `${spec.name} how much does it matter ∿`]);
+  const found = trees().map(({ number }) => [`Tree ${number}`, "", () => { openDrawer(); openStory("tree"); select(number); }]);
+  return [...tabs, ...panels(), ...plots(), ...layers, ...views(), ...sets, ...speeds, ...parameters, ...found, ...sensitivities];
 }

@@ -2,6 +2,7 @@
 
 import { ANNOTATE_KEYS, annotateKey } from "../annotate/panel.js";
 import { byId, el } from "../core/dom.js";
+import { capital } from "../core/format.js";
 import { edits, looksOnly } from "../core/permissions.js";
 import { advance } from "../playback/timeline.js";
 import { toggleLayer } from "../scene/layers.js";
@@ -23,7 +24,7 @@ const actions = {
 function act(event, inScene) {
   const take = () => {
     event.preventDefault();
-    event.stopImmediatePropagation(); // or the arrows would turn the camera too
+    event.stopImmediatePropagation(); // the arrows would also turn the camera
   };
   if (document.querySelector("dialog[open]")) return;
   if ((event.ctrlKey || event.metaKey) && !event.altKey && event.key.toLowerCase() === "k") {
@@ -32,7 +33,7 @@ function act(event, inScene) {
     return;
   }
   const target = event.target;
-  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event, inScene) || tuneKey(event))) {
+  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || tuneKey(event))) {
     take();
     return;
   }
@@ -40,7 +41,7 @@ function act(event, inScene) {
   if (target.matches?.(TYPES) || (event.key === " " && target.matches?.(PRESSED))) return;
   if (target.matches?.("input[type=range]") && event.key.startsWith("Arrow")) return;
   if (!inScene && ["f", "t", "b"].includes(event.key)) {
-    if (!looksOnly()) pressInScene(event.key); // viser listens to these itself when it has the focus
+    if (!looksOnly()) pressInScene(event.key); // viser handles these itself when it has the focus
     return;
   }
   const action = actions[event.key];
@@ -50,8 +51,8 @@ function act(event, inScene) {
 }
 
 function sheet() {
-  const own = ACTIONS.filter(([, keys]) => keys).map(([title, keys, , , told]) => [keys, told ?? title]);
-  return [["ctrl+k", "find anything that can be done"], ...own, ["1 … 0", "show or hide a layer of the scene"], ...ANNOTATE_KEYS];
+  const own = ACTIONS.filter(([, keys]) => keys).map(([title, keys, , , text]) => [keys, text ?? title]);
+  return [["ctrl+k", "search all actions"], ...own, ["1 … 0", "show or hide a layer of the scene"], ...ANNOTATE_KEYS];
 }
 
 export function startKeys() {
@@ -59,5 +60,5 @@ export function startKeys() {
   onSceneLoad((inner) => inner.addEventListener("keydown", (event) => act(event, true), { capture: true }));
   byId("keys-button").addEventListener("click", showSheet);
   byId("keys-list").replaceChildren(...sheet().map(([keys, text]) =>
-    el("div", {}, el("dt", {}, ...keys.split(" ").map((key) => el("kbd", { text: key }))), el("dd", { text: text[0].toUpperCase() + text.slice(1) }))));
+    el("div", {}, el("dt", {}, ...keys.split(" ").map((key) => el("kbd", { text: key }))), el("dd", { text: capital(text) }))));
 }

@@ -1,9 +1,10 @@
-// Starts every part of the page, then connects.
+// Starts all parts of the dashboard, then connects to the server.
 
 import { startAnnotating } from "../annotate/annotations.js";
 import { startAnnotatePanel } from "../annotate/panel.js";
-import { startAnnotateScene } from "../annotate/pointer.js";
+import { startSceneAnnotating } from "../annotate/pointer.js";
 import { startClusters } from "../clusters/clusters.js";
+import { showProblem } from "../core/problem.js";
 import { connect } from "../core/live_feed.js";
 import { startTheme } from "../core/theme.js";
 import { startStory } from "../explain/story.js";
@@ -30,6 +31,7 @@ import { startShare } from "./share.js";
 import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
-for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startAnnotateScene, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
+for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
   startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startPalette, startDrawer, startWelcome, startShare]) start();
+addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

@@ -1,11 +1,11 @@
-// Ctrl+K: everything that can be done, found by typing.
+// Ctrl+K: a searchable list of all actions.
 
 import { byId, el } from "../core/dom.js";
 import { mayDo } from "../core/permissions.js";
 import { ACTIONS } from "./actions.js";
 import { presentActions } from "./dynamic_actions.js";
 
-const MOST = 60; // entries that are listed; nobody reads farther
+const MOST = 60; // listed entries
 let found = [], chosen = 0, before = null;
 
 const dialog = () => byId("palette");
@@ -17,8 +17,8 @@ export function openPalette() {
   sift();
 }
 
-// All words must occur, in the title or in what else an entry is found by. What the title begins with comes first, then titles that
-// have a word so, then other titles; of parameters their names and sentences count last.
+// All words must occur in the title or the keywords of an entry. Order: titles that begin with the text, titles with a word that
+// begins with the first word, other titles, keywords.
 function search(text) {
   const words = text.toLowerCase().split(/\s+/).filter(Boolean);
   const all = [...ACTIONS.map(([title, keys, , run]) => [title, keys, run]), ...presentActions()].filter(([, , run]) => mayDo(run));
@@ -75,6 +75,6 @@ export function startPalette() {
   byId("palette-find").addEventListener("input", sift);
   byId("palette-find").addEventListener("keydown", key);
   byId("palette-button").addEventListener("click", openPalette);
-  dialog().addEventListener("click", (event) => event.target === dialog() && dialog().close()); // beside it
+  dialog().addEventListener("click", (event) => event.target === dialog() && dialog().close()); // a click outside
   dialog().addEventListener("close", () => document.activeElement === document.body && before?.focus());
 }

@@ -1,9 +1,10 @@
-// Links for others: one for looking only, and one that brings back the run, the time and the camera.
+// Links to share: a view-only link, and one that restores the run, the time and the camera.
 
 import { command, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { clock } from "../core/format.js";
 import { access, looksOnly, startAccess } from "../core/permissions.js";
+import { showProblem } from "../core/problem.js";
 import { on, state } from "../core/store.js";
 
 const PATIENCE = 120_000; // [ms] for a run to open
@@ -12,7 +13,7 @@ const controls = () => {
   try {
     return frame.contentWindow?.__viserMutable?.cameraControl ?? null;
   } catch {
-    return null; // the scene could not be loaded: what stands in its frame is the browser's own page
+    return null; // the scene failed to load: its frame holds an error page of the browser
   }
 };
 const rounded = (values) => values.map((value) => value.toFixed(2)).join(",");
@@ -24,7 +25,7 @@ function camera() {
   return rounded([...from.toArray(), ...to.toArray()]);
 }
 
-// Rounded up, or the seek would end at the scan before.
+// Rounded up: otherwise the seek would end at the previous scan.
 const seconds = () => (Math.ceil(1000 * (state.status?.time_s ?? 0)) / 1000).toFixed(3);
 
 function hereLink() {
@@ -42,7 +43,7 @@ function row(id, label, hint, value) {
       await navigator.clipboard.writeText(box.value);
       setText(copy, "Copied");
     } catch {
-      setText(copy, "Press Ctrl+C"); // a page without a certificate may not write to the clipboard
+      setText(copy, "Press Ctrl+C"); // without HTTPS the clipboard is not accessible
     }
   } });
   return el("div", {}, el("label", { for: id, text: label }), el("div", { class: "row" }, box, copy), el("p", { class: "dim", text: hint }));
@@ -51,13 +52,13 @@ function row(id, label, hint, value) {
 function show() {
   const dialog = byId("share-dialog");
   dialog.replaceChildren(el("h2", { id: "share-title", text: "Share" }),
-    row("share-here", "This run, at this time, from this camera", `${state.status?.source ?? ""} at ${clock(state.status?.time_s)}. Whoever opens it needs access to this dashboard.`, hereLink()),
-    ...(access.viewer_link ? [row("share-viewer", "Link for looking only", "Whoever has it sees all and changes nothing. In one browser the link that was opened last counts: open it in another, or in a private window.", `${location.origin}${access.viewer_link}`)] : []),
+    row("share-here", "This run at this time with this camera", `${state.status?.source ?? ""} at ${clock(state.status?.time_s)}. Opening it needs access to this dashboard.`, hereLink()),
+    ...(access.viewer_link ? [row("share-viewer", "View-only link", "It shows everything and changes nothing. In one browser the last opened link applies: try it in another browser or a private window.", `${location.origin}${access.viewer_link}`)] : []),
     el("form", { method: "dialog", class: "row end" }, el("button", { text: "Close" })));
   dialog.showModal();
 }
 
-// What the address asks for is done once, and then taken out of it, so that a reload stays where the run is.
+// Follows the link in the address once and removes it from the address, so that a reload stays at the run.
 async function follow() {
   const asked = new URLSearchParams(location.search);
   if (!asked.has("run") && !asked.has("camera")) return;
@@ -73,14 +74,13 @@ async function follow() {
     await command("pause");
     await command("seek", { time_s: Math.max(0, time) });
   } catch (error) {
-    byId("notice").hidden = false;
-    setText(byId("notice").querySelector("span"), error.message);
+    showProblem(error);
   }
 }
 
 async function lookFrom(values) {
   if (values.length !== 6 || !values.every(Number.isFinite)) return;
-  // The scene takes its own first camera some frames after it has begun, so ours must have stood for a while.
+  // The scene sets its initial camera some frames after its start, so the camera of the link must have held for a while.
   for (let stood = 0; stood < 4;) {
     await new Promise((resolve) => setTimeout(resolve, 300));
     const standing = frame.contentWindow?.__viserSceneTree?.getState()["/world/robot/scan/raw"] ? camera() : null;
@@ -90,7 +90,7 @@ async function lookFrom(values) {
   }
 }
 
-// Whether it came to hold; after PATIENCE nobody waits for the moment any more.
+// Resolves to whether the condition came true within PATIENCE.
 const until = (holds) => new Promise((resolve) => {
   const end = performance.now() + PATIENCE;
   const look = () => (holds() || performance.now() > end ? resolve(holds()) : setTimeout(look, 200));

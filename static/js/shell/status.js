@@ -1,7 +1,7 @@
-// The strip that is read from two metres, and the notice below it.
+// The status strip and the notice below it.
 
 import { byId, el, setText } from "../core/dom.js";
-import { clock, figure, NONE } from "../core/format.js";
+import { capital, clock, figure, NONE } from "../core/format.js";
 import { changed, on, state } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
 
@@ -9,15 +9,15 @@ const WORDS = {
   starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
 };
 const NO_FIGURES = ["starting", "failed"];
-const OLD_AFTER = 3000; // [ms] without a word while a run plays
-const COMPILED_FOR = 20_000; // [ms] in which what was just compiled is loaded, and the first scans take longer
+const OLD_AFTER = 3000; // [ms] without a message while a run plays
+const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans take longer
 
-// name, unit, value, and what it means for the eye; "minor" ones leave first when the strip gets narrow
+// title, unit, function of the status that returns [text, class, title], and "minor" if it is hidden first in a narrow strip
 const FIGURES = {
-  trees: ["trees", "", (s) => [String(s.trees), ...anew(s)]],
+  trees: ["trees", "", (s) => [String(s.trees), ...remapping(s)]],
   health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health] ?? "soon", reason(s)]],
   rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
-  mapping: ["mapping a scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `mapping, of ${figure(budget(s))} ms`], "minor"],
+  mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
   sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
@@ -25,39 +25,39 @@ const FIGURES = {
 };
 const cells = {};
 
-// While the run is mapped again its map is still that of the values before.
-function anew({ remapped }) {
-  return remapped === null || remapped === undefined ? [] : ["anew", `trees; mapped anew, ${Math.floor(100 * remapped)} %`];
+// During a re-mapping the shown map is the one before.
+function remapping({ remapped }) {
+  return remapped === null || remapped === undefined ? [] : ["anew", `trees; re-mapping, ${Math.floor(100 * remapped)} %`];
 }
 
-// Time from scan to scan [ms]: mapping that takes longer falls behind.
+// Time between two scans [ms]; slower mapping falls behind.
 function budget({ scans, end_s: end }) {
   return scans > 1 && end > 0 ? (1000 * end) / (scans - 1) : 100;
 }
 
-// What the standing scan took for trees, against the truth: it moves with a slider, before the map follows.
+// F1 of the map, and how many trees of the current scan are right: they follow a slider before the map does.
 function ofScan() {
-  if (state.evaluation?.warning) return "F1: is it this truth? see Scores";
+  if (state.evaluation?.warning) return "F1 doubtful, see Scores";
   const { right, wrong } = state.map ?? {};
   return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan: ${right} of ${right + wrong} right`;
 }
 
-// Why nothing is said of the map yet.
-const SOON = { "no trees yet": "SLAM: by odometry alone", "just begun": "SLAM: in its first scans" };
+// Explanations of the first states.
+const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first scans" };
 
 function reason({ health }) {
   if (SOON[health]) return SOON[health];
-  const told = state.map?.health;
-  return told && told.state === health && told.reason ? told.reason : "SLAM health";
+  const known = state.map?.health;
+  return known && known.state === health && known.reason ? known.reason : "SLAM health";
 }
 
 function healthFigures() {
   const h = state.map?.health;
   if (!h) return "";
   return [h.reason && `${h.state}: ${h.reason}`, `N_eff ${figure(h.n_eff)}, ${h.ancestors} ancestors`,
-    `${h.detections} detections, ${figure(h.recognised)} of them known, ${figure(h.ambiguous)} ambiguous`,
-    `innovation ${figure(h.innovation)} (1 is as expected)`, `pose sigma ${figure(100 * h.sigma_xy_m)} cm, ${figure(h.sigma_yaw_deg)}°`,
-    `moved ${figure(h.odometry_sigmas)} sigma away from the odometry`].filter(Boolean).join("\n");
+    `${h.detections} detections, ${figure(h.recognised)} associated, ${figure(h.ambiguous)} ambiguous`,
+    `normalised innovation ${figure(h.innovation)} (1 expected)`, `pose sigma ${figure(100 * h.sigma_xy_m)} cm, ${figure(h.sigma_yaw_deg)}°`,
+    `${figure(h.odometry_sigmas)} sigma from the odometry`].filter(Boolean).join("\n");
 }
 
 function build() {
@@ -83,7 +83,7 @@ function show() {
   }
   cells.health.cell.title = healthFigures();
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
-  cells.f1.cell.title = state.evaluation?.warning || "F1 of the map against the truth; clusters of the standing scan that were taken for trees, and how many of them stand at true ones";
+  cells.f1.cell.title = state.evaluation?.warning || "F1 of the map against the ground truth; number of trees of the current scan that are at true trees";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   const title = titleOf(status.source, show);
   showName(title || NONE);
@@ -91,7 +91,7 @@ function show() {
   document.title = `${title} · stemmap`;
 }
 
-// Of folder/number the folder is cut where there is no room: the number tells one run from the next.
+// Of "folder/number" the folder is cut if there is no room: the number identifies the run.
 function showName(title) {
   const name = byId("source-name"), cut = title.lastIndexOf("/");
   name.classList.toggle("numbered", cut > 0);
@@ -99,10 +99,10 @@ function showName(title) {
   else if (name.textContent !== title) name.replaceChildren(el("span", { text: title.slice(0, cut) }), el("i", { text: title.slice(cut) }));
 }
 
-// On a long way to a scan that was sought nothing plays, and nothing stands.
+// Whether the run is on its way to a distant scan.
 const isGoing = (status) => Boolean(status?.going_far);
 
-// "Live robot1": a robot is heard now; its name stands in every state but the failed one.
+// The state, with the name of the robot unless it failed: "Live robot1".
 function stateWord(status) {
   if (isGoing(status)) return "Seeking";
   const word = status.live && status.state === "playing" ? "Live" : (WORDS[status.state] ?? status.state);
@@ -134,13 +134,13 @@ function showState() {
   showNotice(quiet);
 }
 
-// What stands in the robot's way, below the strip so that nothing moves for it. A screen reader says the zone when it
-// changes, not every distance.
-const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "? The sensor does not see the way ahead" };
+// Obstacles ahead of the robot, below the strip so that nothing moves. A screen reader announces changes of the zone, not of
+// the distance.
+const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "? Path ahead not visible to the sensor" };
 
 function showWay() {
   const clearance = state.map?.clearance;
-  // A run that is over drives nowhere: that nobody sees the way there is no news.
+  // A finished run does not drive on, so a path that is not visible does not matter.
   const quiet = NO_FIGURES.includes(state.status?.state) || (state.status?.state === "finished" && clearance?.zone === "unknown");
   const text = clearance && !quiet && WAY[clearance.zone];
   byId("way").hidden = !text;
@@ -149,31 +149,31 @@ function showWay() {
   setText(byId("way-distance"), clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
 }
 
-let ahead = null; // of this machine's clock is the server's [ms], null while that is not asked for
-let compiledAt = -Infinity; // when it was last seen to compile [ms]
+let ahead = null; // [ms] of the server's clock before that of this machine; null while unknown
+let compiledAt = -Infinity; // when the server last reported compiling [ms]
 
 function compilingFor({ compiling_since_s: since }) {
   if (!since) return "";
   compiledAt = performance.now();
   if (ahead === null) askClock();
   const passed = Math.floor((Date.now() + ahead) / 1000 - since);
-  return passed >= 10 ? ` ${passed} s so far; a machine that is busy or small takes longer.` : "";
+  return passed >= 10 ? ` ${passed} s so far; a slow or busy machine takes longer.` : "";
 }
 
-// What counts on while the notice stands: to be seen, but not to be read out again and again.
+// The changing part of the notice, which a screen reader does not announce.
 function progressOf(status) {
   if (!state.connected || !status?.detail) return "";
   return isGoing(status) ? ` Mapped up to ${clock(status.time_s)}.` : compilingFor(status);
 }
 
-// Of two machines each may have a clock of its own: an answer says the server's.
+// The clocks of server and browser may differ; the date of an answer is the server's.
 async function askClock() {
   ahead = 0;
   try {
     const date = Date.parse((await fetch("/api/status")).headers.get("date"));
     if (Number.isFinite(date)) ahead = date - Date.now();
   } catch {
-    ahead = null; // no answer: it is asked again while it compiles
+    ahead = null; // no answer: requested again while the server compiles
   }
 }
 
@@ -181,8 +181,8 @@ function showNotice(quiet) {
   const notice = byId("notice");
   const status = state.status;
   const text = !state.connected && state.lostAt
-    ? `No connection for ${seconds(state.lostAt)} s. This is the last picture; it goes on by itself when stemmap answers again.`
-    : quiet ? `Nothing heard for ${seconds(state.heardAt)} s. This is the last picture.`
+    ? `No connection for ${seconds(state.lostAt)} s. The last state is shown; the page reconnects by itself.`
+    : quiet ? `No data for ${seconds(state.heardAt)} s. The last state is shown.`
     : status?.detail ?? "";
   notice.hidden = !text;
   const failed = state.connected && status?.state === "failed";
@@ -190,12 +190,11 @@ function showNotice(quiet) {
   notice.classList.toggle("wait", !failed);
   notice.classList.toggle("starting", status?.state === "starting");
   document.body.classList.toggle("failed", failed);
-  setText(notice.querySelector("span"), sentence(text));
+  setText(notice.querySelector("span"), capital(text));
   setText(byId("notice-progress"), text && text === status?.detail ? progressOf(status) : "");
   byId("notice-open").hidden = !failed;
 }
 
-const sentence = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 const seconds = (since) => Math.floor((performance.now() - since) / 1000);
 
 export function startStatus() {

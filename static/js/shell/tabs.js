@@ -1,4 +1,4 @@
-// The tabs below the map, after the pattern that screen readers know.
+// The tabs below the map (ARIA pattern), and the drawer that holds map and tabs in a narrow window.
 
 import { byId, recall, remember } from "../core/dom.js";
 import { changed } from "../core/store.js";
@@ -33,8 +33,6 @@ export function startTabs() {
     });
   }
 }
-
-// --- Where the window is narrow, map and figures are a drawer over the scene.
 
 export function startDrawer() {
   const button = byId("drawer-button"), side = byId("side");

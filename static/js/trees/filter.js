@@ -1,9 +1,10 @@
-// The box above the table of trees: a number, what a column may hold, or what the ground truth says.
+// The filter above the table of trees: a number, ranges of columns, or the class in the ground truth.
 
-import { KINDS, rows } from "../annotate/annotations.js";
+import { isReviewed, KINDS } from "../annotate/annotations.js";
+import { distance, nearest } from "../core/nearest.js";
 import { state } from "../core/store.js";
 
-export const HELP = "A number, or: dbh 20..30, dbh none, seen > 50, ± < 5, e < 10, x -5..5; judged, unjudged; by the ground truth tree, pole, person, bush, other, none. Several are joined by spaces.";
+export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, seen > 50, ± < 5, e < 10, x -5..5; reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
 
 export const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2)); // of the position [cm]
 
@@ -18,19 +19,14 @@ const BOUND = new RegExp(`^(${NAMES})\\s*(<=|>=|<|>|=)\\s*(${NUMBER})`, "i");
 const UNKNOWN = new RegExp(`^(${NAMES})\\s+none`, "i");
 const TESTS = { "<": (a, b) => a < b, ">": (a, b) => a > b, "<=": (a, b) => a <= b, ">=": (a, b) => a >= b, "=": (a, b) => a === b };
 
-const near = (tree, others, reach) => others.filter((other) => Math.hypot(other.x - tree.x, other.y - tree.y) <= reach)
-  .sort((a, b) => Math.hypot(a.x - tree.x, a.y - tree.y) - Math.hypot(b.x - tree.x, b.y - tree.y))[0];
-
-// What the ground truth has where the tree stands; "none" where it has nothing, "" where there is no truth.
+// Class of a tree in the ground truth; "none" where it has nothing there, "" without ground truth.
 function kindOf(tree) {
   if (!state.truth) return "";
-  return near(tree, state.truth, state.parameters?.values["evaluation.match_distance"] ?? 0.5)?.kind ?? "none";
+  return nearest(state.truth, (truth) => distance(truth, tree), state.parameters?.values["evaluation.match_distance"] ?? 0.5)?.kind ?? "none";
 }
 
-const isJudged = (tree) => Boolean(near(tree, rows(), state.annotations?.same_thing_m ?? 0.5));
-
-// The first condition of a text, and what is left of it; null where none begins it.
-function taken(text) {
+// [text, test] of the condition at the beginning of a text; null if there is none.
+function firstCondition(text) {
   const column = (match) => COLUMNS[match[1].toLowerCase()];
   let match = RANGE.exec(text);
   if (match && (match[2] ?? match[3]) !== undefined) {
@@ -45,9 +41,9 @@ function taken(text) {
     const of = column(match);
     return [match[0], (tree) => of(tree) === null];
   }
-  if ((match = /^(un)?judged\b/i.exec(text))) {
+  if ((match = /^(un)?(?:reviewed|judged)\b/i.exec(text))) {
     const wanted = !match[1];
-    return [match[0], (tree) => isJudged(tree) === wanted];
+    return [match[0], (tree) => isReviewed(tree) === wanted];
   }
   if ((match = new RegExp(`^(${KINDS.join("|")}|none)\\b`, "i").exec(text))) {
     const kind = match[1].toLowerCase();
@@ -60,12 +56,12 @@ function taken(text) {
   return null;
 }
 
-// {holds, refused}: whether a tree is wanted, and the part that is not understood ("" if all is).
+// {holds, refused}: the test of a tree, and the part of the text that was not understood ("" if all was).
 export function filterOf(text) {
   const conditions = [];
   let rest = text.trim().replace(/,(?=\s|$)/g, " ");
   while (rest) {
-    const next = taken(rest);
+    const next = firstCondition(rest);
     if (!next || !/^(\s|$)/.test(rest.slice(next[0].length))) return { holds: () => false, refused: rest };
     conditions.push(next[1]);
     rest = rest.slice(next[0].length).trim();

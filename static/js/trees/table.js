@@ -1,32 +1,32 @@
-// The table of trees (Table 2): sorted by any column, sifted by what is typed above it.
+// The table of trees (Table 2 of the paper): sorted by any column, filtered by the text above it.
 
 import { byId, el, setText } from "../core/dom.js";
 import { saveCanvas } from "../core/download.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
-import { on, state } from "../core/store.js";
+import { on, state, trees } from "../core/store.js";
+import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
 import { openStory } from "../explain/story.js";
 import { visible } from "../shell/tabs.js";
 import { filterOf, HELP, sigma } from "./filter.js";
 
-const EVERY = 400; // [ms] between two fillings; nobody reads faster
+const EVERY = 400; // [ms] between two updates
 
-// key, title, tooltip, text, what it is sorted by
+// key, title, tooltip, text, value for sorting
 const COLUMNS = [
   ["number", "tree", "Number of the tree", (t) => String(t.number), (t) => t.number],
   ["x", "x m", "Along the first heading, from the start", (t) => fixed(t.x, 2), (t) => t.x],
   ["y", "y m", "To the left of the first heading, from the start", (t) => fixed(t.y, 2), (t) => t.y],
-  ["sigma", "± cm", "Standard deviation of the position; ≈: assumed, for no single scan measured it", sigmaText, sigma],
+  ["sigma", "± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
   ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm ?? -1],
   ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity],
-  ["seen", "seen", "Number of scans that detected it; 0: found only in what the scans gathered together", (t) => String(t.observations), (t) => t.observations],
+  ["seen", "seen", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations],
 ];
 const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
 const rows = new Map();
 let order = { key: "number", descending: false };
-let filledAt = 0, planned = 0;
 
 function dbh(tree) {
   if (tree.dbh_cm === null) return NONE;
@@ -57,10 +57,10 @@ function markOrder() {
   }
 }
 
-function sorted(trees) {
+function sorted(all) {
   const of = COLUMNS.find(([key]) => key === order.key)[4];
   const sign = order.descending ? -1 : 1;
-  return [...trees].sort((a, b) => sign * (of(a) - of(b)) || a.number - b.number);
+  return [...all].sort((a, b) => sign * (of(a) - of(b)) || a.number - b.number);
 }
 
 function rowOf(tree) {
@@ -71,7 +71,7 @@ function rowOf(tree) {
   }
   const row = rows.get(tree.number);
   COLUMNS.forEach(([, , , text], place) => setText(row.cells[place], text(tree)));
-  row.cells[SIGMA].title = isAssumed(tree) ? "Assumed, not measured: no single scan detected this tree, all together did" : "";
+  row.cells[SIGMA].title = isAssumed(tree) ? "Assumed, not measured: no single scan detected this tree, only the accumulated scans did" : "";
   row.setAttribute("aria-selected", String(tree.number === state.selected));
   return row;
 }
@@ -82,30 +82,28 @@ function toggle(number) {
 }
 
 function fill() {
-  planned = 0;
-  filledAt = performance.now();
   if (!visible("trees")) return;
-  const all = state.map?.trees ?? [];
+  const all = trees();
   const wanted = byId("find").value.trim();
   const { holds, refused } = filterOf(wanted);
-  const trees = sorted(all.filter(holds));
+  const listed = sorted(all.filter(holds));
   const body = byId("trees").tBodies[0];
-  trees.forEach((tree, place) => {
+  listed.forEach((tree, place) => {
     const row = rowOf(tree);
     if (body.rows[place] !== row) body.insertBefore(row, body.rows[place] ?? null);
   });
-  while (body.rows.length > trees.length) body.lastChild.remove();
-  setText(byId("tree-count"), wanted ? `${trees.length} of ${all.length}` : count(all.length, "tree"));
-  byId("trees").hidden = !trees.length;
-  byId("trees-png").disabled = !trees.length;
+  while (body.rows.length > listed.length) body.lastChild.remove();
+  setText(byId("tree-count"), wanted ? `${listed.length} of ${all.length}` : count(all.length, "tree"));
+  byId("trees").hidden = !listed.length;
+  byId("trees-png").disabled = !listed.length;
   offerCsv(all.length);
   byId("find").setAttribute("aria-invalid", String(Boolean(refused)));
-  setText(byId("trees-empty"), trees.length ? "" : emptyText(all.length, wanted, refused));
+  setText(byId("trees-empty"), listed.length ? "" : emptyText(all.length, wanted, refused));
 }
 
 const csv = byId("trees-csv"), csvTitle = csv.title;
 
-// A link takes no "disabled": without an address it is none.
+// A link has no "disabled" attribute; without an address it cannot be followed.
 function offerCsv(any) {
   if (any) csv.setAttribute("href", "/api/trees.csv");
   else csv.removeAttribute("href");
@@ -114,14 +112,10 @@ function offerCsv(any) {
 }
 
 function emptyText(all, wanted, refused) {
-  if (all && refused) return `“${refused}” is not understood. ${HELP}`;
-  if (all) return `No tree fits “${wanted}”.`;
-  return state.map ? "No tree yet. A tree is listed when it was seen in enough scans; the tab Clusters tells what became of the clusters."
+  if (all && refused) return `“${refused}” is not a condition. ${HELP}`;
+  if (all) return `No tree matches “${wanted}”.`;
+  return state.map ? "No tree yet. A tree is listed once enough scans have detected it. The tab Clusters shows the verdict on each cluster."
     : nothingYet();
-}
-
-function later() {
-  planned ||= setTimeout(fill, Math.max(0, EVERY - (performance.now() - filledAt)));
 }
 
 export function startTable() {
@@ -129,7 +123,7 @@ export function startTable() {
   byId("find").addEventListener("input", fill);
   byId("find").title = HELP;
   byId("trees-png").addEventListener("click", () => saveCanvas("trees.png", pictureOf(byId("trees"))));
-  on("map truth annotations phase", later);
+  on("map truth annotations phase", throttled(fill, EVERY));
   on("tab", fill);
   on("selection", () => {
     for (const [number, row] of rows) row.setAttribute("aria-selected", String(number === state.selected));
@@ -139,12 +133,12 @@ export function startTable() {
   fill();
 }
 
-// --- A table of the page as a picture.
+// --- the table as a picture ----------------------------------------------------------------------------
 
 const ROW = 24, PAD = 12, SCALE = 2;
-const MOST_ROWS = 600, TALLEST = 16_000; // [px]; of a taller canvas some browsers make no picture at all
+const MOST_ROWS = 600, TALLEST = 16_000; // [px]; some browsers cannot save a taller canvas
 
-// A canvas with the heads and the rows of a table as they stand, in the colours of the page.
+// A canvas with the heads and the rows of a table, in the colours of the page.
 export function pictureOf(table) {
   const lines = [...table.rows].slice(0, MOST_ROWS).map((row) => [...row.cells].map((cell) => cell.textContent));
   const more = table.rows.length - lines.length;

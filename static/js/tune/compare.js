@@ -1,20 +1,22 @@
-// Two sets of parameters on the same scan, side by side; on the map half discs, A the left and B the right half.
+// Comparison of two parameter sets on the current scan. On the map trees are half discs: left half A, right half B.
 
 import { blockFor } from "../core/api.js";
-import { byId, el, setText } from "../core/dom.js";
+import { byId, el, letterOf, setText } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
+import { distance, nearest } from "../core/nearest.js";
 import { changed, on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
+import { keepFresh, oncePerFrame } from "../core/timing.js";
 import { verdictOf } from "../core/verdicts.js";
-import { keepFresh, shownOver } from "../scene/overlay.js";
+import { shownOver } from "../scene/overlay.js";
 import { newEye, pixel, PointPicture, unpack } from "../scene/points.js";
 import { savedSets, shown, specOf, tuning, use } from "./parameters.js";
 
-const EVERY = 700; // [ms] of quiet between two comparisons: the worker has a run to map
-const IN_FORCE = "in force";
+const EVERY = 700; // [ms] between two comparisons
+const IN_USE = "in use";
 const eye = { ...newEye(), tilt: 0, scale: 9 };
 const sides = {};
-let data = null, planned = false;
+let data = null;
 
 const nameOf = (side) => sides[side].list.value;
 const asked = () => JSON.stringify([nameOf("a"), nameOf("b")]);
@@ -23,7 +25,7 @@ function build() {
   for (const [k, side] of ["a", "b"].entries()) {
     const list = el("select", { "aria-label": `Set ${side.toUpperCase()}`, "data-set": side, onchange: chosen });
     const canvas = el("canvas", { tabindex: "0", role: "img", "aria-label": `Clusters by set ${side.toUpperCase()}` });
-    const take = el("button", { "data-edit": true, class: "small", text: "Use", title: "Take this set for the run", onclick: () => use(nameOf(side)) });
+    const take = el("button", { "data-edit": true, class: "small", text: "Use", title: "Use this set for the run", onclick: () => use(nameOf(side)) });
     sides[side] = { k, list, canvas, take, picture: new PointPicture(canvas, eye, redraw) };
     byId(`compare-${side}`).replaceChildren(el("div", { class: "compare-head" }, el("i", { class: `sign ${side}`, text: side.toUpperCase() }), list, take), canvas);
   }
@@ -34,7 +36,7 @@ function build() {
   new ResizeObserver(redraw).observe(byId("compare-pictures"));
 }
 
-// The sets that can be compared: what is in force, presets, saved sets. What was chosen stays chosen.
+// Fills the lists with the values in use, presets and saved sets; the choices are kept.
 function fillLists() {
   const option = ({ name, doc }) => el("option", { value: name, text: name, title: doc ?? "" });
   const names = JSON.stringify([tuning.presets, savedSets().map(({ name }) => name)]);
@@ -42,18 +44,16 @@ function fillLists() {
     if (list.dataset.shown === names) continue;
     const before = list.dataset.shown ? list.value : k === 0 ? state.parameters?.preset ?? "" : "";
     list.dataset.shown = names;
-    list.replaceChildren(el("option", { value: "", text: IN_FORCE }), el("optgroup", { label: "Presets" }, ...tuning.presets.map(option)),
+    list.replaceChildren(el("option", { value: "", text: IN_USE }), el("optgroup", { label: "Presets" }, ...tuning.presets.map(option)),
       ...(savedSets().length ? [el("optgroup", { label: "Saved sets" }, ...savedSets().map(option))] : []));
     list.value = before;
     if (list.selectedIndex < 0) list.value = "";
   }
 }
 
-function redraw() {
-  if (planned) return;
-  planned = true;
-  requestAnimationFrame(() => { planned = false; if (data && shownOver("compare")) for (const side of ["a", "b"]) draw(side); });
-}
+const redraw = oncePerFrame(() => {
+  if (data && shownOver("compare")) for (const side of ["a", "b"]) draw(side);
+});
 
 function draw(side) {
   const { k, picture, canvas, list } = sides[side];
@@ -73,7 +73,7 @@ function draw(side) {
   canvas.setAttribute("aria-label", `Set ${side.toUpperCase()}, ${list.selectedOptions[0]?.text}: ${verdicts.tree ?? 0} trees of ${clusters.x.length} clusters`);
 }
 
-// What stands there is of other sets until the answer comes.
+// The pictures are dimmed until the answer for the new sets arrives.
 function chosen() {
   byId("over-compare").classList.add("waits");
   setText(byId("compare-lead"), "Mapping this scan with both sets …");
@@ -93,16 +93,16 @@ const refresh = keepFresh(async () => {
   }
   try {
     const of = asked();
-    const told = unpack(await blockFor("/api/compare", { a: nameOf("a"), b: nameOf("b") }));
-    if (of === asked()) { // else another set was chosen meanwhile, and its answer is on the way
-      data = { ...told, asked: of };
-      setText(lead, `Scan ${data.pictures[0].index}, mapped with both sets from the same state. On the map: left half A, right half B.`);
+    const answer = unpack(await blockFor("/api/compare", { a: nameOf("a"), b: nameOf("b") }));
+    if (of === asked()) { // else another set was chosen meanwhile
+      data = { ...answer, asked: of };
+      setText(lead, `Scan ${data.pictures[0].index}, mapped with both sets. On the map: left half A, right half B.`);
       byId("over-compare").dataset.scan = String(data.pictures[0].index);
       byId("over-compare").classList.remove("waits");
       fillComparison(data, sides.a.list.selectedOptions[0]?.text, sides.b.list.selectedOptions[0]?.text);
     }
   } catch (error) {
-    if (data?.asked === asked()) byId("over-compare").classList.remove("waits"); // else what stands there stays dim: it is of other sets
+    if (data?.asked === asked()) byId("over-compare").classList.remove("waits"); // else the pictures are of other sets and stay dimmed
     setText(lead, error.message);
   }
   show();
@@ -121,7 +121,7 @@ export function startCompare() {
   on("theme", redraw);
 }
 
-// --- The comparison in numbers: clusters by verdict, trees that only one set finds, and what the sets differ in.
+// --- tables: clusters by verdict, trees that only one set finds, and the parameters that differ ----------
 
 const SAME_PLACE = 0.5; // [m] between two detections of one tree
 
@@ -140,31 +140,29 @@ function verdictTable(a, b) {
   const [onlyA, both, onlyB] = sharedTrees(a.clusters, b.clusters);
   const rows = names.map((name) => {
     const line = row(name, a.verdicts[name] ?? 0, b.verdicts[name] ?? 0);
-    const [letter, meaning] = verdictOf(name);
-    line.cells[0].prepend(el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" }));
+    line.cells[0].prepend(letterOf(verdictOf(name)));
     return line;
   });
-  if (a.right !== null) rows.push(row("at a true tree", a.right, b.right, "truth"), row("elsewhere", a.wrong, b.wrong, "truth"));
+  if (a.right !== null) rows.push(row("at a true tree", a.right, b.right, "truth"), row("not at a tree", a.wrong, b.wrong, "truth"));
   return el("div", {}, el("table", { class: "plain", id: "compare-verdicts" }, head("clusters", "A", "B", ""), el("tbody", {}, ...rows)),
-    el("p", { class: "note dim", id: "compare-shared", text: `Trees that both find: ${both}; A alone: ${onlyA}; B alone: ${onlyB}.` }));
+    el("p", { class: "note dim", id: "compare-shared", text: `Trees found by both: ${both}; only by A: ${onlyA}; only by B: ${onlyB}.` }));
 }
 
 function sharedTrees(a, b) {
-  const trees = ({ x, y, verdict }) => x.map((_, k) => k).filter((k) => verdict[k] === "tree").map((k) => [x[k], y[k]]);
-  const [ofA, ofB] = [trees(a), trees(b)];
-  const left = new Set(ofB.keys());
+  const trees = ({ x, y, verdict }) => x.map((_, k) => ({ x: x[k], y: y[k] })).filter((_, k) => verdict[k] === "tree");
+  const [ofA, left] = [trees(a), new Set(trees(b))];
   let both = 0;
-  for (const [x, y] of ofA) {
-    const near = [...left].map((k) => [Math.hypot(ofB[k][0] - x, ofB[k][1] - y), k]).sort((one, other) => one[0] - other[0])[0];
-    if (!near || near[0] > SAME_PLACE) continue;
-    left.delete(near[1]);
+  for (const tree of ofA) {
+    const match = nearest(left, (other) => distance(tree, other), SAME_PLACE);
+    if (!match) continue;
+    left.delete(match);
     both += 1;
   }
   return [ofA.length - both, both, left.size];
 }
 
 function differenceTable(differences, nameA, nameB) {
-  if (!differences.length) return el("p", { class: "empty", text: "Both sets are the same. Choose another one for A or B, or move a slider." });
+  if (!differences.length) return el("p", { class: "empty", text: "The two sets are equal. Choose another set for A or B, or change a parameter." });
   return el("table", { class: "plain", id: "compare-differences" }, head("parameter", nameA ?? "A", nameB ?? "B"), el("tbody", {}, ...differences.map(([name, a, b]) => {
     const spec = specOf(name);
     return el("tr", { "data-row": name }, el("th", { scope: "row", text: spec?.title ?? name, title: `${spec?.doc ?? ""} (${name})` }),

@@ -1,33 +1,31 @@
-// The tab Tune: sets, undo and redo, what a change did to the clusters, and every parameter by stage.
+// The tab Tune: sets, undo and redo, the effect of the last change on the clusters, and all parameters by stage.
 
-import { byId, el, setText } from "../core/dom.js";
+import { button, byId, el, letterOf, setText } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { counted, verdictOf } from "../core/verdicts.js";
 import { openTab } from "../shell/tabs.js";
-import { forget, isChanged, isTuning, redo, refuse, reset, save, savedSets, specOf, takeFile, tuning, undo, use } from "./parameters.js";
+import { forget, isChanged, isTuning, nameProblem, redo, refuse, reset, save, savedSets, specOf, takeFile, tuning, undo, use } from "./parameters.js";
 import { startWholeRun, wholeRun } from "./remap_status.js";
 import { rowOf } from "./row.js";
 import { searchPart, startSearch } from "./search.js";
-import { matterButton, startSensitivity } from "./sensitivity.js";
+import { sensitivityButton, startSensitivity } from "./sensitivity.js";
 
 const LARGEST_FILE = 100_000;
-const SET_NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .+-]{0,39}$/u;
 const OPEN_FIRST = ["Clustering", "Detection"];
 const rows = new Map(); // by the parameter's name
 const groups = new Map(); // by the stage
 let presetValues = {};
 
-const button = (id, text, title, onclick) => el("button", { id, class: "small", text, title, onclick });
-const counts = el("section", { id: "tune-counts", "aria-label": "What the last change did to the clusters of this scan" });
+const counts = el("section", { id: "tune-counts", "aria-label": "Effect of the last change on the clusters of this scan" });
 
 function build() {
-  const file = el("input", { id: "tune-file", type: "file", accept: ".toml,application/toml,text/plain", hidden: true, "aria-label": "File of parameters", onchange: async () => {
+  const file = el("input", { id: "tune-file", type: "file", accept: ".toml,application/toml,text/plain", hidden: true, "aria-label": "Parameter file", onchange: async () => {
     const [chosen] = file.files;
     file.value = "";
     if (!chosen) return;
-    if (chosen.size > LARGEST_FILE) refuse(`${chosen.name} is larger than ${LARGEST_FILE / 1000} kB; a file of parameters is not.`);
+    if (chosen.size > LARGEST_FILE) refuse(`${chosen.name} is larger than ${LARGEST_FILE / 1000} kB, so it is not a parameter file.`);
     else await takeFile(chosen.name, await chosen.text());
   } });
   const find = el("input", { id: "tune-find", type: "search", placeholder: "Find a parameter", "aria-label": "Find a parameter by name, stage or meaning", autocomplete: "off", oninput: sift });
@@ -36,12 +34,12 @@ function build() {
   byId("panel-tune").replaceChildren(
     el("div", { class: "tune-head" },
       el("select", { id: "tune-set", "aria-label": "Preset or saved set", onchange: (event) => use(event.target.value) }),
-      button("tune-undo", "Undo", "Undo the last change of a parameter (Ctrl+Z in this tab)", undo), button("tune-redo", "Redo", "Do it again (Ctrl+Shift+Z)", redo),
-      button("tune-compare", "A | B", "Compare two sets on this scan (c)", () => byId("compare-button").click())),
+      button("tune-undo", "Undo", "Undo the last parameter change (Ctrl+Z in this tab)", undo), button("tune-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo),
+      button("tune-compare", "A | B", "Compare two sets on this scan (C)", () => byId("compare-button").click())),
     el("div", { class: "tune-files" },
-      button("tune-save", "Save as …", "Keep these values on the server under a name", askName), button("tune-delete", "Delete", "Delete the saved set", dropSet),
-      el("a", { class: "small", id: "tune-download", href: "/api/parameters.toml", download: "parameters.toml", text: "Download", title: "These values as a TOML file; the command line takes it with --config" }),
-      button("tune-upload", "Upload", "Take the values of a TOML file", () => file.click()), file, el("span", { class: "grow" }), button("tune-reset", "Reset all", "Back to the values of the preset", () => reset([]))),
+      button("tune-save", "Save as …", "Save these values on the server under a name", askName), button("tune-delete", "Delete", "Delete the saved set", dropSet),
+      el("a", { class: "small", id: "tune-download", href: "/api/parameters.toml", download: "parameters.toml", text: "Download", title: "These values as a TOML file, for --config of the command line" }),
+      button("tune-upload", "Upload", "Use the values of a TOML file", () => file.click()), file, el("span", { class: "grow" }), button("tune-reset", "Reset all", "Reset all values to the preset", () => reset([]))),
     el("form", { id: "tune-name-form", class: "tune-files", hidden: true, onsubmit: saveSet },
       el("input", { id: "tune-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && closeName() }),
       el("button", { class: "small primary", text: "Save" }), el("button", { class: "small", type: "button", text: "Cancel", onclick: closeName })),
@@ -56,7 +54,7 @@ function build() {
 
 function stageOf(stage) {
   const specs = tuning.specs.filter((spec) => spec.stage === stage);
-  for (const spec of specs) rows.set(spec.name, rowOf(spec, ...(spec.kind === "name" ? [] : [matterButton(spec)])));
+  for (const spec of specs) rows.set(spec.name, rowOf(spec, ...(spec.kind === "name" ? [] : [sensitivityButton(spec)])));
   const told = el("small");
   const group = el("details", { "data-stage": stage }, el("summary", {}, stage, told), ...specs.map(({ name }) => rows.get(name).node));
   group.open = OPEN_FIRST.includes(stage);
@@ -67,7 +65,7 @@ function stageOf(stage) {
 
 const sifting = () => Boolean(byId("tune-find").value.trim() || byId("tune-only").checked);
 
-// Shows what is searched for, what begins with it first, and opens the stages where it is.
+// Filters the rows by the search, best matches first, and opens their stages.
 function sift() {
   const words = byId("tune-find").value.trim().toLowerCase().split(/\s+/).filter(Boolean);
   const only = byId("tune-only").checked;
@@ -90,7 +88,7 @@ function sift() {
   }
   arrange(byId("tune-rows"), stages);
   byId("tune-none").hidden = found > 0;
-  setText(byId("tune-none"), only && !words.length ? "Nothing differs from the preset. Move a slider, and it is listed here." : "No parameter has these words. Clear the search to see all.");
+  setText(byId("tune-none"), only && !words.length ? "No value differs from the preset." : "No parameter matches. Clear the search to see all.");
 }
 
 function show() {
@@ -152,16 +150,16 @@ function closeName() {
 async function saveSet(event) {
   event.preventDefault();
   const name = byId("tune-name").value.trim();
-  if (!SET_NAME.test(name)) refuse("A name begins with a letter or digit; letters, digits, space and . + - _ follow.");
+  if (nameProblem(name)) refuse(nameProblem(name));
   else if (await save(name)) closeName();
 }
 
-// Deleted at once, because saving it again brings it back: its values stay in force.
+// Deletes without a question: the values stay in use and can be saved again.
 async function dropSet() {
   if (await forget(state.parameters.set)) byId("tune-set").focus();
 }
 
-// From the palette: the row of a parameter, with the cursor in its value.
+// Shows the row of a parameter with the cursor in its value.
 export function openParameter(name) {
   openTab("tune");
   byId("side").classList.add("open");
@@ -187,36 +185,35 @@ export function startTunePanel() {
   on("map status parameters", showCounts);
 }
 
-// --- How many clusters of the standing scan ended with each verdict, before the last change and now.
+// --- clusters of the current scan by verdict, before and after the last change ---------------------------
 
 const signed = (number) => (number > 0 ? `+${number}` : number < 0 ? `−${-number}` : "=");
 
 function countsBeforeAfter() {
-  if (!state.map) return [el("p", { class: "empty", text: `${nothingYet("No scan")} Then every change shows here what it does.` })];
+  if (!state.map) return [el("p", { class: "empty", text: `${nothingYet("No scan")} The effect of each change is shown here.` })];
   const { verdicts: now = {}, before, index, right, wrong } = state.map;
   const then = before?.verdicts;
   const names = [...new Set(["tree", ...Object.keys(now), ...Object.keys(then ?? {})])].filter((name) => now[name] || then?.[name] || name === "tree");
   names.sort((a, b) => (b === "tree") - (a === "tree") || (now[b] ?? 0) - (now[a] ?? 0));
   const total = (of) => Object.values(of).reduce((sum, number) => sum + number, 0);
   const pending = state.status?.revision < state.parameters?.revision;
-  const lead = pending ? `Scan ${index} is looked at with the new values …`
+  const lead = pending ? `Mapping scan ${index} with the new values …`
     : then ? `Scan ${index}: ${total(then)} → ${count(total(now), "cluster")} by the last change`
-    : `Scan ${index}: ${count(total(now), "cluster")}. ${state.status?.state === "playing" ? "Pause to see before and after." : "Change something, and before and after stand here."}`;
+    : `Scan ${index}: ${count(total(now), "cluster")}. ${state.status?.state === "playing" ? "Pause to compare before and after." : "Change a parameter to compare before and after."}`;
   const same = names.filter((name) => then && name !== "tree" && (now[name] ?? 0) === (then[name] ?? 0));
   return [el("p", { class: "note dim", text: lead }),
     el("ul", { class: "chips" }, ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
-      same.length ? el("li", { class: "same", text: `as before: ${same.map((name) => counted(now[name], name)).join(", ")}` }) : "")];
+      same.length ? el("li", { class: "same", text: `unchanged: ${same.map((name) => counted(now[name], name)).join(", ")}` }) : "")];
 }
 
 function chip(name, then, now) {
-  const [letter, meaning] = verdictOf(name);
-  return change(name, then, now, el("span", { class: "letter", text: letter, style: { background: `var(--${meaning})` }, "aria-hidden": "true" }));
+  return change(name, then, now, letterOf(verdictOf(name)));
 }
 
 function truthChips(right, wrong, before) {
   if (right === null || right === undefined) return [];
   const ring = () => el("span", { class: "letter ring", "aria-hidden": "true" });
-  return [change("at a true tree", before?.right ?? null, right, ring()), change("elsewhere", before?.wrong ?? null, wrong, ring())];
+  return [change("at a true tree", before?.right ?? null, right, ring()), change("not at a tree", before?.wrong ?? null, wrong, ring())];
 }
 
 function change(name, then, now, sign) {
@@ -225,16 +222,16 @@ function change(name, then, now, sign) {
     then === null ? "" : el("small", { text: signed(now - then) }));
 }
 
-// --- In which order what was found stands: the nearer to the name of a parameter, the earlier.
+// --- order of the matches of a search --------------------------------------------------------------------
 
-// 0: the name or the title begins with the text; 1: words of these begin with the words; 2: words of its meaning or stage
-// do; 3: the words stand somewhere inside.
+// 0: name or title begins with the text; 1: words of name and title begin with the words; 2: words of description or stage
+// do; 3: the words occur anywhere.
 function rankOf({ name, title, doc, stage }, words) {
   const text = words.join(" ");
-  const own = [title, name, name.split(".").pop()].map((each) => each.toLowerCase());
-  if (own.some((each) => each.startsWith(text))) return 0;
-  if (allBegin(own.join(" "), words)) return 1;
-  return allBegin(`${own.join(" ")} ${doc} ${stage}`.toLowerCase(), words) ? 2 : 3;
+  const names = [title, name, name.split(".").pop()].map((each) => each.toLowerCase());
+  if (names.some((each) => each.startsWith(text))) return 0;
+  if (allBegin(names.join(" "), words)) return 1;
+  return allBegin(`${names.join(" ")} ${doc} ${stage}`.toLowerCase(), words) ? 2 : 3;
 }
 
 function allBegin(text, words) {
@@ -242,7 +239,7 @@ function allBegin(text, words) {
   return words.every((word) => text.startsWith(word) || parts.some((part) => part.startsWith(word)) || text.includes(` ${word}`));
 }
 
-// Puts nodes into the order of their ranks, and only where they do not stand so already: what is open or scrolled stays.
+// Sorts nodes by rank. Nodes that are in order are not moved, which would close or scroll them.
 function arrange(parent, entries) {
   const order = entries.map((entry, place) => ({ ...entry, place })).sort((a, b) => a.rank - b.rank || a.place - b.place);
   const now = entries.map(({ node }) => node).sort((a, b) => (a.compareDocumentPosition(b) & Node.DOCUMENT_POSITION_FOLLOWING ? -1 : 1));

@@ -1,7 +1,8 @@
-// The parameters: what they are, and the requests that change them. A refusal becomes `tuning.error`.
+// Parameters: their declarations, and the requests that change them. A refused request is shown as `tuning.error`.
 
 import { myName } from "../annotate/annotations.js";
 import { get, patch, post } from "../core/api.js";
+import { attempted } from "../core/problem.js";
 import { changed, on, state } from "../core/store.js";
 import { visible } from "../shell/tabs.js";
 
@@ -10,8 +11,9 @@ export const tuning = {
   presets: [], // [{name, doc}]
   error: "",
 };
+const SET_NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .+-]{0,39}$/u;
 let last = Promise.resolve(), waiting = {}, sending = false;
-const page = Math.random().toString(36).slice(2); // tells the gestures of two pages apart
+const page = Math.random().toString(36).slice(2); // makes gestures of two pages differ
 let gestures = 0;
 
 export const isTuning = () => visible("tune");
@@ -20,7 +22,7 @@ export const isChanged = (name) => state.parameters?.changed.includes(name) ?? f
 export const savedSets = () => state.sets?.sets ?? [];
 export const specOf = (name) => tuning.specs.find((spec) => spec.name === name);
 
-// Requests go one after the other, so that undo undoes what was done before it.
+// Requests are sent one at a time, so that undo reverts the change before it.
 export function attempt(work) {
   last = last.then(async () => {
     try {
@@ -37,10 +39,10 @@ export function attempt(work) {
   return last;
 }
 
-// A slider is taken: what it sends until it is let go is one step, compared with what was before.
+// Begins a drag of a slider: all values until its end are one undo step.
 export const newGesture = () => `${page} ${gestures += 1}`;
 
-// While the server is busy with a value, only the newest of each slider is kept.
+// While the server is busy, only the newest value of each parameter waits.
 export async function setValue(name, value, gesture = "") {
   waiting[name] = { value, gesture };
   if (sending) return;
@@ -64,7 +66,7 @@ export const forget = (name) => attempt(() => post("/api/sets/delete", { name })
 export const takeFile = (file, text) => attempt(() => post("/api/sets/upload", { file: file.slice(0, 100), text }));
 export const refuse = (text) => { tuning.error = text; changed("tuning"); };
 
-// Ctrl+Z, Ctrl+Shift+Z and Ctrl+Y while the tab is open and nobody types. Returns whether it was meant for it.
+// Ctrl+Z, Ctrl+Shift+Z and Ctrl+Y while the tab is open. Returns whether the key was one of them.
 export function tuneKey(event) {
   if (!isTuning() || !(event.ctrlKey || event.metaKey) || event.altKey) return false;
   const key = event.key.toLowerCase();
@@ -74,15 +76,18 @@ export function tuneKey(event) {
   return true;
 }
 
+// Why a name of a set is not accepted; empty if it is.
+export const nameProblem = (name) => (SET_NAME.test(name) ? "" : "A name begins with a letter or digit, followed by letters, digits, spaces and . + - _ (40 characters at most).");
+
 export function shown(value, spec) {
   if (typeof value === "boolean") return value ? "on" : "off";
   return spec?.unit ? `${value} ${spec.unit}` : String(value);
 }
 
 async function load() {
-  const told = await get("/api/parameters").catch(() => null);
-  if (!told) return;
-  Object.assign(tuning, { specs: told.specs, presets: told.presets });
+  const answer = await attempted(() => get("/api/parameters"));
+  if (!answer) return;
+  Object.assign(tuning, { specs: answer.specs, presets: answer.presets });
   changed("specs");
 }
 

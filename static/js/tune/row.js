@@ -1,12 +1,12 @@
-// One parameter: slider, value typed in, and back to the preset.
+// The row of a parameter: slider, text box, and reset to the preset.
 
 import { el } from "../core/dom.js";
 import { isChanged, isMoving, newGesture, redo, refuse, reset, setValue, shown, undo, valueOf } from "./parameters.js";
 
-export const FINE = 1000; // places of a slider
-const BENT = 3; // how a slider is bent whose usual values lie near its lower end
+export const FINE = 1000; // positions of a slider
+const BENT = 3; // exponent of a slider whose usual values are near its lower end
 
-// Sliders are bent where a straight one would have the useful values within a few pixels.
+// A slider is nonlinear where a linear one would have all useful values within a few pixels.
 const power = ({ minimum, maximum, default: usual }) => (minimum >= 0 && usual - minimum < 0.2 * (maximum - minimum) ? BENT : 1);
 
 export function toPlace(spec, value) {
@@ -24,7 +24,7 @@ function rounded(spec, value) {
   return Math.min(spec.maximum, Math.max(spec.minimum, Number((spec.minimum + steps * step).toFixed(9))));
 }
 
-// `further` stands beside the name. Returns {node, show}; `show` brings it in step with what the server holds.
+// `further` are nodes next to the name. Returns {node, show}; `show` updates it to the values of the server.
 export function rowOf(spec, ...further) {
   const id = `tune-${spec.name}`;
   const back = el("button", { class: "quiet icon back", "aria-label": `Reset ${spec.title}`, text: "↺", onclick: () => reset([spec.name]) });
@@ -76,12 +76,12 @@ function number(spec, id) {
   };
   slider.addEventListener("pointerdown", () => { gesture = newGesture(); });
   slider.addEventListener("input", () => send(fromPlace(spec, Number(slider.value))));
-  slider.addEventListener("change", () => { gesture = ""; }); // it was let go
+  slider.addEventListener("change", () => { gesture = ""; }); // released
   slider.addEventListener("keydown", (event) => {
     gesture = "";
     const step = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10 }[event.key];
     if (!step || event.ctrlKey || event.metaKey) return;
-    event.preventDefault(); // by the step of the parameter, not by that of the picture
+    event.preventDefault(); // by the step of the parameter, not of the slider
     send(rounded(spec, Number(typed.value) + step * (spec.step || 1)));
     slider.value = String(toPlace(spec, Number(typed.value)));
   });
@@ -91,7 +91,7 @@ function number(spec, id) {
     const text = typed.value.trim().replace(",", ".");
     const value = Number(text);
     if (text === "" || !Number.isFinite(value)) {
-      refuse(`${spec.title}: “${typed.value.trim().slice(0, 30)}” is no number.`);
+      refuse(`${spec.title}: “${typed.value.trim().slice(0, 30)}” is not a number.`);
       typed.value = known;
     } else if (text !== known) await setValue(spec.name, value);
   };
@@ -103,7 +103,7 @@ function number(spec, id) {
       typed.classList.remove("dirty");
       typed.value = known;
     } else if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !typed.classList.contains("dirty")) {
-      event.preventDefault(); // nothing typed stands to be undone: the parameters do
+      event.preventDefault(); // no typed text to undo, so the parameter change is undone
       if (event.shiftKey) redo();
       else undo();
     }

@@ -1,43 +1,83 @@
-// "Tune for me": a search for parameters over this run, against its true trees. It runs on the server, in a process of its own.
+// "Tune for me": a search for the parameters with the best score against the ground truth. It runs on the server.
 
 import { myName } from "../annotate/annotations.js";
 import { get, post } from "../core/api.js";
-import { byId, el, setText } from "../core/dom.js";
-import { count, percent } from "../core/format.js";
+import { button, byId, el, setText } from "../core/dom.js";
+import { count, NONE, percent } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { line, picture, svg, text } from "../core/svg.js";
-import { attempt, shown, specOf, tuning } from "./parameters.js";
+import { attempt, nameProblem, refuse, shown, specOf, tuning } from "./parameters.js";
 
 const AT_WORK = ["looking", "searching", "stopping"];
-const NO_PART = ["evaluation.", "obstacles."]; // decide how a map is judged, or are no part of it
-const SET_NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .+-]{0,39}$/u;
-const axes = new Map(); // by the parameter's name: {node, text()}
+const NOT_SEARCHED = ["evaluation.", "obstacles."]; // they change how a map is scored, or nothing of it
+// --- other runs that the search uses or holds out ------------------------------------------------------
+
+const USES = [["", "not used"], ["also", "searched"], ["held_out", "held out"]];
+const chosen = new Map(); // by the number of the run: "also" or "held_out"
+const rows = el("ul", { id: "search-runs", "aria-label": "Other runs of the list" });
+const note = el("p", { class: "note dim" });
+const otherRuns = el("fieldset", { class: "search-others", hidden: true },
+  el("legend", { text: "Other runs", title: "Searched: its score counts too. Held out: it is only scored, which shows whether the set suits other places" }), rows, note);
+
+function showRuns(runs = []) {
+  const usable = runs.filter(({ why_not: why }) => !why);
+  for (const record of chosen.keys()) if (!usable.some((run) => run.record === record)) chosen.delete(record);
+  rows.replaceChildren(...usable.map(({ record, name, truth }) => {
+    const use = el("select", { "aria-label": `Use of ${name}`, onchange: () => (use.value ? chosen.set(record, use.value) : chosen.delete(record)) },
+      ...USES.map(([value, text]) => el("option", { value, text })));
+    use.value = chosen.get(record) ?? "";
+    return el("li", { "data-run": String(record), title: name }, el("span", {}, name, el("small", { class: "dim", text: truth })), use);
+  }));
+  const reasons = new Map();
+  for (const { name, why_not: why } of runs) if (why) reasons.set(why, [...(reasons.get(why) ?? []), name]);
+  note.replaceChildren(...[...reasons].map(([why, names]) => el("span", { title: names.join("\n"), text: `${count(names.length, "run")} cannot be scored: ${why}. ` })));
+  note.hidden = !reasons.size;
+  rows.hidden = !usable.length;
+  otherRuns.hidden = !runs.length;
+}
+
+const runsWanted = () => ({ also: of("also"), held_out: of("held_out") });
+const of = (use) => [...chosen].filter(([, value]) => value === use).map(([record]) => record);
+
+// Scores with the initial and the best values, of the searched and of the held-out runs.
+function scoresTable({ scores = [], label }) {
+  if (!scores.length || (scores.length === 1 && scores[0].runs === 1)) return null;
+  const third = { RMSE: ["RMSE [cm]", "rmse_cm", (v) => v.toFixed(1)], "pair error": ["pairs [%]", "pair_error_percent", (v) => v.toFixed(2)] }[label] ?? ["TA", "TA", percent];
+  const columns = [["F1", "f1", (v) => v.toFixed(3)], third, ["false", "false_share", percent]];
+  const cell = ({ start, best }, [, key, shown]) => el("td", {}, ...[start, best].flatMap((of, k) => [k ? " → " : "", of[key] === undefined || of[key] === null ? "–" : shown(of[key])]));
+  return el("table", { id: "search-scores", title: "Initial values → best set so far" },
+    el("tr", {}, el("th", { text: "" }), ...columns.map(([text]) => el("th", { scope: "col", text }))),
+    ...scores.map((row) => el("tr", { "data-held-out": String(row.held_out) }, el("th", { scope: "row", text: `${row.held_out ? "held out" : "searched"}, ${count(row.runs, "run")}` }), ...columns.map((column) => cell(row, column)))));
+}
+
+// --- form and outcome -----------------------------------------------------------------------------------
+
+const axes = new Map(); // by the name of the parameter: {text()}
 let goals = [], asked = false;
 
-const button = (id, text, title, onclick, kind = "small") => el("button", { id, type: "button", class: kind, text, title, onclick });
 const number = (id, label, value, max) => el("label", {}, `${label} `, el("input", { id, type: "number", min: "1", max: String(max), step: "1", value: String(value) }));
-const opener = button("search-open", "Tune for me …", "Search for the values that map this run best, judged by its true trees", () => openForm(true));
+const opener = button("search-open", "Tune for me …", "Search for the parameters with the best score of this run against its ground truth", () => openForm(true));
 const goal = el("select", { id: "search-goal", "aria-label": "What to search for" });
 const list = el("ul", { id: "search-axes", "aria-label": "Searched over" });
 const more = el("select", { id: "search-more", "aria-label": "Search over another parameter", onchange: () => { if (more.value) addAxis(more.value); more.value = ""; } });
 const form = el("form", { id: "search-form", hidden: true, onsubmit: start },
-  el("p", { class: "note dim", text: "The whole run is mapped again and again with other values, begun at those in force, and judged by its true trees." }),
+  el("p", { class: "note dim", text: "The whole run is mapped repeatedly with other values, starting from those in use, and scored against its ground truth." }),
   el("label", { class: "search-goal" }, "Goal ", goal), el("div", { class: "search-names dim", "aria-hidden": "true" }, ...["Searched over", "from", "to", ""].map((text) => el("span", { text }))), list, more, otherRuns,
-  el("div", { class: "search-limits" }, number("search-trials", "Trials", 200, 5000), number("search-minutes", "Minutes at most", 10, 1440)),
-  el("div", { class: "search-buttons" }, el("button", { id: "search-start", class: "small primary", text: "Search" }), button("search-cancel", "Cancel", "Close, and search for nothing", () => openForm(false))));
+  el("div", { class: "search-limits" }, number("search-trials", "Trials", 200, 5000), number("search-minutes", "Time limit [min]", 10, 1440)),
+  el("div", { class: "search-buttons" }, el("button", { id: "search-start", class: "small primary", text: "Search" }), button("search-cancel", "Cancel", "Close without a search", () => openForm(false))));
 const told = el("p", { id: "search-told", class: "note", role: "status" });
 const failed = el("p", { id: "search-error", class: "error", role: "alert", hidden: true });
-const progress = el("progress", { id: "search-progress", max: "1", hidden: true, "aria-label": "Trials made" });
+const progress = el("progress", { id: "search-progress", max: "1", hidden: true, "aria-label": "Trials done" });
 const warning = el("p", { id: "search-warning", class: "note", hidden: true });
 const drawn = el("div", { id: "search-drawn" });
-const stop = button("search-stop", "Stop", "End the search; the best set so far stays here", () => attempt(() => post("/api/search/stop", {})));
-const goOn = button("search-go-on", "Go on", "Make the trials that are left, with the same choices", () => attempt(() => post("/api/search/go-on", {})));
-const use = button("search-use", "Use these", "Take the values of the best set; Undo takes them back", () => attempt(() => post("/api/search/use", {})), "small primary");
-const save = button("search-save", "Save as set …", "Keep the best set under a name, with where it comes from", () => { naming.hidden = false; name.focus(); });
+const stop = button("search-stop", "Stop", "End the search; the best set so far is kept here", () => attempt(() => post("/api/search/stop", {})));
+const goOn = button("search-go-on", "Resume", "Run the remaining trials with the same settings", () => attempt(() => post("/api/search/go-on", {})));
+const use = button("search-use", "Use these", "Use the values of the best set; Undo reverts it", () => attempt(() => post("/api/search/use", {})), "small primary");
+const save = button("search-save", "Save as set …", "Save the best set under a name, with its origin", () => { naming.hidden = false; name.focus(); });
 const again = button("search-again", "Search again …", "Another search", () => openForm(true));
-const name = el("input", { id: "search-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set that was found", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && (naming.hidden = true) });
+const name = el("input", { id: "search-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the found set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && (naming.hidden = true) });
 const naming = el("form", { id: "search-name-form", class: "search-buttons", hidden: true, onsubmit: saveFound }, name, el("button", { class: "small primary", text: "Save" }));
-const changes = el("ul", { id: "search-changes", "aria-label": "What was found" });
+const changes = el("ul", { id: "search-changes", "aria-label": "Found values" });
 const outcome = el("div", { id: "search-outcome", hidden: true }, told, failed, progress, drawn, warning, changes, el("div", { class: "search-buttons" }, stop, use, save, goOn, again), naming);
 export const searchPart = el("section", { id: "tune-search", "aria-label": "Search for parameters" }, opener, form, outcome);
 
@@ -57,7 +97,7 @@ async function openForm(open) {
   else opener.focus();
 }
 
-// A parameter to be searched over: its bounds, or which of its values.
+// Adds a parameter to the search, between its bounds or over its choices.
 function addAxis(parameter, bounds = "") {
   const spec = specOf(parameter);
   if (!spec || axes.has(parameter)) return;
@@ -74,7 +114,7 @@ function addAxis(parameter, bounds = "") {
 }
 
 function offer() {
-  const left = tuning.specs.filter((spec) => spec.kind !== "name" && !axes.has(spec.name) && !NO_PART.some((part) => spec.name.startsWith(part)));
+  const left = tuning.specs.filter((spec) => spec.kind !== "name" && !axes.has(spec.name) && !NOT_SEARCHED.some((part) => spec.name.startsWith(part)));
   more.replaceChildren(el("option", { value: "", text: "Add a parameter …" }), ...left.map((spec) => el("option", { value: spec.name, text: `${spec.stage}: ${spec.title}` })));
   byId("search-start")?.toggleAttribute("disabled", !axes.size);
 }
@@ -86,23 +126,26 @@ async function start(event) {
   const begun = await attempt(() => post("/api/search", body));
   if (begun) form.hidden = true;
   show();
-  if (begun) searchPart.scrollIntoView({ block: "center" }); // the form was long: what comes of it stands where it began
+  if (begun) searchPart.scrollIntoView({ block: "center" }); // the form was long; its place now holds the progress
 }
 
 async function saveFound(event) {
   event.preventDefault();
-  if (!SET_NAME.test(name.value.trim())) return name.setCustomValidity("A name begins with a letter or digit."), name.reportValidity(), name.setCustomValidity("");
+  const problem = nameProblem(name.value.trim());
+  if (problem) {
+    refuse(problem);
+    return;
+  }
   if (await attempt(() => post("/api/search/save", { name: name.value.trim(), who: myName() }))) naming.hidden = true;
 }
 
-function words({ state: stage, made, wanted, start: first, best, better, goal: aim, go_on: canGoOn }) {
-  if (stage === "looking") return "Looking at the scans of the whole run once …";
-  const now = first ? `, ${first.shown} with the values it began with` : "";
-  if (stage === "searching") return `${made} of ${count(wanted, "trial")}: best ${best?.shown ?? "–"}${now}.`;
+function progressText({ state: stage, made, wanted, start: first, best, better, goal: aim, go_on: canGoOn }) {
+  if (stage === "looking") return "Mapping the whole run once …";
+  if (stage === "searching") return `${made} of ${count(wanted, "trial")}: best ${best?.shown ?? NONE}${first ? `, initial ${first.shown}` : ""}.`;
   if (stage === "stopping") return "Stopping …";
-  if (!best) return "Stopped before anything was tried.";
+  if (!best) return "Stopped before the first trial.";
   const left = canGoOn ? ` ${count(wanted - made, "trial")} left.` : "";
-  return (better ? `Found after ${count(made, "trial")}: ${best.shown} in place of ${first.shown}. Goal: ${aim}.` : `No set of ${count(made, "trial")} was better than the values it began with (${first.shown}).`) + left;
+  return (better ? `Best of ${count(made, "trial")}: ${best.shown}, initial ${first.shown}. Goal: ${aim}.` : `No set of ${count(made, "trial")} is better than the initial one (${first.shown}).`) + left;
 }
 
 function show() {
@@ -115,13 +158,13 @@ function show() {
   failed.hidden = search.state !== "failed";
   told.hidden = search.state === "failed";
   setText(failed, search.error ?? "");
-  setText(told, words(search));
+  setText(told, progressText(search));
   progress.hidden = !working;
   if (search.wanted && search.state !== "looking") progress.value = search.made / search.wanted;
   else progress.removeAttribute("value");
   drawn.replaceChildren(...[scoresPicture(search), scoresTable(search), importanceBars(search, specOf)].filter(Boolean));
   changes.replaceChildren(...(search.better ? search.changes : []).map(([parameter, before, value]) => el("li", {}, el("span", { text: specOf(parameter)?.title ?? parameter }), el("b", { text: `${shown(before, null)} → ${shown(value, specOf(parameter))}` }))));
-  setText(warning, search.warning ? `Mind: ${search.warning}.` : "");
+  setText(warning, search.warning ? `Note: ${search.warning}.` : "");
   warning.hidden = !search.warning || working;
   stop.hidden = !working;
   goOn.hidden = working || !search.go_on;
@@ -136,47 +179,7 @@ export function startSearch() {
   show();
 }
 
-// --- Over which other runs of the list a search goes, which are held out, and how both were mapped.
-
-const USES = [["", "not used"], ["also", "searched too"], ["held_out", "held out"]];
-const chosen = new Map(); // by the record's number: "also" or "held_out"
-const rows = el("ul", { id: "search-runs", "aria-label": "Other runs of the list" });
-const note = el("p", { class: "note dim" });
-const otherRuns = el("fieldset", { class: "search-others", hidden: true },
-  el("legend", { text: "Other runs", title: "Searched over beside this run, or only scored beside: what was not searched over tells whether the set suits other places" }), rows, note);
-
-function showRuns(runs = []) {
-  const usable = runs.filter(({ why_not: why }) => !why);
-  for (const record of chosen.keys()) if (!usable.some((run) => run.record === record)) chosen.delete(record);
-  rows.replaceChildren(...usable.map(({ record, name, truth }) => {
-    const use = el("select", { "aria-label": `What to do with ${name}`, onchange: () => (use.value ? chosen.set(record, use.value) : chosen.delete(record)) },
-      ...USES.map(([value, text]) => el("option", { value, text })));
-    use.value = chosen.get(record) ?? "";
-    return el("li", { "data-run": String(record), title: name }, el("span", {}, name, el("small", { class: "dim", text: truth })), use);
-  }));
-  const reasons = new Map();
-  for (const { name, why_not: why } of runs) if (why) reasons.set(why, [...(reasons.get(why) ?? []), name]);
-  note.replaceChildren(...[...reasons].map(([why, names]) => el("span", { title: names.join("\n"), text: `${count(names.length, "run")} cannot be judged: ${why}. ` })));
-  note.hidden = !reasons.size;
-  rows.hidden = !usable.length;
-  otherRuns.hidden = !runs.length;
-}
-
-const runsWanted = () => ({ also: of("also"), held_out: of("held_out") });
-const of = (use) => [...chosen].filter(([, value]) => value === use).map(([record]) => record);
-
-// Before and with the best set so far: the runs searched over, and those held out.
-function scoresTable({ scores = [], label }) {
-  if (!scores.length || (scores.length === 1 && scores[0].runs === 1)) return null;
-  const third = { RMSE: ["RMSE [cm]", "rmse_cm", (v) => v.toFixed(1)], "pair error": ["pairs [%]", "pair_error_percent", (v) => v.toFixed(2)] }[label] ?? ["TA", "TA", percent];
-  const columns = [["F1", "f1", (v) => v.toFixed(3)], third, ["false", "false_share", percent]];
-  const cell = ({ start, best }, [, key, shown]) => el("td", {}, ...[start, best].flatMap((of, k) => [k ? " → " : "", of[key] === undefined || of[key] === null ? "–" : shown(of[key])]));
-  return el("table", { id: "search-scores", title: "With the values it began with → with the best set so far" },
-    el("tr", {}, el("th", { text: "" }), ...columns.map(([text]) => el("th", { scope: "col", text }))),
-    ...scores.map((row) => el("tr", { "data-held-out": String(row.held_out) }, el("th", { scope: "row", text: `${row.held_out ? "held out" : "searched"}, ${count(row.runs, "run")}` }), ...columns.map((column) => cell(row, column)))));
-}
-
-// --- What a search found, drawn: the score of each trial with the best so far, and how much each parameter mattered.
+// --- pictures: score of each trial with the best so far, and importance of each parameter ----------------
 
 const WIDTH = 300, HEIGHT = 92, LEFT = 38, RIGHT = 6, TOP = 8, BOTTOM = 16;
 const MOST_BARS = 8;
@@ -216,6 +219,6 @@ function scoresPicture({ points = [], held_out: held = [], wanted, label, unit, 
 function importanceBars({ importance = {} }, specOf) {
   const rows = Object.entries(importance).slice(0, MOST_BARS);
   if (!rows.length) return null;
-  return el("div", { id: "search-importance" }, el("h3", { text: "What mattered" }), ...rows.map(([name, share]) => el("div", { class: "share-row" },
+  return el("div", { id: "search-importance" }, el("h3", { text: "Importance" }), ...rows.map(([name, share]) => el("div", { class: "share-row" },
     el("span", { text: specOf(name)?.title ?? name, title: name }), el("span", { class: "share-bar" }, el("i", { style: { width: `${Math.max(100 * share, 0.5)}%` } })), el("small", { text: percent(share) }))));
 }

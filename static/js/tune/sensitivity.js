@@ -1,8 +1,9 @@
-// How much a parameter matters: the score of the whole run over its range, below its row. The server computes point by
-// point, coarse first; a click sets the value.
+// Sensitivity of a parameter: the score of the whole run over its range, below its row. The server computes one point after
+// the other, coarse first; a click on the curve sets the value.
 
-import { post, request } from "../core/api.js";
+import { post, remove } from "../core/api.js";
 import { el, setText } from "../core/dom.js";
+import { roughly } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { line, svg, text } from "../core/svg.js";
 import { attempt, setValue, shown, specOf, valueOf } from "./parameters.js";
@@ -10,10 +11,10 @@ import { FINE, fromPlace, toPlace } from "./row.js";
 
 const POINTS = 17;
 const [WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [340, 154, 40, 12, 19, 28];
-const NEAR = 64; // of two marks, as wide as a word over each
-const LAST = 5; // points by which the pace is told
-let toShow = ""; // asked for here, and not yet brought into view
-let asking = null, arrivals = []; // when its points came: {done, at [ms]}
+const NEAR = 64; // between two marks whose labels would overlap
+const LAST = 5; // points for the estimate of the time left
+let toShow = ""; // requested here and not yet scrolled into view
+let asking = null, arrivals = []; // when points arrived: {done, at [ms]}
 const MEASURES = {
   f1: { words: "F1, %", of: ({ f1 }) => f1 === null ? null : 100 * f1, most: true },
   TA: { words: "trees found", of: ({ TA }) => TA, most: true },
@@ -23,14 +24,14 @@ const MEASURES = {
 };
 const told = el("p", { class: "note dim", role: "status" });
 const plot = el("div", { class: "sensitivity-plot" });
-const choice = el("select", { "aria-label": "What is drawn", class: "small", onchange: draw }, ...Object.entries(MEASURES).map(([name, { words }]) => el("option", { value: name, text: words })));
+const choice = el("select", { "aria-label": "Quantity of the curve", class: "small", onchange: draw }, ...Object.entries(MEASURES).map(([name, { words }]) => el("option", { value: name, text: words })));
 const best = el("button", { class: "small", type: "button", hidden: true });
-const again = el("button", { class: "small", type: "button", text: "Again", title: "Compute it with the values as they are now", onclick: () => askHowMuch(specOf(state.sensitivity.name)) });
-const close = el("button", { class: "small", type: "button", text: "Close", onclick: () => attempt(() => request("/api/sensitivity", { method: "DELETE" })) });
-const section = el("section", { class: "sensitivity", "aria-label": "How much this matters" },
+const again = el("button", { class: "small", type: "button", text: "Update", title: "Compute it again with the present values", onclick: () => requestSensitivity(specOf(state.sensitivity.name)) });
+const close = el("button", { class: "small", type: "button", text: "Close", onclick: () => attempt(() => remove("/api/sensitivity")) });
+const section = el("section", { class: "sensitivity", "aria-label": "Sensitivity" },
   el("div", { class: "sensitivity-head" }, choice, best, el("span", { class: "grow" }), again, close), plot, told);
 
-// Ends, present value and preset's first, then always the middle of what is left.
+// Values in the order of computation: present value, default, both ends, then the middles of the largest gaps.
 function valuesOf(spec, present) {
   if (spec.kind === "bool") return [present, !present];
   if (spec.kind === "choice") return [present, ...spec.choices.filter((value) => value !== present)];
@@ -39,18 +40,18 @@ function valuesOf(spec, present) {
   return [...new Set([present, spec.default, ...places.map((place) => fromPlace(spec, place))])];
 }
 
-export function askHowMuch(spec) {
+export function requestSensitivity(spec) {
   toShow = spec.name;
   return attempt(() => post("/api/sensitivity", { name: spec.name, values: valuesOf(spec, valueOf(spec.name)) }));
 }
 
-export const matterButton = (spec) => el("button", { class: "quiet icon matter", type: "button", text: "∿", title: "How much does this matter? The score of the whole run over its range",
-  "aria-label": `How much does ${spec.title} matter?`, onclick: () => askHowMuch(spec) });
+export const sensitivityButton = (spec) => el("button", { class: "quiet icon matter", type: "button", text: "∿", title: "Sensitivity: score over this parameter's range",
+  "aria-label": `Sensitivity of ${spec.title}`, onclick: () => requestSensitivity(spec) });
 
 const isNumber = (spec) => spec.kind === "int" || spec.kind === "float";
 const choicesOf = (spec) => (spec.kind === "bool" ? [false, true] : spec.choices);
 
-// From 0 to 1 along the plot: as the slider for numbers, one beside the other for choices.
+// Position along the plot, 0 to 1: like the slider for numbers, evenly spaced for choices.
 function share(spec, value) {
   if (isNumber(spec)) return toPlace(spec, value) / FINE;
   const all = choicesOf(spec);
@@ -74,7 +75,7 @@ function draw() {
     .filter(({ y }) => y !== null).sort((a, b) => a.x - b.x);
   if (points.length) plot.replaceChildren(curve(spec, points, measure));
   else if (asked.error || asked.points.length) plot.replaceChildren();
-  else if (!plot.querySelector("progress")) plot.replaceChildren(el("progress", { "aria-label": "The run is mapped for the first value" }));
+  else if (!plot.querySelector("progress")) plot.replaceChildren(el("progress", { "aria-label": "Mapping the run with the first value" }));
   tell(asked, spec, points, measure);
   if (toShow !== asked.name) return;
   toShow = "";
@@ -89,12 +90,12 @@ function heard() {
   draw();
 }
 
-// From the last few points: the first one maps the run for all.
+// Estimated from the last few points; the first one takes longer because it maps the run for all.
 function timeLeft({ of }) {
   const [first, last] = [arrivals.slice(-LAST)[0], arrivals.at(-1)];
   if (!last || last.done === first.done) return "";
   const seconds = ((of - last.done) * (last.at - first.at)) / (last.done - first.done) / 1000;
-  return seconds < 90 ? `, about ${Math.max(1, seconds < 10 ? Math.round(seconds) : 5 * Math.round(seconds / 5))} s left` : `, about ${Math.round(seconds / 60)} min left`;
+  return `, about ${roughly(seconds)} left`;
 }
 
 function curve(spec, points, measure) {
@@ -119,7 +120,7 @@ function curve(spec, points, measure) {
   return node;
 }
 
-// What stands over the marks; one name for both where two would lie upon one another.
+// Labels of the marks; one label for both where two would overlap.
 function namesOf(now, usual) {
   if (now === usual) return [[now, "now, default"]];
   if (Math.abs(now - usual) * (WIDTH - LEFT - RIGHT) >= NEAR) return [[usual, "default"], [now, "now"]];
@@ -140,13 +141,13 @@ function tell(asked, spec, points, measure) {
   again.hidden = !stale.length && !asked.error;
   if (!best.hidden) {
     setText(best, `Best so far: ${shown(top.value, spec)}`);
-    best.title = `${measure.words} ${say(top.y)}; a click takes this value`;
+    best.title = `${measure.words} ${say(top.y)}; click to use this value`;
     best.onclick = () => setValue(spec.name, top.value);
   }
-  const parts = asked.error ? [asked.error] : done < asked.of ? [`${done ? "Mapping the whole run with other values" : "Mapping the run once, then it goes faster"}: ${done} of ${asked.of}${timeLeft(asked)}.`]
-    : flat ? [`${measure.words} does not hang on it.`] : ["Click where the value should be."];
+  const parts = asked.error ? [asked.error] : done < asked.of ? [`${done ? "Mapping the whole run with other values" : "Mapping the run once; the other values are faster"}: ${done} of ${asked.of}${timeLeft(asked)}.`]
+    : flat ? [`${measure.words} does not depend on this parameter.`] : ["Click on the curve to set the value."];
   if (failed.length) parts.push(`${shown(failed[0].value, spec)}: ${failed[0].error}${failed.length > 1 ? `, and ${failed.length - 1} more` : ""}.`);
-  if (stale.length) parts.push(`${stale.slice(0, 2).join(", ")}${stale.length > 2 ? " …" : ""} changed since.`);
+  if (stale.length) parts.push(`${stale.slice(0, 2).join(", ")}${stale.length > 2 ? " …" : ""} changed since then.`);
   setText(told, parts.join(" "));
 }
 
