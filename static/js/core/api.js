@@ -34,7 +34,8 @@ export const block = async (path, options = {}) => (await answered(path, options
 export const blockFor = (path, body) =>
   block(path, { method: "POST", headers, body: JSON.stringify(body) });
 
-export const open = (uri, odometry, chosen = {}) => post("/api/open", { uri, odometry, seed: 0, ...chosen });
+// Opens a run. A source request is {uri, odometry, seed, topics, mount, preset, parameters}, all but `uri` optional.
+export const open = (source) => post("/api/open", source);
 
 // Commands are sent one at a time, so that two quick steps are two steps.
 let last = Promise.resolve();

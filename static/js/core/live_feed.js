@@ -10,6 +10,7 @@ let chosen = null; // {tree, until}: selected here, not yet confirmed by the ser
 
 const receivers = {
   status(message) { state.status = message; },
+  source({ type, ...source }) { state.source = source; },
   map(message) { receiveMap(message); },
   parameters(message) { state.parameters = message; },
   sets(message) { state.sets = message; },

@@ -2,6 +2,7 @@
 
 export const state = {
   status: null,      // the newest status message
+  source: null,      // source request of the open run: {uri, odometry, seed, topics, mount, preset, parameters}
   map: null,         // the newest map message, without its path
   path: [],          // [[x, y], ...], one per scan, in the frame of the map
   odometry: [],      // [x, y] by scan index; holes where the page was not connected

@@ -49,7 +49,7 @@ export async function ask(uri) {
   say("");
   setText(byId("source-open"), "Opening…");
   try {
-    await open(uri, byId("source-odometry").value, chosenFor(uri));
+    await open({ uri, odometry: byId("source-odometry").value, ...chosenFor(uri) });
   } catch (error) {
     finish(error.message);
   }

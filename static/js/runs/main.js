@@ -146,7 +146,7 @@ addEventListener("hashchange", follow);
 addEventListener("focus", load);
 on("theme", repaint);
 startUpload(async ({ uri }) => {
-  await open(uri, "auto");
+  await open({ uri });
   location.href = "/";
 });
 startTheme();

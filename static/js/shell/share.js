@@ -28,12 +28,26 @@ function camera() {
 // Rounded up: otherwise the seek would end at the previous scan.
 const seconds = () => (Math.ceil(1000 * (state.status?.time_s ?? 0)) / 1000).toFixed(3);
 
+// The link carries the whole source request (topics, mounting, seed, odometry, parameters): otherwise another run would open.
 function hereLink() {
-  const query = new URLSearchParams({ run: state.status?.source ?? "", t: seconds() });
+  const { uri, ...options } = state.source ?? { uri: state.status?.source ?? "" };
+  const query = new URLSearchParams({ run: uri, t: seconds() });
+  if (Object.keys(options).length) query.set("options", JSON.stringify(options));
   const seen = camera();
   if (seen) query.set("camera", seen);
   return `${location.origin}/?${query}`;
 }
+
+function optionsOf(text) {
+  try {
+    return JSON.parse(text ?? "{}") ?? {};
+  } catch {
+    throw new Error("The options in this link are damaged. Ask for the link again, or open the run by its address.");
+  }
+}
+
+const isOpen = ({ uri, ...options }) => state.status?.source === uri
+  && Object.entries(options).every(([name, value]) => JSON.stringify(state.source?.[name]) === JSON.stringify(value));
 
 function row(id, label, hint, value) {
   const box = el("input", { id, type: "text", readonly: true, value, onfocus: () => box.select() });
@@ -62,13 +76,14 @@ function show() {
 async function follow() {
   const asked = new URLSearchParams(location.search);
   if (!asked.has("run") && !asked.has("camera")) return;
-  const [run, time, seen] = [asked.get("run"), Number(asked.get("t")), asked.get("camera")];
-  for (const name of ["run", "t", "camera"]) asked.delete(name);
+  const [run, options, time, seen] = [asked.get("run"), asked.get("options"), Number(asked.get("t")), asked.get("camera")];
+  for (const name of ["run", "options", "t", "camera"]) asked.delete(name);
   history.replaceState(null, "", `${location.pathname}${asked.size ? `?${asked}` : ""}`);
   if (seen) lookFrom(seen.split(",").map(Number));
   if (!run || looksOnly()) return;
   try {
-    if (state.status?.source !== run) await open(run, "auto");
+    const source = { uri: run, ...optionsOf(options) };
+    if (!isOpen(source)) await open(source);
     if (!await until(() => state.status?.source === run && state.status.scan_index >= 0)) return;
     if (!Number.isFinite(time)) return;
     await command("pause");
