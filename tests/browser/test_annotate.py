@@ -48,7 +48,7 @@ def doubted(dashboard: Dashboard) -> list[dict[str, Any]]:
     """The found trees, the most doubted first, once the page asks for them in that order."""
     trees = {tree["number"]: tree for tree in dashboard.ask("/api/trees")["trees"]}
     told = [trees[each["tree"]] for each in dashboard.ask("/api/doubts")["trees"]]
-    numbers = "() => import('/static/js/annotate/annotations.js').then(it => it.unjudged().map(tree => tree.number))"
+    numbers = "() => import('/static/js/annotate/annotations.js').then(it => it.unreviewed().map(tree => tree.number))"
     wanted = [tree["number"] for tree in told[:2]]
     dashboard.eventually(
         lambda: dashboard.page.evaluate(numbers)[:2] == wanted, lambda: dashboard.page.evaluate(numbers)
@@ -71,17 +71,17 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     first, second = doubted(person)[:2]
 
     # The tree that the votes are least sure of first, with them; y confirms it, and the next is selected.
-    canvas.press("Tab")
+    canvas.press("s")
     hint = page.locator("#annotate-hint")
-    expect(hint).to_contain_text(f"Tree {first['number']}, seen in")
-    expect(hint).to_contain_text(re.compile(r"votes: tree [\d.]+ % \(40\.?0? % are needed\)"))
+    expect(hint).to_contain_text(f"Tree {first['number']}, detected in")
+    expect(hint).to_contain_text(re.compile(r"votes: tree [\d.]+ % \(40\.?0? % needed\)"))
     canvas.press("y")
-    expect(page.locator("#annotate-count")).to_contain_text(f"1 of {len(found)} found trees judged")
+    expect(page.locator("#annotate-count")).to_contain_text(f"1 of {len(found)} found trees reviewed")
     (row,) = rows(person)
     assert (row["kind"], row["x"], row["y"]) == ("tree", first["x"], first["y"])
     mark = page.locator("#marks .mark.annotation")
     expect(mark).to_have_attribute("title", re.compile(r"0:15\.0 annotated: .+ edited an annotation"))
-    expect(page.locator("#annotate-hint")).to_contain_text(f"Tree {second['number']}, seen in")
+    expect(page.locator("#annotate-hint")).to_contain_text(f"Tree {second['number']}, detected in")
 
     # n refuses one that lies near the path: the scores know it at once.
     near = min(found, key=lambda tree: (tree["x"] - 4.0) ** 2 + (tree["y"] - 2.0) ** 2)
@@ -94,12 +94,12 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     expect(page.locator("#annotations tbody tr")).to_have_count(2)
     person.until_server("/api/evaluation", f"it.FA.count === {before['FA']['count'] + 1}")
     person.tab("Scores")
-    expect(page.locator("#truth-used")).to_contain_text("2 annotations laid over it")
+    expect(page.locator("#truth-used")).to_contain_text("corrected by 2 annotations")
     expect(page.locator("[data-rate=FA] small")).to_have_text(f"1 of {before['FA']['of'] + 1}")
     person.tab("Annotate")
 
     # It contradicts what is known for certain: that is said, and whose word counts is chosen.
-    expect(page.locator("#annotate-warned")).to_contain_text("otherwise than the truth that this run brings")
+    expect(page.locator("#annotate-warned")).to_contain_text("the ground truth of this run and")
     page.locator("#annotate-against").select_option("own")
     person.until_server("/api/evaluation", f"it.FA.count === {before['FA']['count']}")
     expect(page.locator("#annotate-warned")).to_be_hidden()
@@ -173,14 +173,14 @@ def test_whoever_clicks_next_goes_on_by_keys(person: Dashboard):
     first, second = doubted(person)[:2]
     hint = page.locator("#annotate-hint")
     page.locator("#tab-annotate").click()
-    page.keyboard.press("Tab")
-    expect(hint).to_contain_text(f"Tree {first['number']}, seen in")
+    page.keyboard.press("s")
+    expect(hint).to_contain_text(f"Tree {first['number']}, detected in")
     page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
     person.eventually(lambda: bool(page.evaluate(nothing)), lambda: "a tree is selected")
     page.locator("#annotate-next").click()
-    expect(hint).to_contain_text(f"Tree {first['number']}, seen in")
-    page.keyboard.press("Tab")
-    expect(hint).to_contain_text(f"Tree {second['number']}, seen in")
+    expect(hint).to_contain_text(f"Tree {first['number']}, detected in")
+    page.keyboard.press("s")
+    expect(hint).to_contain_text(f"Tree {second['number']}, detected in")
     page.keyboard.press("n")
     expect(page.locator("#annotations tbody tr")).to_have_count(1)
     (row,) = rows(person)
@@ -199,7 +199,7 @@ def test_two_people_see_one_another_and_a_stale_edit_is_refused(
     page.locator("#annotate-file").set_input_files(
         {"name": "plot.csv", "mimeType": "text/csv", "buffer": b"X,Y,dbh_cm\n1.5,30.5,22\n-4.0,31.0,\n"}
     )
-    expect(page.locator("#annotate-hint")).to_contain_text("2 taken from plot.csv")
+    expect(page.locator("#annotate-hint")).to_contain_text("2 trees imported from plot.csv")
     with opened(chromium, annotated.link) as other:
         other.tab("Annotate")
         theirs = other.page.locator("#annotations tbody tr")
@@ -251,9 +251,9 @@ def test_a_shift_click_on_a_stem_in_the_scene_adds_it(person: Dashboard):
 def test_learning_says_what_it_needs_begins_when_asked_and_is_stopped(person: Dashboard):
     page = person.page
     learn = page.get_by_role("region", name="Learn")
-    grow = learn.get_by_role("button", name="Grow a new decision tree")
-    expect(learn).to_contain_text("10 trees and 5 other things are needed")
-    expect(learn).to_contain_text("press n on a found tree that is none")
+    grow = learn.get_by_role("button", name="Train decision trees")
+    expect(learn).to_contain_text("10 trees and 5 other objects")
+    expect(learn).to_contain_text("answer No (N) for a found tree")
     expect(grow).to_be_disabled()
     table = "".join(f"{k},50,{'tree' if k < 10 else 'pole'}\n" for k in range(15))
     page.evaluate(IMPORTED, "x_m,y_m,class\n" + table)
@@ -283,18 +283,18 @@ def test_learned_trees_are_shown_beside_the_old_ones_and_used_when_asked(chromiu
         person.page.evaluate(IMPORTED, "x_m,y_m,class\n" + table)
         person.tab("Annotate")
         learn = person.page.get_by_role("region", name="Learn")
-        learn.get_by_role("button", name="Grow a new decision tree").click()
-        use = learn.get_by_role("button", name="Use it")
+        learn.get_by_role("button", name="Train decision trees").click()
+        use = learn.get_by_role("button", name="Use the new ones")
         expect(use).to_be_visible(timeout=1000 * COMPILING_S)
         expect(learn.get_by_role("row", name=re.compile("^new"))).to_contain_text(" of ")
         person.until_server("/api/parameters", "it.values['gathering.forest'] === 'package'")
         use.click()
         expect(learn.locator("#learn-used")).to_contain_text(
-            re.compile(r"In use: grown 20\d\d-.* from \d+ trees, .* in 1 run")
+            re.compile(r"In use: trained 20\d\d-.* from \d+ trees, .* in 1 run")
         )
         name = person.ask("/api/learning")["learned"]["name"]
         person.until_server("/api/parameters", f"it.values['gathering.forest'] === '{name}'")
-        learn.get_by_role("button", name="Back to the package's").click()
+        learn.get_by_role("button", name="Use the built-in ones").click()
         person.until_server("/api/parameters", "it.values['gathering.forest'] === 'package'")
         assert person.errors == []
 
@@ -305,7 +305,7 @@ def test_what_was_annotated_outlives_a_killed_server_and_goes_out_as_files(chrom
         person.stand(15.05)
         person.until_server("/api/trees", "it.trees.length > 20")
         person.tab("Annotate")
-        person.page.locator("#map").press("Tab")
+        person.page.locator("#map").press("s")
         person.page.locator("#map").press("y")
         person.page.locator("#annotate-name").fill("Ann")
         person.page.locator("#annotate-name").press("Enter")

@@ -161,7 +161,7 @@ NUMBERS = """() => import('/static/js/map/draw.js').then(({ drawNumbers }) => {
   const trees = Array.from({ length: 60 }, (_, k) =>
     ({ number: k + 1, x: 40 + (37 * k) % 300, y: 40 + (53 * k) % 190, observations: k }));
   trees.push({ number: 99, x: 41, y: 41, observations: 0 });
-  drawNumbers(pen, view, trees, 99, {}, { radiusOf: () => radius });
+  drawNumbers(pen, view, trees, 99, { radiusOf: () => radius });
   const apart = (a, b) => a.x >= b.x + b.width || a.y >= b.y + b.height;
   const meet = (a, b) => !apart(a, b) && !apart(b, a);
   const size = { width: 2 * radius, height: 2 * radius };

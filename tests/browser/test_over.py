@@ -56,7 +56,7 @@ def test_two_sets_are_compared_on_the_same_scan(dashboard: Dashboard):
     page.get_by_role("button", name="A | B", exact=True).last.click()
     over = page.locator("#over-compare")
     expect(over.locator("[data-set=a]")).to_have_value("forest")
-    expect(page.locator("#compare-tables .empty")).to_contain_text("Both sets are the same")
+    expect(page.locator("#compare-tables .empty")).to_contain_text("The two sets are equal")
     over.locator("[data-set=b]").select_option("paper")
     row = page.locator("#compare-differences [data-row='clustering.eps'] td")
     expect(row.nth(0)).to_have_text("0.15 m")
@@ -64,7 +64,7 @@ def test_two_sets_are_compared_on_the_same_scan(dashboard: Dashboard):
     trees = page.locator("#compare-verdicts [data-row=tree] td")
     chip = dashboard.tab("Tune").locator("[data-chip=tree] b").inner_text()
     expect(trees.nth(0)).to_have_text(chip.split()[-1])
-    expect(page.locator("#compare-shared")).to_contain_text("Trees that both find")
+    expect(page.locator("#compare-shared")).to_contain_text("Trees found by both")
     assert coloured(over.locator("canvas").nth(0)) > 50
     over.get_by_role("button", name="Swap").click()
     expect(row.nth(0)).to_have_text("0.25 m")

@@ -10,12 +10,12 @@ from tests.browser.dashboard import Dashboard
 
 FOUND = {
     "tree_share": "Votes for a tree",
-    "how much does radius eps": "How much does Radius eps matter?",
+    "how much does radius eps": "Sensitivity of Radius eps",
     "tune for me": "Tune for me",
-    "learn grow": "Learn: grow",
+    "learn train": "Learn: train",
     "score against": "Score against",
     "topics": "Topics and mounting",
-    "plot time": "Plot: Time of each stage",
+    "plot time": "Plot: Time per stage",
     "label dbh": "Label the scene with DBH",
     "upload rec": "Upload a recording",
 }
@@ -69,7 +69,7 @@ def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
     dashboard.tab("Trees")
     dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
     page.locator("#map").press("Control+k")
-    find = page.get_by_role("combobox", name="What do you want to do?")
+    find = page.get_by_role("combobox", name="Search all actions")
     expect(find).to_be_focused()
     find.fill("preset paper")
     options = page.locator("#palette-list [role=option]")

@@ -22,7 +22,7 @@ def test_a_lost_server_is_told_and_found_again(chromium: Browser):
         dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
         first.stop()
         expect(page.locator("#state b")).to_have_text("No connection")
-        expect(page.locator("#notice")).to_contain_text("last picture")
+        expect(page.locator("#notice")).to_contain_text("last state")
         assert page.locator("#trees tbody tr").count() > 0
         dashboard.scene.evaluate("window.wasHere = true")
         second = Server(port=first.port, token=TOKEN)

@@ -82,7 +82,7 @@ def test_runs_are_kept_compared_renamed_deleted_and_played_again(own: Dashboard,
     os.utime(half, (0, 0))
     page.reload()
     row = page.locator("#runs tr.unfinished")
-    expect(row).to_contain_text(f"Half a map in {folder.name}")
+    expect(row).to_contain_text(f"Incomplete map in {folder.name}")
     row.get_by_role("button", name="Delete").click()
     expect(row).to_have_count(0)
     assert not half.exists()

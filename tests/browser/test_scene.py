@@ -161,11 +161,11 @@ def test_a_layer_is_switched_off(dashboard: Dashboard):
 def test_light_and_dark_are_remembered(dashboard: Dashboard):
     page = dashboard.page
     dashboard.scene.evaluate("() => { window.isTheSame = true; }")
-    page.get_by_role("button", name="Light or dark").click()
+    page.get_by_role("button", name="Light or dark theme").click()
     expect(page.locator("html")).to_have_attribute("data-theme", "light")
     assert dashboard.scene.evaluate(GROUND) == "rgb(255, 255, 255)"
     assert page.evaluate("localStorage.getItem('stemmap.theme')") == "light"
-    page.get_by_role("button", name="Light or dark").click()
+    page.get_by_role("button", name="Light or dark theme").click()
     expect(page.locator("html")).to_have_attribute("data-theme", "dark")
     assert dashboard.scene.evaluate("() => window.isTheSame"), "the scene and its camera stay"
     assert dashboard.scene.evaluate(GROUND) != "rgb(255, 255, 255)"

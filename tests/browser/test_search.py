@@ -42,7 +42,7 @@ def test_a_better_set_is_found_used_undone_and_saved(chromium: Browser, tmp_path
         low.fill("0.1")
         page.locator("#search-start").click()
         expect(page.locator("#search-told")).to_be_in_viewport()  # though the button stood below a long form
-        expect(page.locator("#search-told")).to_contain_text("Found after 5 trials", timeout=120_000)
+        expect(page.locator("#search-told")).to_contain_text("Best of 5 trials", timeout=120_000)
         expect(page.locator("#search-drawn .trial")).to_have_count(5)
         expect(page.locator("#search-changes li")).to_have_count(5)
 

@@ -76,7 +76,7 @@ def nothing_that_changes_is_offered(viewer: Dashboard) -> None:
     page = viewer.page
     map_ = page.locator("#map")
     map_.press("Control+k")
-    find = page.get_by_role("combobox", name="What do you want to do?")
+    find = page.get_by_role("combobox", name="Search all actions")
     for word in (
         "preset paper",
         "play or pause",

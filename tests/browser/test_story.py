@@ -36,7 +36,7 @@ def test_a_tree_from_the_table_stays_selected_and_its_story_goes_on(dashboard: D
     dashboard.until("was => Number(document.querySelector('#panel-story').dataset.scan) > was + 5", before)
     expect(panel).to_have_attribute("data-story", f"tree {number}")
     page.locator("#map").press("Escape")
-    expect(panel.locator(".empty")).to_contain_text("Nothing is selected")
+    expect(panel.locator(".empty")).to_contain_text("Nothing selected")
 
 
 def test_a_cluster_of_the_list_stands_while_the_run_plays_on(dashboard: Dashboard):
@@ -141,7 +141,7 @@ def test_a_click_on_a_cluster_in_the_scene_tells_why_it_is_no_tree(dashboard: Da
         for check in story["checks"]:
             if check["fails"]:
                 expect(panel.locator("tr.decides")).to_contain_text(story["verdict"])
-                expect(panel.locator(".verdict p")).to_contain_text(check["title"] or "hides its edge")
+                expect(panel.locator(".verdict p")).to_contain_text(check["title"] or "occluded")
                 break
         read[story["verdict"]] = cluster
         if len(read) >= 2:

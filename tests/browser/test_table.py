@@ -84,9 +84,9 @@ def test_what_is_typed_sifts_the_trees(dashboard: Dashboard):
         fits = [tree["number"] for tree in held if holds(tree)]
         assert sorted(listed(page)) == sorted(fits), text
         expect(page.locator("#tree-count")).to_have_text(f"{len(fits)} of {len(held)}")
-    expect(page.locator("#trees-empty")).to_contain_text("No tree fits “judged”")
+    expect(page.locator("#trees-empty")).to_contain_text("No tree matches “judged”")
     page.locator("#find").fill("as thick as my leg")
-    expect(page.locator("#trees-empty")).to_contain_text("“as thick as my leg” is not understood")
+    expect(page.locator("#trees-empty")).to_contain_text("“as thick as my leg” is not a condition")
     expect(page.locator("#find")).to_have_attribute("aria-invalid", "true")
 
 

@@ -94,11 +94,11 @@ def test_parameters_are_found_by_their_words(dashboard: Dashboard):
     expect(titles.first).to_have_text(re.compile("Radius eps"))
     assert titles.count() > 1
     page.locator("#tune-find").fill("no such thing at all")
-    expect(page.locator("#tune-none")).to_contain_text("No parameter has these words")
+    expect(page.locator("#tune-none")).to_contain_text("No parameter matches")
     page.locator("#tune-find").fill("")
     expect(page.locator("#tune-rows details").first).to_have_attribute("data-stage", "Acquisition")
     page.get_by_label("changed only").check()
-    expect(page.locator("#tune-none")).to_contain_text("Nothing differs")
+    expect(page.locator("#tune-none")).to_contain_text("No value differs")
     page.get_by_label("changed only").uncheck()
 
 

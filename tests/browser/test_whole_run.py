@@ -69,9 +69,9 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     picture = drawn(page)
     slider = page.locator("[data-parameter='gathering.tree_share'] input[type=range]")
     drag(page, slider, before, [0.75, 0.95])
-    expect(told).to_contain_text(f"mapped again: {known} → ", timeout=60_000)
+    expect(told).to_contain_text("Re-mapped to 0:15.0: ", timeout=60_000)
     assert 0.9 < float(share.input_value()) < 1.0
-    fewer = int(re.search(r"→ (\d+)", told.inner_text()).group(1))  # type: ignore[union-attr]
+    fewer = int(re.search(r": (\d+) trees", told.inner_text()).group(1))  # type: ignore[union-attr]
     assert fewer < known
     dashboard.until_server("/api/trees", f"it.trees.length === {fewer}")
     dashboard.until_server("/api/evaluation", f"it.TA.count < {completeness}")
@@ -79,7 +79,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     expect(page.locator("[data-figure=trees] dd")).to_have_text(str(fewer))
     whole = page.locator("#tune-changes-all")
     many = page.locator("#tune-changes li").count() > 8  # which would take the place of the sliders
-    expect(whole.locator("summary")).to_contain_text("not as before")
+    expect(whole.locator("summary")).to_contain_text("change")
     assert (whole.get_attribute("open") is None) == many
     assert page.locator("#map").bounding_box()["height"] > 190  # type: ignore[index]
     rows = page.locator("#tune-changes li[data-kind=vanished]")
@@ -93,7 +93,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     # Back again: the same trees, which now appear; a click selects one of them everywhere.
     share.fill(str(before))
     share.press("Enter")
-    expect(told).to_contain_text(f"mapped again: {fewer} → {known}", timeout=60_000)
+    expect(told).to_contain_text(f"Re-mapped to 0:15.0: {known} trees", timeout=60_000)
     dashboard.until_server("/api/trees", f"it.trees.length === {known}")
     dashboard.until_server("/api/evaluation", f"it.TA.count === {completeness}")
     came = page.locator("#tune-changes li[data-kind=appeared] button").first
@@ -107,7 +107,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     assert page.evaluate(f"{STATE} state.ghost)") is None
     page.evaluate(ANEW)
     expect(page.locator("[data-figure=trees]")).to_have_class(re.compile("anew"))
-    expect(page.locator("[data-figure=trees] dt")).to_have_text("trees; mapped anew, 43 %")
+    expect(page.locator("[data-figure=trees] dt")).to_have_text("trees; re-mapping, 43 %")
     assert dashboard.errors == []
 
 
@@ -125,7 +125,7 @@ def test_a_change_can_act_from_the_standing_scan_on(dashboard: Dashboard):
         dashboard.until_server("/api/parameters", "it.changed.length === 1")
         dashboard.until_server("/api/status", "it.revision > 0 && it.remapped === null")
         assert trees(dashboard) == known
-        expect(page.locator("#tune-whole-told")).to_contain_text("from the scan that stands here on")
+        expect(page.locator("#tune-whole-told")).to_contain_text("from the current scan onwards")
     finally:
         page.locator("#tune-whole").check()
         dashboard.until_server("/api/parameters", "it.whole === true")
@@ -151,7 +151,7 @@ def test_how_much_a_parameter_matters_is_drawn_and_a_click_sets_it(dashboard: Da
     row.hover()
     row.locator(".matter").click()
     section = page.locator(".sensitivity")
-    expect(section).to_contain_text(re.compile("of 1[0-9]|the value should be"))
+    expect(section).to_contain_text(re.compile("of 1[0-9]|to set the value"))
     # The run is scored in the background, at its leisure: points that were computed are put in here.
     page.evaluate("() => fetch('/api/sensitivity', { method: 'DELETE' })")
     expect(section).to_have_count(0)
@@ -162,7 +162,7 @@ def test_how_much_a_parameter_matters_is_drawn_and_a_click_sets_it(dashboard: Da
     expect(section).to_contain_text("0.9: it cannot be")
     section.locator("select").select_option("position error, cm")
     expect(picture).to_have_attribute("aria-label", re.compile("position error, cm from 2 to 2"))
-    expect(section).to_contain_text("does not hang on it")
+    expect(section).to_contain_text("does not depend on this parameter")
     box = picture.bounding_box()
     assert box is not None
     picture.click(position={"x": 0.9 * box["width"], "y": 0.5 * box["height"]})
