@@ -10,8 +10,7 @@ from typing import Any
 
 from app.common.draw_picture import drawn
 from app.dashboard.camera_marks import marks_of, motion
-from app.explain.client import Asking
-from app.explain.questions import NoStoryError
+from app.explain.client import NoStoryError, WorkerClient
 from pipeline.types.records import Frame, Path
 
 #: All browsers together get so many pictures a second at most.
@@ -26,7 +25,7 @@ class CameraDesk:
         asking: Of the mapping process.
     """
 
-    def __init__(self, asking: Asking) -> None:
+    def __init__(self, asking: WorkerClient) -> None:
         self._asking = asking
         self._kept: OrderedDict[int, bytes] = OrderedDict()
         self._turn = asyncio.Lock()

@@ -26,7 +26,7 @@ from app.dashboard.run_recorder import Glance, Logbook
 from app.dashboard.scores import Scores, score_payload
 from app.dashboard.selection import Selecting
 from app.dashboard.user import SOMEBODY, hand
-from app.explain.client import Asking
+from app.explain.client import WorkerClient
 from app.sources.request import SourceRequest
 from app.store.async_store import Keeper
 from app.tuning.job import TuneSearch
@@ -117,7 +117,7 @@ class Dashboard:
         self.truth: TruthTrees | None = None
         self.sets = ParameterSets(self.keeper, self._show_parameters)
         self._before_after = BeforeAfter()
-        self.asking = Asking(lambda question: self.worker.send(question), lambda: self._run)
+        self.asking = WorkerClient(lambda question: self.worker.send(question), lambda: self._run)
         self.camera = CameraDesk(self.asking)
         self.selecting = Selecting(
             self.asking,

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from app.explain.estimate_history import half_axes
+from app.explain.history import half_axes
 from app.worker.internal_protocol import Shown
 from pipeline.classification.forest import CLASSES
 from pipeline.types.clearance import Clearance

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from app.dashboard.broadcast import Live
-from app.explain.client import Asking
-from app.explain.questions import NoStoryError
+from app.explain.client import NoStoryError, WorkerClient
 from app.explain.records import ClusterStory
 
 
@@ -60,7 +59,7 @@ class Selecting:
 
     def __init__(
         self,
-        asking: Asking,
+        asking: WorkerClient,
         live: Live,
         mark: Callable[[int | None, Ring], None],
         *,

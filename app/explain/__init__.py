@@ -1,1 +1,1 @@
-"""Stories: how a cluster or a tree came to be what it is, told when somebody asks."""
+"""Stories: why a cluster or a tree has its verdict, built when a browser requests them."""

@@ -1,12 +1,14 @@
-"""Tells the stories: of a cluster from its scan's frame, of a tree from the newest one."""
+"""Builds the stories: of a cluster from the frame of its scan, of a tree from the newest frame."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from app.explain.estimate_history import TreeHistory, half_axes
-from app.explain.records import Asked, Circle, ClusterStory, Gathered, Told, TreeStory
+from app.explain.history import TreeHistory, half_axes
+from app.explain.records import Check, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
 from app.training.learned_forests import kept_forests
 from pipeline.classification.feature_attribution import what_told
 from pipeline.classification.features import NAMES
@@ -14,40 +16,72 @@ from pipeline.classification.forest import CLASSES, TREE_IN_FREE_AIR, standard_f
 from pipeline.config import Parameters, field_specs
 from pipeline.detection.cylinder_fit import StemFit, fit_one
 from pipeline.detection.verdicts import checks
+from pipeline.errors import StemmapError
 from pipeline.types.records import Clusters, Frame, Sensor, Verdict
+
+if TYPE_CHECKING:
+    from app.worker.run import Run
 
 Float = NDArray[np.float64]
 
 _NS = 1_000_000_000
 _MOST_POINTS = 400
-_MOST_TOLD = 6
-_COLUMN_REACH = 0.45  # m; what stands farther away is another thing
+_MOST_FEATURES = 6
+_COLUMN_REACH = 0.45  # [m]; a column farther away belongs to another object
 _SIDES = 36
 
 
-def make_ready(sensor: Sensor) -> None:
-    """Have compiled what stories need, so that the first one does not hold up the map."""
+def warm_up(sensor: Sensor) -> None:
+    """Compile the kernels of the stories, so that the first story does not delay the mapping."""
     angle = np.linspace(2.0, 4.0, 12)
     arc = np.column_stack([5.0 + 0.2 * np.cos(angle), 0.2 * np.sin(angle), np.linspace(0.0, 1.0, 12)])
     fit_one(arc, sensor)
     what_told(np.zeros(len(NAMES)), standard_forest(sensor.rings > 0), Verdict.TREE)
 
 
-def tell_cluster(
+def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
+    """Return the story of a cluster of a recent scan of an opened run.
+
+    Raises:
+        StemmapError: The scan has no such cluster.
+    """
+    if run is None or not 0 <= cluster < len(frame.clusters.size):
+        raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
+    parameters = run.parameters_at(frame.index)
+    return cluster_of_frame(frame, cluster, parameters, run.source.description.sensor, run.start_ns)
+
+
+def tree_story(run: Run | None, number: int) -> TreeStory:
+    """Return the story of a tree after the newest scan of an opened run.
+
+    Raises:
+        StemmapError: The run has no such tree at this time.
+    """
+    frame = run.frame if run else None
+    row = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
+    if run is None or frame is None or not len(row):
+        raise StemmapError(
+            f"tree {number} is not known at this time of the run", remedy="Play on, or select another"
+        )
+    parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
+    return tree_of_frame(frame, int(row[0]), parameters, sensor, run.start_ns, run.history)
+
+
+def cluster_of_frame(
     frame: Frame, row: int, parameters: Parameters, sensor: Sensor, start_ns: int
 ) -> ClusterStory:
-    """The story of a cluster.
+    """Return the story of a cluster.
 
     Args:
-        frame: The scan's results, `raw` not needed.
-        row: Of the cluster in it.
-        parameters: That the scan was mapped with.
+        frame: Results of the scan; `raw` is not used.
+        row: Row of the cluster in the frame.
+        parameters: Parameters with which the scan was mapped.
         sensor: The LiDAR.
-        start_ns: Time of the run's first scan.
+        start_ns: Time of the first scan of the run [ns].
     """
     clusters, pose = frame.clusters, frame.estimate.T_map_base
     points = frame.filtered[frame.labels == row].astype(np.float64)
-    # Only presets that fit circles have a sigma; what the page is told must be what was judged.
+    # Presets without circle fit have no sigma; the story shows only what the verdict used.
     fit = fit_one(points, sensor) if np.isfinite(clusters.radius_sigma[row]) else None
     to_picture = _to_picture(clusters.centre[row])
     offset = points[:, :2] - clusters.centre[row] if fit is None else fit.offset
@@ -59,7 +93,7 @@ def tell_cluster(
         cluster=row,
         time_s=(frame.stamp_ns - start_ns) / _NS,
         verdict=Verdict(int(clusters.verdict[row])).label,
-        checks=asked(clusters, row, parameters),
+        checks=checks_of(clusters, row, parameters),
         size=int(clusters.size[row]),
         eccentricity=float(clusters.eccentricity[row]),
         position=(float(place[0]), float(place[1])),
@@ -71,11 +105,11 @@ def tell_cluster(
         axes=_axes(points[:, :2], to_picture),
         tree=tree,
         tree_distance=tree_distance,
-        gathered=gathered(frame, place, parameters, sensor),
+        gathered=column_story(frame, place, parameters, sensor),
     )
 
 
-def tell_tree(
+def tree_of_frame(
     frame: Frame,
     row: int,
     parameters: Parameters,
@@ -83,7 +117,7 @@ def tell_tree(
     start_ns: int,
     history: TreeHistory,
 ) -> TreeStory:
-    """The story of a tree: row `row` of the frame's trees; the other arguments as in `tell_cluster`."""
+    """Return the story of the tree in row `row` of the frame's trees; arguments as in `cluster_of_frame`."""
     trees = frame.trees
     major, minor, angle = half_axes(trees.covariance[row : row + 1])[0].tolist()
     sides = [] if trees.sides is None else [bool(int(trees.sides[row]) >> k & 1) for k in range(_SIDES)]
@@ -104,18 +138,18 @@ def tell_tree(
         first_seen_s=(int(trees.first_seen_ns[row]) - start_ns) / _NS,
         last_seen_s=(int(trees.last_seen_ns[row]) - start_ns) / _NS,
         cluster=_cluster_of(frame, trees.position[row], parameters.tracking.distance_max),
-        gathered=gathered(frame, trees.position[row], parameters, sensor),
+        gathered=column_story(frame, trees.position[row], parameters, sensor),
         history=history.of(int(trees.number[row])),
     )
 
 
-def asked(clusters: Clusters, row: int, parameters: Parameters) -> list[Asked]:
-    """The checks of one cluster; none of a stem that another program found."""
+def checks_of(clusters: Clusters, row: int, parameters: Parameters) -> list[Check]:
+    """Return the checks of one cluster in the order in which they decide; empty for an external stem."""
     titles = {spec.name: spec.title for spec in field_specs()}
-    if np.isnan(clusters.eccentricity[row]):  # a stem that another program found is asked nothing
+    if np.isnan(clusters.eccentricity[row]):  # an external stem
         return []
     return [
-        Asked(
+        Check(
             figure=check.figure,
             unit=check.unit,
             value=float(check.value[row]),
@@ -130,14 +164,17 @@ def asked(clusters: Clusters, row: int, parameters: Parameters) -> list[Asked]:
     ]
 
 
-def gathered(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor) -> Gathered | None:
-    """What was gathered at a place (x, y) of the map; None where no column stands there."""
+def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor) -> ColumnStory | None:
+    """Return the classification of the accumulated scans at a place (x, y) of the map [m].
+
+    None where no voxel column is within 0.45 m.
+    """
     columns = frame.columns
     if columns is None or not len(columns.verdict):
         return None
     distance = np.linalg.norm(columns.axis[:, :2] - place, axis=1)
     tree = columns.verdict == Verdict.TREE
-    # A tree is meant rather than the bush beside it.
+    # A tree is preferred to a bush next to it.
     row = int(np.argmin(np.where(tree & (distance <= _COLUMN_REACH), distance - _COLUMN_REACH, distance)))
     if distance[row] > _COLUMN_REACH:
         return None
@@ -147,8 +184,8 @@ def gathered(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor)
     in_free_air = float(tree_in_free_air(figures[None], forest)[0])
     refused = forest.free_end if in_free_air < TREE_IN_FREE_AIR else None
     effect = what_told(figures, refused or forest, Verdict.TREE)
-    strongest = np.argsort(-np.abs(effect), kind="stable")[:_MOST_TOLD]
-    return Gathered(
+    strongest = np.argsort(-np.abs(effect), kind="stable")[:_MOST_FEATURES]
+    return ColumnStory(
         verdict=verdict.label,
         distance=float(distance[row]),
         votes={kind.label: float(share[k]) for k, kind in enumerate(CLASSES)},
@@ -159,7 +196,7 @@ def gathered(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor)
         absent=int(columns.absent[row]),
         viewed=float(columns.viewed[row]),
         told=[
-            Told(NAMES[k], float(figures[k]), float(effect[k]))
+            FeatureEffect(NAMES[k], float(figures[k]), float(effect[k]))
             for k in strongest.tolist()
             if effect[k] != 0.0
         ],
@@ -167,7 +204,7 @@ def gathered(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor)
 
 
 def _decided_by(share: Float, tree_share: float) -> tuple[Verdict, ...]:
-    """The verdict that the votes alone give."""
+    """Return the verdicts that the votes give without any rule."""
     if share[0] >= tree_share:
         return (Verdict.TREE,)
     most = CLASSES[int(share.argmax())]
@@ -187,7 +224,7 @@ def _nearest_tree(frame: Frame, place: Float, reach: float) -> tuple[int | None,
 
 
 def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
-    """The cluster nearest to a tree's place, one that was taken for a tree if there is one in reach."""
+    """Return the row of the cluster nearest to a tree, preferring clusters with the verdict tree; or None."""
     centre = frame.estimate.T_map_base.apply(frame.clusters.centre + frame.sensor_offset[:2])
     distance = np.linalg.norm(centre - place, axis=1)
     for rows in (frame.detections.cluster, np.arange(len(distance))):
@@ -197,7 +234,7 @@ def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
 
 
 def _to_picture(centre: Float) -> Float:
-    """Turns level sensor coordinates into the picture's: up is away from the sensor, shape (2, 2)."""
+    """Return the rotation of level sensor coordinates so that up points away from the sensor, shape (2, 2)."""
     reach = max(float(np.hypot(*centre)), 1e-9)
     ux, uy = centre / reach
     return np.array([[uy, -ux], [ux, uy]])
@@ -221,7 +258,7 @@ def _circle(fit: StemFit, covariance: Float, to_picture: Float) -> Circle:
 
 
 def _axes(points: Float, to_picture: Float) -> list[tuple[float, float]]:
-    if not len(points):  # a stem that another program found
+    if not len(points):  # an external stem
         return []
     spread = points - points.mean(axis=0)
     values, vectors = np.linalg.eigh(spread.T @ spread / max(len(points), 1))
@@ -230,5 +267,5 @@ def _axes(points: Float, to_picture: Float) -> list[tuple[float, float]]:
 
 
 def _evenly(n: int, most: int) -> NDArray[np.int64]:
-    """Rows of a table of n rows, at most `most` of them and none twice."""
+    """Return at most `most` rows of a table of n rows, evenly spaced and without repetition."""
     return np.arange(n) if n <= most else np.arange(most) * n // most

@@ -1,5 +1,7 @@
-"""What a story holds. Plain data: it travels from the worker to the browser. Lengths are metres, angles
-degrees where the name says so and radians else; NaN becomes null in the browser.
+"""Records of a story, sent from the worker to the browser.
+
+Lengths are in metres; angles are in degrees if the name ends in `_deg`, else in radians. NaN becomes null in
+the browser.
 """
 
 from __future__ import annotations
@@ -7,15 +9,15 @@ from __future__ import annotations
 import msgspec
 
 
-class Asked(msgspec.Struct, frozen=True):
+class Check(msgspec.Struct, frozen=True):
     """One check of a cluster.
 
     Attributes:
-        figure, unit, value: What was looked at; NaN where it cannot be told.
-        relation: "at least" or "at most" the limit; empty where any value but 0 fails.
-        limit, parameter, title: The limit with the dotted name of its parameter and its title.
-        fails: Whether it fails.
-        verdict: What the cluster is when this is its first check that fails.
+        figure, unit, value: Name, unit and value of the checked quantity; NaN if it is unknown.
+        relation: "at least" or "at most" the limit; empty if every value except 0 fails.
+        limit, parameter, title: Limit, dotted name of its parameter, and title of the parameter.
+        fails: Whether the cluster fails the check.
+        verdict: Verdict on the cluster if this is the first check that fails.
     """
 
     figure: str
@@ -30,14 +32,14 @@ class Asked(msgspec.Struct, frozen=True):
 
 
 class Circle(msgspec.Struct, frozen=True):
-    """The fitted stem in the picture: seen from above, its axis at the origin, the sensor looking from below.
+    """The fitted stem seen from above: its axis is at the origin and the sensor is below the picture.
 
     Attributes:
         radius, radius_sigma: [m].
-        arc_deg: Visible arc; arc_start, arc_end: counter-clockwise from the picture's right [rad].
+        arc_deg: Visible arc; arc_start, arc_end: counter-clockwise from the right of the picture [rad].
         lean: Shift of the axis per metre of height, to the right and up in the picture.
         lean_deg: Angle of the axis from the vertical.
-        ellipse: Of the centre: half axes [m], direction of the longer one [rad].
+        ellipse: 1-sigma ellipse of the centre: half axes [m], direction of the major axis [rad].
     """
 
     radius: float
@@ -50,28 +52,30 @@ class Circle(msgspec.Struct, frozen=True):
     ellipse: tuple[float, float, float]
 
 
-class Told(msgspec.Struct, frozen=True):
-    """What one figure of a column says: the share of votes for a tree with it, less the share without."""
+class FeatureEffect(msgspec.Struct, frozen=True):
+    """Effect of one feature of a voxel column: share of votes for a tree with it minus the share without it."""
 
     figure: str
     value: float
     effect: float
 
 
-class Gathered(msgspec.Struct, frozen=True):
-    """What all scans together say of a place.
+class ColumnStory(msgspec.Struct, frozen=True):
+    """Classification of the accumulated scans at a place.
 
     Attributes:
-        verdict: In words.
-        distance: From what was asked for to the column [m].
-        votes: Share of each kind, by its name.
-        tree_share: Needed for a tree.
-        tree_in_free_air: Of the decision trees that tell a tree that ends in free air from a pole, the share
-            for a tree; None where they are not asked. `told` is of them where they say pole.
-        by_votes: Whether the votes decided; else a rule did, which `verdict` names.
-        present, absent: In how many gathered scans something, or nothing, stood there in free view.
-        viewed: How high above the ground any scan looked there [m].
-        told: The figures that told most, the strongest first.
+        verdict: Label of the verdict.
+        distance: Distance from the requested place to the axis of the column [m].
+        votes: Share of the votes by class.
+        tree_share: Share of the votes that a tree needs.
+        tree_in_free_air: For an object with a free upper end, the share of votes for a tree of the decision
+            trees that separate trees from poles; None otherwise. Where they vote for a pole, `told` explains
+            their votes.
+        by_votes: Whether the votes decided the verdict; otherwise a rule did.
+        present, absent: Number of accumulated scans with a clear view of the place in which it was occupied, and
+            in which it was empty.
+        viewed: Greatest height above ground that any scan observed there [m].
+        told: The most influential features, the strongest first.
     """
 
     verdict: str
@@ -83,7 +87,7 @@ class Gathered(msgspec.Struct, frozen=True):
     present: int
     absent: int
     viewed: float
-    told: list[Told]
+    told: list[FeatureEffect]
 
 
 class ClusterStory(msgspec.Struct, frozen=True):
@@ -91,27 +95,27 @@ class ClusterStory(msgspec.Struct, frozen=True):
 
     Attributes:
         scan, cluster: Number of the scan, and of the cluster in it.
-        time_s: Of the scan since the run's first one.
-        verdict: In words.
+        time_s: Time of the scan since the first scan of the run [s].
+        verdict: Label of the verdict.
         checks: All of them, in the order in which they decide.
-        size: Points in the cluster.
+        size: Number of points of the cluster.
         eccentricity: lambda1 / lambda2.
-        position: In the frame of the map [m].
-        distance: From the sensor [m].
-        sensor_sigma: Of a range [m].
-        points: Right and up in the picture, from the axis at their own height [m]; some of them if many.
-        residual: Of the same points from the circle, outside positive [m]; empty without a circle.
-        circle: None where the preset fits none, or the points are too few.
+        position: Position in the frame of the map [m].
+        distance: Distance from the sensor [m].
+        sensor_sigma: Standard deviation of a range [m].
+        points: Points (right, up) in the picture relative to the axis at their height [m]; at most 400.
+        residual: Residuals of the same points, positive outside of the circle [m]; empty without a circle.
+        circle: None if the preset fits no circle or the points are too few.
         axes: One standard deviation along the principal axes in the picture: (right, up) of each [m].
-        tree, tree_distance: The nearest confirmed tree in reach, None where there is none.
-        gathered: Of its place, None where nothing is gathered.
+        tree, tree_distance: The nearest confirmed tree and its distance [m]; None and NaN if none is near.
+        gathered: Classification of the accumulated scans at its place; None without them.
     """
 
     scan: int
     cluster: int
     time_s: float
     verdict: str
-    checks: list[Asked]
+    checks: list[Check]
     size: int
     eccentricity: float
     position: tuple[float, float]
@@ -123,12 +127,13 @@ class ClusterStory(msgspec.Struct, frozen=True):
     axes: list[tuple[float, float]]
     tree: int | None
     tree_distance: float
-    gathered: Gathered | None
+    gathered: ColumnStory | None
 
 
 class History(msgspec.Struct, frozen=True):
-    """A tree's estimates after scans that saw it, columns of equal length: time since the run's first scan
-    [s], position [m], half axes [m] and direction [rad] of its 1-sigma ellipse, DBH and its sigma [m]."""
+    """Estimates of a tree after the scans that detected it, as columns of equal length: time since the first
+    scan of the run [s], position [m], half axes [m] and direction [rad] of its 1-sigma ellipse, DBH and its
+    sigma [m]."""
 
     time_s: list[float]
     x: list[float]
@@ -145,19 +150,19 @@ class TreeStory(msgspec.Struct, frozen=True):
 
     Attributes:
         tree: Its number.
-        scan, time_s: What holds after this scan.
+        scan, time_s: The estimates are those after this scan.
         confirmed: Whether it is shown in the map.
-        position, ellipse: [m]; half axes [m] and direction of the longer one [rad].
-        dbh, dbh_sigma: [m], NaN where no arc carried one.
-        coverage_deg: Part of its circumference that was seen.
-        dbh_arc_deg: How much is needed for a DBH.
-        sides: Which of 36 sectors were seen, counted from x to y; empty where that is not known.
+        position, ellipse: [m]; half axes [m] and direction of the major axis [rad].
+        dbh, dbh_sigma: [m]; NaN if the DBH was not measured.
+        coverage_deg: Observed part of the circumference.
+        dbh_arc_deg: Part of the circumference that a DBH needs.
+        sides: Observed sectors of 36, counted from x to y; empty if unknown.
         eccentricity: Mean over the observations.
-        observations: Number of scans it was seen in.
+        observations: Number of scans that detected it.
         first_seen_s, last_seen_s: [s].
-        cluster: Its cluster in the standing scan, None where there is none.
-        gathered: Of its place, None where nothing is gathered.
-        history: In the order of time.
+        cluster: Row of its cluster in the current scan; None without one.
+        gathered: Classification of the accumulated scans at its place; None without them.
+        history: Estimates in order of time.
     """
 
     tree: int
@@ -176,5 +181,5 @@ class TreeStory(msgspec.Struct, frozen=True):
     first_seen_s: float
     last_seen_s: float
     cluster: int | None
-    gathered: Gathered | None
+    gathered: ColumnStory | None
     history: History

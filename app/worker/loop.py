@@ -18,7 +18,7 @@ from typing import TypeVar
 import msgspec
 
 from app.common.text import COMPILING
-from app.explain.recent_scans import Recent
+from app.explain.history import RecentScans
 from app.worker.internal_protocol import (
     Begin,
     FromWorker,
@@ -74,14 +74,14 @@ class Driver:
         commands: queue.Queue[ToWorker | None],
         put: Put,
         clock: Callable[[], float] = time.monotonic,
-        recent: Recent | None = None,
+        recent: RecentScans | None = None,
     ) -> None:
         self._session = session
         session.on_preview = lambda revision, trees: put(Rough(self._run, revision, trees))
         self._commands = commands
         self._put = put
         self._clock = clock
-        self._recent = recent or Recent()
+        self._recent = recent or RecentScans()
         self._answering = Answering(session, self._recent)
         self._taken: deque[ToWorker | None] = deque()
         self._pacer = Pacer()

@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 from msgspec import structs
 
-from app.explain.recent_scans import Recent
+from app.explain.history import RecentScans
 from app.worker.codec import WireError, from_worker
 from app.worker.internal_protocol import FromWorker, Opened, Report, Shown
 from app.worker.thin_frame import picture_of
@@ -33,9 +33,9 @@ class Mailbox:
         recent: Remembers the pictures that are sent.
     """
 
-    def __init__(self, stream: BinaryIO, recent: Recent | None = None) -> None:
+    def __init__(self, stream: BinaryIO, recent: RecentScans | None = None) -> None:
         self._stream = stream
-        self._recent = recent or Recent()
+        self._recent = recent or RecentScans()
         self._channel = from_worker()
         self._changed = threading.Condition()
         self._messages: deque[FromWorker] = deque()

@@ -20,7 +20,7 @@ from typing import BinaryIO
 
 from app.common.text import COMPILING
 from app.common.timers import Stopwatch
-from app.explain.recent_scans import Recent
+from app.explain.history import RecentScans
 from app.worker.codec import WireError, to_worker
 from app.worker.internal_protocol import ToWorker
 from app.worker.loop import Driver
@@ -79,7 +79,7 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     finished = threading.Event()
     reader = threading.Thread(target=_read, args=(incoming, commands, finished, session), daemon=True)
     reader.start()
-    recent = Recent()
+    recent = RecentScans()
     mailbox = Mailbox(outgoing, recent)
     driver = Driver(session, commands, mailbox.put, recent=recent)
     with on_compiling(_said_once(driver.compiling)):

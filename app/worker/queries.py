@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 
-from app.explain.recent_scans import Recent
+from app.explain.history import RecentScans
 from app.worker.camera import camera_picture
 from app.worker.internal_protocol import Answer, AskCamera, AskCompare, AskTree, Question
 from app.worker.session import Session
@@ -22,7 +22,7 @@ class Answering:
         recent: The pictures that were sent, of which people may ask.
     """
 
-    def __init__(self, session: Session, recent: Recent) -> None:
+    def __init__(self, session: Session, recent: RecentScans) -> None:
         self._session = session
         self._recent = recent
 

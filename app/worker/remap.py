@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from app.dashboard.map_changes import MapChanges, changes_between
-from app.explain.estimate_history import TreeHistory
+from app.explain.history import TreeHistory
 from app.worker.snapshots import ParameterHistory, Snapshots, nbytes
 from pipeline.config import Parameters
 from pipeline.remapping import ClusterTable, Rerun

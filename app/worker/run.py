@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from app.common.timers import Stopwatch
-from app.explain.estimate_history import TreeHistory
+from app.explain.history import TreeHistory
 from app.worker.cursor import Cursor, LiveCursor
 from app.worker.parallel import segment_ahead, segment_all
 from app.worker.remap import NOT_OF_THE_MAP, EarlierMaps, MapperLike, Remapping, RunMap

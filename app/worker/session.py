@@ -11,8 +11,7 @@ from pathlib import Path as FilePath
 from typing import Literal
 
 from app.dashboard.map_changes import MapChanges
-from app.explain import run_queries
-from app.explain.build import make_ready
+from app.explain import build as stories
 from app.explain.records import ClusterStory, TreeStory
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
@@ -182,7 +181,7 @@ class Session:
         if self._run is not None:
             self._compile_ahead()
             self._run.prepare()
-            make_ready(self._run.source.description.sensor)
+            stories.warm_up(self._run.source.description.sensor)
 
     def disturb(self) -> None:
         """What is being mapped waits for something that is no part of the mapping: its times do not count."""
@@ -310,7 +309,7 @@ class Session:
         Raises:
             StemmapError: There is no such cluster.
         """
-        return run_queries.cluster_story(self._run, frame, cluster)
+        return stories.cluster_story(self._run, frame, cluster)
 
     def tree_story(self, number: int) -> TreeStory:
         """The story of a tree as the standing scan knows it.
@@ -318,7 +317,7 @@ class Session:
         Raises:
             StemmapError: There is no such tree now.
         """
-        return run_queries.tree_story(self._run, number)
+        return stories.tree_story(self._run, number)
 
     def compare(self, sets: Sequence[Parameters]) -> list[Frame]:
         """The standing scan under each of other parameters; the run stays as it is.

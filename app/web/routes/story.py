@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query
 from starlette.responses import Response
 
-from app.explain.questions import NoStoryError
+from app.explain.client import NoStoryError
 from app.web.responses import failure_reply, json_reply
 from app.web.routes.access import Dash
 

@@ -1,4 +1,4 @@
-"""Stories made by hand."""
+"""Example stories."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import Any
 
 import msgspec
 
-from app.explain.records import Asked, Circle, ClusterStory, Gathered, History, Told, TreeStory
+from app.explain.records import Check, Circle, ClusterStory, ColumnStory, FeatureEffect, History, TreeStory
 
-TOO_LONG = Asked(
+TOO_LONG = Check(
     "eccentricity", "", 99.0, "at most", 60.0, "detection.e_max", "Eccentricity max", True, "too long"
 )
-GATHERED = Gathered(
+GATHERED = ColumnStory(
     verdict="tree",
     distance=0.1,
     votes={"tree": 0.9, "pole": 0.1},
@@ -21,7 +21,7 @@ GATHERED = Gathered(
     present=9,
     absent=1,
     viewed=4.0,
-    told=[Told("tilt", 0.01, 0.2)],
+    told=[FeatureEffect("tilt", 0.01, 0.2)],
 )
 
 
@@ -32,7 +32,7 @@ def cluster_story(**fields: Any) -> ClusterStory:
         time_s=23.1,
         verdict="too long",
         checks=[
-            Asked("eccentricity", "", 99.0, "at most", 60.0, "detection.e_max", "Eccentricity max", True, "x")
+            Check("eccentricity", "", 99.0, "at most", 60.0, "detection.e_max", "Eccentricity max", True, "x")
         ],
         size=3,
         eccentricity=99.0,

@@ -55,7 +55,7 @@ def test_a_pole_in_free_air_is_told_by_the_trees_that_took_it_for_one(
     forest = asked()
     monkeypatch.setattr(build, "kept_forests", lambda: lambda _name, _all_around: forest)
     frame = replace(make_frame(), columns=column(forest, top, thick))
-    story = build.gathered(frame, np.zeros(2), preset("forest"), SENSOR)
+    story = build.column_story(frame, np.zeros(2), preset("forest"), SENSOR)
     assert story is not None
     assert (story.tree_in_free_air, story.verdict) == (share, verdict)
     assert [figure.figure for figure in story.told] == told

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.explain import estimate_history as module
-from app.explain.estimate_history import TreeHistory, half_axes
+from app.explain import history as module
+from app.explain.history import RecentScans, TreeHistory, half_axes
 from tests.app.fakes import PERIOD_NS, START_NS, frame
 
 
@@ -71,3 +71,15 @@ def test_half_axes_give_the_ellipse_back(major: float, part: float, angle: float
     assert (a, b) == pytest.approx((major, minor), rel=1e-6)
     if part < 0.99:
         assert np.sin(turned - angle) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_the_newest_scans_are_kept_without_their_raw_points():
+    recent = RecentScans()
+    for index in range(100):
+        recent.keep(1, frame(index, index))
+    assert recent.find(1, 10) is None
+    assert recent.find(2, 99) is None
+    kept = recent.find(1, 99)
+    assert kept is not None
+    assert len(kept.raw) == 0
+    assert len(kept.filtered) > 0

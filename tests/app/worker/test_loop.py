@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from app.common.text import COMPILING
-from app.explain.recent_scans import Recent
+from app.explain.history import RecentScans
 from app.worker.codec import from_worker
 from app.worker.internal_protocol import (
     Answer,
@@ -388,7 +388,7 @@ def test_who_asks_is_answered_and_the_run_goes_on_as_it_did() -> None:
 
 
 def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    recent = Recent()
+    recent = RecentScans()
     mailbox = Mailbox(io.BytesIO(), recent)
     mailbox.put(Shown(1, 0.0, frame(0, 0), 0, path([0.0])))
     mailbox.close(timeout_s=5.0)
@@ -396,7 +396,7 @@ def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None
     said: list[FromWorker] = []
     for message in (Open("fake:"), AskCluster(1, 1, 0, 0), AskCluster(2, 1, 0, 7), None):
         waiting.put(message)
-    monkeypatch.setattr("app.explain.run_queries.tell_cluster", lambda *_: cluster_story())
+    monkeypatch.setattr("app.explain.build.cluster_of_frame", lambda *_: cluster_story())
     Driver(make_session(FakeSource(3)), waiting, said.append, recent=recent).run()
     answers = [message for message in said if isinstance(message, Answer)]
     assert answers[0].cluster == cluster_story()

@@ -1,6 +1,10 @@
-"""How the estimate of each tree came to where it is: a bounded memory of what each scan made of it."""
+"""Bounded memories for the stories: the estimates of each tree over time, and the scans shown last."""
 
 from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,19 +12,20 @@ from numpy.typing import NDArray
 from app.explain.records import History
 from pipeline.types.records import Frame
 
+_MOST_SCANS = 60  # at twenty scans per second a click may be three seconds old
 _WIDTH = 11  # scan, number, observations, time, x, y, var x, cov xy, var y, DBH, its sigma
 _SCAN, _NUMBER, _OBSERVATIONS, _TIME = range(4)
 _MOST_ROWS = 200_000
 _ALL_OF_FIRST = 10  # observations; there the ellipse shrinks fastest
-_MOST_TOLD = 200
+_MOST_RETURNED = 200  # rows
 _NS = 1_000_000_000
 
 
 class TreeHistory:
-    """What each scan made of the trees that it saw.
+    """The estimate of each tree after every scan that detected it.
 
-    The first ten estimates of each tree are kept, and the later ones of every scan; when all together are
-    more than 200,000, the later ones of every second scan are forgotten, again and again.
+    The first ten estimates of each tree are always kept. When more than 200,000 estimates are stored, the
+    later ones of every second scan are dropped, repeatedly.
     """
 
     def __init__(self) -> None:
@@ -45,11 +50,11 @@ class TreeHistory:
         self._append(rows)
 
     def of(self, number: int) -> History:
-        """The story of one tree: at most 200 rows, the first and the last among them."""
+        """Return the estimates of one tree: at most 200 rows, the first and the last among them."""
         known = self._rows[: self._count]
         mine = known[known[:, _NUMBER] == number]
-        if len(mine) > _MOST_TOLD:  # closer together where it is young
-            place = np.unique(np.geomspace(1, len(mine), _MOST_TOLD).astype(np.int64) - 1)
+        if len(mine) > _MOST_RETURNED:  # closer together where it is young
+            place = np.unique(np.geomspace(1, len(mine), _MOST_RETURNED).astype(np.int64) - 1)
             mine = mine[place]
         ellipse = half_axes(_matrices(mine[:, 6:9]))
         return History(
@@ -79,7 +84,11 @@ class TreeHistory:
 
 
 def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Half axes [m] and direction of the longer one [rad] of the 1-sigma ellipses of (T, 2, 2): (T, 3)."""
+    """Return half axes [m] and direction of the major axis [rad] of 1-sigma ellipses, shape (T, 3).
+
+    Args:
+        covariance: shape (T, 2, 2) [m^2].
+    """
     values, vectors = np.linalg.eigh(covariance)
     minor, major = np.sqrt(np.maximum(values, 0.0)).T
     return np.stack([major, minor, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])], axis=1)
@@ -106,3 +115,30 @@ def _rows_of(frame: Frame, start_ns: int) -> NDArray[np.float64]:
             trees.dbh_sigma[rows],
         ]
     )
+
+
+class RecentScans:
+    """The scans that were sent to the browsers last, without their raw points. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def keep(self, run: int, frame: Frame) -> None:
+        """Store a scan of a run that is being sent to the browsers."""
+        small = replace(frame, raw=np.zeros((0, 3), np.float32))
+        with self._lock:
+            self._frames[run, frame.index] = small
+            self._frames.move_to_end((run, frame.index))
+            while len(self._frames) > _MOST_SCANS:
+                self._frames.popitem(last=False)
+
+    def forget(self) -> None:
+        """Remove all scans."""
+        with self._lock:
+            self._frames.clear()
+
+    def find(self, run: int, scan: int) -> Frame | None:
+        """Return a scan as it was sent last; None if it is not stored any more."""
+        with self._lock:
+            return self._frames.get((run, scan))
