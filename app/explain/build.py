@@ -234,7 +234,7 @@ def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
 
 
 def _to_picture(centre: Float) -> Float:
-    """Return the rotation of level sensor coordinates so that up points away from the sensor, shape (2, 2)."""
+    """Return the rotation of level sensor coordinates after which up points away from the sensor, (2, 2)."""
     reach = max(float(np.hypot(*centre)), 1e-9)
     ux, uy = centre / reach
     return np.array([[uy, -ux], [ux, uy]])

@@ -53,7 +53,7 @@ class Circle(msgspec.Struct, frozen=True):
 
 
 class FeatureEffect(msgspec.Struct, frozen=True):
-    """Effect of one feature of a voxel column: share of votes for a tree with it minus the share without it."""
+    """Effect of a feature of a voxel column: share of votes for a tree with it minus the share without it."""
 
     figure: str
     value: float
@@ -72,8 +72,8 @@ class ColumnStory(msgspec.Struct, frozen=True):
             trees that separate trees from poles; None otherwise. Where they vote for a pole, `told` explains
             their votes.
         by_votes: Whether the votes decided the verdict; otherwise a rule did.
-        present, absent: Number of accumulated scans with a clear view of the place in which it was occupied, and
-            in which it was empty.
+        present, absent: Number of accumulated scans with a clear view of the place that show it occupied, and
+            that show it empty.
         viewed: Greatest height above ground that any scan observed there [m].
         told: The most influential features, the strongest first.
     """

@@ -48,7 +48,8 @@ def doubted(dashboard: Dashboard) -> list[dict[str, Any]]:
     """The found trees, the most doubted first, once the page asks for them in that order."""
     trees = {tree["number"]: tree for tree in dashboard.ask("/api/trees")["trees"]}
     told = [trees[each["tree"]] for each in dashboard.ask("/api/doubts")["trees"]]
-    numbers = "() => import('/static/js/annotate/annotations.js').then(it => it.unreviewed().map(tree => tree.number))"
+    module = "import('/static/js/annotate/annotations.js')"
+    numbers = f"() => {module}.then(it => it.unreviewed().map(tree => tree.number))"
     wanted = [tree["number"] for tree in told[:2]]
     dashboard.eventually(
         lambda: dashboard.page.evaluate(numbers)[:2] == wanted, lambda: dashboard.page.evaluate(numbers)

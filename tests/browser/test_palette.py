@@ -39,7 +39,8 @@ def test_the_sheet_names_every_key_that_acts(dashboard: Dashboard):
     page.locator("#map").press("?")
     told = page.locator("#keys-list kbd").all_inner_texts()
     acting = page.evaluate(
-        "() => import('/static/js/shell/actions.js').then(all => all.ACTIONS.map(row => row[2]).filter(Boolean))"
+        "() => import('/static/js/shell/actions.js')"
+        ".then(all => all.ACTIONS.map(row => row[2]).filter(Boolean))"
     )
     shown = {" ": "space", "Escape": "esc"}
     assert {shown.get(key, key) for key in acting} <= set(told)
