@@ -27,7 +27,7 @@ PARTICLES = 30  # of the local map
 EVERY = 3  # scans between two searches
 HYPOTHESES = 100_000
 FARTHEST = 100.0  # m; after so long a search the map goes on where the odometry leads
-SEED_OFFSET = 1  # added to the seed of the run, for the local map
+LOCAL_MAP = 1  # spawn key of the random numbers of the local map
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +67,7 @@ class Relocaliser(Generic[S]):
     """Finds a lost robot in the map of a mapper whose states are of type S."""
 
     def __init__(self, seed: int) -> None:
-        self._seed = seed + SEED_OFFSET
+        self._seed = local_seed(seed)
         self.state: RelocaliserState[S] = RelocaliserState()
 
     @property
@@ -172,3 +172,8 @@ def _stems(slam: FastSlam, parameters: Parameters) -> Stems:
     known = landmarks.hits >= parameters.slam.hits_to_weigh
     unknown = np.full(int(np.count_nonzero(known)), np.nan)
     return Stems(landmarks.mean[known], worst_sigma(landmarks.covariance[known]), unknown, unknown)
+
+
+def local_seed(seed: int) -> int:
+    """The seed of the local map: independent of the seeds of all runs, also of those with a near seed."""
+    return int(np.random.SeedSequence(seed, spawn_key=(LOCAL_MAP,)).generate_state(1)[0])

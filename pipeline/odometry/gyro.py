@@ -23,7 +23,10 @@ BLOCKS_MOST = 20  # that are averaged: the bias wanders
 STILL_SIGMA, STILL_MOST = 0.03, 0.1  # rad/s; scatter and mean of a block in which the robot stands
 DEAD = 20  # the same reading so many times is no gyroscope
 NOISE = 1e-3  # rad/sqrt(s), of a small MEMS gyroscope on a robot that shakes
-SCALE = 0.01  # of the turn
+SCALE = 0.01  # of the turn: one sigma of the scale error
+# rad; over a turn of this size the scale error is the same, so that the sigmas of its steps add up, not their
+# variances (as WANDERS does for the bias).
+SCALE_TURN = math.pi / 2.0
 BIAS_UNKNOWN, BIAS_KNOWN = 0.01, 5e-4  # rad/s
 WANDERS = 10.0  # s, over which what is left of a bias errs alike: short scans must not take it for noise
 CONTRADICTION, CONTRADICTION_LEAST = 4.0, 0.01  # sigma, rad
@@ -121,7 +124,7 @@ class Gyro:
         if self._blocks:
             bias_sigma = math.hypot(BIAS_KNOWN, self._scatter / math.sqrt(BLOCK * self._blocks))
         of_bias = bias_sigma**2 * seconds * max(seconds, WANDERS)
-        variance = NOISE**2 * seconds + of_bias + (SCALE * angle) ** 2
+        variance = NOISE**2 * seconds + of_bias + SCALE**2 * abs(angle) * max(abs(angle), SCALE_TURN)
         return Turn(angle, math.sqrt(variance))
 
     def rate(self, stamp_ns: int) -> float | None:

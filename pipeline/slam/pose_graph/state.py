@@ -16,6 +16,7 @@ from pipeline.slam.resampling import normalised
 from pipeline.slam.running_statistics import Recent
 from pipeline.slam.state import SlamState
 
+HANDED_OVER = 2  # distinguishes these draws from those of a scan and of a placing
 NOTHING = np.full(3, np.nan)  # the odometry to a keyframe that it does not lead to
 
 
@@ -115,7 +116,7 @@ class GraphState:
         knows of the errors that landmarks share is lost."""
         path = self.path()
         values, axes = np.linalg.eigh(self.covariance)
-        rng = np.random.default_rng([seed, len(path)])
+        rng = np.random.default_rng([seed, len(path), HANDED_OVER])
         noise = rng.standard_normal((particles, 3))
         pose = self.pose + noise @ (axes * np.sqrt(np.maximum(values, 0.0))).T
         pose[:, 2] = wrap_angle(pose[:, 2])

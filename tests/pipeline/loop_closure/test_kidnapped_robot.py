@@ -13,10 +13,11 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers import open_source
-from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
+from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState, local_seed
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import Motion, SlamState
+from pipeline.slam.random_draws import draws
 from pipeline.types.sensor_data import PoseMeasurement
 from tests.pipeline.strategies import NOTHING_SEEN, detections
 from tests.pipeline.test_mapper import as_bytes
@@ -182,3 +183,10 @@ def test_measured_poses_are_of_the_map_and_not_of_the_small_one_of_a_search():
         assert recovery.search(index, motion, seen, NOTHING_SEEN, preset("forest"), run) is None
     assert recovery.state.local is not None
     np.testing.assert_allclose(recovery.state.local.pose.mean(axis=0), [0.3, 0.0, 0.0], atol=0.1)
+
+
+def test_the_local_map_shares_no_random_numbers_with_runs_of_near_seeds():
+    local, _ = draws(local_seed(4), 7, 10)
+    for seed in range(10):
+        run, _ = draws(seed, 7, 10)
+        assert not np.array_equal(local, run)

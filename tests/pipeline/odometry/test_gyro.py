@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.mapper import Mapper
-from pipeline.odometry.gyro import SLIPPED, Gyro, fused
+from pipeline.odometry.gyro import BIAS_UNKNOWN, NOISE, SLIPPED, WANDERS, Gyro, fused
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing.acquisition import acquire
 from pipeline.slam.motion import Motion, accumulated
@@ -86,6 +87,17 @@ def test_the_sigma_of_a_turn_knows_how_well_the_bias_was_learnt(blocks):
         assert turn is not None
         z.append(turn.angle / turn.sigma)
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+@pytest.mark.parametrize("steps", [1, 10, 50])
+def test_the_scale_error_is_the_same_in_all_steps_of_a_turn(steps):
+    """One percent of 90 degrees is 0.9 degrees, however many scans the turn takes."""
+    gyro = told(lambda _: np.radians(90.0) / 5.0, 5100)
+    times = [START + 5000 * MS * k // steps for k in range(steps + 1)]
+    turns = [gyro.turn(*pair) for pair in pairwise(times)]
+    others = NOISE**2 * 5.0 + steps * BIAS_UNKNOWN**2 * (5.0 / steps) * max(5.0 / steps, WANDERS)
+    scale = np.sqrt(sum(turn.sigma**2 for turn in turns) - others)
+    assert np.degrees(scale) == pytest.approx(0.9, rel=0.02)
 
 
 def test_a_robot_that_is_turned_by_hand_teaches_no_bias():
