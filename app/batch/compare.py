@@ -1,4 +1,4 @@
-"""Two finished maps side by side: one is laid upon the other, and each tree finds its partner."""
+"""Comparison of two finished maps: aligns one with the other and pairs their trees."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.sources import sandbox
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
 
-# Farther apart than MATCH two trees are two; farther than MOVED one tree stands elsewhere [m].
+# Trees within MATCH are the same tree; beyond MOVED its position has changed [m].
 MATCH, MOVED = 0.5, 0.1
 _LEAST_SIGMA = 0.02
 
@@ -20,16 +20,16 @@ Run = dict[str, Any]
 
 
 async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
-    """Run b against run a, both with their `map`.
+    """Compare run b with run a, both with their `map`.
 
-    Two runs of one recording begin at the same place, so their maps share a frame. Others are laid upon
-    one another by the distances between their stems, or compared as they stand where those do not agree.
+    Maps of the same recording share a frame. Others are aligned by the distances between their stems, or
+    compared without alignment where those do not agree.
 
     Returns:
-        The tables as the page shows them; what is of b stands in the frame of a.
+        The tables of the page; positions of b are in the frame of a.
     """
-    known, how = (Pose2(), "same recording") if same_source else await laid(a, b)
-    pose, how = (Pose2(), f"as they stand: {how}") if known is None else (known, how)
+    known, how = (Pose2(), "same recording") if same_source else await align(a, b)
+    pose, how = (Pose2(), f"not aligned: {how}") if known is None else (known, how)
     place_a, place_b = _places(a), pose.apply(_places(b))
     pairs, only_a, only_b = await asyncio.to_thread(
         _paired, a["map"]["trees"], b["map"]["trees"], place_a, place_b
@@ -54,16 +54,15 @@ async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
     }
 
 
-async def laid(a: Run, b: Run) -> tuple[Pose2 | None, str]:
-    """The pose of b in a, both with their `map`, and how it is known, in words; None and why, where it is
-    not."""
+async def align(a: Run, b: Run) -> tuple[Pose2 | None, str]:
+    """Return the pose of map b in map a and how it was found; where it is unknown, None and the reason."""
     try:
         found = await sandbox.ask({"ask": "laid", "local": _stems(b), "reference": _stems(a)})
     except StemmapError as error:
         return None, error.what
     if found["pose"] is None:
         return None, f"their stems do not agree with certainty ({found['reason']})"
-    return Pose2(*found["pose"]), f"laid upon one another by {found['stems']} stems"
+    return Pose2(*found["pose"]), f"aligned by {found['stems']} stems"
 
 
 def _stems(run: Run) -> list[list[float | None]]:
@@ -86,7 +85,7 @@ def _rows(points: list[list[float]]) -> Float:
 def _paired(
     a: list[dict[str, Any]], b: list[dict[str, Any]], place_a: Float, place_b: Float
 ) -> tuple[list[dict[str, Any]], list[int], list[int]]:
-    """The trees in both, the farthest apart first, and the numbers of those in one alone."""
+    """The trees of both maps, the largest shift first, and the numbers of those in only one map."""
     from pipeline.evaluation import match
 
     a_of = match(place_b, place_a, MATCH)
@@ -114,7 +113,7 @@ def _change(before: float | None, after: float | None) -> float | None:
 
 
 def _differences(a: dict[str, Any], b: dict[str, Any]) -> list[dict[str, Any]]:
-    """The parameters that differ, by dotted name."""
+    """The parameters that differ."""
     names = dict.fromkeys([*a, *b])
     return [
         {"name": name, "a": _plain(a.get(name)), "b": _plain(b.get(name))}

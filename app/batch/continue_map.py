@@ -1,21 +1,27 @@
-"""How a run begins: at the origin, or in the map that another run saved."""
+"""Continuing a map: the saved state of a run (`state.zip`), and where another run starts in its map."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from app.batch.run_totals import Tally
-from app.batch.saved_run import RunSource, SavedRun
+from app.batch.run_folder import is_of_cloud, read_run_record
+from app.batch.summary import RunTotals
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
+from pipeline.config.model import validated
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
+from pipeline.io.checkpoints import decode, encode, read_archive, write_archive
+from pipeline.io.checkpoints.archive import damaged
+from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.base import Source
 from pipeline.loop_closure.stem_matching import Match, Stems, find_constellation
@@ -23,37 +29,142 @@ from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import OdometryChoice, steps
 from pipeline.types.records import Step, Truth
 
+STATE = "state.zip"
+FORMAT = 8
+LARGEST_FILE = 4 << 30
 Start = Literal["auto", "resume", "last"] | Pose2
-GIVEN_SIGMA = (0.3, 0.3, np.radians(5.0))  # m, m, rad; how well a person can tell a pose
-PAUSE_NS = 1_000_000_000  # between two runs, where the clock of the second does not follow
-FIRST_TRY, NEXT_TRY = 10, 1.3  # scans, and by which factor more before it is tried again
+GIVEN_SIGMA = (0.3, 0.3, np.radians(5.0))  # m, m, rad; accuracy of a pose that a user gives
+PAUSE_NS = 1_000_000_000  # between two runs whose times overlap
+FIRST_TRY, NEXT_TRY = 10, 1.3  # first attempt after so many scans, then after 1.3 times as many
 HYPOTHESES = 1_000_000
-KNOWN_ALREADY = "this very recording is in the map already: it tells nothing new, its errors count twice"
+KNOWN_ALREADY = "this recording is already part of the map; its errors count twice"
+
+
+@dataclass(frozen=True, slots=True)
+class RunSource:
+    """One source of a map.
+
+    Attributes:
+        uri, digest: See SourceDescription.
+        from_scan: Number of its first scan in the run.
+        start: How its first pose was found: "origin", "resume", "last", "given" or "constellation".
+        pose: T_map_start: x, y [m], yaw [rad] of its first pose.
+        stems: Number of stems that agreed with that pose; 0 where it was not found by stems.
+        stamp_shift_ns: Offset that was added to its times, so that they follow the earlier sources.
+    """
+
+    uri: str
+    digest: str
+    from_scan: int
+    start: str
+    pose: tuple[float, float, float]
+    stems: int
+    stamp_shift_ns: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Continued:
-    """A saved run to go on from, and where the robot starts in it."""
+class SavedRun:
+    """The state with which a run can be continued.
+
+    Attributes:
+        format: Version of the file.
+        sources: The mapped sources, oldest first.
+        preset, parameters: Name of the preset, and JSON of all parameters.
+        seed: Random seed.
+        start_ns: Time of the first scan.
+        tally: Counts so far.
+        losses: Messages that were left out, by reason.
+        map: State of the mapper.
+    """
+
+    format: int
+    sources: tuple[RunSource, ...]
+    preset: str
+    parameters: str
+    seed: int
+    start_ns: int
+    tally: RunTotals
+    losses: dict[str, int]
+    map: SavedMap
+
+    def chosen_parameters(self) -> Parameters:
+        """Return the parameters at the end of the run."""
+        return validated(json.loads(self.parameters))
+
+    def as_bytes(self) -> bytes:
+        """Return the contents of the file."""
+        return write_archive(*encode(self))
+
+
+def read_saved_run(folder: Path) -> SavedRun:
+    """Read the saved state in the folder of a run.
+
+    Raises:
+        StemmapError: There is none, or it is damaged or has another version.
+    """
+    file = folder / STATE
+    try:
+        if file.stat().st_size > LARGEST_FILE:
+            raise damaged(str(file), "it is larger than 4 GB")
+        data = file.read_bytes()
+    except OSError as error:
+        if _is_map_of_cloud(folder):
+            raise StemmapError(
+                "this is the map of a whole cloud, which cannot be continued",
+                where=str(folder),
+                remedy="Map a drive and continue that map, or drive through the cloud with sim:cloud?file=",
+            ) from None
+        raise StemmapError(
+            f"there is no saved state: {error.strerror}",
+            where=str(file),
+            remedy="Name a folder that `stemmap map` wrote",
+        ) from None
+    tree, blob = read_archive(data, str(file))
+    if isinstance(tree, dict) and tree.get("format") != FORMAT:
+        raise damaged(str(file), f"it has format {tree.get('format')!r} and not {FORMAT}")
+    try:
+        saved = decode(SavedRun, tree, blob)
+        if not saved.sources or not len(saved.map.stamp_ns):
+            raise ValueError("there is no scan in it")
+        saved.map.state()
+        saved.chosen_parameters()
+    except (ValueError, RecursionError) as error:
+        raise damaged(str(file), str(error)) from None
+    except StemmapError as error:
+        raise damaged(str(file), error.what) from None
+    return saved
+
+
+def _is_map_of_cloud(folder: Path) -> bool:
+    try:
+        return is_of_cloud(read_run_record(folder))
+    except StemmapError:
+        return False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContinuedMap:
+    """A saved run that is continued, and where the robot starts in its map."""
 
     saved: SavedRun
     start: Start
 
 
 @dataclass(slots=True, eq=False)
-class Beginning:
-    """From where a run goes on.
+class RunStart:
+    """How a run begins: as the first of a map, or after earlier runs.
 
     Attributes:
-        tally: What was counted before; losses: by reason.
-        scans: Mapped before.
-        sources: All of them, this one the last.
-        start_ns: Time of the first scan of all, None when there was none yet.
-        after_ns: Scans up to this time were mapped before.
-        stamp_shift_ns: To be added to the times of this source.
-        truth: What is known of the map's frame, where this source's own truth is in another one.
+        tally, losses: Counts of the earlier runs.
+        scans: Number of scans of the earlier runs.
+        sources: All sources, the present one last.
+        start_ns: Time of the first scan of all; None before it.
+        after_ns: Scans up to this time are in the map already.
+        stamp_shift_ns: Offset that is added to the times of this source.
+        truth: Ground truth in the frame of the map, where the source's own truth is in another frame.
     """
 
-    tally: Tally
+    tally: RunTotals
     scans: int = 0
     sources: tuple[RunSource, ...] = ()
     start_ns: int | None = None
@@ -63,7 +174,7 @@ class Beginning:
     truth: Truth | None = None
 
     def steps(self, source: Source, odometry: OdometryChoice, left_out: Counter[str]) -> Iterator[Step]:
-        """The steps that are still to be mapped, numbered on."""
+        """Return the steps that are not in the map yet, with continued numbers and times."""
         index = self.scans
         for step in steps(source.records(), odometry=odometry, losses=left_out):
             stamp = step.scan.stamp_ns + self.stamp_shift_ns
@@ -73,34 +184,34 @@ class Beginning:
             index += 1
 
 
-def at_origin(source: Source, warnings: list[str]) -> Beginning:
-    """The first run of a map."""
+def at_origin(source: Source, warnings: list[str]) -> RunStart:
+    """Return the start of the first run of a map."""
     known = source.description
     first = RunSource(known.uri, known.digest, 0, "origin", (0.0, 0.0, 0.0), 0, 0)
-    return Beginning(Tally(Counter(warnings)), sources=(first,))
+    return RunStart(RunTotals(Counter(warnings)), sources=(first,))
 
 
-def go_on(
-    continued: Continued,
+def continue_map(
+    continued: ContinuedMap,
     source: Source,
     mapper: Mapper,
     odometry: OdometryChoice,
     seed: int,
     warnings: list[str],
-) -> Beginning:
-    """Give a fresh mapper the saved map, and find where the robot starts in it.
+) -> RunStart:
+    """Load the saved map into a new mapper, and find where the robot starts in it.
 
     Raises:
-        StemmapError: It was to be found by its stems and was not.
+        StemmapError: The start is to be found by the stems, and was not.
     """
     saved, start = continued.saved, continued.start
     path = saved.map.stamp_ns
-    beginning = Beginning(
+    begin = RunStart(
         saved.tally, len(path), saved.sources, saved.start_ns, int(path[-1]), losses=Counter(saved.losses)
     )
     if start == "resume":
         mapper.load(saved.map.state(), path, saved.map.sigma_xy, saved.map.motion)
-        return _resumed(beginning, source)
+        return _resumed(begin, source)
     found: Match | None = None
     pose = start if isinstance(start, Pose2) else None
     covariance = np.diag(np.square(GIVEN_SIGMA))
@@ -115,47 +226,47 @@ def go_on(
         pose = Pose2(float(end.x[-1]), float(end.y[-1]), float(end.yaw[-1]))
     else:
         mapper.place(len(path), pose, covariance)
-    return _in_another_run(beginning, source, start, pose, found, warnings)
+    return _in_another_run(begin, source, start, pose, found, warnings)
 
 
-def _resumed(beginning: Beginning, source: Source) -> Beginning:
-    known, last = source.description, beginning.sources[-1]
-    beginning.stamp_shift_ns = last.stamp_shift_ns
+def _resumed(begin: RunStart, source: Source) -> RunStart:
+    known, last = source.description, begin.sources[-1]
+    begin.stamp_shift_ns = last.stamp_shift_ns
     if known.digest == last.digest:
-        beginning.losses.clear()  # they are counted anew: the source is read from its start
-        return beginning
-    part = RunSource(known.uri, known.digest, beginning.scans, "resume", last.pose, 0, last.stamp_shift_ns)
-    beginning.sources += (part,)
-    return beginning
+        begin.losses.clear()  # they are counted again, because the source is read from its start
+        return begin
+    part = RunSource(known.uri, known.digest, begin.scans, "resume", last.pose, 0, last.stamp_shift_ns)
+    begin.sources += (part,)
+    return begin
 
 
 def _in_another_run(
-    beginning: Beginning, source: Source, start: Start, pose: Pose2, found: Match | None, warnings: list[str]
-) -> Beginning:  # fmt: skip
-    known, after_ns = source.description, beginning.after_ns or 0
+    begin: RunStart, source: Source, start: Start, pose: Pose2, found: Match | None, warnings: list[str]
+) -> RunStart:  # fmt: skip
+    known, after_ns = source.description, begin.after_ns or 0
     first_ns = next((s.scan.stamp_ns for s in steps(source.records(), odometry="static")), 0)
-    beginning.stamp_shift_ns = max(after_ns + PAUSE_NS - first_ns, 0) if first_ns <= after_ns else 0
+    begin.stamp_shift_ns = max(after_ns + PAUSE_NS - first_ns, 0) if first_ns <= after_ns else 0
     how = "given" if isinstance(start, Pose2) else "last" if start == "last" else "constellation"
     part = RunSource(
-        known.uri, known.digest, beginning.scans, how, (pose.x, pose.y, pose.yaw),
-        0 if found is None else len(found.local), beginning.stamp_shift_ns,
+        known.uri, known.digest, begin.scans, how, (pose.x, pose.y, pose.yaw),
+        0 if found is None else len(found.local), begin.stamp_shift_ns,
     )  # fmt: skip
-    if known.digest in (part.digest for part in beginning.sources):
-        beginning.tally.warned[f"{KNOWN_ALREADY} ({known.uri})"] += 1
-    beginning.truth = _truth_of(beginning.sources[0].uri)
-    beginning.sources += (part,)
-    beginning.tally.warned.update(warnings)
-    return beginning
+    if known.digest in (part.digest for part in begin.sources):
+        begin.tally.warned[f"{KNOWN_ALREADY} ({known.uri})"] += 1
+    begin.truth = _truth_of(begin.sources[0].uri)
+    begin.sources += (part,)
+    begin.tally.warned.update(warnings)
+    return begin
 
 
 def localise(
     source: Source, parameters: Parameters, reference: Stems, odometry: OdometryChoice, seed: int
 ) -> Match:
-    """Where a source's first pose is in a map: its first scans are mapped apart until their stems are
-    found there.
+    """Find the first pose of a source in a map. The first scans are mapped separately until their stems
+    match.
 
     Raises:
-        StemmapError: No part of the source was found, with the reason of the last refusal.
+        StemmapError: No match was found; the message has the last reason.
     """
     mapper = mapper_of(source.description, parameters, seed)
     due, frame, match = float(FIRST_TRY), None, None
@@ -175,14 +286,14 @@ def localise(
         if match.pose is not None:
             return match
     raise StemmapError(
-        f"the robot was not found in the saved map: {match.reason if match else 'there is no scan'}",
+        f"the robot was not found in the saved map: {match.reason if match else 'the source has no scan'}",
         where=source.description.uri,
-        remedy="Say where it starts with --start X,Y,YAW (m, m, degrees) or --start last",
+        remedy="Give the start with --start X,Y,YAW (m, m, degrees) or --start last",
     )
 
 
 def _truth_of(uri: str) -> Truth:
-    """The true trees of the first run, in whose frame the map is; none where it cannot be asked."""
+    """The true trees of the first run, whose frame is that of the map; none where it cannot be opened."""
     try:
         with closing(open_source(uri, SourceOptions())) as source:
             known = source.truth()

@@ -1,8 +1,7 @@
-"""A whole cloud of a plot mapped into a folder, with the same files as a run.
+"""Maps a whole cloud of a plot and writes the same files as for a run.
 
-Positions are in the cloud's own coordinates. `path.csv` has a header and no row, because nobody drove, and
-there is no `state.zip`, with which a drive goes on; `slices.csv` stands beside the files of a run and tells
-every circle of every tree, and `terrain.csv` the ground where the cloud shows it.
+Positions are in the coordinates of the cloud. `path.csv` has no rows, because there is no drive, and there is
+no `state.zip`. `slices.csv` contains the cross-sections of all trees, `terrain.csv` the visible ground.
 """
 
 from __future__ import annotations
@@ -10,12 +9,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
+from app.batch.map_run import Outcome
 from app.batch.run_folder import as_written
 from app.batch.summary import evaluation_lines
 from app.common.text import changed_values, count, preset_words
@@ -43,23 +43,14 @@ SLICE_COLUMNS = (
 )
 
 
-@dataclass(slots=True, eq=False)
-class PlotOutcome:
-    """What came of a plot, for people: lines to print, warnings, and what was left out by reason."""
-
-    summary: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    losses: dict[str, int] = field(default_factory=dict)
-
-
 def map_plot_run(
     cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, folder: FilePath
-) -> PlotOutcome:
+) -> Outcome:
     """Map a whole cloud and write its files.
 
     Raises:
-        SourceError: Nothing could be read.
-        OSError: The folder could not be written; nothing new stands in it then.
+        SourceError: The cloud cannot be read.
+        OSError: The folder cannot be written; it is unchanged then.
     """
     files = RunFiles(folder)
     try:
@@ -71,7 +62,7 @@ def map_plot_run(
 
 def _map(
     cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, files: RunFiles
-) -> PlotOutcome:
+) -> Outcome:
     about = cloud.description
     plot = map_plot(cloud, parameters, kept_forests())
     trees = replace(plot.trees, position=plot.trees.position + about.offset[:2])
@@ -99,7 +90,7 @@ def _map(
         },
     )
     summary = [*_summary(about.uri, plot, trees, evaluation), preset_words(preset, parameters)]
-    return PlotOutcome(summary, warnings, losses)
+    return Outcome(summary, warnings, losses)
 
 
 _OWN_FRAME = {**ROBOTS_FRAME, "origin": "that of the cloud"}
@@ -108,7 +99,7 @@ _NO_PATH = Path(_NOTHING.astype(np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHIN
 
 
 def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
-    """Longitude and latitude (WGS84) of places, None where their reference system is not known."""
+    """Longitude and latitude (WGS84) of positions; None where their reference system is unknown."""
     if not crs:
         return None
     import pyproj
@@ -120,7 +111,7 @@ def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
     except pyproj.exceptions.ProjError:
         lon_lat = np.full((1, 2), np.inf)
     if not np.isfinite(lon_lat).all():
-        warnings.append("the cloud's coordinate reference system is not understood: no WGS84 coordinates")
+        warnings.append("unknown coordinate reference system of the cloud: no WGS84 coordinates")
         return None
     return lon_lat
 
@@ -163,8 +154,8 @@ def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
 
 
 def _terrain_rows(ground: HeightMap, offset: Float) -> Iterator[list[str]]:
-    """The middles of the cells in which returns of the ground lay, from west to east; what was filled in
-    between is not told. A cloud has no views to be counted, and how far the heights err is not known."""
+    """The centres of the cells with ground returns, from west to east, without interpolated cells. The number
+    of views and the uncertainty of the heights are unknown for a cloud."""
     columns, rows = np.nonzero(ground.seen)
     place = ground.low + (np.stack([columns, rows], axis=1) + 0.5) * ground.cell + offset[:2]
     height = ground.height[columns, rows] + offset[2]
@@ -218,7 +209,7 @@ def _range(values: Float) -> tuple[float, float]:
 
 def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: Evaluation | None) -> list[str]:
     dbh = 100.0 * trees.dbh[np.isfinite(trees.dbh)]
-    wide = f", DBH {dbh.min():.1f} to {dbh.max():.1f} cm ({len(dbh)} told)" if len(dbh) else ", no DBH"
+    wide = f", DBH {dbh.min():.1f} to {dbh.max():.1f} cm ({len(dbh)} measured)" if len(dbh) else ", no DBH"
     verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict if v != Verdict.TREE)
     refused = ", ".join(f"{n} {label}" for label, n in sorted(verdicts.items()))
     lines = [

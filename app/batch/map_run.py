@@ -1,4 +1,4 @@
-"""A run mapped from its first to its last scan, in this process, into a folder."""
+"""Maps a run from its first to its last scan, in this process, and writes its files to a folder."""
 
 from __future__ import annotations
 
@@ -11,11 +11,16 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from app.batch.continue_map import Beginning, Continued, at_origin, go_on
-from app.batch.driven_distance import breaks_of, driven
+from app.batch.continue_map import (
+    FORMAT,
+    ContinuedMap,
+    RunStart,
+    SavedRun,
+    at_origin,
+    continue_map,
+)
 from app.batch.run_folder import as_written
-from app.batch.saved_run import FORMAT, SavedRun
-from app.batch.summary import start_lines, summary_lines
+from app.batch.summary import breaks_of, driven, start_lines, summary_lines
 from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
 from app.common.text import changed_values, count, preset_words
@@ -33,27 +38,27 @@ from pipeline.jit import on_compiling
 from pipeline.mapper import Mapper
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
-MEASURED_SCANS = 100_000  # of which times are kept for the medians
+MEASURED_SCANS = 100_000  # whose times enter the medians
 
 
 class Progress(Protocol):
-    """What shows how far it is; tqdm is one."""
+    """A progress display, such as tqdm."""
 
     def update(self, n: int = 1, /) -> object:
-        """So many scans more."""
+        """Add completed scans."""
 
     def close(self) -> None:
-        """No more will come."""
+        """End the display."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OfflineRun:
-    """What to map, and how.
+    """A run to be mapped.
 
     Attributes:
-        odometry: Where the motion comes from, as asked, see `app.sources.opening`.
-        stop_after: So many scans.
-        revisions: Other parameters, each from a scan on, in their order.
+        odometry: Source of the motion, see `app.sources.opening`.
+        stop_after: Largest number of scans.
+        revisions: Parameter changes: first scan and parameters.
         on_frame: Told of each scan's results.
         chosen: Topics and mounting that were asked for, see `SourceRequest.kept_choices`.
     """
@@ -64,7 +69,7 @@ class OfflineRun:
     seed: int
     odometry: str
     truth_trees: TruthTrees | None = None
-    continued: Continued | None = None
+    continued: ContinuedMap | None = None
     stop_after: int | None = None
     revisions: tuple[tuple[int, Parameters], ...] = ()
     on_frame: Callable[[Frame, Mapper], None] | None = None
@@ -73,14 +78,13 @@ class OfflineRun:
 
 @dataclass(slots=True, eq=False)
 class Outcome:
-    """What came of it, for people.
+    """The result of a mapping command, for people.
 
     Attributes:
         summary: Lines to print.
-        warnings: Each once, with how often it came.
-        losses: What was left out, by reason.
-        scan_ms, stage_ms: Median time of a scan and of each stage [ms]; what waited for a kernel to be
-            compiled does not count.
+        warnings: Each warning once, with its number.
+        losses: Numbers of messages or points that were left out, by reason.
+        scan_ms, stage_ms: Median time of a scan and of each stage [ms], without compilation.
     """
 
     summary: list[str] = field(default_factory=list)
@@ -96,14 +100,14 @@ def map_run(
     """Map a run and write its files.
 
     Args:
-        plan: What to map.
-        folder: For the files.
-        progress: Told of each scan.
+        plan: The run.
+        folder: Folder for the files.
+        progress: Updated after each scan.
         earlier: Folder of the run that is continued.
 
     Raises:
-        SourceError: Nothing could be read.
-        OSError: The folder could not be written; nothing new stands in it then.
+        SourceError: The source cannot be read.
+        OSError: The folder cannot be written; it is unchanged then.
     """
     files = RunFiles(folder, earlier)
     stopwatch = Stopwatch(scans=MEASURED_SCANS)
@@ -121,7 +125,7 @@ def map_run(
 
 
 class _Mapped(NamedTuple):
-    """What pictures of trees are made of, once the map is written."""
+    """Input for the pictures of trees, which are made after the map is written."""
 
     source: Source
     trees: Trees
@@ -155,9 +159,9 @@ def _map(
     counted = begun.losses + left_out + Counter(plan.source.losses)
     losses = {reason: n for reason, n in counted.items() if n}
     state = _saved(plan, begun, mapper, start_ns, losses).as_bytes()
-    tally.tell_of_far_truth(evaluation)
+    tally.warn_of_far_truth(evaluation)
     if plan.parameters.classification.method == "none":  # else a track is judged by more than its hits
-        tally.tell_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
+        tally.warn_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
     record["odometry_used"] = chosen.words
@@ -182,17 +186,17 @@ def _map(
 def _map_scans(
     plan: OfflineRun,
     mapper: Mapper,
-    begun: Beginning,
+    begun: RunStart,
     to_map: Iterable[Step],
     files: RunFiles,
     progress: Progress,
     stopwatch: Stopwatch,
 ) -> tuple[Frame, int]:
-    """Map scan by scan; the last frame, and the stamp [ns] that times are told from."""
+    """Map scan by scan. Returns the last frame and the time of the first scan [ns]."""
     start_ns, frame = begun.start_ns, None
     for step in to_map:
         _use_revisions(plan, mapper, step.index)
-        # The first scan loads the kernels, which takes many times longer than to map it.
+        # The first scan loads the kernels, which takes much longer than mapping.
         with stopwatch.aside() if frame is None else stopwatch.whole_scan():
             frame = mapper.process(step)
         if plan.on_frame is not None:
@@ -208,13 +212,13 @@ def _map_scans(
 
 
 def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: Outcome) -> None:
-    """The map stands whole: whatever happens here takes nothing away from it."""
+    """The map is complete already; errors here become warnings."""
     try:
         kept, told = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
     except (StemmapError, OSError) as error:
-        kept, told = 0, f"not all pictures of trees were made: {error}"
+        kept, told = 0, f"some pictures of trees are missing: {error}"
     except KeyboardInterrupt:
-        kept, told = 0, "not all pictures of trees were made: it was stopped; the map is whole"
+        kept, told = 0, "some pictures of trees are missing because of Ctrl-C; the map is complete"
     if kept:
         outcome.summary.append(f"{count(kept, 'picture')} of trees in {folder / PICTURES}")
     if told:
@@ -228,7 +232,7 @@ def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
 
 
 def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
-    """The revisions for run.json: what each changed."""
+    """The changes of each revision, for run.json."""
     told: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
     before = plan.parameters.flat()
     for first, parameters in plan.revisions:
@@ -240,16 +244,16 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
     return told
 
 
-def _beginning(plan: OfflineRun, mapper: Mapper, chosen: Chosen) -> Beginning:
+def _beginning(plan: OfflineRun, mapper: Mapper, chosen: Chosen) -> RunStart:
     told = (chosen.warning,) if chosen.warning else ()
     warnings = [*told, *plan.source.description.warnings]
     if plan.continued is None:
         return at_origin(plan.source, warnings)
-    return go_on(plan.continued, plan.source, mapper, chosen.steps, plan.seed, warnings)
+    return continue_map(plan.continued, plan.source, mapper, chosen.steps, plan.seed, warnings)
 
 
 def _saved(
-    plan: OfflineRun, begun: Beginning, mapper: Mapper, start_ns: int, losses: dict[str, int]
+    plan: OfflineRun, begun: RunStart, mapper: Mapper, start_ns: int, losses: dict[str, int]
 ) -> SavedRun:
     return SavedRun(
         FORMAT,
@@ -264,7 +268,7 @@ def _saved(
     )
 
 
-def _truth(plan: OfflineRun, begun: Beginning) -> Truth:
+def _truth(plan: OfflineRun, begun: RunStart) -> Truth:
     known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
 
@@ -277,7 +281,7 @@ def _evaluate(trees: Trees, path: Path, truth: Truth, parameters: Parameters) ->
 
 def _run_record(
     plan: OfflineRun,
-    begun: Beginning,
+    begun: RunStart,
     frame: Frame,
     driven_s_m: tuple[float, float],
     start_ns: int,
@@ -285,7 +289,7 @@ def _run_record(
     error: PathError | None,
     losses: dict[str, int],
 ) -> dict[str, Any]:
-    """run.json: no time of day and no time taken, so that the same run gives the same bytes."""
+    """run.json, without times of day and computing times, so that the same run gives the same bytes."""
     description, tally = plan.source.description, begun.tally
     first, *others = begun.sources
     return {

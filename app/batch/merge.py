@@ -1,4 +1,4 @@
-"""Two finished runs of one stand made one: its files, and which tree is which."""
+"""Merges two finished runs of one stand into one map, with the correspondence of their trees."""
 
 from __future__ import annotations
 
@@ -12,12 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from app.batch.continue_map import PAUSE_NS
-from app.batch.driven_distance import breaks_of, driven
-from app.batch.output_folder import check_folder
-from app.batch.run_folder import read_run_record
-from app.batch.run_totals import Tally
-from app.batch.saved_run import SavedRun, read_saved_run
+from app.batch.continue_map import PAUSE_NS, SavedRun, read_saved_run
+from app.batch.run_folder import check_folder, read_run_record
+from app.batch.summary import RunTotals, breaks_of, driven
 from app.common.text import changed_values
 from app.common.version import version
 from app.worker.run_health import RunHealth
@@ -35,8 +32,8 @@ HYPOTHESES = 3_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Merging:
-    """What came of it, for people: trees of a, of b, and in both; the match of the two maps."""
+class MergeResult:
+    """Numbers of trees of run a, of run b and in both, and the match of the two maps."""
 
     a: int
     b: int
@@ -51,18 +48,18 @@ def merge_runs(
     parameters: Parameters | None,
     *,
     force: bool = False,
-) -> Merging:
-    """Merge run b into run a and write the files of a run, with correspondence.csv beside them.
+) -> MergeResult:
+    """Merge run b into run a, and write the files of a run and correspondence.csv.
 
     Args:
-        folder_a, folder_b: Of finished runs.
-        out: For the files.
-        parameters: None takes those of run a.
-        force: Write over the map of another source.
+        folder_a, folder_b: Folders of finished runs.
+        out: Folder for the files.
+        parameters: Parameters of the merged map; None for those of run a.
+        force: Whether the map of another source may be overwritten.
 
     Raises:
-        StemmapError: A run cannot be read, or the two maps do not fit with confidence.
-        OSError: The folder cannot be written; nothing new stands in it then.
+        StemmapError: A run cannot be read, or the two maps do not match with confidence.
+        OSError: The folder cannot be written; it is unchanged then.
     """
     a, b = read_saved_run(folder_a), read_saved_run(folder_b)
     chosen = a.chosen_parameters() if parameters is None else parameters
@@ -74,7 +71,7 @@ def merge_runs(
     )
     if match.pose is None:
         raise StemmapError(
-            f"the two maps do not fit with confidence: {match.reason} "
+            f"the two maps do not match with confidence: {match.reason} "
             f"({len(match.local)} stems agree, {match.second} in another pose)",
             where=str(folder_b),
             remedy="Merge runs that share more trees, or map the second one with --continue and --start",
@@ -95,7 +92,7 @@ def merge_runs(
         files.abandon()
         raise
     both = sum(1 for row in table if row[1] and row[2])
-    return Merging(sum(1 for row in table if row[1]), sum(1 for row in table if row[2]), both, match)
+    return MergeResult(sum(1 for row in table if row[1]), sum(1 for row in table if row[2]), both, match)
 
 
 def _joined(
@@ -115,7 +112,7 @@ def _joined(
                 stamp_shift_ns=source.stamp_shift_ns + shift,
             )
         )
-    tally = Tally(
+    tally = RunTotals(
         a.tally.warned + b.tally.warned,
         a.tally.points + b.tally.points,
         a.tally.verdicts + b.tally.verdicts,
@@ -138,7 +135,7 @@ def _path(merged: MergedMap) -> Path:
 
 
 def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, match: Match) -> None:
-    """Make the record of run a that of both."""
+    """Update the record of run a to that of the merged run."""
     first, *others = saved.sources
     seconds, metres = driven(path, breaks_of(saved.sources))
     record["source"].update(uri=first.uri, sha256=first.digest)
@@ -168,19 +165,20 @@ def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, mat
 
 
 def _shown(trees: Trees) -> set[int]:
-    """Numbers of the trees that a map shows and writes."""
+    """Numbers of the confirmed trees, which the files contain."""
     return set(trees.number[trees.confirmed].tolist())
 
 
 def _correspondence(
     merged: MergedMap, b: SavedMap, shown: set[int], of_a: set[int], of_b: set[int]
 ) -> list[list[str]]:
-    """Rows of CORRESPONDENCE_COLUMNS of the trees that the merged map shows, by number; a run that did not
-    show the tree has no number of it.
-    """
+    """Rows of CORRESPONDENCE_COLUMNS for the confirmed trees of the merged map, by number. The cell of a run
+    in which the tree was not confirmed is empty."""
     rows = {n: [str(n), str(n) if n in of_a else "", "", ""] for n in sorted(shown)}
-    told = zip(b.tracks.number.tolist(), merged.number_of.tolist(), merged.distance.tolist(), strict=True)
-    for old, new, distance in told:
+    merged_rows = zip(
+        b.tracks.number.tolist(), merged.number_of.tolist(), merged.distance.tolist(), strict=True
+    )
+    for old, new, distance in merged_rows:
         if new in rows and old in of_b:
             rows[new][2] = str(old)
             rows[new][3] = "" if math.isnan(distance) or not rows[new][1] else f"{distance:.3f}"
@@ -190,7 +188,7 @@ def _correspondence(
 def _moved_rows(
     file: FilePath, T: Pose2, scans: int, shift: int, a: SavedRun, b: SavedRun
 ) -> list[list[str]]:
-    """The detections of run b in the frame, the numbers and the times of run a."""
+    """The detections of run b with frame, scan numbers and times of run a."""
     seconds = (b.start_ns + shift - a.start_ns) * 1e-9
     try:
         with file.open(encoding="utf-8", newline="") as text:

@@ -1,4 +1,4 @@
-"""A finished run, read back from its folder."""
+"""The folder of a mapped run: reading it back, and checking it before it is overwritten."""
 
 from __future__ import annotations
 
@@ -13,20 +13,32 @@ import numpy as np
 
 from pipeline.config import Parameters
 from pipeline.config.model import validated
-from pipeline.errors import ParameterError, SourceError
+from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import PATH_COLUMNS, TREE_COLUMNS, path_rows, tree_rows
 from pipeline.types.records import Int, Path, Trees
 
 LARGEST_FILE = 256 << 20
+_FILES = (
+    "trees.csv",
+    "path.csv",
+    "trees.geojson",
+    "detections.csv",
+    "terrain.csv",
+    "slices.csv",
+    "state.zip",
+)
+_REMEDY = "Name another folder with --out, or add --force to overwrite it"
 _NEVER_EMPTY = frozenset({"t_s", "x_m", "y_m", "tree", "observations", "sigma_x_m", "sigma_y_m"})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedRun:
-    """What `stemmap map` wrote: the source's URI, the seed, the parameters, path and trees.
+    """The files of `stemmap map`.
 
-    Of a whole cloud (`of_cloud`) there is no path.
+    Attributes:
+        uri: URI of the source.
+        of_cloud: Whether a whole cloud was mapped, which has an empty path.
     """
 
     uri: str
@@ -38,10 +50,10 @@ class FinishedRun:
 
 
 def read_run(folder: FilePath) -> FinishedRun:
-    """Read a run's folder.
+    """Read the folder of a run.
 
     Raises:
-        SourceError: A file is missing or is not what `stemmap map` writes.
+        SourceError: A file is missing or damaged.
     """
     try:
         record = json.loads(_text(folder / "run.json"))
@@ -60,15 +72,15 @@ def read_run(folder: FilePath) -> FinishedRun:
 
 
 def is_of_cloud(record: dict[str, Any]) -> bool:
-    """Whether run.json tells of a whole cloud, which nobody drove through."""
+    """Whether run.json describes the map of a whole cloud."""
     return isinstance(record.get("source"), dict) and "offset_m" in record["source"]
 
 
 def read_run_record(folder: FilePath) -> dict[str, Any]:
-    """run.json of a run's folder.
+    """Read run.json of a folder.
 
     Raises:
-        SourceError: It is missing or is not what `stemmap map` writes.
+        SourceError: It is missing or damaged.
     """
     try:
         record = json.loads(_text(folder / "run.json"))
@@ -80,8 +92,8 @@ def read_run_record(folder: FilePath) -> dict[str, Any]:
 
 
 def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
-    """The confirmed trees and the path as `read_run` gives them once they are in their files, so that figures
-    which are told when a run is mapped are those which are told of it later."""
+    """Return the confirmed trees and the path with the precision of their files, so that scores after mapping
+    are the same as scores of the files later."""
     columns = (
         _table(path_rows(path, start_ns), PATH_COLUMNS),
         _table(tree_rows(trees, start_ns), TREE_COLUMNS),
@@ -101,13 +113,13 @@ def _text(file: FilePath) -> str:
             remedy="Name a folder that `stemmap map` wrote",
         ) from None
     except UnicodeDecodeError:
-        raise SourceError("it is not text", where=str(file)) from None
+        raise SourceError("the file is not text", where=str(file)) from None
 
 
 def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
     rows = list(csv.reader(_text(file).splitlines()))
     if not rows or tuple(rows[0]) != names:
-        raise SourceError(f"its columns are not {', '.join(names)}", where=str(file))
+        raise SourceError(f"the columns are not {', '.join(names)}", where=str(file))
     try:
         columns = _table(rows[1:], names)
     except ValueError:
@@ -119,10 +131,10 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
 
 
 def _table(rows: list[list[str]], names: tuple[str, ...]) -> dict[str, Float]:
-    """Columns by name; an empty cell is NaN.
+    """Return columns by name; an empty cell is NaN.
 
     Raises:
-        ValueError: A row has no such cells.
+        ValueError: A row does not fit the columns.
     """
     table = np.array([[float(cell) if cell else math.nan for cell in row] for row in rows], np.float64)
     return dict(zip(names, table.reshape(len(rows), len(names)).T, strict=True))
@@ -154,8 +166,46 @@ def _trees(c: dict[str, Float]) -> Trees:
 
 
 def _stamps(seconds: Float) -> Int:
-    """Nanoseconds; -1 where no time is known, as in the map of a whole cloud."""
+    """Nanoseconds; -1 where the time is unknown, as in the map of a whole cloud."""
     stamps: Int = np.where(np.isfinite(seconds), np.round(np.nan_to_num(seconds) * 1e9), -1.0).astype(
         np.int64
     )
     return stamps
+
+
+def check_folder(folder: FilePath, digest: str, *, force: bool) -> bool:
+    """Check whether the files of a run may be written to a folder.
+
+    Args:
+        folder: The folder for the files.
+        digest: Digest of the run's first source. A run of the same source may be replaced.
+        force: Whether anything may be overwritten.
+
+    Returns:
+        Whether a run in the folder will be replaced.
+
+    Raises:
+        StemmapError: The folder contains the run of another source, or files of that name from elsewhere.
+    """
+    if not (folder / "run.json").exists():
+        there = [name for name in _FILES if (folder / name).exists()]
+        if there and not force:
+            raise StemmapError(
+                f"the folder has a file {there[0]} that is not from a run", where=str(folder), remedy=_REMEDY
+            )
+        return bool(there)
+    if force:
+        return True
+    try:
+        source = read_run_record(folder)["source"]
+    except StemmapError:
+        raise StemmapError(
+            "the folder has a run.json that cannot be read", where=str(folder), remedy=_REMEDY
+        ) from None
+    if source.get("sha256") != digest:
+        raise StemmapError(
+            f"the folder has the map of another source, {source.get('uri')}",
+            where=str(folder),
+            remedy=_REMEDY,
+        )
+    return True

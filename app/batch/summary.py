@@ -1,13 +1,94 @@
-"""What came of a run, as lines for people."""
+"""Totals of a run and its summary as text."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from app.batch.saved_run import RunSource
 from app.common.text import count
+from app.worker.run_health import RunHealth
 from pipeline.evaluation import Evaluation, PathError, Rate
-from pipeline.types.records import Frame
+from pipeline.types.records import Frame, Path, Verdict
+
+if TYPE_CHECKING:
+    from app.batch.continue_map import RunSource
+
+_SAME_DRIVE = ("origin", "resume")
+_NS = 1e-9
+
+
+@dataclass(slots=True, eq=False)
+class RunTotals:
+    """Counts over a run.
+
+    Attributes:
+        warned: Warnings with their numbers.
+        points: Points by the stage that removed them.
+        verdicts: Clusters by verdict.
+        health: Quality of the poses.
+    """
+
+    warned: Counter[str]
+    points: Counter[str] = field(default_factory=Counter)
+    verdicts: Counter[str] = field(default_factory=Counter)
+    health: RunHealth = field(default_factory=RunHealth)
+
+    def add(self, frame: Frame) -> None:
+        """Count a scan."""
+        self.health.add(frame)
+        self.points.update(frame.counts)
+        self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
+        self.warned.update(frame.warnings)
+
+    def warn_of_far_truth(self, evaluation: Evaluation | None) -> None:
+        """Warn where no true tree is near the path."""
+        if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
+            self.warned[far_truth(evaluation.reach)] += 1
+
+    def warn_of_unconfirmed(self, frame: Frame, hits: int) -> None:
+        """Warn of trees that were seen in too few scans."""
+        tentative = int(np.count_nonzero(~frame.trees.confirmed))
+        if tentative:
+            them = "1 tree was" if tentative == 1 else f"{tentative} trees were"
+            self.warned[
+                f"{them} seen fewer than {hits} times and left out of the map; "
+                "--set tracking.hits_to_confirm=1 includes them"
+            ] += 1
+
+    def warnings(self) -> list[str]:
+        """Return each warning once, with its number."""
+        return [text if n == 1 else f"{text} ({n:,} times)" for text, n in self.warned.items()]
+
+
+def far_truth(reach: float) -> str:
+    """Return the message for ground truth that is not near the path."""
+    return (
+        f"no ground truth is within {reach:g} m of the path: it must be in the frame of the map, "
+        "with the first pose as the origin and x along its heading "
+        "(evaluation.reach includes trees at a larger distance)"
+    )
+
+
+def breaks_of(sources: Iterable[RunSource]) -> list[int]:
+    """Return the numbers of the scans with which another drive begins."""
+    return [source.from_scan for source in sources if source.start not in _SAME_DRIVE]
+
+
+def driven(path: Path, breaks: Iterable[int] = ()) -> tuple[float, float]:
+    """Return duration [s] and distance [m] of the drives, without the gaps between two drives.
+
+    Args:
+        path: One row per scan.
+        breaks: First scan of each further drive, see `breaks_of`.
+    """
+    is_step = np.ones(max(len(path.x) - 1, 0), np.bool_)
+    is_step[[scan - 1 for scan in breaks if 0 < scan < len(path.x)]] = False
+    seconds = float(np.diff(path.stamp_ns)[is_step].sum()) * _NS
+    return seconds, float(np.hypot(np.diff(path.x), np.diff(path.y))[is_step].sum())
 
 
 def summary_lines(
@@ -17,18 +98,19 @@ def summary_lines(
     evaluation: Evaluation | None,
     error: PathError | None,
 ) -> list[str]:
-    """What came of a run, its scores where there is a truth.
+    """Return the summary of a run, with scores where ground truth is known.
 
     Args:
-        uri: Of the source; frame: its last.
-        driven_s_m: How long [s] and how far [m] the robot drove.
-        evaluation, error: Of trees and path, where a truth is known.
+        uri: URI of the source.
+        frame: Result of the last scan.
+        driven_s_m: Duration [s] and distance [m].
+        evaluation, error: Scores of trees and path; None without ground truth.
     """
     seconds, metres = driven_s_m
     trees = int(np.count_nonzero(frame.trees.confirmed))
     scans = count(frame.index + 1, "scan")
-    told = int(np.count_nonzero(frame.trees.confirmed & np.isfinite(frame.trees.dbh)))
-    mapped = f"{count(trees, 'tree')}, {told} of them with a DBH"
+    with_dbh = int(np.count_nonzero(frame.trees.confirmed & np.isfinite(frame.trees.dbh)))
+    mapped = f"{count(trees, 'tree')}, {with_dbh} of them with a DBH"
     lines = [f"{uri}: {scans}, {seconds:.1f} s, {metres:.1f} m driven, {mapped}"]
     if evaluation is not None:
         lines += evaluation_lines(evaluation)
@@ -42,13 +124,16 @@ def summary_lines(
 
 
 def evaluation_lines(e: Evaluation, *, whole: bool = False) -> list[str]:
-    """The scores as lines for people, counts beside the rates; `whole` where nobody drove, so that all of the
-    truth was asked for."""
+    """Return the scores as text, with counts and rates.
+
+    Args:
+        whole: Whether a whole cloud was mapped, so that all true trees count.
+    """
     where = "in the whole cloud" if whole else f"within {e.reach:g} m of the path"
     return [
         f"trees found (TA) {_rate(e.TA)}, missed (FR) {_rate(e.FR)} {where}",
-        f"other things left out (TR) {_rate(e.TR)}, taken for trees (FA) {_rate(e.FA)}; "
-        f"{count(e.spurious, 'tree')} where nothing stands",
+        f"other objects left out (TR) {_rate(e.TR)}, mapped as trees (FA) {_rate(e.FA)}; "
+        f"{count(e.spurious, 'spurious tree')}",
         f"completeness {_percent(e.completeness)}   correctness {_percent(e.correctness)}   "
         f"F1 {_percent(e.f1)}",
         f"position RMSE {_metres(e.position_rmse)}   DBH RMSE {_metres(e.dbh_rmse)} "
@@ -58,14 +143,14 @@ def evaluation_lines(e: Evaluation, *, whole: bool = False) -> list[str]:
 
 
 def truth_in_doubt(e: Evaluation) -> str:
-    """What a person is asked where the truth may be of another forest; empty where nothing says so."""
+    """Return a warning where the ground truth may belong to another forest; empty otherwise."""
     if not e.is_doubtful:
         return ""
     few = f"only {e.TA.count}" if e.TA.count else "none"
-    lie = "lies" if e.TA.count <= 1 else "lie"
+    verb = "is" if e.TA.count <= 1 else "are"
     return (
-        f"{few} of {count(e.TA.of, 'true tree')} {lie} near a mapped one: is this the truth of this forest, "
-        "in the map's frame?"
+        f"{few} of {count(e.TA.of, 'true tree')} {verb} near a mapped one: is this the ground truth of this "
+        "forest, in the frame of the map?"
     )
 
 
@@ -86,7 +171,7 @@ def _pair(value: float | None) -> str:
 
 
 def start_lines(last: RunSource) -> list[str]:
-    """Where a run that goes on in an earlier map was found to start."""
+    """Return where a run was found to start in an earlier map, if it was found by its stems."""
     if last.start != "constellation":
         return []
     x, y, yaw = last.pose

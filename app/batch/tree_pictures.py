@@ -1,4 +1,4 @@
-"""A picture of each tree, where a camera drove along: chosen after the run, kept in its folder."""
+"""Pictures of the mapped trees, for runs with a camera: selected after the run and written to its folder."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from pipeline.types.records import Bool, Int, Path, Trees
 FOLDER = "pictures"
 MOST = 300  # pictures
 NEAREST, FARTHEST, BEST = 1.5, 15.0, 4.0  # m ahead of the camera
-FROM_Z, TO_Z, THIN = 0.0, 2.0, 0.2  # m above the base; the width of a stem whose diameter is not known
+FROM_Z, TO_Z, THIN = 0.0, 2.0, 0.2  # m above the base; width of a stem of unknown diameter
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """From where a tree is seen best.
+    """The best view of a tree.
 
     Attributes:
         tree: Its number.
-        stamp_ns: Of the picture.
+        stamp_ns: Time of the picture.
         box: left, top, right, bottom [pixels].
     """
 
@@ -36,10 +36,10 @@ class View:
 
 
 def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[View]:
-    """The best view of each confirmed tree that was in view, in the order of time, MOST at most.
+    """Return the best view of each confirmed tree that the camera saw, ordered by time, at most MOST.
 
     Args:
-        stamps: When pictures were taken, ascending [ns].
+        stamps: Times of the pictures, ascending [ns].
     """
     views: list[View] = []
     if not len(stamps):
@@ -78,10 +78,10 @@ def _best_view(camera: Camera, trees: Trees, row: int, path: Path, taken: Int, t
 
 
 def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) -> tuple[int, str]:
-    """Write a picture of each tree into `folder`/pictures, in place of those of an earlier run.
+    """Write a picture of each tree to `folder`/pictures; pictures of an earlier run are deleted.
 
     Returns:
-        How many there are, and what a person should know, "" for nothing.
+        Number of pictures, and a warning; "" for none.
 
     Raises:
         OSError: The folder cannot be written.

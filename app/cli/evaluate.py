@@ -95,7 +95,7 @@ def _judged(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, boo
     import numpy as np
 
     from app.batch.run_folder import read_run
-    from app.batch.run_totals import far_truth
+    from app.batch.summary import far_truth
     from app.common.text import count
     from pipeline.config import assign
     from pipeline.evaluation import evaluate

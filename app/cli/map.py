@@ -91,10 +91,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--start is of a continued map", remedy="Name it with --continue DIR")
     chosen_parameters(arguments, "forest")  # a mistyped flag is said before anything heavy is loaded
 
-    from app.batch.partial_outputs import left_in
+    from app.batch.data_folders import partial_output_warnings
     from pipeline.io.readers.clouds import is_cloud
 
-    for line in left_in(arguments.out):
+    for line in partial_output_warnings(arguments.out):
         print(f"warning: {line}", file=sys.stderr)
     if arguments.kind == "plot" or (arguments.kind == "auto" and is_cloud(arguments.source)):
         return _run_plot(arguments)
@@ -108,7 +108,7 @@ def _run_plot(arguments: argparse.Namespace) -> int:
             "a whole cloud has no scans to go on with", remedy="Leave --continue and --stop-after away"
         )
     from app.batch.map_cloud import map_plot_run
-    from app.batch.output_folder import check_folder
+    from app.batch.run_folder import check_folder
     from pipeline.io.ground_truth import read_truth_trees
     from pipeline.io.readers.clouds import open_cloud
 
@@ -124,10 +124,9 @@ def _run_plot(arguments: argparse.Namespace) -> int:
 
 
 def _run_scans(arguments: argparse.Namespace) -> int:
-    from app.batch.continue_map import Continued
+    from app.batch.continue_map import ContinuedMap, read_saved_run
     from app.batch.map_run import OfflineRun, map_run
-    from app.batch.output_folder import check_folder
-    from app.batch.saved_run import read_saved_run
+    from app.batch.run_folder import check_folder
     from app.cli.live_commands import begin_recording, heard, recording_of, told_of_frames
     from app.common.compile_ahead import compile_ahead
     from app.sources.opening import open_any
@@ -157,7 +156,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             odometry=arguments.odometry,
             truth_trees=truth_trees,
-            continued=Continued(saved, _in_the_map(arguments.start)) if saved else None,
+            continued=ContinuedMap(saved, _in_the_map(arguments.start)) if saved else None,
             stop_after=arguments.stop_after,
             revisions=revisions,
             on_frame=told_of_frames(opened),

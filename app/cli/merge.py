@@ -37,8 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Merge the runs."""
     import numpy as np
 
+    from app.batch.continue_map import read_saved_run
     from app.batch.merge import merge_runs
-    from app.batch.saved_run import read_saved_run
     from app.common.text import count
     from pipeline.config import assign
 

@@ -130,10 +130,10 @@ def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
 
 
 def _tell_of_unfinished(settings: Settings) -> None:
-    from app.batch.partial_outputs import unfinished
+    from app.batch.data_folders import partial_outputs
     from app.common.text import count
 
-    if left := unfinished(settings):
+    if left := partial_outputs(settings):
         they = count(len(left), "run was", "runs were")
         print(f"{they} ended before the map was whole; the page Runs can delete what is left of them")
 

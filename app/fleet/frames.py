@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from app.batch.compare import laid
+from app.batch.compare import align
 from pipeline.geometry.poses import Pose2
 
 #: So many trees more than at the last try make another worth its second of computing.
@@ -63,7 +63,7 @@ class Frames:
             if count < LEAST_TREES or (tried is not None and count < tried + MORE_TREES):
                 continue
             self._tried[name], self._of[name] = count, digest
-            pose, how = await laid({"map": maps[first][1]}, {"map": shown})
+            pose, how = await align({"map": maps[first][1]}, {"map": shown})
             self._set(name, digest, pose, how if pose is None else f"{how} of {first}")
             return True
         return False

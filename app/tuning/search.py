@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from app.batch.run_totals import far_truth
+from app.batch.summary import far_truth
 from app.common.text import count
 from app.dashboard.annotations import contents_of, laid_over
 from app.store.records import Annotation

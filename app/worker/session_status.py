@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.batch.driven_distance import driven
+from app.batch.summary import driven
 from app.dashboard.payload import health_word
 from app.robot.source import LiveSource
 from app.worker.camera import has_camera

@@ -19,7 +19,7 @@ from typing import IO, Any
 import msgspec
 
 import pipeline.jit
-from app.batch.run_totals import far_truth
+from app.batch.summary import far_truth
 from app.common.child_process import ParentConnection, run_child
 from app.training.learned_forests import kept_forests
 from app.tuning.scored_runs import OpenRun, open_run

@@ -13,9 +13,7 @@ from msgspec import Meta
 from starlette.responses import Response
 
 from app.batch.compare import compare
-from app.batch.partial_outputs import delete as delete_unfinished
-from app.batch.partial_outputs import unfinished
-from app.batch.run_folders import finished_folders, read_folder
+from app.batch.data_folders import delete_partial_output, finished_folders, partial_outputs, read_folder
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.sources.request import request_of_kept
@@ -47,7 +45,7 @@ async def listed(request: Request, dashboard: Dash) -> Response:
             "folders": [
                 {"key": f"{_FOLDER}{name}", "name": name, "changed_s": changed[name]} for name in folders
             ],
-            "unfinished": await asyncio.to_thread(unfinished, settings),
+            "unfinished": await asyncio.to_thread(partial_outputs, settings),
             "open": dashboard.logbook.record,
         }
     )
@@ -91,7 +89,7 @@ async def rename(request: Request, number: _Number, dashboard: Dash) -> Response
 async def take_away(request: Request, name: _Asked) -> Response:
     """Delete what a killed run left in the data folder; nothing brings it back, and nothing is lost by it."""
     try:
-        await asyncio.to_thread(delete_unfinished, name, request.app.state.settings)
+        await asyncio.to_thread(delete_partial_output, name, request.app.state.settings)
     except UnknownError as error:
         return failure_reply(404, error)
     return json_reply({"name": name})

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.batch.driven_distance import breaks_of, driven
-from app.batch.saved_run import RunSource
+from app.batch.continue_map import RunSource
+from app.batch.summary import breaks_of, driven
 from pipeline.types.records import Path
 
 STEP = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.integers(1, 10**10))
