@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -203,23 +204,31 @@ def _simulated(scene: str, seeds: list[int], every: int) -> None:
 
 
 def _dbh() -> None:
+    error, of = tape_errors()
+    print(f"{len(error)} of {of} slices have a circle")
+    print(f"trunk_dbh: RMSE {np.sqrt(np.mean(np.square(error))):.2f} cm, bias {np.mean(error):+.2f} cm")
+
+
+def tape_errors() -> tuple[list[float], int]:
+    """Fitted diameter less that by tape of each trunk slice with a circle [cm], and the number of slices."""
     folder = DATA / "trunk_dbh"
-    error = []
+    error, of = list[float](), 0
     for name, tape in _tape(folder / "dbh_reference.csv"):
         with closing(open_source(str(folder / name))) as source:
             points = next(r.points for r in source.records() if hasattr(r, "points")).astype(np.float64)
+        of += 1
         # Merged from several views, as a whole cloud is: no ray tells which side of the trunk was seen.
         circle = np.zeros(FIGURES)
         best_circle(points[:, :2], TOLERANCE, RADIUS_MIN, RADIUS_MAX, circle)
         if not fit_circle(points[:, :2], REACH_OF_A_SLICE, RADIUS_MIN, RADIUS_MAX, circle):
-            print(f"{name}: no circle, tape {tape:.1f} cm")
+            print(f"{name}: no circle, tape {tape:.1f} cm", file=sys.stderr)
             continue
         radius = float(without_scatter(circle[2], circle[7]))
         error.append(200.0 * radius - tape)
         said = f"{200 * radius:.1f} +- {200 * np.sqrt(circle[6]):.1f} cm"
-        print(f"{name}: {said}, tape {tape:.1f} cm, {np.degrees(circle[8]):.0f} degrees seen")
-    print(f"{len(error)} circles")
-    print(f"trunk_dbh: RMSE {np.sqrt(np.mean(np.square(error))):.2f} cm, bias {np.mean(error):+.2f} cm")
+        seen = f"{np.degrees(circle[8]):.0f} degrees seen"
+        print(f"{name}: {said}, tape {tape:.1f} cm, {seen}", file=sys.stderr)
+    return error, of
 
 
 def _tape(file: Path) -> Iterator[tuple[str, float]]:

@@ -48,7 +48,7 @@ def _whole(folder: Path) -> Table:
         plot = map_plot(cloud, preset("forest"))
         seconds = time.process_time() - began
         place = plot.trees.position + cloud.description.offset[:2]
-        scores = _scores(place, plot.trees.dbh, folder / f"{name}_stems.csv")
+        scores = stem_scores(place, plot.trees.dbh, folder / f"{name}_stems.csv")
         rows.append((name, plot.counts["read"], len(place), *scores, seconds))
     columns = ("cloud", "points", "trees", *_SCORES, "CPU [s]")
     return Table("The whole cloud", columns, tuple(rows))
@@ -113,7 +113,7 @@ _SCORES = (
 _NO_SCORES = (None,) * len(_SCORES)
 
 
-def _scores(place, dbh, table: Path) -> tuple[int | float | None, ...]:
+def stem_scores(place, dbh, table: Path) -> tuple[int | float | None, ...]:
     """Found stems of the table, error of place and of those diameters that can be scored, and of the place of
     those stems."""
     import csv

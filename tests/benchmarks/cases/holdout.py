@@ -1,0 +1,241 @@
+"""Trees in places that the classifier did not learn from, whole clouds, and diameters against a tape.
+
+A place is left out of training as a whole. Park scenes 04 and 07 show the same trees from two positions: a
+rigid motion brings 21 of their stems within 0.25 m of one another, and at most 5 stems of any other pair, as
+many as of a mirrored scene. So they are one place.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tests.benchmarks.table import Cell, Table
+
+if TYPE_CHECKING:
+    from app.training.fit_forest import Examples
+    from pipeline.classification.forest import Forest
+    from pipeline.types.records import Float
+
+NAME = "holdout"
+LINE = "Trees in places left out of training, whole clouds, diameters by tape (needs STEMMAP_DATA)"
+
+DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
+PARKS = (("00",), ("02",), ("03",), ("04", "07"), ("06",))
+STREET = DATA / "semantickitti" / "000000.bin"
+TRAINING_SEEDS = range(3)
+STAND_SEEDS, STREET_SEEDS, EVERY = range(11, 17), range(200, 240), 4
+REACH = 25.0  # m
+COPIES = 8  # of each park scene with pasted things; `stemmap train` makes 48
+RESAMPLES = 10_000
+SPREAD = 4.0  # cm; the reference DBH of a stem counts where the tools agree to this
+MATCH = 0.5  # m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """Result in one scene.
+
+    Attributes:
+        found: Whether each true tree is in the map, shape (T,).
+        false: The number of trees of the map that are no true tree; what is on a trunk with fewer than 30
+            labelled points counts neither way.
+        kinds: How many false trees stand on each class, by most of the labelled points there.
+    """
+
+    found: Float
+    false: int
+    kinds: Counter[str]
+
+
+def run() -> list[Table]:
+    """Detection in places left out, whole clouds, and trunk slices."""
+    from pipeline.errors import StemmapError
+
+    if not (DATA / "park_trunks").is_dir():
+        raise StemmapError("there is no real data", where=str(DATA), remedy="Set STEMMAP_DATA")
+    return [_detection(), _whole_clouds(), _tape()]
+
+
+def _detection() -> Table:
+    examples, pasted = _training_examples()
+    rows, parks = list[tuple[Cell, ...]](), list[list[Outcome]]()
+    groups = [[DATA / "park_trunks" / name for name in names] for names in PARKS]
+    for group in [*groups, [STREET]]:
+        fitted = [_fitted_without(group, examples, pasted, seed) for seed in TRAINING_SEEDS]
+        outcomes = [[_outcome(scene, forest) for forest in fitted] for scene in group]
+        if group == [STREET]:
+            rows += [_row("all parks", parks), _row("street", outcomes)]
+        else:
+            rows.append(_row(" and ".join(f"park {scene.name}" for scene in group), outcomes))
+            parks += outcomes
+    columns = (
+        "place left out",
+        "found",
+        "of",
+        "false",
+        "completeness [%]",
+        "95 %",
+        "correctness [%]",
+        "95 %",
+    )
+    kinds = ", ".join(f"{n} {kind}" for kind, n in _kinds(parks).most_common())
+    note = f"Sums over {len(TRAINING_SEEDS)} training seeds. False trees of the parks: {kinds}."
+    intervals = (
+        "95 %: bootstrap over trees; the results of the training seeds share their trees and are averaged."
+    )
+    return Table("Trees in places left out of training, within 25 m", columns, tuple(rows), (note, intervals))
+
+
+def _row(name: str, scenes: Sequence[Sequence[Outcome]]) -> tuple[Cell, ...]:
+    """One row of the table from the outcomes of scenes, of each with every training seed."""
+    hit, of, false = (
+        sum(float(value(o)) for outcomes in scenes for o in outcomes)
+        for value in (lambda o: o.found.sum(), lambda o: len(o.found), lambda o: o.false)
+    )
+    complete, correct = _intervals(scenes)
+    return (
+        name, int(hit), int(of), int(false), 100.0 * hit / of, complete,
+        100.0 * hit / max(hit + false, 1.0), correct,
+    )  # fmt: skip
+
+
+def _intervals(scenes: Sequence[Sequence[Outcome]]) -> tuple[str, str]:
+    """95 % bootstrap intervals of completeness and correctness: true trees are drawn with replacement, the
+    number of false trees from a Poisson distribution."""
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    found = np.concatenate([np.mean([o.found for o in outcomes], axis=0) for outcomes in scenes])
+    false = sum(o.false / len(outcomes) for outcomes in scenes for o in outcomes)
+    hits = found[rng.integers(0, len(found), (RESAMPLES, len(found)))].sum(axis=1)
+    rates = (hits / len(found), hits / np.maximum(hits + rng.poisson(false, RESAMPLES), 1.0))
+    low_high = [np.percentile(100.0 * rate, (2.5, 97.5)) for rate in rates]
+    complete, correct = (f"{low:.0f} to {high:.0f}" for low, high in low_high)
+    return complete, correct
+
+
+def _kinds(scenes: Sequence[Sequence[Outcome]]) -> Counter[str]:
+    return sum((o.kinds for outcomes in scenes for o in outcomes), Counter())
+
+
+def _outcome(scene: Path, forest: Forest) -> Outcome:
+    """One scene mapped by the whole mapper."""
+    import numpy as np
+
+    from app.training.scenes import labelled_points, trunks
+    from pipeline.evaluation.matching import match
+    from tests.benchmarks.classes import ByClass
+    from tests.benchmarks.trunks import mapped
+
+    frame, _, _ = mapped(str(scene), odometry="static", forest=forest)
+    place = frame.trees.position[frame.trees.confirmed]
+    place = place[np.hypot(place[:, 0], place[:, 1]) <= REACH]
+    points, label = labelled_points(scene)
+    truth, any_trunk = trunks(points, label, 30, REACH), trunks(points, label, 1, np.inf)
+    truth_of = match(place, truth, MATCH)
+    nearest = np.hypot(*(place[:, None] - any_trunk[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
+    false = (truth_of < 0) & (nearest > MATCH)
+    found = np.isin(np.arange(len(truth)), truth_of).astype(np.float64)
+    by_class = ByClass()
+    by_class.add_labels(place[false], points, label)
+    return Outcome(found, int(false.sum()), by_class.taken)
+
+
+def _training_examples() -> tuple[list[Examples], list[Examples]]:
+    """Examples of all simulated and labelled scenes, and of the copies with pasted things; kept in the data
+    folder, or in the folder STEMMAP_EXAMPLES."""
+    from functools import partial
+
+    from app.training.augmentation import FOLDER, copies
+    from app.training.keeping import kept_or_made
+    from app.training.scenes import labelled_examples, stand_examples, stand_name, street_examples
+    from pipeline.config import preset
+
+    kept = examples_folder()
+    p, found = preset("forest"), list["Examples"]()
+    for uri, furnished in _stands():
+        make = partial(stand_examples, uri, p, EVERY, furnished=furnished)
+        found += kept_or_made(kept, stand_name(uri, furnished), make)
+    for seed in STREET_SEEDS:
+        for one_way in (False, True):
+            make = partial(street_examples, seed, one_way, p, REACH)
+            found += kept_or_made(kept, f"{'park' if one_way else 'street'} {seed}", make)
+    parks = [DATA / "park_trunks" / name for names in PARKS for name in names]
+    for scene in (*parks, STREET):
+        found += kept_or_made(kept, str(scene), partial(labelled_examples, scene, p, REACH))
+    return found, [e for scene in parks for e in copies(scene, kept / FOLDER, p, REACH, COPIES)]
+
+
+def examples_folder() -> Path:
+    """Where the examples of training scenes are kept."""
+    from app.common.settings import data_folder
+    from pipeline.errors import StemmapError
+
+    if named := os.environ.get("STEMMAP_EXAMPLES"):
+        return Path(named)
+    folder = data_folder(os.environ)
+    if folder is None:
+        raise StemmapError("there is no data folder", remedy="Set STEMMAP_EXAMPLES to a folder")
+    return folder / "training"
+
+
+def _stands() -> Iterator[tuple[str, bool]]:
+    """The simulated stands, as `stemmap train` makes them."""
+    sigma = ("0.02", "0.03", "0.01")
+    for name in ("stand", "slope", "dense"):
+        for n, seed in enumerate(STAND_SEEDS):
+            yield f"sim:{name}?seed={seed}&odometry=exact&sigma={sigma[n % 3]}", n % 2 == 1
+
+
+def _fitted_without(
+    scenes: Sequence[Path], examples: list[Examples], pasted: list[Examples], seed: int
+) -> Forest:
+    """The classifier fitted to all scenes but these."""
+    from app.training.augmentation import is_of
+    from app.training.fit_forest import as_json, grow_all
+    from pipeline.classification.forest import ALL_AROUND, ONE_WAY, forest_of
+
+    left_out = {str(scene) for scene in scenes}
+    others = [e for e in examples if e.scene not in left_out]
+    copies = [e for e in pasted if not any(is_of(e.scene, scene) for scene in left_out)]
+    kind = ALL_AROUND if scenes[0] == STREET else ONE_WAY
+    return forest_of(as_json(grow_all(others, copies, (kind,), seed), []), kind)
+
+
+def _whole_clouds() -> Table:
+    from pipeline.config import preset
+    from pipeline.inventory import map_plot
+    from pipeline.io.readers.clouds import open_cloud
+    from tests.benchmarks.cases.plot import stem_scores
+
+    rows = []
+    for name in ("pine_plot", "LPine1"):
+        file = next((DATA / "forest").glob(f"{name}*.laz"))
+        cloud = open_cloud(str(file))
+        plot = map_plot(cloud, preset("forest"))
+        place = plot.trees.position + cloud.description.offset[:2]
+        rows.append(
+            (name, len(place), *stem_scores(place, plot.trees.dbh, DATA / "forest" / f"{name}_stems.csv"))
+        )
+    columns = (
+        "cloud", "trees", "found", "of", "position RMSE [cm]", "DBH RMSE [cm]", "DBH bias [cm]", "DBH scored",
+        "position of these [cm]",
+    )  # fmt: skip
+    note = "pine_plot was looked at while the method was built, LPine1 was not."
+    return Table("Stems of whole clouds", columns, tuple(rows), (note,))
+
+
+def _tape() -> Table:
+    import numpy as np
+
+    from tests.benchmarks.trunks import tape_errors
+
+    error, of = tape_errors()
+    row = (len(error), of, float(np.sqrt(np.mean(np.square(error)))), float(np.mean(error)))
+    columns = ("slices fitted", "of", "DBH RMSE [cm]", "DBH bias [cm]")
+    return Table("Trunk slices against a tape", columns, (row,))
