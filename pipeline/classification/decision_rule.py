@@ -14,8 +14,9 @@ from pipeline.types.records import AT_ROUND, Bool, Columns, Int32, Verdict
 VOXELS, LEAST_VOXELS = NAMES.index("voxels to 3 m"), 6.0
 GONE, GONE_SCANS = 0.5, 5  # of the scans that could see something there, and at least so many
 UNFORCED = -1
+BREAST_HEIGHT = slice(6, 11)  # slices, 1.2 to 2.2 m
 ABOVE_A_HEAD = slice(int(BANDS[3, 0]), int(BANDS[3, 1]))  # slices, 2.2 to 3.2 m
-ENDS, RAYS = 0.3, 10  # a trunk stops more of the rays up there, of so many that tell something
+STOPPED, RAYS = 0.3, 10  # a trunk stops a larger part of the rays, of at least so many that reach it
 MIGHT = 0.3  # of the votes as they count at a round place; so many for a tree might make it one
 
 
@@ -28,7 +29,8 @@ class Judged:
         votes: Shares of the votes, shape (C, classes), that for a tree first.
         otherwise: int32: the verdict where these are too few, see Verdict. What might be a tree for being
             round is TOO_LOW where rays saw that nothing of it stands above a head.
-        forced: int32: the verdict whatever the votes, UNFORCED for none: too few voxels, or walked away.
+        forced: int32: the verdict whatever the votes, UNFORCED for none: too few voxels, gone, or TOO_LOW
+            where rays pass at breast height.
     """
 
     place: Float
@@ -56,20 +58,29 @@ def judged(columns: Columns) -> Judged:
         return Judged(np.zeros((0, 2)), np.zeros((0, len(CLASSES))), nothing, nothing)
     otherwise = np.array(CLASSES, np.int32)[c.share.argmax(axis=1)]
     otherwise[otherwise == Verdict.TREE] = Verdict.OTHER
-    otherwise[(c.share[:, 0] >= MIGHT * (c.share @ np.array(AT_ROUND))) & ends_below_a_crown(c)] = (
+    otherwise[(c.share[:, 0] >= MIGHT * (c.share @ np.array(AT_ROUND))) & is_transparent(c, ABOVE_A_HEAD)] = (
         Verdict.TOO_LOW
     )
     forced = np.full(len(c.share), UNFORCED, np.int32)
+    forced[is_transparent(c, BREAST_HEIGHT)] = Verdict.TOO_LOW
     forced[too_few(c.figures)] = Verdict.TOO_FEW_POINTS
     forced[(c.absent >= GONE_SCANS) & (c.absent > GONE * (c.present + c.absent))] = Verdict.MOVING
     return Judged(c.axis[:, :2].copy(), c.share.copy(), otherwise, forced)
 
 
-def ends_below_a_crown(columns: Columns) -> Bool:
-    """Columns of which rays saw that they end at a person's height, whatever hangs over them, shape (C,)."""
-    met, passed = (rays[:, ABOVE_A_HEAD].sum(axis=1) for rays in (columns.met, columns.passed))
-    ends: Bool = (met + passed >= RAYS) & (met < ENDS * (met + passed))
-    return ends
+def is_transparent(columns: Columns, slices: slice) -> Bool:
+    """Columns that let most rays pass in a band of heights, shape (C,).
+
+    A trunk is opaque: of 5,106 views of simulated and labelled trunks with at least `RAYS` rays between
+    1.2 and 2.2 m, one stopped less than `STOPPED` of them. Above parked motorcycles rays go on.
+
+    Args:
+        columns: With the rays that ended at them and those that passed them, by slice.
+        slices: The band.
+    """
+    met, passed = (rays[:, slices].sum(axis=1) for rays in (columns.met, columns.passed))
+    transparent: Bool = (met + passed >= RAYS) & (met < STOPPED * (met + passed))
+    return transparent
 
 
 def too_few(figures: Float) -> Bool:

@@ -30,7 +30,7 @@ const RULES = {
   tree: (g) => `Accepted as tree: single scans fitted a round trunk on more than half of its circumference, so votes against a round stem count a tenth. A tree needs ${percent(g.tree_share)} of the votes.`,
   moving: (g) => `Rejected as moving: empty in ${g.absent} of ${g.absent + g.present} clear views.`,
   wall: () => "Rejected as wall: it is wide but not thick and continues sideways.",
-  "too low": () => "Rejected as too low: hardly any ray between 2.2 and 3.2 m above the ground ended at it, so it is no taller than a person.",
+  "too low": () => "Rejected as too low: less than 30 % of the rays at breast height (1.2 to 2.2 m above the ground), or above a person's height (2.2 to 3.2 m), ended at it.",
   "too few points": () => "Rejected as too few points: so few voxels can be occupied by chance.",
 };
 
