@@ -1,4 +1,4 @@
-"""Colours by meaning, safe for colour-blind eyes (Okabe-Ito), and ramps for figures. All uint8 RGB."""
+"""Colours by meaning (Okabe-Ito, safe for colour-blind people) and colour ramps, as uint8 RGB."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BUSH: Rgb = (153, 153, 51)
 OTHER: Rgb = (136, 136, 136)
 UNCERTAIN: Rgb = (240, 228, 66)
 TRUTH: Rgb = (230, 159, 0)
-# The background shines through: one scene is seen in light pages and in dark ones.
+# Translucent, because the background is light or dark.
 GROUND: Rgb = (122, 115, 102)
 GROUND_OPACITY = 0.35
 PATH: Rgb = (150, 156, 164)
@@ -67,19 +67,19 @@ _RAMP = np.array(
 
 
 def by_verdict(verdicts: NDArray[np.integer]) -> Colours:
-    """The colour of each verdict, shape (K, 3)."""
+    """Return the colour of each verdict, shape (K, 3)."""
     chosen: Colours = _BY_VERDICT[np.clip(verdicts, 0, len(_BY_VERDICT) - 1)]
     return chosen
 
 
 def by_category(numbers: NDArray[np.integer]) -> Colours:
-    """A hue for each number, the same for the same number, shape (K, 3)."""
+    """Return a hue for each number, shape (K, 3); equal numbers have equal hues."""
     chosen: Colours = _CATEGORIES[np.asarray(numbers) % len(_CATEGORIES)]
     return chosen
 
 
 def ramp(values: NDArray[np.floating], low: float, high: float) -> Colours:
-    """Colours from violet (`low`) to yellow (`high`), shape (K, 3); what is not finite counts as `high`."""
+    """Return colours from violet (`low`) to yellow (`high`), shape (K, 3); NaN counts as `high`."""
     t = (np.nan_to_num(values, nan=high, posinf=high, neginf=low) - low) / max(high - low, 1e-9)
     place = np.clip(t, 0.0, 1.0) * (len(_RAMP) - 1)
     rgb = np.stack([np.interp(place, np.arange(len(_RAMP)), _RAMP[:, c]) for c in range(3)], axis=-1)
@@ -87,20 +87,22 @@ def ramp(values: NDArray[np.floating], low: float, high: float) -> Colours:
 
 
 def of_points(cluster_colours: Colours, labels: NDArray[np.integer], noise: Rgb) -> Colours:
-    """Each point in the colour of its cluster, `noise` where the label is -1, shape (M, 3)."""
+    """Return the colour of the cluster of each point, `noise` for label -1, shape (M, 3)."""
     table = np.vstack([cluster_colours.reshape(-1, 3), np.array([noise], dtype=np.uint8)])
     chosen: Colours = table[labels]
     return chosen
 
 
 def choose(first: NDArray[np.bool_], one: Rgb, other: Rgb) -> Colours:
-    """`one` where `first` holds, else `other`, shape (N, 3)."""
+    """Return `one` where `first` is true, else `other`, shape (N, 3)."""
     return np.array([other, one], dtype=np.uint8)[first.astype(np.int64)]
 
 
 def of_lines(each: NDArray[np.uint8]) -> Colours:
-    """What viser must be given so that a line is seen in these colours: its client takes the colours of lines
-    for linear light, and brightens them once more."""
+    """Return the colours that viser needs to draw lines in these colours.
+
+    Its client treats the colours of lines as linear light and converts them to sRGB once more.
+    """
     c = each / 255.0
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     return np.round(255.0 * linear).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Labels that stay where they are while what they name is measured again and again."""
+"""Text labels of clusters and trees that do not flicker or tremble."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from pipeline.types.records import Frame, Verdict
 
-MOST_LABELS = 60  # more than 200 halve the frame rate of a browser, and nobody reads 60
-STEM_HEIGHT = 2.0  # m; drawn where no height was measured
-# Two labels nearer to one another than this lie upon one another for who looks over the robot's shoulder,
-# from BEHIND metres behind it: a part of how far away they are, as a text keeps its size on the screen.
-BEHIND = 6.0  # m
+MOST_LABELS = 60  # more than 200 halve the frame rate of a browser
+STEM_HEIGHT = 2.0  # [m], drawn where no height was measured
+# Width of a label as a share of its distance from a camera BEHIND metres behind the robot: a text keeps its
+# size on the screen.
+BEHIND = 6.0  # [m]
 NUMBER_WIDTH, WORDS_WIDTH = 0.05, 0.11
 
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A text at a place in the frame of the map [m]; `key` says what it names."""
+    """A text at a place in the frame of the map [m]; `key` identifies the labelled object."""
 
     key: int
     text: str
@@ -30,7 +30,7 @@ class Label:
 
 
 class Labels:
-    """A pool of label nodes. A node keeps to its key, so a text that did not change costs no message."""
+    """A pool of label nodes. A node stays with its key, so that an unchanged text is not sent again."""
 
     def __init__(self, scene: viser.SceneApi, name: str, scale: float = 0.9) -> None:
         self._scene, self._name, self._scale = scene, name, scale
@@ -53,7 +53,7 @@ class Labels:
 
     @property
     def texts(self) -> list[str]:
-        """What is to be read now."""
+        """The visible texts."""
         return [label.text for label in self._shown.values()]
 
     def _another(self) -> viser.LabelHandle:
@@ -67,7 +67,7 @@ class Labels:
 
     def _place(self, key: int, label: Label) -> None:
         node, before = self._node_of[key], self._shown.get(key)
-        # A label that trembles by a few centimetres cannot be read, and each move is a message.
+        # Moves of a few centimetres make a label hard to read, and each one is a message.
         if before is not None and math.dist(before.place, label.place) < 0.15:
             label = replace(label, place=before.place)
         if label == before:
@@ -79,14 +79,14 @@ class Labels:
 def apart(
     places: NDArray[np.float64], order: NDArray[np.int64], robot: NDArray[np.float64], width: float, most: int
 ) -> list[int]:
-    """Rows of places whose labels do not lie upon one another, the first ones of an order, at most so many.
+    """Return rows of places whose labels do not overlap, in order of preference.
 
     Args:
         places: x, y in the frame of the map, shape (N, 2) [m].
-        order: Rows, the most wanted first.
-        robot: Its x, y, shape (2,) [m].
-        width: Of a label, as a part of its distance.
-        most: Labels.
+        order: Rows, the preferred ones first.
+        robot: Position of the robot, shape (2,) [m].
+        width: Width of a label as a share of its distance.
+        most: Largest number of labels.
     """
     kept: list[int] = []
     for row in order.tolist():
@@ -99,12 +99,12 @@ def apart(
 
 
 def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Label]:
-    """Labels for the clusters of a scan, trees first, then the nearest, none upon another.
+    """Return labels for the clusters of a scan without overlaps: trees first, then the nearest.
 
     Args:
-        frame: The scan's results.
-        numbers: What each cluster is known by from scan to scan, shape (K,).
-        label_by: One of view.LABEL_BY.
+        frame: Results of the scan.
+        numbers: Persistent number of each cluster, shape (K,).
+        label_by: One of layers.LABEL_BY.
     """
     if label_by == "none":
         return []
@@ -134,12 +134,12 @@ def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
 
 
 def shown_height(height: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How tall a cluster is drawn [m]; a stem that another program found has no height."""
+    """Return the drawn height of clusters [m]; an external stem has no measured height."""
     return np.where(np.isnan(height), STEM_HEIGHT, np.maximum(height, 0.2))
 
 
 def short(value: float) -> str:
-    """A figure that does not tremble: two digits below 100, one above."""
+    """Return a number with two digits below 100 and one above, so that the text rarely changes."""
     if not np.isfinite(value):
         return "∞"
     if value >= 100.0:

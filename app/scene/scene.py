@@ -13,37 +13,31 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from app.scene.camera import WORLD, Follower
-from app.scene.error_node import ErrorNode
-from app.scene.hotkeys import add_hotkeys
-from app.scene.map_cloud import Accumulated, MapCloud
-from app.scene.map_nodes import MapNodes, Ring
-from app.scene.robot_nodes import ROBOT, RobotNodes
-from app.scene.scan_nodes import ScanNodes, Vector
-from app.scene.server import silenced, start_server
-from app.scene.tune_panel import TunePanel
-from app.scene.tuning import SceneCommands, Tuning, Value
-from app.scene.view import View
-from app.scene.voxel_node import VoxelNode
-from app.scene.way_node import WayNode
+from app.scene.camera import WORLD, Follower, add_hotkeys
+from app.scene.layers import View
+from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
+from app.scene.panel import SceneCommands, TunePanel, Tuning, Value
+from app.scene.robot import ROBOT, RobotNodes, WayNode
+from app.scene.scan import ScanNodes, Vector, VoxelNode
+from app.scene.viser_server import messages_sent, silenced, start_server
 from pipeline.config import Parameters, preset
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Frame, TruthTrees
 
 Float = NDArray[np.float64]
 
-# A browser that comes late walks through every message number that was ever given out: 50 million took 17 s.
+# A browser that connects later steps through all message numbers: 50 million took 17 s.
 RENEW_AFTER = 2_000_000
 
 
 class Scene:
-    """Shows frames in viser and carries what people do there to the server.
+    """Shows frames in viser and passes the actions of people there to the server.
 
-    All methods are called on `loop`. What viser calls in its own thread crosses over to `loop` first, so
-    that no two threads ever touch the nodes.
+    All methods are called on `loop`. Callbacks from the thread of viser are passed to `loop` first, so that
+    only one thread changes the nodes.
 
     Args:
-        commands: What the scene asks of the server.
+        commands: Commands of the scene to the server.
         loop: The server's loop.
     """
 
@@ -63,20 +57,20 @@ class Scene:
 
     @property
     def port(self) -> int:
-        """Where viser listens on 127.0.0.1. It changes when the scene renews itself: read it each time."""
+        """Port of viser on 127.0.0.1. It changes when the scene restarts viser: read it each time."""
         return self._server.get_port()
 
     @property
     def messages(self) -> int:
-        """Message numbers that viser has given out since it started."""
-        return self._server._websock_server.get_message_buffer().message_counter
+        """Number of messages that viser has numbered since it started."""
+        return messages_sent(self._server)
 
     def show(self, frame: Frame, path: Float) -> None:
-        """Show what came of a scan.
+        """Show the results of a scan.
 
         Args:
-            frame: The results.
-            path: shape (N, 2) [m], where the robot was at each scan, in the frame of the map.
+            frame: Results of the scan.
+            path: Positions of the robot at all scans in the frame of the map, shape (N, 2) [m].
         """
         self._frame, self._path = frame, np.asarray(path, dtype=np.float64).reshape(-1, 2)
         if self.messages > RENEW_AFTER:
@@ -85,33 +79,35 @@ class Scene:
         self._show_frame()
 
     def show_parameters(self, parameters: Parameters, preset_name: str) -> None:
-        """Move the sliders to what holds now, without calling back."""
+        """Set the widgets to parameters, without a callback."""
         self._parameters, self._preset = parameters, preset_name
         with self._server.atomic():
             self._tune.show(parameters, preset_name, self._tuning.moving)
 
     def show_truth(self, trees: TruthTrees | None) -> None:
-        """Show the ground truth; None takes it away."""
+        """Show the ground truth; None removes it."""
         self._truth = trees
         with self._server.atomic():
             self._map.show_truth(trees)
 
     def select(self, tree: int | None, ring: Ring = None) -> None:
-        """Mark a tree by its number and a cluster by a ring around it: x, y and radius [m] in the frame of
-        the map. None marks none."""
+        """Mark a tree by its number, and a cluster by a ring: x, y and radius [m] in the frame of the map.
+
+        None removes the mark.
+        """
         self._selected, self._ring = tree, ring
-        if self._frame is not None:  # the scan is large and does not change by this
+        if self._frame is not None:  # the scan itself does not change
             with self._server.atomic():
                 self._map.repaint(self._frame, tree, ring, self._view)
 
     @property
     def view(self) -> dict[str, Any]:
-        """What people chose to see, for the page."""
+        """Visible layers, choices and counts, for the page."""
         return {**self._view.as_plain(), "counts": self.counts}
 
     @property
     def counts(self) -> dict[str, int]:
-        """How much the layers show of which only the scene knows."""
+        """Number of elements of the layers that only the scene counts."""
         return {
             "ground": self._map.ground.faces,
             "voxels": self._voxels.count,
@@ -120,7 +116,7 @@ class Scene:
         }
 
     def choose(self, name: str, value: str | bool) -> None:
-        """Show or hide a layer, follow the robot or not, or colour and label by something else.
+        """Show or hide a layer, follow the robot or not, or choose colouring and labels.
 
         Raises:
             ParameterError: There is no such choice.
@@ -129,7 +125,7 @@ class Scene:
         self._repaint()
 
     def clear(self) -> None:
-        """Forget the run: an empty scene, the panel as it is."""
+        """Remove the run: the scene is empty, the panel stays."""
         self._frame, self._path = None, np.zeros((0, 2))
         self._truth = self._selected = self._ring = None
         self._accumulated = Accumulated()
@@ -184,7 +180,7 @@ class Scene:
 
     def _renew(self) -> None:
         old = self._server
-        # Browsers lose their connection when the old one stops, and find the new port through the bridge.
+        # Browsers lose their connection when the old server stops, and reconnect to the new one by the proxy.
         self._build()
         self._map.show_truth(self._truth)
         self._show_frame()
@@ -204,9 +200,9 @@ class Scene:
     def _show_frame(self) -> None:
         if self._frame is None:
             return
-        with self._server.atomic():  # or the points would run ahead of the robot
+        with self._server.atomic():  # otherwise the points would move before the robot
             self._follower.show(self._pose, self._base_z, self._view.follow)
-            # First, because all else stands on its ground.
+            # First, because the other nodes use the heights of its ground.
             self._map.show(self._frame, self._selected, self._ring, self._view)
             self._robot.show(self._frame, self._path, self._view, self._map.ground)
             self._scan.show(self._frame, self._view)
@@ -214,7 +210,7 @@ class Scene:
             self._show_more(self._frame)
 
     def _show_more(self, frame: Frame) -> None:
-        """The layers that are made only while people want to see them."""
+        """Show the layers that are computed only while they are visible."""
         size = self._parameters.filters.voxel_size
         self._voxels.show(frame.filtered, size, self._view.layers["voxels"])
         self._way.show(frame.clearance, self._parameters.obstacles, self._view.layers["way"])
@@ -235,7 +231,7 @@ class Scene:
             self._gathered.repaint(self._view.layers["gathered"])
             self._show_more(self._frame)
 
-    # --- what people do; each runs in viser's thread and crosses over ---------------------------
+    # --- callbacks in the thread of viser, passed to the loop -------------------------------------
 
     def _cross(self, function: Callable[..., None], *arguments: Any) -> None:  # noqa: ANN401
         with contextlib.suppress(RuntimeError):  # the loop has ended before viser's thread

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.scene import Scene, colours
-from app.scene.lines import CHUNK, Line
+from app.scene.nodes import CHUNK, Line
 
 
 def drawn(line: Line) -> np.ndarray:

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene import Scene
-from app.scene.error_node import errors
-from app.scene.map_cloud import BLOCK, SIDE, STEP, Accumulated
+from app.scene.map import BLOCK, SIDE, STEP, Accumulated, errors
 from pipeline.config import preset
 from pipeline.config.stages import Evaluation
 from pipeline.geometry.poses import Pose2
@@ -56,7 +55,7 @@ def test_a_robot_that_stands_gathers_nothing_new():
 
 
 def test_what_has_no_room_is_counted(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("app.scene.map_cloud.MOST_POINTS", 50)
+    monkeypatch.setattr("app.scene.map.MOST_POINTS", 50)
     gathered = Accumulated()
     gathered.take(make_frame(0))
     assert len(gathered.points) == 50

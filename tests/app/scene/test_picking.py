@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.scene.picking import distances, meant
+from app.scene.scan import distances, meant
 
 coordinate = st.floats(-20.0, 20.0)
 vector = st.tuples(coordinate, coordinate, coordinate).map(np.array)

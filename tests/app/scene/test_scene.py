@@ -10,7 +10,7 @@ import pytest
 
 from app.scene import Scene
 from app.scene import scene as scene_module
-from app.scene.cloud import Cloud
+from app.scene.nodes import Cloud
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import TruthTrees
 from tests.app.scene.frames import make_frame, make_trees

@@ -9,7 +9,7 @@ import pytest
 from viser import _messages
 
 from app.scene import Scene
-from app.scene.widgets import set_value
+from app.scene.viser_server import set_value
 from pipeline.config import Parameters, field_specs, preset
 from tests.app.scene.recorder import Recorder, Refusing
 

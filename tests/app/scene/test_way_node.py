@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene import Scene
-from app.scene.way_node import OF_ZONE, way_lines
+from app.scene.robot import OF_ZONE, way_lines
 from pipeline.config.stages import Obstacles
 from pipeline.detection.obstacles import find_clearance
 from pipeline.types.clearance import Clearance, Zone

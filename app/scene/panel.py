@@ -1,14 +1,19 @@
-"""The Tune panel: a slider for every parameter, made from the one declaration of the parameters."""
+"""The panel of viser: a widget for every declared parameter, and the commands of the scene to the server.
+
+The tab Tune of the page shows the same declarations, see `static/js/tune/`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any, Protocol
 
 import viser
 
-from app.scene.widgets import set_value
+from app.scene.viser_server import set_value
 from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs, preset
+from pipeline.errors import StemmapError
 
 Value = float | int | bool | str
 CHANGED = "● "
@@ -19,12 +24,12 @@ OnReset = Callable[[list[str], viser.ClientHandle], None]
 
 
 class TunePanel:
-    """Sliders, a preset list and reset buttons. All callbacks run in viser's thread.
+    """Sliders, a list of presets and reset buttons. All callbacks run in the thread of viser.
 
     Args:
-        gui: viser's panel, standing where the widgets are to be added.
-        parameters, preset_name: What holds at first.
-        on_change, on_preset, on_reset: Told what a person did; nothing that was set from code.
+        gui: Panel of viser, at the place of the new widgets.
+        parameters, preset_name: Initial values.
+        on_change, on_preset, on_reset: Called after actions of people, not after changes by the server.
     """
 
     def __init__(
@@ -96,13 +101,13 @@ class TunePanel:
 
         @widget.on_update
         async def _(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:  # None: it was set by us
+            if event.client is not None:  # None: set by the server
                 self._on_change(spec.name, _meant(spec, event.target.value), event.client)
 
         return widget
 
     def _add_reset(self, gui: viser.GuiApi, title: str, names: list[str]) -> None:
-        button = gui.add_button(title, color="gray", hint="Back to the values of the preset.")
+        button = gui.add_button(title, color="gray", hint="Reset to the values of the preset.")
 
         @button.on_click
         async def _(event: viser.GuiEvent[Any]) -> None:
@@ -118,7 +123,7 @@ def make_widget(gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiIn
     if spec.kind == "choice":
         return gui.add_dropdown(label, spec.choices, initial_value=str(value), hint=spec.doc)
     if spec.kind == "name":
-        # Chosen on the page: here each letter that is typed would be a change.
+        # Changed on the page: here every typed letter would be a change.
         return gui.add_text(label, str(value), disabled=True, hint=spec.doc)
     kind = int if spec.kind == "int" else float
     low, high, step = (kind(bound or 0) for bound in (spec.minimum, spec.maximum, spec.step))
@@ -135,7 +140,7 @@ def _shown(spec: FieldSpec, value: Value) -> Value:
 
 
 def _meant(spec: FieldSpec, value: Value) -> Value:
-    # A slider of step 0.01 gives 0.15000000000000002; the person meant 0.15.
+    # A slider of step 0.01 gives 0.15000000000000002 for 0.15.
     return round(float(value), 9) if spec.kind == "float" else value
 
 
@@ -148,3 +153,96 @@ def _summary(changed: int, preset_name: str) -> str:
         return f"As in *{preset_name}*."
     differ = "value differs" if changed == 1 else "values differ"
     return f"**{changed}** {differ} from *{preset_name}* (marked ●)."
+
+
+class SceneCommands(Protocol):
+    """Commands of the scene to the server; they run on the loop of the server."""
+
+    async def change_parameters(self, changes: dict[str, Value]) -> None:
+        """Change parameters by dotted name.
+
+        Raises:
+            ParameterError: The values are refused and nothing changes.
+        """
+
+    async def use_preset(self, name: str) -> None:
+        """Use all values of a preset."""
+
+    async def reset_parameters(self, names: list[str]) -> None:
+        """Reset parameters to the preset; an empty list means all."""
+
+    async def choose_view(self, name: str, value: str | bool) -> None:
+        """Choose a layer, the colouring, the labels or following.
+
+        Raises:
+            ParameterError: There is no such choice.
+        """
+
+    async def select_tree(self, number: int | None) -> None:
+        """Select a tree in all views; None clears the selection."""
+
+    async def select_cluster(self, scan: int, cluster: int) -> None:
+        """Select a cluster of a scan in all views.
+
+        Raises:
+            StemmapError: The scan is not stored any more.
+        """
+
+
+class Tuning:
+    """Sends changes of the panel to the server, one at a time, on the loop of the server.
+
+    Args:
+        commands: Commands to the server.
+        put_back: Resets the widgets to the present values after a refusal.
+    """
+
+    def __init__(self, commands: SceneCommands, put_back: Callable[[], None]) -> None:
+        self._commands, self._put_back = commands, put_back
+        self._waiting: dict[str, Value] = {}
+        self._asker: viser.ClientHandle | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._busy = False
+
+    @property
+    def moving(self) -> frozenset[str]:
+        """Parameters whose newest value has not been sent yet."""
+        return frozenset(self._waiting)
+
+    def change(self, name: str, value: Value, client: viser.ClientHandle | None) -> None:
+        """Send a value; while the server is busy, only the newest value of each parameter waits."""
+        self._waiting[name] = value
+        self._asker = client
+        if not self._busy:
+            self._busy = True
+            self._start(self._send_waiting())
+
+    def ask(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
+        """Run another command; a refusal is shown in the browser of the client."""
+        self._start(self._told(command, client))
+
+    def stop(self) -> None:
+        """Cancel all commands in progress."""
+        for task in self._tasks:
+            task.cancel()
+
+    async def _send_waiting(self) -> None:
+        try:
+            while self._waiting:
+                changes, self._waiting = self._waiting, {}
+                await self._told(self._commands.change_parameters(changes), self._asker)
+        finally:
+            self._busy = False
+
+    async def _told(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
+        try:
+            await command
+        except StemmapError as error:
+            self._put_back()
+            if client is not None:
+                client.add_notification("Not changed", str(error), color="orange", auto_close_seconds=8.0)
+
+    def _start(self, work: Awaitable[None]) -> None:
+        task: asyncio.Task[None] = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)

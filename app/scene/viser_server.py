@@ -1,4 +1,7 @@
-"""viser's server as the dashboard needs it: on this machine only, and only for who knows the secret."""
+"""viser's server for the dashboard: local, and only for requests with a secret.
+
+The only module that uses private parts of viser; `tests/app/scene/test_viser_contract.py` checks them.
+"""
 
 from __future__ import annotations
 
@@ -38,17 +41,17 @@ def start_server(secret: str) -> viser.ViserServer:
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """viser greets and parts on standard output, which belongs to the command line."""
+    """Suppress viser's messages on standard output, which belongs to the command line."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield
 
 
 @contextlib.contextmanager
 def _guarded_handshakes(secret: str) -> Iterator[None]:
-    # viser has no login and its port can be reached by everybody on this machine. It hands its own
-    # `process_request` to websockets.asyncio.server.serve inside of one long method, so there is nothing to
-    # override; while it starts (its constructor waits until the socket is bound) `serve` is wrapped so that
-    # our check runs first. The lock keeps two scenes from wrapping one another.
+    # viser has no login, and every user of this machine can reach its port. It passes its own
+    # `process_request` to websockets.asyncio.server.serve inside one long method, so nothing can be
+    # overridden. While it starts (its constructor waits until the socket is bound) `serve` is wrapped so that
+    # the secret is checked first. The lock keeps two scenes from wrapping each other.
     with _starting:
         serve = websockets.asyncio.server.serve
 
@@ -75,14 +78,19 @@ def _check_first(secret: str, then: Callable[..., Any] | None) -> Callable[..., 
     return process_request
 
 
+def messages_sent(server: viser.ViserServer) -> int:
+    """Return how many message numbers the server has used since it started."""
+    return server._websock_server.get_message_buffer().message_counter
+
+
 def _refuse_tunnels(server: viser.ViserServer) -> None:
-    # Any client could ask for a public address of this machine; nobody answers that message any more.
+    # Any client could request a public address of this machine; without a handler the message is ignored.
     for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
         server._websock_server.unregister_handler(message)
 
 
 def _take_values_only(server: viser.ViserServer) -> None:
-    # viser sets whatever attribute of a slider a client names. Ours only ever change their value.
+    # viser sets any attribute of a widget that a client names. Only the value may be set here.
     handle = server.gui._handle_gui_updates
     server._websock_server.unregister_handler(_messages.GuiUpdateMessage, handle)
 
@@ -93,3 +101,20 @@ def _take_values_only(server: viser.ViserServer) -> None:
             await handle(client_id, message)
 
     server._websock_server.register_handler(_messages.GuiUpdateMessage, guarded)
+
+
+def add_posed(scene: viser.SceneApi, name: str) -> viser.FrameHandle:
+    """Add a frame without axes at the origin of its parent, and send its pose.
+
+    viser does not send the default pose of a new node. A node that is removed and added again reaches a
+    browser as a change, so it would keep the pose of the last run until its pose differs from the origin.
+    """
+    frame = scene.add_frame(name, show_axes=False)
+    frame.position, frame.wxyz = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)  # only the last of both is sent
+    frame.position, frame.wxyz = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+    return frame
+
+
+def set_value(widget: Any, value: float | int | bool | str) -> None:  # noqa: ANN401
+    """Set the value of a widget from code. (mypy does not see the setter of viser's generic property.)"""
+    widget.value = value

@@ -1,4 +1,4 @@
-"""The ground in the scene: one mesh over the known cells of the height map."""
+"""The ground in the scene: one mesh over the known cells of the terrain map."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pipeline.types.records import HeightMap
 
 Float = NDArray[np.float64]
 
-MOST_CELLS = 40_000  # that one mesh shows; above, cells are joined two by two
+MOST_CELLS = 40_000  # of the mesh; in a larger map two by two cells are averaged
 NOTHING = np.full((1, 1), np.nan)
 
 
 class GroundNode:
-    """The surface, and the height at which all else stands on it.
+    """The mesh of the ground, and its heights for the other nodes.
 
-    It is sent again only when the height map is another one.
+    The mesh is sent again only for another height map.
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
@@ -40,7 +40,7 @@ class GroundNode:
 
     @property
     def visible(self) -> bool:
-        """Whether people want to see it."""
+        """Whether the layer is on."""
         return self._visible
 
     @visible.setter
@@ -51,11 +51,11 @@ class GroundNode:
 
     @property
     def faces(self) -> int:
-        """Of its mesh."""
+        """Number of faces of the mesh."""
         return self._faces
 
     def show(self, ground: HeightMap | None) -> bool:
-        """Show a height map; None keeps the one before. Returns whether it is another one."""
+        """Show a height map; None keeps the present one. Return whether the height map changed."""
         if ground is None or ground is self._shown:
             return False
         self._shown = ground
@@ -70,7 +70,7 @@ class GroundNode:
         return True
 
     def heights(self, places: NDArray[np.floating], otherwise: float) -> Float:
-        """Height of the ground at places of shape (N, 2) [m]; `otherwise` where it is not known."""
+        """Return the height of the ground at places (N, 2) [m]; `otherwise` where it is unknown."""
         cell = np.floor((np.asarray(places, np.float64).reshape(-1, 2) - self._low) / self._cell)
         inside = np.all((cell >= 0) & (cell < self._raster.shape), axis=1)
         i, j = np.where(inside[:, None], cell, 0).astype(np.int64).T
@@ -79,8 +79,11 @@ class GroundNode:
 
 
 def raster(ground: HeightMap) -> tuple[Float, Float, float]:
-    """Heights of all cells of the box around the known ones, shape (I, J) [m], NaN where unknown; the box's
-    lower corner (2,) [m] and the side of a cell [m]. Large maps get larger cells."""
+    """Return the heights of a grid around all known cells, its lower corner, and the side of a cell.
+
+    Heights have shape (I, J) [m] and are NaN where unknown; the corner has shape (2,) [m]. A map with more
+    than `MOST_CELLS` cells gets larger cells.
+    """
     place, height, cell = ground.place.astype(np.int64), ground.height.astype(np.float64), ground.cell
     if len(place) == 0:
         return NOTHING, np.zeros(2), cell
@@ -95,9 +98,9 @@ def raster(ground: HeightMap) -> tuple[Float, Float, float]:
 
 
 def surface(grid: Float, low: Float, cell: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """A mesh through the middles of the known cells: vertices (V, 3) [m] and faces (F, 3).
+    """Return a mesh through the centres of the known cells: vertices (V, 3) [m] and faces (F, 3).
 
-    A square of four known middles becomes two triangles. The scene's light shades them by their slope.
+    Four neighbouring known centres become two triangles.
     """
     known = np.isfinite(grid)
     square = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]

@@ -1,0 +1,361 @@
+"""The tree map in the scene: one mesh for all trees, their numbers, and the ground truth as rings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from app.scene import colours, nodes
+from app.scene.ground import GroundNode
+from app.scene.labels import NUMBER_WIDTH, Label, Labels, apart
+from app.scene.layers import View
+from app.scene.nodes import Batch, Circles, Cloud
+from pipeline.config.stages import Evaluation
+from pipeline.types.records import Frame, Trees, TruthTrees
+
+Ring = tuple[float, float, float] | None
+
+TREE_HEIGHT = 2.2  # what a robot sees of a trunk; the map knows no height of trees [m]
+UNKNOWN_RADIUS = 0.08  # drawn where no arc carried a diameter [m]
+NUMBERS = 20  # nearest trees that carry their number
+
+
+class MapNodes:
+    """Trees and ground truth.
+
+    Args:
+        scene: Where the nodes are added.
+        on_tree: Called in viser's thread with the number of a tree that was clicked.
+    """
+
+    def __init__(self, scene: viser.SceneApi, on_tree: Callable[[int], None]) -> None:
+        self.ground = GroundNode(scene)
+        self._truth_trees: TruthTrees | None = None
+        self._trees = Batch(scene, "/world/trees", nodes.cylinder(), opacity=0.55)
+        self._truth = Circles(scene, "/world/truth", 0.04, 2.5)
+        self._mark = Circles(scene, "/world/selection", 0.06, 5.0)
+        self._labels = Labels(scene, "/world/numbers", 1.0)
+        self._shown: NDArray[np.float64] = np.zeros((0, 5))
+        self._numbers: list[int] = []
+
+        @self._trees.node.on_click
+        async def _(event: viser.SceneNodePointerEvent[Any]) -> None:
+            numbers = self._numbers
+            if event.instance_index is not None and 0 <= event.instance_index < len(numbers):
+                on_tree(numbers[event.instance_index])
+
+    def show(self, frame: Frame, selected: int | None, ring: Ring, view: View) -> None:
+        """Show the map after a scan; what moved by less than a centimetre stays where it is."""
+        if self.ground.show(frame.ground):
+            self.show_truth(self._truth_trees)
+        trees = confirmed(frame.trees)
+        foot = np.round(self.ground.heights(trees.position, frame.base_z), 1)
+        radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh, UNKNOWN_RADIUS)
+        place = np.column_stack([trees.number, np.round(trees.position, 2), np.round(radius, 3), foot])
+        numbers = [int(number) for number in trees.number]
+        if not np.array_equal(place, self._shown) or numbers != self._numbers:
+            self._shown, self._numbers = place, numbers
+            self._show_trees(place, np.isfinite(trees.dbh))
+        self.repaint(frame, selected, ring, view)
+
+    def repaint(self, frame: Frame, selected: int | None, ring: Ring, view: View) -> None:
+        """Show the same map after a choice of layers, of a tree, or of a cluster that stands at `ring`: x, y
+        and radius [m] in the frame of the map."""
+        self.ground.visible = view.layers["ground"]
+        self._trees.wanted = view.layers["trees"]
+        self._truth.wanted = view.layers["truth"]
+        trees = confirmed(frame.trees)
+        pose = frame.estimate.T_map_base
+        foot = self.ground.heights(trees.position, frame.base_z)
+        self._show_mark(trees, selected, ring, frame.base_z)
+        self._labels.show(
+            tree_labels(trees, np.array([pose.x, pose.y]), selected, foot) if view.layers["trees"] else []
+        )
+
+    def show_truth(self, trees: TruthTrees | None) -> None:
+        """Rings where trees and others really stand; None takes them away."""
+        self._truth_trees = trees
+        if trees is None:
+            self._truth.show(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3), dtype=np.uint8))
+            return
+        radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh, UNKNOWN_RADIUS) + 0.12
+        is_tree = np.array([kind == "tree" for kind in trees.kind], dtype=bool)
+        place = np.column_stack([trees.x, trees.y])
+        self._truth.show(
+            place,
+            radius,
+            colours.choose(is_tree, colours.TRUTH, colours.OTHER),
+            self.ground.heights(place, 0.0),
+        )
+
+    @property
+    def texts(self) -> list[str]:
+        """The labels that are to be read now."""
+        return self._labels.texts
+
+    def _show_trees(self, place: NDArray[np.float64], measured: NDArray[np.bool_]) -> None:
+        self._trees.show(
+            place[:, [1, 2, 4]],
+            np.column_stack([place[:, 3], place[:, 3], np.full(len(place), TREE_HEIGHT)]),
+            colours.choose(measured, colours.TREE, colours.UNMEASURED),
+        )
+
+    def _show_mark(self, trees: Trees, selected: int | None, ring: Ring, base_z: float) -> None:
+        # Around a cluster there is its own ring; a second one around its tree would only cover it.
+        row = trees.number == (-1 if selected is None or ring is not None else selected)
+        places, radii = np.round(trees.position[row], 2), []
+        for dbh in trees.dbh[row]:
+            radii.append(0.4 + (0.5 * dbh if np.isfinite(dbh) else UNKNOWN_RADIUS))
+        if ring is not None:
+            places, radii = np.vstack([places, ring[:2]]), [*radii, ring[2] + 0.12]
+        each = np.tile(np.array([colours.SELECTION], dtype=np.uint8), (len(radii), 1))
+        self._mark.show(places, np.array(radii), each, self.ground.heights(places, base_z))
+
+
+def confirmed(trees: Trees) -> Trees:
+    """Return the confirmed trees only."""
+    known = {name: column for name in Trees.__slots__ if (column := getattr(trees, name)) is not None}
+    return Trees(**{name: column[trees.confirmed] for name, column in known.items()})
+
+
+def tree_labels(
+    trees: Trees, robot: NDArray[np.float64], selected: int | None, foot: NDArray[np.float64]
+) -> list[Label]:
+    """Return labels for the selected tree and the trees nearest to the robot, without overlaps.
+
+    Args:
+        trees: Trees of the map.
+        robot: Position of the robot (x, y) [m].
+        selected: Number of the selected tree.
+        foot: Height of the ground at each tree, shape (T,) [m].
+    """
+    distance = np.linalg.norm(trees.position - robot, axis=1)
+    order = np.lexsort((distance, trees.number != (-1 if selected is None else selected)))
+    return [
+        Label(
+            int(trees.number[row]),
+            _tree_text(trees, row, int(trees.number[row]) == selected),
+            (
+                float(trees.position[row, 0]),
+                float(trees.position[row, 1]),
+                round(float(foot[row]), 1) + TREE_HEIGHT + 0.15,
+            ),
+        )
+        for row in apart(trees.position, order, robot, NUMBER_WIDTH, NUMBERS)
+    ]
+
+
+def _tree_text(trees: Trees, row: int, selected: bool) -> str:
+    number = int(trees.number[row])
+    if not selected:
+        return f"{number}"
+    dbh = float(trees.dbh[row])
+    return (
+        f"tree {number}, DBH {100 * dbh:.1f} cm" if np.isfinite(dbh) else f"tree {number}, DBH not measured"
+    )
+
+
+Float = NDArray[np.float64]
+
+TIMES = 10.0  # magnification of position errors, which are centimetres
+CROSS = 0.45  # half the width of the cross of a missed tree [m]
+AROUND = 0.6  # radius of the ring of a false tree [m]
+HEIGHT = 0.08  # above the ground [m]
+
+
+class ErrorNode:
+    """Errors of the map against the ground truth, as lines: offsets, missed trees and false trees."""
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._node = scene.add_line_segments(
+            "/world/errors",
+            np.zeros((1, 2, 3), dtype=np.float32),
+            np.zeros((1, 2, 3), dtype=np.uint8),
+            thickness=3.0,
+            thickness_units="screen",
+            visible=False,
+        )
+        self.count = 0
+
+    def hide(self) -> None:
+        """Hide all errors."""
+        self.count, self._node.visible = 0, False
+
+    def show(
+        self, trees: Trees, truth: TruthTrees | None, path: Float, wanted: Evaluation, ground: GroundNode
+    ) -> None:
+        """Show the errors against the ground truth within reach of the path, shape (N, 2) [m]."""
+        if truth is None or len(path) == 0:
+            self.hide()
+            return
+        offsets, missed, false = errors(trees, truth, path, wanted)
+        self.count = len(missed) + len(false)
+        lines: list[NDArray[np.floating]] = [
+            np.stack([offsets[:, 0], offsets[:, 0] + TIMES * (offsets[:, 1] - offsets[:, 0])], axis=1),
+            _crosses(missed),
+            nodes.circles(false, np.full(len(false), AROUND), np.zeros(len(false)))[:, :, :2],
+        ]
+        sizes = [len(each) for each in lines]
+        flat = np.concatenate(lines).reshape(-1, 2)
+        self._node.visible = len(flat) > 0
+        if not len(flat):
+            return
+        xyz = np.column_stack([flat, ground.heights(flat, 0.0) + HEIGHT]).reshape(-1, 2, 3)
+        self._node.points = xyz.astype(np.float32)
+        each = np.array([colours.SELECTION, colours.ERROR, colours.ERROR], dtype=np.uint8)
+        self._node.colors = np.repeat(colours.of_lines(np.repeat(each, sizes, axis=0)), 2, axis=0).reshape(
+            -1, 2, 3
+        )
+
+
+def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> tuple[Float, Float, Float]:
+    """Return pairs of true and mapped position of matched trees, missed trees, and false trees.
+
+    Shapes (M, 2, 2), (K, 2) and (F, 2), all in metres. Only trees within reach of the path count as missed or
+    false.
+    """
+    from scipy.spatial import cKDTree
+
+    from pipeline.evaluation.matching import matched_rows
+
+    true = np.column_stack([truth.x, truth.y])
+    rows, truth_of = matched_rows(trees, truth, wanted.match_distance)
+    offsets = np.stack([true[truth_of], trees.position[rows]], axis=1)
+    way = cKDTree(path)
+    missed = np.array([kind == "tree" for kind in truth.kind], np.bool_)
+    missed[truth_of] = False
+    false = trees.confirmed.copy()
+    false[rows] = False
+    left_out, wrong = true[missed], trees.position[false]
+    return offsets, left_out[_near(way, left_out, wanted.reach)], wrong[_near(way, wrong, wanted.reach)]
+
+
+def _near(way: object, places: Float, reach: float) -> NDArray[np.bool_]:
+    if not len(places):
+        return np.zeros(0, np.bool_)
+    distance: Float = way.query(places)[0]  # type: ignore[attr-defined]
+    return distance <= reach
+
+
+def _crosses(places: Float) -> Float:
+    arms = CROSS * np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]])
+    return (places[:, None, None, :] + arms).reshape(-1, 2, 2)
+
+
+SIDE = 0.1  # side of a cell, which is shown as one point [m]
+MOST_POINTS = 200_000
+BLOCK = 20_000  # points per node, so that a large map is not sent again with each scan
+STEP, TURN = 0.25, 0.17  # motion after which the next scan is added [m, rad]
+LOW, HIGH = 0.0, 3.0  # heights at the ends of the colour ramp [m]
+_HALF = 1 << 20  # largest cell coordinate of a key
+
+
+class Accumulated:
+    """Filtered points of all scans in the frame of the map, one per cell, placed by the pose of their scan.
+
+    Attributes:
+        points: float32, shape (N, 3) [m], in order of arrival.
+        left_out: Number of cells left out because of the limit MOST_POINTS.
+    """
+
+    def __init__(self) -> None:
+        self.points = np.zeros((0, 3), np.float32)
+        self.left_out = 0
+        self._keys = np.zeros(0, np.int64)
+        self._scans: list[tuple[int, int, NDArray[np.float64]]] = []  # scan, points before it, pose
+
+    def take(self, frame: Frame) -> bool:
+        """Add the filtered points of a scan; if the run went back, remove those of later scans first.
+
+        Returns:
+            Whether `points` changed.
+        """
+        went_back = self._go_back(frame.index)
+        pose = frame.estimate.T_map_base.as_array()
+        if self._scans:
+            moved = pose - self._scans[-1][2]
+            turned = abs((moved[2] + np.pi) % (2.0 * np.pi) - np.pi)
+            if np.hypot(*moved[:2]) < STEP and turned < TURN:
+                return went_back
+        points = frame.filtered + frame.sensor_offset.astype(np.float32)
+        placed = np.column_stack(
+            [frame.estimate.T_map_base.apply(points[:, :2].astype(np.float64)), points[:, 2] + frame.base_z]
+        )
+        keys, first = np.unique(_keys(placed), return_index=True)
+        new = np.sort(first[~np.isin(keys, self._keys)])
+        room = MOST_POINTS - len(self.points)
+        self.left_out += max(0, len(new) - room)
+        new = new[:room]
+        self._scans.append((frame.index, len(self.points), pose))
+        self.points = np.vstack([self.points, placed[new].astype(np.float32)])
+        self._keys = np.concatenate([self._keys, _keys(placed[new])])
+        return went_back or len(new) > 0
+
+    def _go_back(self, index: int) -> bool:
+        keep = None
+        while self._scans and self._scans[-1][0] >= index:
+            keep = self._scans.pop()[1]
+        if keep is None:
+            return False
+        self.points, self._keys, self.left_out = self.points[:keep], self._keys[:keep], 0
+        return True
+
+
+class MapCloud:
+    """The accumulated points in the scene, in blocks; only changed blocks are sent.
+
+    Args:
+        scene: Scene of the nodes.
+        gathered: Accumulated points; they outlive the nodes when viser restarts.
+    """
+
+    def __init__(self, scene: viser.SceneApi, gathered: Accumulated) -> None:
+        self._scene, self._gathered = scene, gathered
+        self._blocks: list[Cloud] = []
+        self._sent = np.zeros((0, 3), np.float32)
+        self._visible = False
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return len(self._gathered.points)
+
+    def show(self, frame: Frame, visible: bool) -> None:
+        """Add a scan; hidden points are accumulated too."""
+        self._gathered.take(frame)
+        self.repaint(visible)
+
+    def repaint(self, visible: bool) -> None:
+        """Show or hide the points."""
+        self._visible = visible
+        if visible:
+            self._send(self._gathered.points)
+        for number, block in enumerate(self._blocks):
+            block.visible = visible and number * BLOCK < len(self._sent)
+
+    def _send(self, points: NDArray[np.float32]) -> None:
+        shared = min(len(points), len(self._sent))
+        changed = np.flatnonzero(np.any(points[:shared] != self._sent[:shared], axis=1))
+        first = int(changed[0]) if len(changed) else shared
+        if first == len(points) == len(self._sent):
+            return
+        self._sent = points
+        for number in range(first // BLOCK, -(-len(points) // BLOCK)):
+            if number == len(self._blocks):
+                name = f"/world/gathered/{number}"
+                self._blocks.append(Cloud(self._scene, name, 0.05, precision="float32"))
+            part = points[number * BLOCK : (number + 1) * BLOCK]
+            self._blocks[number].show(part, colours.ramp(part[:, 2], LOW, HIGH))
+
+
+def _keys(points: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Return the key of the cell of each point, shape (N,)."""
+    cell = (
+        np.clip(np.floor(np.asarray(points, np.float64) / SIDE), -_HALF, _HALF - 1).astype(np.int64) + _HALF
+    )
+    keys: NDArray[np.int64] = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+    return keys

@@ -1,0 +1,280 @@
+"""The current scan in the scene: points by stage, voxels, fitted circles, labels, clicks on clusters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from app.scene import colours, nodes
+from app.scene.colours import Colours
+from app.scene.labels import Labels, cluster_labels, shown_height
+from app.scene.layers import View
+from app.scene.nodes import Batch, Cloud
+from app.scene.viser_server import add_posed
+from pipeline.types.records import Frame
+
+Float = NDArray[np.float64]
+Vector = tuple[float, float, float]
+OnCluster = Callable[[int | None, Vector, Vector], None]
+
+# Heights at the ends of the colour ramp: about those of ground and trunks of a stand [m].
+HEIGHT_LOW, HEIGHT_HIGH = -1.0, 3.0
+WIDEST_MARKER = 0.6  # [m], the radius of a thick trunk
+
+
+class ScanNodes:
+    """Nodes of the current scan, children of the frame of the robot.
+
+    The points stay in the frame of the sensor: viser sends 16-bit coordinates, which would be steps of
+    decimetres far from the origin of a large map.
+
+    Args:
+        scene: Where the nodes are added.
+        robot: Name of the node of the robot.
+        on_cluster: Called in the thread of viser with the number of the clicked marker and the ray (origin,
+            direction) in the world frame of viser.
+    """
+
+    def __init__(self, scene: viser.SceneApi, robot: str, on_cluster: OnCluster) -> None:
+        self._sensor = add_posed(scene, f"{robot}/scan")
+        self._raw = Cloud(scene, f"{robot}/scan/raw", 0.02)
+        self._filtered = Cloud(scene, f"{robot}/scan/filtered", 0.03)
+        self._clusters = Cloud(scene, f"{robot}/scan/clusters", 0.045)
+        self._fits = Batch(scene, f"{robot}/scan/fits", nodes.cylinder(), opacity=0.4, side="double")
+        self._markers = Batch(scene, f"{robot}/scan/markers", nodes.cylinder(), opacity=0.14)
+        self._axes: tuple[Float, Float, Float] = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+        self._labels = Labels(scene, "/world/labels")
+        self._cluster_numbers = ClusterNumbers()
+        self._numbers: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+
+        for batch in (self._markers, self._fits):
+            _report(batch, self._markers, on_cluster)
+
+    def show(self, frame: Frame, view: View) -> None:
+        """Show a new scan."""
+        centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
+        self._numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
+        self._sensor.position = frame.sensor_offset
+        self._show_fits(frame)
+        self._show_markers(frame)
+        self.repaint(frame, view)
+
+    def repaint(self, frame: Frame, view: View) -> None:
+        """Update the same scan after a change of colours, labels or layers."""
+        for cloud, layer in ((self._raw, "raw"), (self._filtered, "filtered"), (self._clusters, "clusters")):
+            if cloud.visible != view.layers[layer]:
+                cloud.visible = view.layers[layer]
+        self._fits.wanted = view.layers["fits"]
+        self._markers.wanted = view.layers["clusters"]
+        self._raw.show(frame.raw, self._ramp_or(frame.raw, view, colours.RAW))
+        self._filtered.show(frame.filtered, self._ramp_or(frame.filtered, view, colours.FILTERED))
+        member = frame.labels >= 0
+        self._clusters.show(
+            frame.filtered[member], cluster_colours(frame, self._numbers, view.colour_by)[member]
+        )
+        shown = cluster_labels(frame, self._numbers, view.label_by) if view.layers["labels"] else []
+        self._labels.show(shown)
+
+    def meant(self, instance: int | None, origin: Float, direction: Float) -> int | None:
+        """Return the row of the cluster of the newest scan that a click hit; None if there is none.
+
+        Args:
+            instance: Number of the hit marker in the scan that the browser showed.
+            origin, direction: Ray of the click in the frame of the map, shape (3,) each.
+        """
+        return meant(origin, direction, *self._axes, instance)
+
+    @property
+    def texts(self) -> list[str]:
+        """The visible labels."""
+        return self._labels.texts
+
+    @staticmethod
+    def _ramp_or(points: NDArray[np.float32], view: View, plain: colours.Rgb) -> Colours | colours.Rgb:
+        if view.colour_by == "height":
+            return colours.ramp(points[:, 2], HEIGHT_LOW, HEIGHT_HIGH)
+        return plain
+
+    def _show_fits(self, frame: Frame) -> None:
+        rows = frame.detections.cluster
+        rows = rows[np.isfinite(frame.clusters.radius[rows])]
+        clusters = frame.clusters
+        height = shown_height(clusters.extent[rows, 2])
+        foot = clusters.centroid[rows, 2] - 0.5 * height
+        radius = clusters.radius[rows]
+        self._fits.show(
+            np.column_stack([clusters.centre[rows], foot]),
+            np.column_stack([radius, radius, height]),
+            colours.by_verdict(clusters.verdict[rows]),
+        )
+
+    def _show_markers(self, frame: Frame) -> None:
+        """Show a cylinder around each cluster, because point clouds take no clicks.
+
+        Its radius is limited, so that a wide cluster does not cover its neighbours.
+        """
+        c = frame.clusters
+        height = shown_height(c.extent[:, 2]) + 0.06
+        # fmax: an external stem has no extent, and a cluster may have no circle.
+        width = np.fmax(0.5 * np.hypot(c.extent[:, 0], c.extent[:, 1]), c.radius)
+        radius = np.minimum(np.fmax(width, 0.06), WIDEST_MARKER) + 0.03
+        foot = np.column_stack([c.centroid[:, :2], c.centroid[:, 2] - 0.5 * height])
+        self._markers.show(foot, np.column_stack([radius, radius, height]), colours.by_verdict(c.verdict))
+        low = foot + frame.sensor_offset + np.array([0.0, 0.0, frame.base_z])
+        low[:, :2] = frame.estimate.T_map_base.apply(low[:, :2])
+        self._axes = (low, low + np.column_stack([np.zeros((len(height), 2)), height]), radius)
+
+
+def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
+    @batch.node.on_click
+    async def _(event: viser.SceneNodePointerEvent[Any]) -> None:
+        # There are fewer circles than clusters, so their number is not that of a cluster; the ray decides.
+        instance = event.instance_index if batch is markers else None
+        on_cluster(instance, event.ray_origin, event.ray_direction)
+
+
+def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:
+    """Return the colours of the filtered points, shape (M, 3).
+
+    Args:
+        frame: Results of the scan.
+        numbers: Persistent number of each cluster, shape (K,).
+        colour_by: One of layers.COLOUR_BY.
+    """
+    clusters = frame.clusters
+    if colour_by == "height":
+        return colours.ramp(frame.filtered[:, 2], HEIGHT_LOW, HEIGHT_HIGH)
+    if colour_by == "cluster":
+        table = colours.by_category(numbers)
+    elif colour_by == "eccentricity":  # 1 is round, 100 a line
+        table = colours.ramp(np.log10(np.fmax(clusters.eccentricity, 1.0)), 0.0, 2.0)
+    elif colour_by == "stage":
+        table = np.tile(np.array([colours.CLUSTERED], dtype=np.uint8), (len(clusters.size), 1))
+        table[frame.detections.cluster] = colours.TREE
+    else:
+        table = colours.by_verdict(clusters.verdict)
+    return colours.of_points(table, frame.labels, colours.FILTERED)
+
+
+MOST_VOXELS = 20_000  # drawn; boxes are slower than points
+
+
+class VoxelNode:
+    """The occupied voxels of the voxel grid filter as boxes in the frame of the sensor."""
+
+    def __init__(self, scene: viser.SceneApi, sensor: str) -> None:
+        self._boxes = Batch(scene, f"{sensor}/voxels", nodes.box(), opacity=0.5)
+        self.count = 0
+
+    def show(self, filtered: NDArray[np.float32], size: float, visible: bool) -> None:
+        """Show the voxels of filtered points (N, 3) [m] for a voxel size [m]; 0 means no voxels.
+
+        `count` is the number of all voxels; at most MOST_VOXELS are drawn.
+        """
+        self._boxes.wanted = visible
+        if not visible or size <= 0.0:
+            self.count = 0
+            self._boxes.show(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+            return
+        low = size * np.unique(np.floor(np.asarray(filtered, np.float64) / size), axis=0)
+        self.count = len(low)
+        drawn = low[:MOST_VOXELS]
+        each = np.tile(np.array([colours.VOXELS], dtype=np.uint8), (len(drawn), 1))
+        self._boxes.show(drawn, np.full((len(drawn), 3), size), each)
+
+
+Int = NDArray[np.int64]
+
+
+class ClusterNumbers:
+    """Gives clusters the numbers of the clusters at the same places in the previous scan.
+
+    Colours and labels follow these numbers, so that they do not flicker.
+
+    Args:
+        reach: Largest distance between the places of one cluster in consecutive scans [m].
+    """
+
+    def __init__(self, reach: float = 0.5) -> None:
+        self._reach = reach
+        self._places: Float = np.zeros((0, 2))
+        self._numbers: Int = np.zeros(0, dtype=np.int64)
+        self._next = 0
+
+    def follow(self, places: Float) -> Int:
+        """Return a number for each cluster at these places.
+
+        Args:
+            places: shape (K, 2) [m] in the frame of the map.
+
+        Returns:
+            Different numbers, shape (K,).
+        """
+        numbers = np.full(len(places), -1, dtype=np.int64)
+        if len(places) and len(self._places):
+            gaps = np.linalg.norm(places[:, None, :] - self._places[None, :, :], axis=2)
+            for row, column in _nearest_first(gaps, self._reach):
+                numbers[row] = self._numbers[column]
+        new = numbers < 0
+        numbers[new] = self._next + np.arange(int(new.sum()))
+        self._next += int(new.sum())
+        self._places, self._numbers = np.array(places, dtype=np.float64), numbers
+        return numbers
+
+
+def _nearest_first(gaps: Float, reach: float) -> list[tuple[int, int]]:
+    rows, columns = np.nonzero(gaps <= reach)
+    order = np.argsort(gaps[rows, columns], kind="stable")
+    taken_rows: set[int] = set()
+    taken_columns: set[int] = set()
+    pairs = []
+    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
+        if row not in taken_rows and column not in taken_columns:
+            taken_rows.add(row)
+            taken_columns.add(column)
+            pairs.append((row, column))
+    return pairs
+
+
+NEAR = 0.5  # [m]; a ray that misses a marker by more hit a marker of another scan
+
+
+def meant(
+    origin: Float, direction: Float, low: Float, high: Float, radius: Float, instance: int | None
+) -> int | None:
+    """Return the row of the upright cylinder that a ray hits; None if none is near.
+
+    While a run plays, the browser shows an older scan, in which the numbers belong to other clusters. If the
+    ray misses the cylinder with the reported number, the cylinder nearest to the ray is returned.
+
+    Args:
+        origin, direction: Ray, shape (3,) each; the direction may have any length.
+        low, high, radius: Base and top of each axis, shape (K, 3) [m], and radii, shape (K,) [m].
+        instance: Number that the browser reports.
+    """
+    if not len(radius):
+        return None
+    gap = distances(origin, direction, low, high) - radius
+    if instance is not None and 0 <= instance < len(radius) and gap[instance] <= 0.05:
+        return instance
+    best = int(np.argmin(gap))
+    return best if gap[best] <= NEAR else None
+
+
+def distances(origin: Float, direction: Float, low: Float, high: Float) -> Float:
+    """Return the distances between a ray and the segments from `low` to `high`, shape (K,) [m]."""
+    d = direction / max(float(np.linalg.norm(direction)), 1e-12)
+    axis, away = high - low, low - origin
+    # Closest points of two lines: s along the segment within 0..1, t along the ray not behind its origin.
+    aa, ad = np.einsum("ij,ij->i", axis, axis), axis @ d
+    da, dd = np.einsum("ij,ij->i", axis, away), away @ d
+    flat = np.maximum(aa - ad**2, 1e-12)
+    s = np.clip((ad * dd - da) / flat, 0.0, 1.0)
+    t = np.maximum(dd + s * ad, 0.0)
+    s = np.clip((t * ad - da) / np.maximum(aa, 1e-12), 0.0, 1.0)
+    nearest: Float = np.linalg.norm(away + s[:, None] * axis - t[:, None] * d, axis=1)
+    return nearest
