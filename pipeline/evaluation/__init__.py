@@ -1,8 +1,14 @@
-"""Evaluation: the map against the ground truth, as in the paper and as in forestry."""
+"""Evaluation of a map against ground truth: the rates of the paper and the scores of forest inventories."""
 
 from pipeline.evaluation.matching import match, matched_rows
-from pipeline.evaluation.pairs import PairErrors, pair_distances, pair_errors
-from pipeline.evaluation.score import Evaluation, Rate, evaluate
+from pipeline.evaluation.score import (
+    Evaluation,
+    PairErrors,
+    Rate,
+    evaluate,
+    pair_distances,
+    pair_errors,
+)
 from pipeline.evaluation.trajectory import PathError, path_error
 
 __all__ = [

@@ -1,4 +1,5 @@
-"""TA, TR, FA, FR with their counts, completeness, correctness, and the errors of what was matched."""
+"""Scores of a map against the ground truth: TA, TR, FA and FR as in the paper, completeness, correctness, and
+the errors of positions, diameters and distances between trees."""
 
 from __future__ import annotations
 
@@ -8,42 +9,43 @@ import numpy as np
 
 from pipeline.config.stages import Evaluation as Parameters
 from pipeline.evaluation.matching import match
-from pipeline.evaluation.pairs import pair_errors
 from pipeline.geometry.poses import Float
 from pipeline.types.records import Bool, Trees, TruthTrees
 
-_LEAST_TREES = 4
-_DOUBTFUL = 0.25  # share of the trees that match
+# A ground truth is doubtful if less than this share of at least so many trees matches.
+_DOUBTFUL_SHARE, _DOUBTFUL_TREES = 0.25, 4
 
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """A count out of a whole; the rate is None where the whole is empty."""
+    """A count and the whole of which it is a part."""
 
     count: int
     of: int
 
     @property
     def rate(self) -> float | None:
-        """count / of."""
+        """count / of, or None if the whole is empty."""
         return self.count / self.of if self.of else None
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """The map against the ground truth within reach of the path. Lengths in metres; None where
-    nothing was matched.
+    """Scores of a map against the ground truth within reach of the path. Lengths are in metres; a score
+    without matched trees is None.
 
     Attributes:
-        TA, FR: True acceptance and false rejection, of the real trees; they sum to the whole.
-        TR, FA: True rejection and false acceptance, of the other things; they sum to the whole.
-        spurious: Trees of the map where nothing stands.
-        completeness: TA as a rate; correctness: part of the map's trees that are trees; f1: their
-            harmonic mean.
-        position_rmse, position_bias: Of the matched trees; the bias is the length of the mean error.
-        dbh_rmse, dbh_bias: Of the matched trees with a diameter on both sides; dbh_count: how many.
-        mean_pair_error_percent, largest_pair_error_percent: Of the distances between matched trees.
-        reach: Truth farther than this from the path was not asked for.
+        TA, FR: True acceptances and false rejections of the real trees; the counts sum to the real trees.
+        TR, FA: True rejections and false acceptances of other objects; the counts sum to the other objects.
+        spurious: Number of mapped trees at which the ground truth has neither a tree nor another object.
+        completeness: Mapped share of the real trees; correctness: share of the mapped trees that are real
+            trees; f1: harmonic mean of both.
+        position_rmse, position_bias: Position error of the matched trees; the bias is the length of the mean
+            error vector.
+        dbh_rmse, dbh_bias, dbh_count: DBH error, mean error and number of the matched trees whose diameter is
+            known in the map and in the ground truth.
+        mean_pair_error_percent, largest_pair_error_percent: See `PairErrors`, for the matched trees.
+        reach: Maximum distance between the path and an object of the ground truth that counts.
     """
 
     TA: Rate
@@ -65,65 +67,111 @@ class Evaluation:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether so few of the trees match, of map or truth, whichever has fewer, that the truth may be of
-        another forest or in another frame. A few trees tell nothing."""
+        """Whether the ground truth may belong to another forest or another frame: of the smaller of the two
+        sets of trees less than a quarter matches. With fewer than four trees the result is False."""
         mapped = self.TA.count + self.FA.count + self.spurious
         fewer = min(mapped, self.TA.of)
-        return fewer >= _LEAST_TREES and self.TA.count < _DOUBTFUL * fewer
+        return fewer >= _DOUBTFUL_TREES and self.TA.count < _DOUBTFUL_SHARE * fewer
 
 
 def evaluate(
     trees: Trees, truth: TruthTrees, parameters: Parameters, path: Float | None = None
 ) -> Evaluation:
-    """Compare the confirmed trees with the truth.
+    """Return the scores of the confirmed trees.
 
     Args:
         trees: The map.
-        truth: What really stands there, in the frame of the map.
-        parameters: The distance of a match, and how far from the path truth is asked for.
-        path: shape (N, 2) [m]; None asks for all truth.
+        truth: Trees and other objects of the ground truth, in the frame of the map.
+        parameters: Maximum distance of a match, and maximum distance of the ground truth from the path.
+        path: Positions of the robot, shape (N, 2) [m]; None scores the whole ground truth.
     """
     confirmed = trees.confirmed
     found = trees.position[confirmed]
     position = np.stack([truth.x, truth.y], axis=1)
     is_tree = np.array([kind == "tree" for kind in truth.kind], np.bool_)
-    asked = _within(position, path, parameters.reach)
+    in_reach = _within(position, path, parameters.reach)
     truth_of = match(found, position, parameters.match_distance)
     matched = truth_of >= 0
     hit = np.zeros(len(position), np.bool_)
     hit[truth_of[matched]] = True
     counted = _within(found, path, parameters.reach)
-    counted[matched] = asked[truth_of[matched]]
+    counted[matched] = in_reach[truth_of[matched]]
     right = matched & counted
     right[matched] &= is_tree[truth_of[matched]]
     spurious = int(np.count_nonzero(counted & ~matched))
-    completeness = Rate(_count(hit & asked & is_tree), _count(asked & is_tree))
+    completeness = Rate(_count(hit & in_reach & is_tree), _count(in_reach & is_tree))
     correctness = Rate(_count(right), _count(counted)).rate
     offset = found[right] - position[truth_of[right]]
-    wider = trees.dbh[confirmed][right] - truth.dbh[truth_of[right]]
-    wider = wider[np.isfinite(wider)]
+    dbh_error = trees.dbh[confirmed][right] - truth.dbh[truth_of[right]]
+    dbh_error = dbh_error[np.isfinite(dbh_error)]
     pairs = pair_errors(found[right], position[truth_of[right]])
     return Evaluation(
         TA=completeness,
-        TR=Rate(_count(~hit & asked & ~is_tree), _count(asked & ~is_tree)),
-        FA=Rate(_count(hit & asked & ~is_tree), _count(asked & ~is_tree)),
-        FR=Rate(_count(~hit & asked & is_tree), _count(asked & is_tree)),
+        TR=Rate(_count(~hit & in_reach & ~is_tree), _count(in_reach & ~is_tree)),
+        FA=Rate(_count(hit & in_reach & ~is_tree), _count(in_reach & ~is_tree)),
+        FR=Rate(_count(~hit & in_reach & is_tree), _count(in_reach & is_tree)),
         spurious=spurious,
         completeness=completeness.rate,
         correctness=correctness,
         f1=_harmonic(completeness.rate, correctness),
         position_rmse=_rms(np.hypot(*offset.T)),
         position_bias=float(np.hypot(*offset.mean(axis=0))) if len(offset) else None,
-        dbh_rmse=_rms(wider),
-        dbh_bias=float(wider.mean()) if len(wider) else None,
-        dbh_count=len(wider),
+        dbh_rmse=_rms(dbh_error),
+        dbh_bias=float(dbh_error.mean()) if len(dbh_error) else None,
+        dbh_count=len(dbh_error),
         mean_pair_error_percent=_none(pairs.mean),
         largest_pair_error_percent=_none(pairs.largest),
         reach=parameters.reach,
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PairErrors:
+    """Errors of the distances between all pairs of N trees (Fig. 7).
+
+    Attributes:
+        percent: shape (N, N): 100 |d_map - d_truth| / d_truth, 0 on the diagonal.
+        mean: Mean over the pairs [%], NaN for fewer than two trees.
+        largest: Maximum over the pairs [%], NaN for fewer than two trees.
+    """
+
+    percent: Float
+    mean: float
+    largest: float
+
+
+def pair_distances(position: Float) -> Float:
+    """Return the distances between all pairs of N positions (Fig. 6), shape (N, N) [m].
+
+    Args:
+        position: shape (N, 2) [m].
+    """
+    difference = position[:, None, :] - position[None, :, :]
+    distances: Float = np.hypot(difference[..., 0], difference[..., 1])
+    return distances
+
+
+def pair_errors(found: Float, truth: Float) -> PairErrors:
+    """Return the errors of the distances between N mapped trees.
+
+    Distances do not depend on the frame, so the two maps need no alignment.
+
+    Args:
+        found: Positions of the mapped trees, shape (N, 2) [m].
+        truth: Positions of the same trees in the ground truth, in the same order, shape (N, 2) [m].
+    """
+    d_map, d_truth = pair_distances(found), pair_distances(truth)
+    apart = d_truth > 0.0
+    percent = np.zeros_like(d_truth)
+    percent[apart] = 100.0 * np.abs(d_map - d_truth)[apart] / d_truth[apart]
+    pairs = percent[np.triu_indices(len(found), k=1)]
+    if len(pairs) == 0:
+        return PairErrors(percent, float("nan"), float("nan"))
+    return PairErrors(percent, float(pairs.mean()), float(pairs.max()))
+
+
 def _within(position: Float, path: Float | None, reach: float) -> Bool:
+    """Whether each position, shape (N, 2) [m], is at most `reach` [m] from the path; True without a path."""
     if path is None or len(position) == 0:
         return np.ones(len(position), np.bool_)
     if len(path) == 0:

@@ -1,4 +1,4 @@
-"""The error of the path against a true one (absolute trajectory error)."""
+"""Absolute trajectory error (ATE) of the path."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from pipeline.types.records import Int, Path, TruthPath
 
 @dataclass(frozen=True, slots=True)
 class PathError:
-    """Distances between path and truth at the times of the truth.
+    """Distances between the path and the true path at the times of the true path.
 
     Attributes:
-        rms, median, largest: [m].
-        at_end: [m], at the last common time.
-        compared: How many true positions lay within the time of the path.
-        aligned: Whether the path was moved and turned as a whole onto the truth before.
+        rms, median, largest: Over all compared positions [m].
+        at_end: At the last common time [m].
+        compared: Number of true positions within the time of the path.
+        aligned: Whether a rigid motion was fitted first.
     """
 
     rms: float
@@ -30,12 +30,12 @@ class PathError:
 
 
 def path_error(path: Path, truth: TruthPath, *, align: bool | None = None) -> PathError | None:
-    """Compare; None where the two share fewer than three times.
+    """Return the error of a path, or None if fewer than three true positions are within its time.
 
     Args:
         path: In the frame of the map.
-        truth: In the same frame or another.
-        align: Whether to fit a rigid motion in the plane first; None does it where the frames differ.
+        truth: In the frame of the map or in another one.
+        align: Whether to fit a rigid motion in the plane first; None fits it if the frames differ.
     """
     if len(path.stamp_ns) < 2:
         return None
@@ -60,7 +60,8 @@ def path_error(path: Path, truth: TruthPath, *, align: bool | None = None) -> Pa
 
 
 def fit_rigid(a: Float, b: Float) -> Pose2:
-    """T_b_a that brings points a nearest to points b, both of shape (N, 2) [m] (Umeyama 1991, no scale)."""
+    """Return the T_b_a that minimises sum |b - T_b_a a|^2 for N pairs of points, both of shape (N, 2) [m]
+    (Umeyama 1991, without scale)."""
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     M = (a - mean_a).T @ (b - mean_b)
     yaw = float(np.arctan2(M[0, 1] - M[1, 0], M[0, 0] + M[1, 1]))

@@ -1,9 +1,10 @@
-"""Loops: whether the trees that were found lately stand on the map already, at another place.
+"""Loop detection: recently mapped trees that are on the map already, at another position.
 
-The odometry drifts, and where it drifted by more than the trees stand apart, no association brings the
-robot back: it would map the same trees once more. So the constellation of the trees that were begun lately
-is looked for among those that were left long ago, as long as the pose is uncertain. What is found must agree
-with how far the path can have drifted; else the robot was carried, or the place is another one.
+If the odometry drifts by more than the distance between trees, the data association cannot correct it, and
+the
+robot maps the same trees a second time. While the pose is uncertain, this module therefore searches for the
+constellation of the recently begun landmarks among the trees that the robot left long ago. A match must agree
+with the possible drift of the path; otherwise the robot was carried, or the match is wrong.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from pipeline.slam.motion import Noise
 from pipeline.types.records import Int, PoseEstimate, Trees
 
 EVERY = 10  # scans between two searches
-UNSURE = 0.4  # m, sigma of the position; who knows it better recognises the trees one by one
-RECENT = 300  # scans in which it was unsure
-LATELY = 40.0  # m driven, in which what is looked for was begun
-REACH = 30.0  # m around the robot
+UNSURE = 0.4  # m, sigma of the position; below it the data association recognises the trees one by one
+RECENT = 300  # scans; a search is due if the position was unsure in one of them
+LATELY = 40.0  # m of the path, in which the landmarks to be found were begun
+REACH = 30.0  # m around the robot, in which these landmarks are
 LEAST_HITS = 3
 HYPOTHESES = 30_000
-LEAST_GAP = 0.5  # m; what is less the particles settle, and the trees recognised one by one
-DRIFT = 5.0  # sigma; what lies farther off is no drift
+LEAST_GAP = 0.5  # m; the particles correct smaller errors themselves
+DRIFT = 5.0  # sigma; a larger error is not drift
 OWN = np.diag(np.square([0.05, 0.05, 0.01]))  # m, rad; of a particle's pose among its own landmarks
-LEAST_LEFT = 2  # trees, of those that agree
-FARTHEST = 90.0  # m around the robot is searched at the most
-SIGMA = 0.1  # m, of a place among its neighbours at the most
-# Ties: two scans of one place, and the trees that must have been seen at both times.
+LEAST_LEFT = 2  # trees that agree, at least, that the robot left at the same time
+FARTHEST = 90.0  # m, maximum radius of the search around the robot
+SIGMA = 0.1  # m, maximum sigma of a position relative to its neighbours
+# Ties: pairs of scans at one place, with trees that were seen at both times.
 TIE_NEAR, TIE_APART, TIE_VIEW, TIE_TREES, TIE_SPACING = 6.0, 30.0, 12.0, 3, 2.0  # m, m, m, -, m
 
 
@@ -45,13 +46,15 @@ class RunHistory:
     """Path and map of a run.
 
     Attributes:
-        stamp_ns: int64, of its scans, shape (N,); path: x, y [m], yaw [rad], shape (N, 3).
+        stamp_ns: int64, time of each scan, shape (N,).
+        path: x, y [m], yaw [rad] at each scan, shape (N, 3).
         trees: The trees of the map.
         begun_since: Returns the landmarks that were begun at a scan or later, see FastSlam.begun_since.
-        estimate: Of the pose at the newest scan; noise: of the odometry.
-        motion: By it to each scan from the one before, x, y [m], yaw [rad], shape (N, 3).
-        placed: Scan; the path is driven since then, for the robot was put there.
-        closed: Scan at which the last loop was closed: until then the path has no drift left to find.
+        estimate: Pose at the newest scan.
+        noise: Noise of the odometry.
+        motion: x, y [m], yaw [rad] by odometry from each scan to the next, shape (N, 3).
+        placed: Scan at which the pose was last set from outside; the path begins there.
+        closed: Scan at which the last loop was closed; the path before it has no drift left.
     """
 
     stamp_ns: Int
@@ -65,21 +68,26 @@ class RunHistory:
     closed: int = 0
 
     def scan_of(self, stamp_ns: Int) -> Int:
-        """The scans of times."""
+        """Return the scan of each time, the newest scan for later times."""
         scan: Int = np.minimum(np.searchsorted(self.stamp_ns, stamp_ns), len(self.stamp_ns) - 1)
         return scan
 
 
 def is_due(index: int, sigma_xy: Float) -> bool:
-    """Whether a loop is worth a search after a scan; `sigma_xy`: of the pose at each scan so far [m].
+    """Return whether a search is due after a scan.
 
-    A pose that was unsure and is not any more may have been made sure by the wrong trees.
+    A pose that was uncertain and is no longer may have been corrected by the wrong trees, so the search goes
+    on for RECENT scans.
+
+    Args:
+        index: Number of the scan.
+        sigma_xy: Standard deviation of the position at each scan so far, shape (N,) [m].
     """
     return index % EVERY == 0 and bool(sigma_xy[-RECENT:].max(initial=0.0) > UNSURE)
 
 
 def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
-    """The loop that the robot has just closed, if it has."""
+    """Search for a loop that ends at the newest scan; None if there is none."""
     way = _way(run.path)
     lately = max(int(np.searchsorted(way, way[-1] - LATELY)), run.placed)
     if lately == 0:
@@ -90,7 +98,7 @@ def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
     if np.count_nonzero(near) < parameters.stems_min:
         return None
     trees = run.trees
-    # A tree that a drifted scan took for another one counts as seen then, so it is old by its first view.
+    # A drifted scan may have associated a tree wrongly, which changes its last view but not its first one.
     old = (trees.observations >= LEAST_HITS) & (run.scan_of(trees.first_seen_ns) < lately)
     drift = drift_of(run.path, 0, run.noise)
     reach = min(REACH + DRIFT * math.sqrt(max(drift[0, 0], drift[1, 1])), FARTHEST)
@@ -115,19 +123,22 @@ def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
 def loop_to(
     run: RunHistory, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
 ) -> Loop | None:
-    """The loop that leads from known trees to where they were found again; None where the path cannot have
-    drifted so far.
+    """Return the loop from the scan at which known trees were left to the newest scan, at which they are
+    found again; None if the error is too small, or larger than the drift of the path can be.
 
     Args:
-        numbers: Of the trees that agree.
-        T_map_base: Where the base is by them; R: covariance of that, shape (3, 3).
-        last_mapped: Scan; later ones mapped nothing.
-        spread: Covariance of the pose, shape (3, 3); None takes what the odometry may have drifted since.
+        run: Path and map.
+        numbers: Numbers of the trees that agree.
+        T_map_base: Pose of the base by these trees.
+        R: Covariance of this pose, shape (3, 3).
+        last_mapped: Last scan that changed the map.
+        spread: Covariance of the pose, shape (3, 3); None uses the drift of the odometry since the trees were
+            left.
     """
     trees, path = run.trees, run.path
     rows = np.flatnonzero(np.isin(trees.number, numbers))
-    # What was driven before the robot was put somewhere did not lead there, and no loop bends it; and what a
-    # loop has bent has drifted no more: else trees that still stand twice would close it again, wrongly.
+    # The path before `placed` does not lead to the newest scan. The path before `closed` has no drift left;
+    # duplicate trees that remain there would otherwise close the same loop again.
     left = _left(run.scan_of(trees.last_seen_ns[rows]), _way(path))
     first = max(left, run.placed, run.closed)
     if first >= last_mapped:
@@ -147,20 +158,26 @@ def loop_to(
 
 
 def _gap(T_map_base: Pose2, pose: Float) -> Float:
-    """What a pose lacks, x, y [m], yaw [rad], shape (3,)."""
+    """Return the difference from a pose to T_map_base, x, y [m], yaw [rad], shape (3,)."""
     gap = T_map_base.as_array() - pose
     gap[2] = wrap_angle(gap[2])
     return gap
 
 
 def _is_beyond(gap: Float, covariance: Float) -> bool:
-    """Whether a gap is more than drift can make."""
+    """Return whether a difference of poses is larger than DRIFT sigma of its covariance."""
     return bool(gap @ np.linalg.solve(covariance, gap) > DRIFT**2)
 
 
 def through(T_map_local: Pose2, covariance: Float, T_local_base: Pose2, own: Float) -> tuple[Pose2, Float]:
-    """The pose of the base in the map, and its covariance from those of a match and of the pose in the frame
-    of what was matched, shapes (3, 3)."""
+    """Return the pose of the base in the map, T_map_local @ T_local_base, and its covariance, shape (3, 3).
+
+    Args:
+        T_map_local: Pose of a local frame in the map, by a match.
+        covariance: Its covariance, shape (3, 3).
+        T_local_base: Pose of the base in the local frame.
+        own: Its covariance, shape (3, 3).
+    """
     C = np.eye(3)
     C[:2, :2] = T_map_local.rotation()
     T_map_base = T_map_local @ T_local_base
@@ -170,8 +187,15 @@ def through(T_map_local: Pose2, covariance: Float, T_local_base: Pose2, own: Flo
 
 
 def _left(seen: Int, way: Float) -> int:
-    """The scan at which trees were left that were seen last at these scans. Some of them may have been taken
-    for others since, by a scan that had drifted, so the first time counts when a quarter of them was left."""
+    """Return the scan at which the robot left a group of trees.
+
+    A drifted scan may have associated some of the trees wrongly since, so the result is the first time at
+    which at least a quarter of the trees was seen last.
+
+    Args:
+        seen: Scan in which each tree was seen last, shape (K,).
+        way: Distance driven at each scan, shape (N,) [m].
+    """
     seen = np.sort(seen)
     group = np.cumsum(np.diff(way[seen], prepend=way[seen[0]]) > TIE_APART)
     counts = np.bincount(group)
@@ -179,7 +203,7 @@ def _left(seen: Int, way: Float) -> int:
 
 
 def nearby(estimate: PoseEstimate) -> Float:
-    """The covariance of a pose with respect to the trees around, shape (3, 3)."""
+    """Return the covariance of a pose with respect to the landmarks around, shape (3, 3)."""
     return estimate.covariance if estimate.relative is None else estimate.relative
 
 
@@ -190,14 +214,15 @@ def _way(path: Float) -> Float:
 
 
 def _stems(place: Float, covariance: Float) -> Stems:
-    """Without diameters, which are of far trees not known; the common error of places is what is sought."""
+    """Return stems without diameters, which are unknown for distant trees. Their sigma is limited to SIGMA,
+    since the error that all positions share is what the match finds."""
     unknown = np.full(len(place), np.nan)
     return Stems(place, np.minimum(worst_sigma(covariance), SIGMA), unknown, unknown)
 
 
 def _ties(run: RunHistory, first: int, last: int) -> Int:
-    """Pairs of scans of one place between which the path need not bend, see Loop: trees stand there that were
-    known at the earlier one and seen until the later one, so that the second was found by them."""
+    """Return pairs of scans at one place whose relative pose is known (see Loop), int64, shape (K, 2): at
+    least TIE_TREES trees near by were known at the earlier scan and seen at the later one."""
     from scipy.spatial import cKDTree
 
     path, trees = run.path, run.trees
@@ -211,7 +236,7 @@ def _ties(run: RunHistory, first: int, last: int) -> Int:
     kept: list[int] = []
     for k in np.lexsort((early, late)).tolist():
         if kept and late[k] == late[kept[-1]]:
-            continue  # one tie a scan, and the earlier the better
+            continue  # one tie per later scan, with the earliest partner
         near = np.hypot(*(trees.position - path[late[k], :2]).T) < TIE_VIEW
         both = near & (begun <= early[k]) & (seen >= late[k])
         if np.count_nonzero(both) >= TIE_TREES:

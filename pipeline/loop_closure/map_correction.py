@@ -1,4 +1,4 @@
-"""A path that was bent after the fact, and what was mapped from it moved along."""
+"""Correction of the path by a loop closure, and the motion of mapped objects that follows from it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from pipeline.geometry.poses import Float, wrap_angle
 from pipeline.types.records import Int
 
-TILE = 4.0  # m; what stands in one tile moves as one piece, so that no trunk is torn
-NEAR = 20.0  # m driven before and after a tree was seen first; what was driven there later may bend otherwise
+TILE = 4.0  # m; all objects of one tile move as one piece, so that no trunk is split
+NEAR = 20.0  # m of path before and after the first view of a tree; later passes may move in another way
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bend:
-    """Where the scans were taken to be, and where they are now.
+    """The path before and after a correction.
 
     Attributes:
         before, after: x, y [m], yaw [rad] of every scan, shape (N, 3), in the frame of the map.
-        first: Scan; what was mapped until it stays.
-        last: Scan; what came after it mapped nothing.
+        first: Objects that were mapped up to this scan stay.
+        last: Last scan that changed the map.
     """
 
     before: Float
@@ -29,12 +29,12 @@ class Bend:
     last: int
 
     def moved(self, place: Float, scan: Int) -> Float:
-        """Where places are now, shape (N, 2) [m].
+        """Return the corrected positions, shape (N, 2) [m].
 
         Args:
-            place: Where they were, shape (N, 2) [m].
-            scan: int64, shape (N,): the scan that each one was mapped by; it tells whether a place moves, not
-                by how much, for neighbours must move alike.
+            place: Positions before the correction, shape (N, 2) [m].
+            scan: int64, shape (N,): the scan that mapped each position. It decides whether a position moves,
+                not by how much, since neighbours move alike.
         """
         out = place.copy()
         moves = np.flatnonzero(scan > self.first)
@@ -49,13 +49,14 @@ class Bend:
         return out
 
     def of_trees(self, place: Float, scan: Int) -> tuple[Float, Float]:
-        """Where trees are now, shape (N, 2) [m], and by how much they are turned, shape (N,) [rad].
+        """Return the corrected positions of trees, shape (N, 2) [m], and their rotations, shape (N,) [rad].
 
-        A tree moves with the scan nearest to it of those driven when it was seen first: a path that went
-        astray may have led past it later, as it seemed, and bends otherwise there.
+        A tree moves with the nearest scan within NEAR of its first view. A later part of the path may seem to
+        pass the tree because of its error, and has another correction.
 
         Args:
-            place: Where they were, shape (N, 2) [m]; scan: int64, shape (N,), that each was seen in first.
+            place: Positions before the correction, shape (N, 2) [m].
+            scan: int64, shape (N,): the scan in which each tree was seen first.
         """
         out, turn = place.copy(), np.zeros(len(place))
         moves = np.flatnonzero(scan > self.first)
@@ -76,7 +77,7 @@ class Bend:
         return out, turn
 
     def turned(self, place: Float, scan: Int) -> Float:
-        """By how much what stands at places is turned, shape (N,) [rad]; see `moved`."""
+        """Return the rotation of the objects at positions, shape (N,) [rad]; arguments as in `moved`."""
         turn = np.zeros(len(place))
         moves = np.flatnonzero(scan > self.first)
         if len(moves) and self.last > self.first:
@@ -85,7 +86,7 @@ class Bend:
         return turn
 
     def poses(self, pose: Float, scan: Int) -> Float:
-        """Poses near those of scans, shape (N, 3), moved with them."""
+        """Return poses, shape (N, 3), moved with the scans that they belong to, int64, shape (N,)."""
         before, after = self.before[scan], self.after[scan]
         turn = after[:, 2] - before[:, 2]
         c, s = np.cos(turn), np.sin(turn)
@@ -95,7 +96,7 @@ class Bend:
         )
 
     def _nearest(self, place: Float) -> Int:
-        """The scan that moves that was taken nearest to the tile of each place."""
+        """Return, for each position, the moving scan nearest to the centre of its tile."""
         from scipy.spatial import cKDTree
 
         tiles, of = np.unique(np.floor(place / TILE), axis=0, return_inverse=True)
