@@ -1,10 +1,9 @@
 """Loop detection: recently mapped trees that are on the map already, at another position.
 
 If the odometry drifts by more than the distance between trees, the data association cannot correct it, and
-the
-robot maps the same trees a second time. While the pose is uncertain, this module therefore searches for the
-constellation of the recently begun landmarks among the trees that the robot left long ago. A match must agree
-with the possible drift of the path; otherwise the robot was carried, or the match is wrong.
+the robot maps the same trees a second time. While the pose is uncertain, this module therefore searches for
+the constellation of the recently begun landmarks among the trees that the robot left long ago. A match must
+agree with the possible drift of the path; otherwise the robot was carried, or the match is wrong.
 """
 
 from __future__ import annotations
@@ -222,7 +221,7 @@ def _stems(place: Float, covariance: Float) -> Stems:
 
 def _ties(run: RunHistory, first: int, last: int) -> Int:
     """Return pairs of scans at one place whose relative pose is known (see Loop), int64, shape (K, 2): at
-    least TIE_TREES trees near by were known at the earlier scan and seen at the later one."""
+    least TIE_TREES nearby trees were known at the earlier scan and seen at the later one."""
     from scipy.spatial import cKDTree
 
     path, trees = run.path, run.trees

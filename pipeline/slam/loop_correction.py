@@ -1,10 +1,9 @@
-"""A loop that is closed: the path since a known place was left is bent, so that it ends where that place was
-found again.
+"""Correction of the path by a loop closure: least squares over the poses since the robot left a known place.
 
 x* = argmin sum |x_k^-1 x_k+1 - u_k|^2_Q + sum |x_i^-1 x_j - z_ij|^2_T + |x_n - z|^2_R
 
-u_k is the path as it was driven, z_ij are ties between scans that saw the same trees, and z is where the
-robot was found.
+u_k are the motions of the path before the correction, z_ij are ties between scans that saw the same trees,
+and z is the pose at which the known place was found again.
 """
 
 from __future__ import annotations
@@ -21,27 +20,27 @@ from pipeline.slam.particle_maps import MapColumns
 from pipeline.slam.poses import composed, interpolated, inverse
 from pipeline.types.records import Int
 
-SPACING, MOST_NODES = 1.0, 2000  # m between two nodes, more where there would be more of them
+SPACING, MOST_NODES = 1.0, 2000  # m between two nodes; more if the path would have more nodes
 TIE_SIGMA = np.array([0.1, 0.1, 0.02])  # m, m, rad
-FLOOR = 1e-3  # m, rad; what stood still has no sigma
+FLOOR = 1e-3  # m, rad; minimum sigma of a motion, also of a robot that stands still
 ROUNDS, SETTLED = 20, 1e-6  # m, rad
-JUMP, JUMP_TURN = 1.0, 1.0  # m, rad between a step of the path and that of the odometry
-TWICE = 1.0  # m; landmarks of before and after the loop that are nearer are one tree
+JUMP, JUMP_TURN = 1.0, 1.0  # m, rad; a larger difference between path and odometry is no motion
+TWICE = 1.0  # m; closer landmarks of before and after the loop are the same tree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Loop:
-    """Where the robot was found again.
+    """A loop: the robot is at a known place again.
 
     Attributes:
-        first: Scan; the path until it, and what was mapped from it, stay as they are.
-        last: Scan; those after it mapped nothing.
+        first: Scan up to which path and map stay unchanged.
+        last: Last scan that changed the map.
         anchor: Scan at or before `first` that was taken near the place.
-        T_map_base: Where the base is at the newest scan; covariance: of x, y [m], yaw [rad], shape (3, 3),
-            with respect to the trees there.
-        ties: int64, shape (K, 2): pairs of scans, earlier and later, whose poses agree by the trees that both
-            saw.
-        motion: By the odometry to each scan from the one before, x, y [m], yaw [rad], shape (N, 3).
+        T_map_base: Pose of the base at the newest scan.
+        covariance: Covariance of this pose relative to the trees there, x, y [m], yaw [rad], shape (3, 3).
+        ties: int64, shape (K, 2): pairs of an earlier and a later scan that saw the same trees, so that their
+            relative pose is known.
+        motion: x, y [m], yaw [rad] by odometry from each scan to the next, shape (N, 3).
     """
 
     first: int
@@ -54,11 +53,13 @@ class Loop:
 
 
 def bent_path(path: Float, loop: Loop, noise: Noise) -> Float:
-    """The whole path, x, y [m], yaw [rad], shape (N, 3), after a loop was closed at its end.
+    """Return the corrected path, x, y [m], yaw [rad], shape (N, 3).
 
     Args:
-        path: As it was, shape (N, 3).
-        noise: Of the odometry; its shape says where the path bends, its size matters little.
+        path: The path before the correction, shape (N, 3).
+        loop: The loop that ends at the newest scan.
+        noise: Noise of the odometry. The ratio of its parts decides how the correction is distributed; its
+            scale matters little.
     """
     if loop.first >= len(path) - 1:
         return path.copy()
@@ -77,17 +78,18 @@ def bent_path(path: Float, loop: Loop, noise: Noise) -> Float:
 
 
 def without_jumps(path: Float, motion: Float) -> tuple[Float, int]:
-    """The path as if the robot had gone on by the odometry where a correction put it elsewhere, for that was
-    no motion; and how many such jumps there are.
+    """Return the path with each jump replaced by the motion of the odometry, and the number of jumps.
+
+    A jump is a step of the path that differs from the odometry by more than JUMP or JUMP_TURN: a correction
+    moved the pose, not the robot. A long step that the odometry reports is no jump, since scans may be lost.
 
     Args:
         path: x, y [m], yaw [rad], shape (N, 3).
-        motion: By the odometry to each scan from the one before, shape (N, 3). A step that it tells of is
-            driven, however far it leads: scans may have been lost.
+        motion: Motion by odometry from each scan to the next, shape (N, 3).
     """
     step = composed(inverse(path[:-1]), path[1:])
     apart = step - motion[1:]
-    turned = np.abs(wrap_angle(apart[:, 2])) > JUMP_TURN  # a heading put right on the spot is no turn either
+    turned = np.abs(wrap_angle(apart[:, 2])) > JUMP_TURN
     jumps = np.flatnonzero((np.hypot(*apart[:, :2].T) > JUMP) | turned).tolist()
     out = path.copy()
     for k in jumps:
@@ -98,8 +100,8 @@ def without_jumps(path: Float, motion: Float) -> tuple[Float, int]:
 
 
 def drift_of(path: Float, first: int, noise: Noise) -> Float:
-    """Covariance of x, y [m], yaw [rad] at the end of a path, shape (3, 3), by the odometry alone since scan
-    `first`: an error of the heading counts with the way that lies before it."""
+    """Return the covariance of the last pose relative to that of scan `first`, x, y [m], yaw [rad], shape
+    (3, 3), if only odometry connects the two. A heading error moves all later positions."""
     step = np.diff(path[first:], axis=0)
     distance = np.hypot(step[:, 0], step[:, 1])
     heading = noise.turn_distance**2 * distance + noise.turn**2 * np.abs(wrap_angle(step[:, 2]))
@@ -111,8 +113,16 @@ def drift_of(path: Float, first: int, noise: Noise) -> Float:
 
 
 def bent_landmarks(known: MapColumns, scan: Int, bend: Bend) -> MapColumns:
-    """Landmarks moved with the scans that began them; two that were one tree all the time become the older
-    one, one to one."""
+    """Return the landmarks after a correction of the path.
+
+    A landmark moves with the scan that began it. Duplicates of before and after the loop are joined one to
+    one and keep the older birth.
+
+    Args:
+        known: The landmarks before the correction.
+        scan: int64, shape (L,): the scan that began each landmark.
+        bend: The correction.
+    """
     mean, turn = bend.of_trees(known.mean, scan)
     c, s = np.cos(turn), np.sin(turn)
     C = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
@@ -133,7 +143,7 @@ def bent_landmarks(known: MapColumns, scan: Int, bend: Bend) -> MapColumns:
 
 
 def _nodes(path: Float, first: int) -> Int:
-    """Scans from `first` to the last, about SPACING apart."""
+    """Return the scans from `first` to the last one that are nodes of the graph, about SPACING apart."""
     way = _way(path)[first:]
     spacing = max(SPACING, float(way[-1] - way[0]) / MOST_NODES)
     cell = np.floor((way - way[0]) / spacing)
@@ -142,7 +152,7 @@ def _nodes(path: Float, first: int) -> Int:
 
 
 def _way(path: Float) -> Float:
-    """Metres driven until each scan, and as many for radians turned."""
+    """Return the distance driven until each scan, shape (N,) [m]; a turn counts one metre per radian."""
     step = np.diff(path, axis=0, prepend=path[:1])
     way: Float = np.cumsum(np.hypot(step[:, 0], step[:, 1]) + np.abs(wrap_angle(step[:, 2])))
     return way
@@ -154,7 +164,8 @@ _Edges = tuple[Int, Int, Float, Float]
 def _edges(
     path: Float, nodes: Int, between: Float, loop: Loop, noise: Noise, tied: tuple[Int, Int, Float]
 ) -> _Edges:
-    """From and to which node, the motion, shape (E, 3), and the square root of its information, (E, 3, 3)."""
+    """Return the edges of the graph: first node, second node, measured motion, shape (E, 3), and the square
+    root of its information matrix, shape (E, 3, 3)."""
     step = np.diff(path, axis=0, prepend=path[:1])
     distance = np.cumsum(np.hypot(step[:, 0], step[:, 1]))[nodes]
     turn = np.cumsum(np.abs(wrap_angle(step[:, 2])))[nodes]
@@ -179,8 +190,8 @@ def _edges(
 
 
 def _tied(path: Float, driven: Float, nodes: Int, loop: Loop) -> tuple[Int, Int, Float]:
-    """The ties as edges between nodes; one with a scan that stays holds the other one where it is. Both scans
-    saw the same trees, so their motion is that of the path with its jumps."""
+    """Return the ties as edges between nodes: first node, second node, motion. A tie with a scan that stays
+    fixes the other scan. Both scans saw the same trees, so the motion is that of the path with its jumps."""
     scans = np.maximum(loop.ties, loop.first)
     ends = np.searchsorted(nodes, scans)
     apart = ends[:, 1] > ends[:, 0] + 1
@@ -191,7 +202,8 @@ def _tied(path: Float, driven: Float, nodes: Int, loop: Loop) -> tuple[Int, Int,
 
 
 def _solved(x: Float, i: Int, j: Int, z: Float, root: Float) -> Float:
-    """Gauss-Newton over the poses x, shape (K, 3), of which the first one stays."""
+    """Return the poses that minimise the squared errors of the edges, by Gauss-Newton from the poses x, shape
+    (K, 3); the first pose is fixed."""
     from scipy import sparse
     from scipy.sparse.linalg import spsolve
 

@@ -1,9 +1,8 @@
-"""Where the particles of today were before: the path that one of them has behind it.
+"""Ancestry of the particles: the path of each particle.
 
-Each scan leaves the poses of all particles and, where it resampled, who came from whom. Walking
-back from a particle gives its own path, which the scans after a loop have chosen, while the means of
-the past only knew the scans up to then. As soon as the past is long enough it is settled: the rows of
-one particle are kept of it, so that memory stays bounded.
+Each scan stores the poses of all particles and, if it resampled, the ancestor of each particle. The path of a
+particle follows its ancestors back to the first scan, so later scans select among the paths. The distant past
+keeps the poses of one particle only, which bounds the memory.
 """
 
 from __future__ import annotations
@@ -16,15 +15,20 @@ import numpy as np
 from pipeline.geometry.poses import Float
 from pipeline.types.records import Float32, Int
 
-RECENT_POSES = 300_000  # of all particles that are kept: the time in which a loop can still choose
-BLOCK = 512  # scans that are settled at once
-FOUNDED = 50  # scans; a filter whose particles all come from one so early has no other past to choose
+RECENT_POSES = 300_000  # poses of all particles that are kept, so that later scans can select among them
+BLOCK = 512  # scans that are reduced to the path of one particle at once
+FOUNDED = 50  # scans between two counts of the distinct ancestors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Generation:
-    """One scan: `pose`, float32, shape (P, 3), of its particles, and `ancestors`, int64, shape (Q,):
-    which of them each particle after it comes from; None where each comes from itself."""
+    """The particles of one scan.
+
+    Attributes:
+        pose: float32, shape (P, 3): pose of each particle before resampling.
+        ancestors: int64, shape (Q,): the particle from which each particle after the scan descends; None
+            without resampling.
+    """
 
     pose: Float32
     ancestors: Int | None
@@ -32,13 +36,13 @@ class Generation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Genealogy:
-    """Immutable, so that it may be kept with every state: growing it makes another.
+    """The poses and ancestors of all scans. The record is immutable, so states may share it.
 
     Attributes:
-        settled: Blocks of float64, shape (BLOCK, 3): x, y [m], yaw [rad], the far past.
-        recent: The generations since then, oldest first.
-        founders: Which particle each one comes from, shape (P,), since the last time that the number of
-            scans was a multiple of FOUNDED, and since the time before it; None before the first scan.
+        settled: The distant past of one particle: blocks of float64, shape (BLOCK, 3), x, y [m], yaw [rad].
+        recent: The generations after it, oldest first.
+        founders: Ancestor of each particle, shape (P,), at the last scan whose number is a multiple of
+            FOUNDED, and at the multiple before it; None before the first scan.
     """
 
     settled: tuple[Float, ...] = ()
@@ -47,7 +51,7 @@ class Genealogy:
 
     @classmethod
     def of_path(cls, path: Float, particles: int) -> Genealogy:
-        """All particles with one path behind them, x, y [m], yaw [rad], shape (N, 3)."""
+        """Return an ancestry in which all particles have the same path, x, y [m], yaw [rad], shape (N, 3)."""
         blocks = len(path) // BLOCK
         settled = tuple(path[BLOCK * k : BLOCK * (k + 1)].copy() for k in range(blocks))
         recent = tuple(
@@ -61,22 +65,22 @@ class Genealogy:
 
     @property
     def nbytes(self) -> int:
-        """Of all arrays but the founders."""
+        """Size of all arrays except the founders."""
         poses = sum(block.nbytes for block in self.settled) + sum(g.pose.nbytes for g in self.recent)
         return poses + sum(g.ancestors.nbytes for g in self.recent if g.ancestors is not None)
 
     def with_scan(self, pose: Float, ancestors: Int | None, leaf: int) -> Genealogy:
-        """One scan more.
+        """Return the ancestry with one more scan.
 
         Args:
-            pose: shape (P, 3), before the scan resampled.
-            ancestors: Who comes from whom after it, shape (Q,).
-            leaf: The best particle after it; its path is taken where the past has to be settled.
+            pose: Poses before resampling, shape (P, 3).
+            ancestors: Ancestor of each particle after resampling, shape (Q,), or None.
+            leaf: The best particle after the scan; the distant past keeps its path.
         """
         return self.with_scans([(pose, ancestors, leaf)])
 
     def with_scans(self, scans: Iterable[tuple[Float | Float32, Int | None, int]]) -> Genealogy:
-        """Many scans more, each as `with_scan` takes it: the past is copied once and not for each."""
+        """Return the ancestry with more scans, each given as in `with_scan`; the past is copied only once."""
         settled, recent, founders = list(self.settled), list(self.recent), self.founders
         for pose, ancestors, leaf in scans:
             founders = _founders_after(BLOCK * len(settled) + len(recent), founders, len(pose), ancestors)
@@ -88,12 +92,12 @@ class Genealogy:
 
     @property
     def distinct_ancestors(self) -> int:
-        """How many particles of FOUNDED to 2 FOUNDED scans ago the particles of today come from; of the
-        first scan, while there were fewer."""
+        """Number of distinct ancestors of the particles FOUNDED to 2 FOUNDED scans ago, or at the first scan
+        of a shorter run."""
         return 0 if self.founders is None else int(np.count_nonzero(np.bincount(self.founders[1])))
 
     def redrawn(self, rows: Int) -> Genealogy:
-        """The same past of particles drawn anew: each one comes from the particle in its row."""
+        """Return the ancestry of redrawn particles: particle k descends from particle rows[k]."""
         if not self.recent:
             return self
         last = self.recent[-1]
@@ -102,15 +106,14 @@ class Genealogy:
         return Genealogy(self.settled, (*self.recent[:-1], Generation(last.pose, ancestors)), founders)
 
     def path(self, leaf: int) -> Float:
-        """x, y [m], yaw [rad] of every scan as the particle `leaf` of the last one has it behind it,
-        shape (N, 3)."""
+        """Return the path of particle `leaf` of the newest scan, x, y [m], yaw [rad], shape (N, 3)."""
         return np.concatenate([*self.settled, _walk(self.recent, leaf)])
 
 
 def _founders_after(
     scans: int, founders: tuple[Int, Int] | None, particles: int, ancestors: Int | None
 ) -> tuple[Int, Int]:
-    """The founders after one scan more, that many before it; see Genealogy."""
+    """Return the founders after one more scan (see Genealogy); `scans`: number of scans before it."""
     newer, older = founders or (np.arange(particles),) * 2
     if scans % FOUNDED == 0:
         newer, older = np.arange(particles), newer
