@@ -13,6 +13,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from pipeline.errors import StemmapError
 
@@ -25,8 +26,12 @@ VARIABLES: dict[str, str] = {
     "STEMMAP_RECORDINGS": "folder whose recordings the page offers",
     "STEMMAP_FOLDER": "folder for runs, annotations and uploads (default: stemmap in your folder for data)",
     "STEMMAP_DATABASE": "PostgreSQL database for runs and annotations, postgresql://name@host/database",
+    "STEMMAP_FILES": "files that the owner's link may open: any, or folders for those of the data folder only"
+    " (default: any from this machine, folders from elsewhere; set folders behind a proxy or tunnel)",
     "STEMMAP_UPLOAD_GB": "largest recording that a browser may upload, in GB (default: 20)",
 }
+
+Files = Literal["", "any", "folders"]
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{16,200}")
@@ -47,6 +52,8 @@ class Settings:
         database: Address of a PostgreSQL database for runs and annotations; empty for a file in the folder.
         upload_limit: Largest recording that a browser may upload [bytes].
         message_limit: Largest message of a browser's websocket [bytes].
+        files: Which files an owner may open: "any", "folders" (recordings of the data folders), or "" for any
+            file in requests from this machine and only the data folders in others.
     """
 
     host: str = DEFAULT_HOST
@@ -59,6 +66,7 @@ class Settings:
     message_limit: int = 1_000_000
     folder: Path | None = None
     database: str = ""
+    files: Files = ""
 
     @property
     def uploads(self) -> Path | None:
@@ -117,6 +125,7 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
         recordings=_folder(recordings) if recordings else None,
         folder=data_folder(given),
         database=given.get("STEMMAP_DATABASE", ""),
+        files=_files(given.get("STEMMAP_FILES", "")),
         upload_limit=_gigabytes(given.get("STEMMAP_UPLOAD_GB", "20")),
     )
 
@@ -145,6 +154,13 @@ def _port(text: str) -> int:
     if text.isdecimal() and int(text) <= 65535:
         return int(text)
     raise StemmapError(f"{text!r} is no port", where="STEMMAP_PORT", remedy="Give a number from 0 to 65535")
+
+
+def _files(text: str) -> Files:
+    known: dict[str, Files] = {"": "", "any": "any", "folders": "folders"}
+    if text in known:
+        return known[text]
+    raise StemmapError(f"{text!r} is unknown", where="STEMMAP_FILES", remedy="Give any or folders")
 
 
 def _gigabytes(text: str) -> int:

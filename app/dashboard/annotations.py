@@ -166,6 +166,7 @@ class Annotating:
         self.edited: Callable[[str, int], None] = lambda _who, _number: None
         self._own: TruthTrees | None = None
         self._keeper = keeper
+        self._generation = 0  # grows whenever another run is opened or the run is left
 
     async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
         """A run was opened.
@@ -183,18 +184,25 @@ class Annotating:
             return run, rows, truth_of(own, rows, "both")
 
         self._own = self.truth = own
+        generation = self._generation
         try:
-            self.run, self.rows, truth = await self._keeper.ask(work)
+            run, rows, truth = await self._keeper.ask(work)
+            if generation != self._generation:  # another run was opened meanwhile
+                return
+            self.run, self.rows = run, rows
             # Somebody may have chosen meanwhile.
             self.truth = truth if self.against == "both" else truth_of(own, self.rows, self.against)
             self.problem = ""
         except StemmapError as error:
+            if generation != self._generation:
+                return
             if str(error) != self.problem:
                 _log.warning("%s", error)
             self.problem = str(error)
 
     def leave(self) -> None:
         """No run is open."""
+        self._generation += 1
         self.run, self.rows, self.truth, self._own, self.against = None, [], None, None, "both"
 
     def score_against(self, against: Against) -> None:
@@ -220,7 +228,7 @@ class Annotating:
             raise StaleError(
                 "another run was opened", remedy="Your edit was not made; look at what stands now"
             )
-        own, against = self._own, self.against
+        own, against, generation = self._own, self.against, self._generation
 
         def work(store: Store) -> tuple[T | StaleError, list[Annotation], TruthTrees | None]:
             done: T | StaleError
@@ -232,7 +240,7 @@ class Annotating:
             return done, rows, truth_of(own, rows, against)
 
         done, rows, truth = await self._keeper.ask(work)
-        if run == self.run:
+        if generation == self._generation:  # else another run was opened meanwhile
             who, number = _edits(self.rows, rows)
             self.rows = rows
             self.truth = truth if against == self.against else truth_of(own, rows, self.against)

@@ -1,5 +1,5 @@
-"""What the browsers are told. Everything told is a state, so only the newest of each kind counts: a
-slow browser skips what it was too slow for, and costs the others nothing.
+"""Broadcasts states to the browsers. Only the newest message of each kind counts: a slow browser skips the
+messages in between, and does not slow down the others.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ _EMPTY_MAP: dict[str, Any] = {"type": "map", "index": -1, "trees": []}
 
 
 class Live:
-    """The newest message of each kind, and who listens."""
+    """The newest message of each kind, and the browsers that listen."""
 
     def __init__(self) -> None:
         self._messages: dict[str, tuple[int, bytes]] = {}
-        self._map: tuple[int, dict[str, Any], NDArray[np.float64]] | None = None
+        self._map: tuple[int, bytes, NDArray[np.float64]] | None = None
+        self._path_json: tuple[int, int, bytes] = (-1, 0, b"")
         self._count = 0
         self._listeners: set[Listener] = set()
 
@@ -49,18 +50,18 @@ class Live:
         self._wake()
 
     def show(self, payload: dict[str, Any], path_xy: NDArray[np.float64]) -> None:
-        """Replace the map; `path_xy` of shape (N, 2) is never changed afterwards."""
-        self._map = (self._next(), payload, path_xy)
+        """Replace the map. `path_xy`, shape (N, 2), must not be changed afterwards."""
+        self._map = (self._next(), _encode(payload), path_xy)  # once for all listeners
         self._wake()
 
     def forget_map(self) -> None:
-        """There is no map any more: another run begins. Browsers are told an empty one."""
+        """Replace the map by an empty one, because another run begins."""
         if self._map is not None:
             self.show(_EMPTY_MAP, np.zeros((0, 2)))
 
     @contextmanager
     def listener(self) -> Iterator[Listener]:
-        """Listen; what is known already comes first."""
+        """Listen inside the context; the newest message of each kind comes first."""
         listener = Listener(self)
         self._listeners.add(listener)
         try:
@@ -69,12 +70,18 @@ class Live:
             self._listeners.discard(listener)
 
     def messages_after(self, count: int) -> list[tuple[int, bytes]]:
-        """The messages told after a count, in their order."""
+        """Return the messages after a count, in their order."""
         return sorted(m for m in self._messages.values() if m[0] > count)
 
-    def map_after(self, count: int) -> tuple[int, dict[str, Any], NDArray[np.float64]] | None:
-        """The map if it was shown after a count."""
+    def map_after(self, count: int) -> tuple[int, bytes, NDArray[np.float64]] | None:
+        """Return count, JSON and path of the map if it was shown after a count."""
         return self._map if self._map is not None and self._map[0] > count else None
+
+    def path_json(self, count: int, path_xy: NDArray[np.float64], start: int) -> bytes:
+        """Return the path of the map shown at a count, from a row on, as JSON that listeners share."""
+        if self._path_json[:2] != (count, start):
+            self._path_json = (count, start, _encode(path_points(path_xy, start)))
+        return self._path_json[2]
 
     def _next(self) -> int:
         self._count += 1
@@ -86,7 +93,7 @@ class Live:
 
 
 class Listener:
-    """One browser's place in what is told."""
+    """The messages that one browser still has to receive."""
 
     def __init__(self, live: Live) -> None:
         self.news = asyncio.Event()
@@ -98,7 +105,7 @@ class Listener:
         self._path: NDArray[np.float64] | None = None
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """JSON texts for ever, each as soon as it is told, maps at most ten a second."""
+        """Yield JSON texts as they are broadcast, for ever; maps at most ten a second."""
         while True:
             await self._wait()
             self.news.clear()
@@ -120,7 +127,7 @@ class Listener:
     def _map_wait(self) -> float:
         return self._map_at + MAP_PAUSE_S - time.monotonic()
 
-    def _map_message(self, count: int, payload: dict[str, Any], path_xy: NDArray[np.float64]) -> bytes:
+    def _map_message(self, count: int, payload: bytes, path_xy: NDArray[np.float64]) -> bytes:
         start = first_difference(self._path, path_xy)
         self._map_seen, self._map_at, self._path = count, time.monotonic(), path_xy
-        return _encode({**payload, "path": path_points(path_xy, start)})
+        return b'%s,"path":%s}' % (payload[:-1], self._live.path_json(count, path_xy, start))

@@ -6,6 +6,7 @@ Joins the worker, the parameters, the 3D scene and the browsers. Everything runs
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol
@@ -15,23 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.common.timers import Throttle
+from app.common.user import SOMEBODY, current_user
 from app.dashboard.annotations import Annotating
 from app.dashboard.broadcast import Live
 from app.dashboard.camera_view import CameraDesk
 from app.dashboard.events import Events
 from app.dashboard.map_changes import MapChanges
 from app.dashboard.parameters import ParameterSets, ParameterState
-from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
+from app.dashboard.payload import BeforeAfter, Counts, counts_of, map_payload, truth_payload
 from app.dashboard.run_recorder import Glance, Logbook
 from app.dashboard.scores import Scores, score_payload
 from app.dashboard.selection import Selecting
-from app.dashboard.user import SOMEBODY, hand
 from app.explain.client import WorkerClient
 from app.sources.request import SourceRequest
 from app.store.async_store import Keeper
 from app.tuning.job import TuneSearch
 from app.tuning.sweep.sensitivity import Sensitivity, question_of
-from app.web.connection_limits import Places, Turns
 from app.worker.internal_protocol import (
     Answer,
     Begin,
@@ -45,7 +45,7 @@ from app.worker.internal_protocol import (
 )
 from app.worker.loop_playback import Loop
 from app.worker.outbox import joined
-from app.worker.protocol import Open, Play, SetParameters, Status
+from app.worker.protocol import Open, Play, SetParameters, Status, WorkerBusyError
 from pipeline.config import Parameters, preset
 from pipeline.config.model import Value
 from pipeline.types.records import Frame, Path, Trees, TruthTrees
@@ -126,17 +126,16 @@ class Dashboard:
             run=lambda: self._run,
             newest=lambda: None if self.shown is None else self.shown.frame.index,
         )
-        self.pages, self.scenes = Places(), Places()
-        self.viewers_turns = Turns()
-        self.scene_hand = SOMEBODY  # who moved something in the scene last
         self.source = SourceRequest("")
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
         self.search = TuneSearch(lambda told: live.tell("search", told))
-        self.loop = Loop(live, lambda command: self.worker.send(command))
+        self.loop = Loop(live, self._send_if_ready)
         self._run: int | None = None
         self._notice = ""
         self._restarts = 0
+        self._opens = 0
+        self._opening = asyncio.Lock()
         self._go = False
         self._show_scene = Throttle(lambda f, xy: self.scene.show(f, xy), pause_s=_SCENE_PAUSE_S)
 
@@ -163,7 +162,7 @@ class Dashboard:
         await self.logbook.close()
         await self.worker.close()
         await self.keeper.close()
-        self.scene.close()
+        await asyncio.to_thread(self.scene.close)
 
     # --- what people do --------------------------------------------------------------------------
 
@@ -173,6 +172,11 @@ class Dashboard:
         # A worker that is down comes back with the source closed; then this is still to be done.
         self._go = isinstance(command, Play | Open) and self.worker.pid is None
         await self.worker.send(command)
+
+    async def _send_if_ready(self, command: ToWorker) -> None:
+        """Send a command that has no meaning while the worker restarts."""
+        with contextlib.suppress(WorkerBusyError):
+            await self.worker.send(command)
 
     async def choose_view(self, name: str, value: str | bool) -> None:
         """Show or hide a layer of the scene, or colour, label or follow otherwise.
@@ -201,6 +205,15 @@ class Dashboard:
             self._show_parameters()  # the worker receives them when the source is open
         command = msgspec.structs.replace(_open_command(request), preset="", parameters={})
         source = command.request()
+        self._opens += 1
+        number = self._opens
+        async with self._opening:
+            if number == self._opens:  # else another source was asked for meanwhile
+                await self._leave_for(source)
+                await self.command(command)
+
+    async def _leave_for(self, source: SourceRequest) -> None:
+        """Leave the run; from now on this source is the one that is expected to open."""
         self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self._run, self.source, self.digest = None, source, ""
         self.live.tell("source", source.for_page())
@@ -210,7 +223,6 @@ class Dashboard:
         await self.sensitivity.leave()
         await self.search.leave()
         await self._forget()
-        await self.command(command)
 
     async def change_parameters(self, changes: dict[str, Value], gesture: str = "") -> None:
         """Change values by their dotted names, as part of a gesture (see `ParameterState.change`).
@@ -252,7 +264,7 @@ class Dashboard:
             self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
             self._tell_events()
         state = self.parameters
-        who = hand.get() or self.scene_hand
+        who = current_user.get() or SOMEBODY
         self.logbook.changed(before.flat(), state.parameters.flat(), state.preset, state.revision, who)
         self._score()
 
@@ -311,9 +323,7 @@ class Dashboard:
             case Opened() if message.asked in ("", self.source.uri):  # else it was left before it was open
                 await self._begin(message)
             case Shown():
-                self._show(message)
-                if message.run == self._run:
-                    await self.loop.shown(message.time_s, self.status)
+                await self._show(message)
             case Answer():
                 self.asking.take(message)
             case Remapped(run=run, changes=changes) if run == self._run:
@@ -342,8 +352,9 @@ class Dashboard:
     async def _begin(self, opened: Opened) -> None:
         """A source is open and waits: parameters that suit it first, then it plays."""
         self._run, self.digest = opened.run, opened.digest or opened.uri
+        number = self._opens
         await self.annotating.begin(opened.digest or opened.uri, opened.uri, opened.truth)
-        if self._run != opened.run:  # it was left meanwhile
+        if number != self._opens:  # another source was asked for meanwhile
             return
         await self._forget()
         if self.parameters.suit(opened.preset):
@@ -390,9 +401,10 @@ class Dashboard:
             self.events.annotated(who, number, self.shown.time_s)
             self._tell_events()
 
-    def _show(self, shown: Shown) -> None:
+    async def _show(self, shown: Shown) -> None:
         if shown.run != self._run:  # of a run that was left
             return
+        number = self._opens
         self.path = joined(self.path, shown.path_start, shown.path)
         if shown.frame.ground is None and self.shown is not None:
             # An earlier picture brought it, which the scene may not have drawn, or before it was built anew.
@@ -400,16 +412,20 @@ class Dashboard:
             shown = msgspec.structs.replace(shown, frame=frame)
         self.shown = shown
         self.path_xy = np.column_stack([self.path.x, self.path.y])
+        path_xy = self.path_xy
         distance = self.parameters.parameters.evaluation.match_distance
-        counts = self._before_after.shown(counts_of(shown.frame, self.truth, distance))
-        payload = map_payload(shown)
+        payload, counted = await asyncio.to_thread(_map_and_counts, shown, self.truth, distance)
+        if number != self._opens:  # another source was asked for meanwhile
+            return
+        counts = self._before_after.shown(counted)
         payload["layers"] |= self.scene.counts
-        self.live.show({**payload, **counts}, self.path_xy)
+        self.live.show({**payload, **counts}, path_xy)
         if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
             self._tell_events()
         self.logbook.shown(self._glance(shown))
         self._score()
         self._show_scene(shown.frame, self.path_xy)
+        await self.loop.shown(shown.time_s, self.status)
 
     def _glance(self, shown: Shown) -> Glance:
         state = self.parameters
@@ -433,6 +449,13 @@ class Dashboard:
         self.live.tell("status", status)
         if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
             self._tell_events()
+
+
+def _map_and_counts(
+    shown: Shown, truth: TruthTrees | None, match_distance: float
+) -> tuple[dict[str, Any], Counts]:
+    """The message "map" without its path, and the verdict counts of the scan."""
+    return map_payload(shown), counts_of(shown.frame, truth, match_distance)
 
 
 def _open_command(request: SourceRequest) -> Open:

@@ -208,6 +208,8 @@ class ParameterState:
         self.step += 1
 
 
+# Names have two parts. The TOML reader needs memory that grows with the square of the depth.
+_NESTED = re.compile(r"(?:[\w\"'-]{0,40}[ \t]*\.[ \t]*){8}")
 _PRESET = re.compile(r"# preset: ([a-z0-9-]{1,40})\s*\n")
 
 
@@ -227,6 +229,8 @@ def read_file(text: str, where: str, otherwise: str = DEFAULT_PRESET) -> tuple[s
     Raises:
         ParameterError: It is no such file, or a value does not fit.
     """
+    if _NESTED.search(text):
+        raise ParameterError("the names in the file are nested too deeply", where=where)
     named = _PRESET.match(text.removeprefix("\ufeff"))
     name = named.group(1) if named and named.group(1) in PRESETS else otherwise
     return name, from_toml(text.removeprefix("\ufeff"), preset(name), where)

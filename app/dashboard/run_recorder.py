@@ -29,6 +29,7 @@ _log = logging.getLogger(__name__)
 
 # A record is a picture of the run for later: it need not be newer than this while the run plays.
 _PAUSE_S = 5.0
+_REVISE_PAUSE_S = 1.0
 MOST_PATH_POINTS = 3000
 
 
@@ -60,6 +61,9 @@ class _Page:
     best: Glance | None = None
     newest: Glance | None = None
     dirty: bool = False
+    changes: list[Change] = field(default_factory=list)
+    reviser: asyncio.Task[None] | None = None
+    wake: asyncio.Event = field(default_factory=asyncio.Event)
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
@@ -105,6 +109,8 @@ class Logbook:
         if self._writer is not None:
             self._writer.cancel()
             self._writer = None
+        if page is not None and page.reviser is not None:
+            page.wake.set()
         if page is not None and page.dirty:
             self._start(self._write(page))
 
@@ -135,8 +141,16 @@ class Logbook:
         page = self._page
         if page is None or page.newest is None or not changes:
             return
-        time_s = page.newest.shown.time_s
-        self._start(self._revise(page, Change(revision, time_s, who, preset, changes)))
+        change = Change(revision, page.newest.shown.time_s, who, preset, changes)
+        last = page.changes[-1] if page.changes else None
+        if last is not None and last.who == who and last.changes.keys() == changes.keys():
+            # A slider that moves: one change from its first value to its newest.
+            merged = {name: [last.changes[name][0], after] for name, (_, after) in changes.items()}
+            page.changes[-1] = replace(change, changes=merged)
+        else:
+            page.changes.append(change)
+        if page.reviser is None or page.reviser.done():
+            page.reviser = self._start(self._revise_soon(page))
 
     async def close(self) -> None:
         """Write what is left to be written."""
@@ -153,12 +167,16 @@ class Logbook:
             await asyncio.shield(self._start(self._write(page)))
             await asyncio.sleep(_PAUSE_S)
 
-    async def _revise(self, page: _Page, change: Change) -> None:
+    async def _revise_soon(self, page: _Page) -> None:
+        """Write the parameter changes of the page after a pause, so that a slider costs few transactions."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(page.wake.wait(), _REVISE_PAUSE_S)
         if page.record is None:
             await self._write(page)
+        changes, page.changes = page.changes, []
         record = page.record
-        if record is not None:
-            await self._ask(lambda store: store.book.revise(record, change))
+        if record is not None and changes:
+            await self._ask(lambda store: store.book.revise_all(record, changes))
 
     async def _write(self, page: _Page) -> None:
         async with page.lock:

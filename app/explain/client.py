@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from app.explain.records import ClusterStory, TreeStory
 from app.worker.camera import CameraPicture
 from app.worker.internal_protocol import Answer, AskCamera, AskCluster, AskCompare, AskTree, Question
+from app.worker.protocol import WorkerBusyError
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame
@@ -20,14 +21,14 @@ Send = Callable[[Question], Awaitable[None]]
 
 
 class NoStoryError(StemmapError):
-    """The requested story, comparison or picture does not exist, or the worker did not answer."""
+    """The requested story, comparison or picture does not exist."""
 
 
 class WorkerClient:
     """Sends questions about the shown run to the worker and waits for the answers.
 
     Each question has a ticket, which its answer repeats. All methods that wait raise `NoStoryError` if there
-    is no run, no such object, or no answer in time.
+    is no run or no such object, and `WorkerBusyError` without an answer in time.
 
     Args:
         send: Sends a question to the worker.
@@ -86,13 +87,13 @@ class WorkerClient:
 
     async def _ask(self, question: Question) -> Answer:
         if len(self._waiting) >= _MOST_WAITING:
-            raise NoStoryError("too many requests at once", remedy="Try again")
+            raise WorkerBusyError("too many requests at once", remedy="Try again")
         waiting = self._waiting[question.ticket] = asyncio.get_running_loop().create_future()
         try:
             await self._send(question)
             return await asyncio.wait_for(waiting, self._patience_s)
         except TimeoutError:
-            raise NoStoryError("the mapping process is busy", remedy="Try again in a moment") from None
+            raise WorkerBusyError("the mapping process is busy", remedy="Try again in a moment") from None
         finally:
             del self._waiting[question.ticket]
 

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import viser
 
+from app.common.user import current_user
 from app.scene.viser_server import set_value
 from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs, preset
 from pipeline.errors import StemmapError
@@ -189,6 +191,14 @@ class SceneCommands(Protocol):
         """
 
 
+@dataclass(frozen=True, slots=True, eq=True)
+class _Origin:
+    """The person and the connection from which a change comes."""
+
+    user: str
+    client: viser.ClientHandle | None
+
+
 class Tuning:
     """Sends changes of the panel to the server, one at a time, on the loop of the server.
 
@@ -199,8 +209,7 @@ class Tuning:
 
     def __init__(self, commands: SceneCommands, put_back: Callable[[], None]) -> None:
         self._commands, self._put_back = commands, put_back
-        self._waiting: dict[str, Value] = {}
-        self._asker: viser.ClientHandle | None = None
+        self._waiting: dict[str, tuple[Value, _Origin]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._busy = False
 
@@ -211,8 +220,7 @@ class Tuning:
 
     def change(self, name: str, value: Value, client: viser.ClientHandle | None) -> None:
         """Send a value; while the server is busy, only the newest value of each parameter waits."""
-        self._waiting[name] = value
-        self._asker = client
+        self._waiting[name] = (value, _Origin(current_user.get(), client))
         if not self._busy:
             self._busy = True
             self._start(self._send_waiting())
@@ -229,8 +237,11 @@ class Tuning:
     async def _send_waiting(self) -> None:
         try:
             while self._waiting:
-                changes, self._waiting = self._waiting, {}
-                await self._told(self._commands.change_parameters(changes), self._asker)
+                _, origin = next(iter(self._waiting.values()))
+                changes = {name: value for name, (value, of) in self._waiting.items() if of == origin}
+                self._waiting = {k: each for k, each in self._waiting.items() if k not in changes}
+                current_user.set(origin.user)  # of this task only
+                await self._told(self._commands.change_parameters(changes), origin.client)
         finally:
             self._busy = False
 

@@ -14,6 +14,7 @@ import io
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
+from urllib.parse import unquote
 
 import viser
 import websockets.asyncio.server
@@ -21,7 +22,10 @@ from viser import _messages
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from app.common.user import SOMEBODY, current_user, is_user_name
+
 SECRET_HEADER = "X-Stemmap-Secret"  # noqa: S105 - the name, not the secret
+USER_HEADER = "X-Stemmap-User"
 
 _starting = threading.Lock()
 
@@ -72,6 +76,10 @@ def _check_first(secret: str, then: Callable[..., Any] | None) -> Callable[..., 
         given = request.headers.get(SECRET_HEADER, "")
         if not hmac.compare_digest(given.encode(), secret.encode()):
             return connection.respond(http.HTTPStatus.FORBIDDEN, "Open the dashboard instead.\n")
+        # viser handles all messages of a connection in tasks that copy this context, so a change of a slider
+        # is credited to the person whose connection sent it.
+        name = unquote(request.headers.get(USER_HEADER, ""))
+        current_user.set(name if is_user_name(name) else SOMEBODY)
         answer = None if then is None else then(connection, request)
         return await answer if inspect.isawaitable(answer) else answer
 

@@ -1,4 +1,4 @@
-"""The store in a thread of its own, so that no disk ever holds up the event loop."""
+"""Runs the store in its own thread, so that the disk never blocks the event loop."""
 
 from __future__ import annotations
 
@@ -15,31 +15,46 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+# Far more than all pages of a dashboard ask for at once; a database that hangs must not collect requests.
+LARGEST_QUEUE = 200
+
+
+class StoreBusyError(StemmapError):
+    """Too many requests wait for the database. The same request may succeed later."""
+
 
 class Keeper:
-    """Opens the store when it is first asked, and asks it one thing after the other.
+    """Opens the store with the first request, and runs one request after the other.
 
     Args:
-        folder: Where the database is kept; None keeps it in memory.
+        folder: Folder of the database; None keeps it in memory.
         database: Address of a PostgreSQL database in place of the folder.
     """
 
     def __init__(self, folder: Path | None, database: str = "") -> None:
         self._folder, self._database = folder, database
         self._store: Store | None = None
-        # One thread: what is asked for first is done first, and the store is never used twice at once.
+        # One thread runs the requests in their order and never two at once.
         self._thread = ThreadPoolExecutor(1, "store")
+        self._waiting = 0
 
     async def ask(self, function: Callable[[Store], T]) -> T:
-        """Let something be done to the store in its thread.
+        """Run a function of the store in the store's thread and return its result.
 
         Raises:
+            StoreBusyError: Too many requests wait.
             StemmapError: The store cannot be used.
         """
-        return await asyncio.get_running_loop().run_in_executor(self._thread, self._work, function)
+        if self._waiting >= LARGEST_QUEUE:
+            raise StoreBusyError("the database is busy", remedy="Try again in some seconds")
+        self._waiting += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._thread, self._work, function)
+        finally:
+            self._waiting -= 1
 
     async def close(self) -> None:
-        """Finish what is under way, and let go of the database."""
+        """Finish the requests that wait, and close the database."""
         if self._store is not None:
             await self.ask(lambda store: store.close())
         self._thread.shutdown()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -110,27 +110,15 @@ class RunBook:
             connection.execute(update(_maps).where(_maps.c.record == record).values(map=dict(standing.map)))
 
     def revise(self, record: int, change: Change) -> None:
-        """Write down a change of parameters; those of one move of a slider become one."""
+        """Store a change of parameters; changes by one movement of a slider become one."""
+        self.revise_all(record, [change])
+
+    def revise_all(self, record: int, changes: Sequence[Change]) -> None:
+        """Store changes of parameters in one transaction, the oldest first."""
         now = self._clock()
-        query = select(_revisions).where(_revisions.c.record == record).order_by(_revisions.c.id.desc())
         with self._engine.begin() as connection:
-            last = connection.execute(query.limit(1)).one_or_none()
-            values = {"revision": change.revision, "at_ns": now, "time_s": change.time_s}
-            if last is not None and _is_one_move(last, change, now):
-                changes = {
-                    name: [last.changes[name][0], after] for name, (_, after) in change.changes.items()
-                }
-                connection.execute(
-                    update(_revisions)
-                    .where(_revisions.c.id == last.id)
-                    .values(**values, preset=change.preset, changes=changes)
-                )
-                return
-            connection.execute(
-                insert(_revisions).values(
-                    record=record, **values, who=change.who, preset=change.preset, changes=change.changes
-                )
-            )
+            for change in changes:
+                _revise(connection, record, change, now)
 
     def listed(self) -> list[dict[str, Any]]:
         """The runs, the newest first, without their maps."""
@@ -203,6 +191,19 @@ class RunBook:
         """What is known of uploaded files, by their names in the folder."""
         with self._engine.begin() as connection:
             return {row.file: _plain(row) for row in connection.execute(select(_uploads)).all()}
+
+
+def _revise(connection: Connection, record: int, change: Change, now: int) -> None:
+    query = select(_revisions).where(_revisions.c.record == record).order_by(_revisions.c.id.desc())
+    last = connection.execute(query.limit(1)).one_or_none()
+    values = {"revision": change.revision, "at_ns": now, "time_s": change.time_s, "preset": change.preset}
+    if last is not None and _is_one_move(last, change, now):
+        changes = {name: [last.changes[name][0], after] for name, (_, after) in change.changes.items()}
+        same = _revisions.c.id == last.id
+        connection.execute(update(_revisions).where(same).values(**values, changes=changes))
+        return
+    inserted = {"record": record, "who": change.who, "changes": change.changes}
+    connection.execute(insert(_revisions).values(**values, **inserted))
 
 
 def _with_source() -> Select[Any]:

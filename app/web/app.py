@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.responses import Response
@@ -21,53 +22,25 @@ from app.dashboard.broadcast import Live
 from app.dashboard.dashboard import Dashboard, SceneLike, WorkerLike
 from app.dashboard.learning import Learning
 from app.dashboard.parameters import ParameterState
-from app.store.async_store import Keeper
+from app.store.async_store import Keeper, StoreBusyError
 from app.store.records import UnknownError
 from app.training.learned_forests import Forests
-from app.web.auth import BodyTooLargeError, Guard, viewer_token
-from app.web.responses import BadRequestError, error_reply, failure_reply
+from app.web.auth import Guard, viewer_token
+from app.web.connection_limits import Limits, TooManyRequestsError
+from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
-from app.web.routes import (
-    camera,
-    page,
-    parameter_sets,
-    parameters,
-    pictures,
-    results,
-    run,
-    runs,
-    sensitivity,
-    sockets,
-    story,
-    tuning,
-)
-from app.web.routes import learning as learning_routes
+from app.web.routes import page, parameters, results, run, runs, sockets, tuning
 from app.web.routes import uploads as upload_routes
+from app.web.routes.run import NotPermittedError
 from app.web.uploads import Uploads
-from app.worker.protocol import Open
+from app.worker.protocol import Open, WorkerBusyError
 from pipeline.errors import ParameterError, StemmapError
 
 _log = logging.getLogger(__name__)
 
 ROUTERS = tuple(
     module.router
-    for module in (
-        camera,
-        page,
-        run,
-        runs,
-        sensitivity,
-        parameters,
-        parameter_sets,
-        pictures,
-        results,
-        annotation_routes,
-        learning_routes,
-        upload_routes,
-        story,
-        tuning,
-        sockets,
-    )
+    for module in (page, run, runs, parameters, results, annotation_routes, tuning, upload_routes, sockets)
 )
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
@@ -76,11 +49,11 @@ MakeWorker = Callable[[Dashboard], WorkerLike]
 
 @dataclass(frozen=True, slots=True)
 class OfFleet:
-    """What a dashboard knows of the fleet that it belongs to.
+    """The fleet that a dashboard belongs to.
 
     Attributes:
-        port: Of the page of all robots.
-        open_records: Tells the records of the runs that are open in any of its dashboards.
+        port: Port of the page of all robots.
+        open_records: Returns the numbers of the runs that are open in any dashboard of the fleet.
     """
 
     port: int
@@ -95,6 +68,7 @@ _HEADERS = (
     (b"x-frame-options", b"SAMEORIGIN"),
     (b"cross-origin-resource-policy", b"same-origin"),
 )
+_RETRY_AFTER_S = 3
 _POLICY = (b"content-security-policy", b"default-src 'none'; frame-ancestors 'self'")
 
 
@@ -109,28 +83,31 @@ def build(
     make_worker: MakeWorker | None = None,
     fleet: OfFleet | None = None,
 ) -> FastAPI:
-    """The application.
+    """Return the application of one dashboard.
 
     Args:
-        settings: Of the deployment.
-        port: On which it is served, for Host and Origin.
-        token: That browsers must show.
-        source: Opened at the start.
-        parameter_state: The parameters at the start.
-        make_scene, make_worker: Stand in for viser and for the worker's process in tests.
-        fleet: That it belongs to; None when it is alone.
+        settings: Settings of the deployment.
+        port: Port on which it is served, to check Host and Origin.
+        token: Token of the owner's link.
+        source: Source that is opened at the start.
+        parameter_state: Parameters at the start.
+        make_scene, make_worker: Replace viser and the worker process in tests.
+        fleet: The fleet that the dashboard belongs to, if any.
     """
     parameter_state.check = Forests(settings.folder).check
     dashboard = Dashboard(parameter_state, Live(), Keeper(settings.folder, settings.database))
 
-    learning = Learning(dashboard.keeper, settings.folder, lambda told: dashboard.live.tell("learning", told))
+    learning = Learning(
+        dashboard.keeper, settings.folder, lambda state: dashboard.live.tell("learning", state)
+    )
     uploads = Uploads(settings.uploads, settings.upload_limit, dashboard.keeper)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(uploads.clear)
         dashboard.worker = (make_worker or partial(_worker, settings.folder))(dashboard)
-        dashboard.scene = (make_scene or _scene)(dashboard, asyncio.get_running_loop())
+        loop = asyncio.get_running_loop()
+        dashboard.scene = await asyncio.to_thread(make_scene or _scene, dashboard, loop)
         await dashboard.start(source)
         try:
             yield
@@ -142,14 +119,14 @@ def build(
     app.state.dashboard, app.state.settings = dashboard, settings
     app.state.fleet_port = None if fleet is None else fleet.port
     app.state.open_records = fleet.open_records if fleet else lambda: {dashboard.logbook.record}
-    app.state.uploads, app.state.learning = uploads, learning
+    app.state.uploads, app.state.learning, app.state.limits = uploads, learning, Limits()
     for router in ROUTERS:
         app.include_router(router)
     return app
 
 
 def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) -> FastAPI:
-    """An application without a route that lets through only who may, and answers errors for people."""
+    """Return an application without routes that checks access and answers errors as JSON."""
     guard = Middleware(
         Guard,
         token=token,
@@ -165,7 +142,7 @@ def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) ->
         middleware=[Middleware(SafeHeaders), guard],
         docs_url=None,  # its page loads scripts from another server
         redoc_url=None,
-        openapi_url=None,
+        openapi_url="/api/openapi.json",
         redirect_slashes=False,
     )
     app.state.token, app.state.viewer_token = token, viewer_token(token)
@@ -174,13 +151,13 @@ def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) ->
 
 
 class SafeHeaders:
-    """ASGI middleware: every answer, the refusals too, carries the headers that keep browsers careful."""
+    """ASGI middleware that adds security headers to every response, refusals included."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Add the headers to the answer."""
+        """Add the headers to the response."""
 
         async def careful(message: Message) -> None:
             if message["type"] in ("http.response.start", "websocket.http.response.start"):
@@ -195,8 +172,11 @@ class SafeHeaders:
 def _answer_errors(app: FastAPI) -> None:
     statuses = {
         BadRequestError: 422,
+        NotPermittedError: 403,
+        TooManyRequestsError: 429,
+        WorkerBusyError: 503,
+        StoreBusyError: 503,
         ParameterError: 422,
-        BodyTooLargeError: 413,
         UnknownError: 404,
         StemmapError: 409,
     }
@@ -204,7 +184,13 @@ def _answer_errors(app: FastAPI) -> None:
     @app.exception_handler(StemmapError)
     async def for_people(_: Request, error: Exception) -> Response:
         assert isinstance(error, StemmapError)  # noqa: S101 - the handler is registered for it
-        return failure_reply(next(statuses[t] for t in type(error).__mro__ if t in statuses), error)
+        status = next(statuses[t] for t in type(error).__mro__ if t in statuses)
+        return failure_reply(status, error, _RETRY_AFTER_S if status in (429, 503) else None)
+
+    @app.exception_handler(RequestValidationError)
+    async def of_validation(_: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)  # noqa: S101 - the handler is registered for it
+        return invalid_reply(error.errors())
 
     @app.exception_handler(HTTPException)
     async def of_the_framework(_: Request, error: Exception) -> Response:

@@ -1,9 +1,9 @@
-"""Who may talk to the server: the holder of the token, by a name that we know, from our own page.
+"""Access control: a request needs the token or a session cookie, a known Host and, if it has one, our Origin.
 
-The link that is printed at the start carries the token once; the answer sets a cookie that scripts
-cannot read, that other sites do not send with what they ask for, and that ends with the browser. Host
-is checked against names rebound to this machine, Origin against pages of other servers (another port
-is another origin, but not another site).
+The link that is printed at the start carries the token once. The response sets a session cookie that scripts
+cannot read, that other sites do not send, and that expires after SESSION_S. The Host check defeats names that
+are rebound to this machine; the Origin check refuses pages of other servers (another port is another origin,
+but not another site).
 """
 
 from __future__ import annotations
@@ -14,33 +14,47 @@ import html
 import ipaddress
 import secrets
 import socket
+import time
 from collections.abc import Iterable
 from http.cookies import CookieError, SimpleCookie
 from typing import Literal
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, RedirectResponse, Response
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.dashboard.user import hand, name_in
+from app.common.settings import is_loopback
+from app.common.user import current_user, user_of_cookies
 from app.web.responses import error_reply
-from pipeline.errors import StemmapError
 
-# Where bodies may be as long as a recording.
+# The only route whose bodies may be as large as a recording.
 UPLOADS = "/api/uploads"
 Role = Literal["owner", "viewer"]
+#: A session lasts so long; each page load in its second half starts a new one.
+SESSION_S = 7 * 86_400
+TICKET_S = 60
 _SAFE_METHODS = frozenset({"GET", "HEAD"})
-_CHANGES_NOTHING = frozenset({("POST", "/api/compare")})  # asks with a body, and the run stays as it is
+_CHANGES_NOTHING = frozenset({("POST", "/api/compare")})  # a query with a body
+_FORWARDING = (
+    "forwarded",
+    "via",
+    "x-forwarded-for",
+    "x-forwarded-host",
+    "x-forwarded-proto",
+    "x-real-ip",
+    "cf-connecting-ip",
+)
 _LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 _ANY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - compared with, not bound to
 
 _LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
 <style>body{font:1.1rem/1.6 system-ui,sans-serif;max-width:36rem;margin:15vh auto;padding:0 1.5rem}</style>
 <h1>Open the link that stemmap printed</h1>
-<p>This dashboard belongs to whoever started it. In the terminal where <code>stemmap</code> runs stands a
-link that ends in <code>?token=</code> and some letters: open that one.
-It changes at every start.</p></html>"""
+<p>This dashboard needs the link that <code>stemmap</code> printed in the terminal when it was started.
+The link ends in <code>?token=</code> and some letters. It changes at every start, and a session ends after a
+week.</p></html>"""
 
 
 _LEAD_ON = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
@@ -48,32 +62,60 @@ _LEAD_ON = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemma
 
 
 def new_token() -> str:
-    """A token that nobody guesses."""
+    """Return a random token of 192 bits."""
     return secrets.token_urlsafe(24)
 
 
 def viewer_token(token: str) -> str:
-    """The token of the link for those who may look and not touch. It comes of the other one, so that it
-    outlives a restart as that does, and nobody can go the way back."""
+    """Return the token of the view-only link. It is derived from the owner's token, so that it stays valid
+    after a restart with the same token, and does not reveal that one."""
     made = hmac.new(token.encode(), b"stemmap viewer", "sha256").digest()
     return base64.urlsafe_b64encode(made[:24]).decode()
 
 
 def role_of(scope: Scope) -> Role:
-    """What the guard found out about who asks."""
+    """Return the role that the guard determined for a request."""
     role: Role = scope.get("state", {}).get("role", "viewer")
     return role
 
 
-def session_value(token: str, port: int) -> str:
-    """What the cookie holds: of its own, so that whoever reads it (browsers send it to every port of this
-    machine) has not got the token. It is the same after a restart with the same token, so that an open
-    page finds its server again."""
-    return hmac.new(token.encode(), f"stemmap cookie {port}".encode(), "sha256").hexdigest()
+def session_value(token: str, port: int, expires_s: int) -> str:
+    """Return the value of a session cookie that expires at a time [Unix seconds].
+
+    It is signed with the token and does not reveal it, because browsers send cookies to every port of this
+    machine. It stays valid after a restart with the same token, so that an open page finds its server again.
+    """
+    return f"{expires_s}.{_signature(token, f'stemmap cookie {port} {expires_s}')}"
+
+
+def ticket(token: str, port: int, role: Role) -> str:
+    """Return a code that opens the dashboard on a port once, within TICKET_S seconds, with a role."""
+    expires_s = int(time.time()) + TICKET_S
+    nonce = secrets.token_urlsafe(12)
+    signed = f"{role}.{expires_s}.{nonce}"
+    return f"{signed}.{_signature(token, f'stemmap ticket {port} {signed}')}"
+
+
+def _signature(token: str, text: str) -> str:
+    return hmac.new(token.encode(), text.encode(), "sha256").hexdigest()
+
+
+def is_local(headers: Headers) -> bool:
+    """Whether a request was sent to a loopback name and not forwarded by a proxy that says so.
+
+    A proxy that hides itself cannot be detected: behind one, set STEMMAP_FILES=folders.
+    """
+    if any(name in headers for name in _FORWARDING):
+        return False
+    try:
+        name = urlsplit(f"//{headers.get('host', '')}").hostname or ""
+    except ValueError:
+        return False
+    return is_loopback(name)
 
 
 def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozenset[str]:
-    """The values of the Host header by which the server may be called."""
+    """Return the accepted values of the Host header."""
     names = {*_LOOPBACK_NAMES, f"[{host}]" if ":" in host else host.lower(), *further}
     if host in _ANY_ADDRESS:
         names.add(socket.gethostname().lower())
@@ -81,14 +123,15 @@ def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozense
 
 
 class Guard:
-    """ASGI middleware: lets through only who may, for requests and websockets alike.
+    """ASGI middleware that refuses requests and websockets without the right to them.
 
     Args:
-        app: What is guarded.
-        token: That must be shown.
-        host, port: Where the server listens.
-        further_hosts: Other names of it.
-        body_limit: Largest body of a request [bytes]; upload_limit: of an upload.
+        app: The guarded application.
+        token: Token of the owner.
+        host, port: Address on which the server listens.
+        further_hosts: Further accepted host names.
+        body_limit: Largest body of a request [bytes].
+        upload_limit: Largest body of an upload [bytes].
     """
 
     def __init__(
@@ -105,7 +148,7 @@ class Guard:
         self._app = app
         tokens: tuple[tuple[Role, str], ...] = (("owner", token), ("viewer", viewer_token(token)))
         self._tokens = tokens
-        self._sessions = tuple((role, session_value(given, port)) for role, given in tokens)
+        self._used_tickets: dict[str, int] = {}  # with the time at which they expire
         self._port = port
         self._hosts = allowed_hosts(host, port, further_hosts)
         self._any_address = host in _ANY_ADDRESS
@@ -113,7 +156,7 @@ class Guard:
         self.cookie = f"stemmap_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer with an error, or hand on."""
+        """Refuse the request, or pass it on with its role and user."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -124,17 +167,38 @@ class Guard:
         if refusal is not None:
             await refusal(scope, receive, send)
             return
-        hand.set(name_in(headers.getlist("cookie")))
+        current_user.set(user_of_cookies(headers.getlist("cookie")))
         if scope["type"] == "http":
-            await self._app(scope, _limited(receive, self._limit_of(scope)), send)
+            await self._app(
+                scope, _limited(receive, self._limit_of(scope)), self._renewing(scope, headers, send)
+            )
         else:
             await self._app(scope, receive, send)
 
+    def _renewing(self, scope: Scope, headers: Headers, send: Send) -> Send:
+        """Return a `send` that renews a session in its second half when the page is loaded."""
+        if scope["path"] != "/" or not self._is_half_over(headers):
+            return send
+        reply = Response()
+        self._set_session(reply, role_of(scope))
+        cookie = next(each for each in reply.raw_headers if each[0] == b"set-cookie")
+
+        async def renewing(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message.get("headers", ()), cookie]
+            await send(message)
+
+        return renewing
+
+    def _is_half_over(self, headers: Headers) -> bool:
+        ends = [_seconds(value.partition(".")[0]) for value in self._cookies(headers)]
+        return bool(ends) and max(end or 0 for end in ends) < time.time() + SESSION_S / 2
+
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """The answer to a request that comes by a wrong name, from a wrong page, or is too large."""
+        """The response to a wrong Host or Origin, or to a body that is too large; None if all are right."""
         if not self._knows_host(headers):
             return error_reply(
-                403, "this server is not known by that name", remedy="Open the link that stemmap printed"
+                403, "this server has another host name", remedy="Open the link that stemmap printed"
             )
         unsafe = scope["type"] == "websocket" or scope["method"] not in _SAFE_METHODS
         if unsafe and not self._fits_origin(scope, headers):
@@ -142,11 +206,11 @@ class Guard:
         length = headers.get("content-length", "0")
         limit = self._limit_of(scope)
         if not length.isdecimal() or int(length) > limit:
-            return error_reply(413, f"a body may have {limit} bytes")
+            return error_reply(413, f"the body is larger than {limit} bytes")
         return None
 
     def _restraint(self, scope: Scope, headers: Headers) -> Response | None:
-        """The answer to who may look and wants to touch; the role of all others is kept in the scope."""
+        """The response to a viewer who tries to change something; None otherwise. Stores the role."""
         role = self._role(headers)
         scope.setdefault("state", {})["role"] = role
         if role == "owner" or scope["type"] == "websocket" or scope["method"] in _SAFE_METHODS:
@@ -155,8 +219,8 @@ class Guard:
             return None
         return error_reply(
             403,
-            "this link is for looking only",
-            remedy="Ask who runs stemmap for the link that may change things",
+            "this is a view-only link",
+            remedy="Ask the person who runs stemmap for the owner's link",
         )
 
     def _limit_of(self, scope: Scope) -> int:
@@ -165,13 +229,15 @@ class Guard:
         return max(self._body_limit, self._upload_limit) if is_upload else self._body_limit
 
     def _login(self, scope: Scope, headers: Headers) -> Response | None:
-        """The answer to who brings the token in the link, or brings none."""
+        """The response to a link with a token or ticket, or to a request without a session, else None."""
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] in _SAFE_METHODS:
             query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
-            given = [value for name, value in query if name == "token"]
-            role = self._role_by_token(given[-1]) if given else None
+            given = dict(query)
+            role = self._role_by_token(given["token"]) if "token" in given else None
+            if role is None and "ticket" in given and scope["method"] == "GET":
+                role = self._role_by_ticket(given["ticket"])
             if role is not None:
-                rest = [(name, value) for name, value in query if name != "token"]
+                rest = [(name, value) for name, value in query if name not in ("token", "ticket")]
                 from_elsewhere = headers.get("sec-fetch-site") == "cross-site"
                 return self._welcome(role, rest, from_elsewhere=from_elsewhere)
         if self._role(headers) is not None:
@@ -181,10 +247,10 @@ class Guard:
         return error_reply(401, "the token is missing or wrong", remedy="Open the link that stemmap printed")
 
     def _welcome(self, role: Role, query: list[tuple[str, str]], *, from_elsewhere: bool) -> Response:
-        """Give the cookie and lead on to the page without the token.
+        """Set the session cookie and redirect to the page without the token.
 
-        A strict cookie is not sent along a redirect that began in a file or on another site; from a
-        page of our own it is, so whoever comes from there is led on by such a page.
+        A browser does not send a strict cookie along a redirect that began in a file or on another site. From
+        there, a page of this server leads on instead.
         """
         target = "/" + (f"?{urlencode(query)}" if query else "")
         reply: Response = RedirectResponse(target, 303)
@@ -192,8 +258,12 @@ class Guard:
             reply = HTMLResponse(_LEAD_ON.format(target=html.escape(target)))
         reply.headers["Cache-Control"] = "no-store"
         reply.headers["Referrer-Policy"] = "no-referrer"
-        reply.set_cookie(self.cookie, dict(self._sessions)[role], path="/", httponly=True, samesite="strict")
+        self._set_session(reply, role)
         return reply
+
+    def _set_session(self, reply: Response, role: Role) -> None:
+        value = session_value(dict(self._tokens)[role], self._port, int(time.time()) + SESSION_S)
+        reply.set_cookie(self.cookie, value, max_age=SESSION_S, path="/", httponly=True, samesite="strict")
 
     def _knows_host(self, headers: Headers) -> bool:
         given = headers.getlist("host")
@@ -203,7 +273,7 @@ class Guard:
         return host in self._hosts or (self._any_address and self._is_own_address(host))
 
     def _is_own_address(self, host: str) -> bool:
-        """Whether it is a bare address with our port: only names can be rebound to this machine."""
+        """Whether a Host is a bare address with our port: only names can be rebound to this machine."""
         try:
             parts = urlsplit(f"//{host}")
             ipaddress.ip_address(parts.hostname or "")
@@ -222,16 +292,39 @@ class Guard:
         return self._role_by_cookie(headers) or self._role_by_bearer(headers)
 
     def _role_by_cookie(self, headers: Headers) -> Role | None:
-        # Several cookies of one name can be sent; one of another path must not hide ours.
-        given = [
+        roles = {self._role_by_session(value) for value in self._cookies(headers)}
+        return "owner" if "owner" in roles else "viewer" if "viewer" in roles else None
+
+    def _cookies(self, headers: Headers) -> list[str]:
+        """All session cookies of the request: one of another path must not hide ours."""
+        return [
             value
             for line in headers.getlist("cookie")
             for part in line.split(";")
             if (value := _cookie_value(part, self.cookie)) is not None
         ]
-        return next(
-            (role for role, session in self._sessions for value in given if _same(value, session)), None
-        )
+
+    def _role_by_session(self, value: str) -> Role | None:
+        expires_s = _seconds(value.partition(".")[0])
+        if expires_s is None or expires_s < time.time():
+            return None
+        sessions = ((role, session_value(token, self._port, expires_s)) for role, token in self._tokens)
+        return next((role for role, session in sessions if _same(value, session)), None)
+
+    def _role_by_ticket(self, value: str) -> Role | None:
+        """The role of a ticket that is valid and was not used before."""
+        signed, _, signature = value.rpartition(".")
+        parts = signed.split(".")
+        expires_s = _seconds(parts[1]) if len(parts) == 3 else None
+        now = time.time()
+        if expires_s is None or expires_s < now or signed in self._used_tickets:
+            return None
+        owner_token = dict(self._tokens)["owner"]
+        if not _same(signature, _signature(owner_token, f"stemmap ticket {self._port} {signed}")):
+            return None
+        self._used_tickets = {k: end for k, end in self._used_tickets.items() if end >= now}
+        self._used_tickets[signed] = expires_s
+        return "owner" if parts[0] == "owner" else "viewer"
 
     def _role_by_bearer(self, headers: Headers) -> Role | None:
         scheme, _, given = headers.get("authorization", "").partition(" ")
@@ -253,12 +346,12 @@ def _cookie_value(part: str, name: str) -> str | None:
     return None if morsel is None else morsel.value
 
 
-class BodyTooLargeError(StemmapError):
-    """A body that goes on beyond the limit."""
+def _seconds(text: str) -> int | None:
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= 12 else None
 
 
 def _limited(receive: Receive, limit: int) -> Receive:
-    """`receive` that counts: a body without a length in its head may not go on for ever."""
+    """Return a `receive` that limits the body, also where the request does not announce its length."""
     seen = 0
 
     async def counted() -> dict[str, object]:
@@ -266,7 +359,7 @@ def _limited(receive: Receive, limit: int) -> Receive:
         message = await receive()
         seen += len(message.get("body", b""))
         if seen > limit:
-            raise BodyTooLargeError(f"a body may have {limit} bytes")
+            raise HTTPException(413, f"the body is larger than {limit} bytes")
         return dict(message)
 
     return counted

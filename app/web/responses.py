@@ -1,56 +1,83 @@
-"""How the server answers: JSON, and errors that say what, where, and what to do."""
+"""Request bodies and responses of the API: validated models, JSON, and errors with their remedy."""
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import msgspec
-from starlette.requests import Request
+from fastapi import Path
+from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
+from app.common.user import USER_NAME
 from pipeline.errors import StemmapError
 
-T = TypeVar("T")
+LARGEST_NUMBER = 2**31 - 1
+
+#: A number in the path, as of a run or of a tree.
+Number = Annotated[int, Path(ge=0, le=LARGEST_NUMBER)]
+#: The same in a body.
+Id = Annotated[int, Field(ge=0, le=LARGEST_NUMBER)]
+#: A name that the server looks up, as of a parameter.
+Word = Annotated[str, Field(max_length=100)]
+#: A parameter's value. The bounds of each parameter are checked by its declaration.
+Value = (
+    bool | Annotated[int, Field(ge=-(2**53), le=2**53)] | Annotated[float, Field(ge=-1e12, le=1e12)] | Word
+)
+#: The name that a person entered in the page.
+UserName = Annotated[str, Field(pattern=USER_NAME.replace(r"\Z", r"$"), max_length=40)]
+
+
+class Body(BaseModel):
+    """The JSON body of a request: types are not converted, and unknown fields and NaN are refused."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class BadRequestError(StemmapError):
+    """A request that does not fit the route."""
 
 
 def json_reply(content: object, status: int = 200) -> Response:
-    """Records, dicts and lists as JSON; NaN becomes null."""
+    """Return records, dicts and lists as JSON; NaN becomes null."""
     return Response(
         msgspec.json.encode(content), status, {"Cache-Control": "no-store"}, media_type="application/json"
     )
 
 
-def error_reply(status: int, what: str, *, where: str = "", remedy: str = "") -> Response:
-    """An error as the page shows it."""
-    return json_reply({"error": {"what": what, "where": where, "remedy": remedy}}, status)
+def error_reply(
+    status: int, what: str, *, where: str = "", remedy: str = "", retry_after_s: int | None = None
+) -> Response:
+    """Return an error as the page shows it; `retry_after_s` says when the same request may succeed."""
+    reply = json_reply({"error": {"what": what, "where": where, "remedy": remedy}}, status)
+    if retry_after_s is not None:
+        reply.headers["Retry-After"] = str(retry_after_s)
+    return reply
 
 
-def failure_reply(status: int, error: StemmapError) -> Response:
-    """An error for people, as the page shows it."""
-    return error_reply(status, error.what, where=error.where, remedy=error.remedy)
+def failure_reply(status: int, error: StemmapError, retry_after_s: int | None = None) -> Response:
+    """Return an exception as the page shows it."""
+    return error_reply(
+        status, error.what, where=error.where, remedy=error.remedy, retry_after_s=retry_after_s
+    )
 
 
-def table_reply(text: str, filename: str, media_type: str = "text/csv") -> Response:
-    """A text to be saved as a file."""
+def invalid_reply(errors: Sequence[Any]) -> Response:
+    """Return the first error of a validation: which field does not fit, and why."""
+    first = errors[0] if errors else {}
+    place = [str(part)[:100] for part in first.get("loc", ()) if part != "body"]
+    given = first.get("ctx", {}).get("tag", "")  # an unknown kind of command
+    words = f"{first.get('msg', '')} {str(given)[:100]}".strip()
+    return error_reply(422, f"the request does not fit: {'.'.join(place)}: {words}".replace(": :", ":"))
+
+
+def file_reply(text: str, filename: str, media_type: str = "text/csv") -> Response:
+    """Return a text that the browser saves as a file."""
     headers = {"Content-Disposition": f'attachment; filename="{filename}"', "Cache-Control": "no-store"}
     return Response(text, 200, headers, media_type=f"{media_type}; charset=utf-8")
 
 
-class BadRequestError(StemmapError):
-    """A body that is not what the route takes."""
-
-
-async def body_of(request: Request, expected: type[T] | Any) -> T:  # noqa: ANN401 - a union is no `type`
-    """The JSON body of a request as one of the expected types.
-
-    Raises:
-        BadRequestError: It is not JSON, or not of these types.
-    """
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind != "application/json":
-        raise BadRequestError("the body must be JSON", where="Content-Type", remedy="Send application/json")
-    try:
-        body: T = msgspec.json.decode(await request.body(), type=expected)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise BadRequestError(f"the body does not fit: {error}") from None
-    return body
+def block_reply(content: bytes) -> Response:
+    """Return a binary block, see `app.dashboard.payload.packed`."""
+    return Response(content, 200, {"Cache-Control": "no-store"}, media_type="application/octet-stream")

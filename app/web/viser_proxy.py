@@ -12,9 +12,9 @@ import contextlib
 import logging
 import math
 import socket
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
+from urllib.parse import quote
 
 import msgspec
 from msgspec import Meta
@@ -171,34 +171,33 @@ async def bridge(
     browser: WebSocket,
     viser: ViserServer,
     *,
+    user: str,
     looks_only: bool = False,
-    touched: Callable[[], None] = lambda: None,
 ) -> None:
     """Carry messages between a browser and viser until one of them leaves.
 
     Args:
-        browser: Not accepted yet.
-        viser: Where viser listens.
-        looks_only: The browser may move its own camera and nothing else.
-        touched: Called before a message that may change something.
+        browser: The websocket of the browser, not accepted yet.
+        viser: Port and secret of viser.
+        user: Name of the person at the browser, to whom its changes are credited.
+        looks_only: Whether the browser may move its own camera and nothing else.
     """
-    touched = (lambda: None) if looks_only else touched
     protocols = [Subprotocol(p) for p in browser.scope["subprotocols"] if p.startswith("viser-v")]
     try:
-        upstream = await _connect(viser, protocols[:_PROTOCOLS])
+        upstream = await _connect(viser, user, protocols[:_PROTOCOLS])
     except (OSError, InvalidHandshake, TimeoutError) as error:
         _log.warning("the 3D scene cannot be reached: %s", error)
         await browser.close(_TRY_AGAIN_LATER)
         return
     async with upstream:
         await browser.accept(upstream.subprotocol)
-        await _carry(browser, upstream, looks_only, touched)
+        await _carry(browser, upstream, looks_only)
     if browser.application_state is WebSocketState.CONNECTED:
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # it has just left by itself
             await browser.close()
 
 
-async def _connect(viser: ViserServer, protocols: list[Subprotocol]) -> ClientConnection:
+async def _connect(viser: ViserServer, user: str, protocols: list[Subprotocol]) -> ClientConnection:
     loopback = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     loopback.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BUFFER)
     loopback.setblocking(False)
@@ -208,7 +207,7 @@ async def _connect(viser: ViserServer, protocols: list[Subprotocol]) -> ClientCo
             f"ws://127.0.0.1:{viser.port}/",
             sock=loopback,
             subprotocols=protocols or None,
-            additional_headers={"X-Stemmap-Secret": viser.secret},
+            additional_headers={"X-Stemmap-Secret": viser.secret, "X-Stemmap-User": quote(user)},
             compression=None,
             max_size=_LARGEST_FROM_VISER,
             max_queue=_QUEUE,
@@ -220,13 +219,11 @@ async def _connect(viser: ViserServer, protocols: list[Subprotocol]) -> ClientCo
         raise
 
 
-async def _carry(
-    browser: WebSocket, upstream: ClientConnection, looks_only: bool, touched: Callable[[], None]
-) -> None:
+async def _carry(browser: WebSocket, upstream: ClientConnection, looks_only: bool) -> None:
     """Both directions at once; the first that ends, ends the other."""
     directions = {
         asyncio.create_task(_to_browser(browser, upstream)),
-        asyncio.create_task(_to_viser(browser, upstream, looks_only, touched)),
+        asyncio.create_task(_to_viser(browser, upstream, looks_only)),
     }
     try:
         await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
@@ -246,12 +243,9 @@ async def _to_browser(browser: WebSocket, upstream: ClientConnection) -> None:
             await (browser.send_bytes(message) if isinstance(message, bytes) else browser.send_text(message))
 
 
-async def _to_viser(
-    browser: WebSocket, upstream: ClientConnection, looks_only: bool, touched: Callable[[], None]
-) -> None:
+async def _to_viser(browser: WebSocket, upstream: ClientConnection, looks_only: bool) -> None:
     with contextlib.suppress(ConnectionClosed):
         while (event := await browser.receive())["type"] != "websocket.disconnect":
             message = event.get("bytes")
             if message is not None and is_allowed(message, looks_only=looks_only):
-                touched()
                 await upstream.send(message)

@@ -19,14 +19,16 @@ from pipeline.types.records import HeightMap, Path
 
 # Faster pictures nobody sees; they would only fill the pipe and the browsers' sockets.
 _SHORTEST_PAUSE_S = 0.05
+# Answers and notices; a web process that reads none of so many is gone or hangs.
+MOST_MESSAGES = 500
 
 
 class Mailbox:
     """Writes messages to a stream in a thread of its own, so that a slow reader never stops the map.
 
-    Pictures wait in one slot: a newer one replaces it. Other messages are sent in order and none is
-    dropped. After `Opened` no picture of an older run is sent. What cannot be sent is left out, and
-    the status says so.
+    Pictures wait in one slot: a newer one replaces it, as a newer status replaces the one before it. Other
+    messages are sent in order; beyond MOST_MESSAGES the oldest is dropped. After `Opened` no picture of an
+    older run is sent. A message that cannot be sent is left out, and the status reports it.
 
     Args:
         stream: Where the bytes go; closed by nobody here.
@@ -58,6 +60,11 @@ class Mailbox:
             else:
                 if isinstance(message, Opened):
                     self._picture = None  # of the run before
+                if isinstance(message, Report) and self._messages and isinstance(self._messages[-1], Report):
+                    self._messages.pop()  # the newer state replaces one that was not sent yet
+                if len(self._messages) >= MOST_MESSAGES:
+                    self._messages.popleft()
+                    self._refused = "the web process reads too slowly: messages were left out"
                 self._messages.append(message)
             self._changed.notify()
 

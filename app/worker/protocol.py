@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from app.sources.request import SourceRequest
+from pipeline.errors import StemmapError
 
 # Beyond any run, and well inside of an int64 of nanoseconds.
 LONGEST_S = 1e9
@@ -134,6 +135,10 @@ class Open(SourceRequest, frozen=True, tag="open"):
 
     record: str = ""
     publish: bool = False
+
+
+class WorkerBusyError(StemmapError):
+    """The worker is being restarted or does not answer in time. The same command may succeed later."""
 
 
 Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open

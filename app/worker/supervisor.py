@@ -1,4 +1,4 @@
-"""The web process's side of the worker: starts it, talks to it, and starts it again when it dies."""
+"""The web process's side of the worker: starts it, exchanges messages, and restarts it when it ends."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import sys
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
+from typing import Literal
 
 from app.robot.address import is_live
 from app.worker.codec import LENGTH_BYTES, WireError, check_size, from_worker, to_worker
-from app.worker.internal_protocol import FromWorker, Report, ToWorker
-from app.worker.protocol import Open, Play, SetParameters, SetSpeed, Status
+from app.worker.internal_protocol import Begin, FromWorker, Opened, Report, Shown, ToWorker
+from app.worker.protocol import Open, Pause, Play, SetParameters, SetSpeed, Status, WorkerBusyError
 
 # -P: a folder that holds a file `app.py` must not decide what runs.
 WORKER = (sys.executable, "-P", "-m", "app.worker.process")
@@ -27,19 +28,32 @@ _GRACE_S = 0.7
 #: Of a live run: the worker finishes the recording, then leaves the robot's network.
 _LIVE_GRACE_S = 10.0
 _BUFFER = 8 * 1024 * 1024
+# A large recording on a slow disk takes a minute to open; no message for so long means that it never will.
+OPENING_LIMIT_S = 300.0
+# Another source may be opened before the first is open. A live recording that is left may need 10 s to close.
+_REPLACE_AFTER_S = 12.0
+_WRITE_LIMIT_S = 5.0
+# Ends without a result in between, after which a remembered speed is taken for their cause.
+_SUSPICIOUS_ENDS = 2
+# What is remembered over a restart, or has no meaning for a new process.
+_REMEMBERED = (SetParameters, SetSpeed, Open, Play, Pause, Begin)
 
 
 class WorkerProcess:
-    """A worker that is kept alive.
+    """A worker process that is restarted when it ends.
 
-    When it dies it is started again, with the same parameters, speed and source; the owner sees
-    `Opened` again and decides how it goes on. After five deaths within a minute it stays dead until
-    somebody plays or opens again.
+    A restart repeats parameters, speed and source; the owner receives `Opened` again and decides how the run
+    goes on. After five ends within a minute, or when a source does not finish opening, the worker stays down
+    until the next `Play` or `Open`.
 
     Args:
         on_message: Awaited on the event loop for each message in turn; must not block it.
         command: The program and its arguments.
         clock: Seconds from any start.
+        opening_limit_s: Longest time without a message while a source is being opened.
+
+    Attributes:
+        restarts: How often the worker ended unexpectedly and was restarted.
     """
 
     def __init__(
@@ -47,6 +61,7 @@ class WorkerProcess:
         on_message: Callable[[FromWorker], Awaitable[None]],
         command: Sequence[str] = WORKER,
         clock: Callable[[], float] = time.monotonic,
+        opening_limit_s: float = OPENING_LIMIT_S,
     ) -> None:
         self._on_message = on_message
         self._command = command
@@ -60,32 +75,50 @@ class WorkerProcess:
         self._pauses_s = _PAUSES_S
         self._deaths: deque[float] = deque(maxlen=len(_PAUSES_S))
         self._wanted = asyncio.Event()
+        self._ends_without_result = 0
+        self._opening_limit_s = opening_limit_s
+        self._opening: Literal["", "asked", "begun"] = ""
+        self._opening_since = 0.0
+        self._opening_timer: asyncio.TimerHandle | None = None
+        self._replaced = False
+        self._gave_up = False
         self.restarts = 0
 
     @property
     def pid(self) -> int | None:
-        """Of the worker, None while there is none."""
+        """Process number of the worker; None while it is down."""
         return self._process.pid if self._process else None
 
     async def start(self) -> None:
-        """Start the worker and watch over it."""
+        """Start the worker and restart it whenever it ends."""
         await self._spawn()
         self._task = asyncio.create_task(self._watch(), name="worker")
 
     async def send(self, command: ToWorker) -> None:
-        """Send a command. What the worker must know again after a restart is remembered; while it is
-        down, other commands are lost."""
+        """Send a command. Parameters, speed and source are remembered and repeated after a restart.
+
+        Raises:
+            WorkerBusyError: The worker is down or takes no commands, and this command is not remembered.
+        """
         if isinstance(command, SetParameters | SetSpeed):
             self._settings[type(command)] = command
         elif isinstance(command, Open):
             self._open = command
+            if self._opening and self._clock() - self._opening_since > _REPLACE_AFTER_S:
+                self._kill_while_opening()
+                return
+            self._await_opening()
         if isinstance(command, Open | Play):
             self._wanted.set()
-        await self._write(command)
+        if not await self._write(command) and not isinstance(command, _REMEMBERED):
+            raise WorkerBusyError(
+                "the mapping process is not ready for commands", remedy="Try again in some seconds"
+            )
 
     async def close(self) -> None:
-        """End the worker: kindly, then not."""
+        """Ask the worker to end, and kill it if it does not."""
         self._closing = True
+        self._stop_opening_timer()
         if self._task is not None:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -101,31 +134,99 @@ class WorkerProcess:
                 limit=_BUFFER,
                 start_new_session=True,  # Ctrl-C in the terminal must not reach it
             )
-        except OSError:  # no memory, no process: counts as a death, so it is tried again
+        except OSError:  # no memory, no process: counts as an end, so it is tried again
             return
         for command in (*self._settings.values(), self._open):
             if command is not None:
                 await self._write(command)
+        if self._open is not None:
+            self._await_opening()
 
-    async def _write(self, command: ToWorker) -> None:
+    async def _write(self, command: ToWorker) -> bool:
+        """Write a command to the worker; returns whether the worker accepted it in time."""
         process = self._process
         if process is None or process.stdin is None or process.stdin.is_closing():
-            return
-        with contextlib.suppress(ConnectionError):
+            return False
+        try:
             process.stdin.write(self._channel_out.encode(command))
-            await process.stdin.drain()
+            async with asyncio.timeout(_WRITE_LIMIT_S):
+                await process.stdin.drain()
+        except (ConnectionError, TimeoutError):
+            return False
+        return True
 
     async def _watch(self) -> None:
         while True:
             reason = await self._listen()
+            self._stop_opening_timer()
             await self._end()
-            self._deaths.append(self._clock())
-            await self._pause(reason)
-            self.restarts += 1
+            if self._replaced:  # another source was asked for while one did not finish opening
+                self._replaced = False
+            elif self._gave_up:
+                self._gave_up = False
+                await self._wait_for_a_person(
+                    f"Opening took longer than {self._opening_limit_s:g} s and was ended. Open another "
+                    "source, or press play to try again"
+                )
+            else:
+                self._deaths.append(self._clock())
+                self._ends_without_result += 1
+                await self._pause(reason)
+                self.restarts += 1
             await self._spawn()
 
+    # --- a source that does not finish opening ---------------------------------------------------
+
+    def _await_opening(self) -> None:
+        """Expect that the source is open, or refused, before the time limit."""
+        self._opening, self._opening_since = "asked", self._clock()
+        self._restart_opening_timer()
+
+    def _restart_opening_timer(self) -> None:
+        if self._opening_timer is not None:
+            self._opening_timer.cancel()
+        loop = asyncio.get_running_loop()
+        self._opening_timer = loop.call_later(self._opening_limit_s, self._give_up_opening)
+
+    def _stop_opening_timer(self) -> None:
+        self._opening = ""
+        if self._opening_timer is not None:
+            self._opening_timer.cancel()
+            self._opening_timer = None
+
+    def _note_opening(self, message: FromWorker) -> None:
+        """Follow from the messages of the worker whether the source is still being opened."""
+        if not self._opening or self._open is None:
+            return
+        if isinstance(message, Opened) and message.asked in ("", self._open.uri):
+            self._stop_opening_timer()
+        elif isinstance(message, Report) and message.status.source == self._open.uri:
+            if message.status.state == "starting":
+                self._opening = "begun"
+                self._restart_opening_timer()
+            elif self._opening == "begun":
+                self._stop_opening_timer()
+
+    def _give_up_opening(self) -> None:
+        self._opening_timer = None
+        self._gave_up = True
+        self._kill()
+
+    def _kill_while_opening(self) -> None:
+        self._replaced = True
+        self._wanted.set()
+        self._stop_opening_timer()
+        self._kill()
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.kill()
+
+    # --- messages ---------------------------------------------------------------------------------
+
     async def _listen(self) -> str:
-        """Hand on messages until the worker ends. Returns why it ended, in words."""
+        """Hand on messages until the worker ends; returns why it ended, as a phrase."""
         process = self._process
         if process is None or process.stdout is None:
             return "it could not be started"
@@ -137,27 +238,42 @@ class WorkerProcess:
         except asyncio.IncompleteReadError:
             return _ending(await process.wait())
         except WireError as error:
-            return f"it spoke gibberish: {error}"
+            return f"protocol error: {error}"
 
     async def _hand_on(self, message: FromWorker) -> None:
+        self._note_opening(message)
+        if isinstance(message, Shown):
+            self._ends_without_result = 0
         try:
             await self._on_message(message)
-        except Exception:  # a fault in showing must not end the watch over the worker
+        except Exception as error:  # must not end the watch over the worker, and must not pass unseen
             _log.exception("a message of the worker could not be handled")
+            if not isinstance(message, Report):
+                await self._tell(
+                    f"A result could not be shown: {type(error).__name__}: {error}. This is a fault in "
+                    "stemmap; the terminal shows where"
+                )
 
     async def _pause(self, reason: str) -> None:
-        """Wait before the next start, longer each time; forever when it dies again and again."""
+        """Wait before the next start, longer each time; after several ends until a person acts."""
         what = f"The mapping process ended ({reason})"
+        if self._ends_without_result >= _SUSPICIOUS_ENDS and SetSpeed in self._settings:
+            del self._settings[SetSpeed]
+            what += "; the playback speed was reset"
         recent = [t for t in self._deaths if self._clock() - t < _FORGIVEN_AFTER_S]
         if len(recent) < len(self._pauses_s):
             await self._tell(f"{what}; it is being started again")
             await asyncio.sleep(self._pauses_s[len(recent) - 1])
             return
-        await self._tell(
+        await self._wait_for_a_person(
             f"{what}, {len(recent)} times within a minute. Press play to try again, or open another run"
         )
         self._deaths.clear()
+
+    async def _wait_for_a_person(self, detail: str) -> None:
+        """Report why the worker is down, and wait until somebody plays or opens a source."""
         self._wanted.clear()
+        await self._tell(detail)
         await self._wanted.wait()
 
     async def _tell(self, detail: str) -> None:

@@ -23,10 +23,12 @@ from tests.app.fakes import FakeScene, FakeWorker
 PORT = 8765
 HOST = f"127.0.0.1:{PORT}"
 TOKEN = "a-token-for-the-tests-only"
+#: When the sessions of the tests end [Unix time].
+ENDS = 4_000_000_000
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
 #: A client that may do all, and what it talks to.
 Running = tuple[httpx.AsyncClient, Dashboard]
-COOKIE = {"Cookie": f"stemmap_{PORT}={session_value(TOKEN, PORT)}"}
+COOKIE = {"Cookie": f"stemmap_{PORT}={session_value(TOKEN, PORT, ENDS)}"}
 
 
 def build_app(

@@ -1,71 +1,81 @@
-"""Ground truth trees that people annotate: list, add, change, delete, undo, redo, import, export."""
+"""Annotated ground truth trees: list, add, change, delete, undo, redo, import, export."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from typing import Annotated, Any, Literal
 
-import msgspec
-from fastapi import APIRouter, Path, Request
-from msgspec import Meta
+from fastapi import APIRouter
+from pydantic import Field
 from starlette.responses import Response
 
 from app.dashboard.annotations import Against, contents_of, row_payload
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.user import NAME
-from app.store.records import MOST_ANNOTATIONS, Author, Content, UnknownError, moment
-from app.web.responses import BadRequestError, body_of, failure_reply, json_reply, table_reply
+from app.store.records import MOST_ANNOTATIONS, Author, Content, moment
+from app.web.responses import BadRequestError, Body, Id, Number, UserName, file_reply, json_reply
 from app.web.routes.access import Dash
 from pipeline.errors import SourceError
 
 router = APIRouter(prefix="/api")
 
-# Eastings and northings of the earth are smaller.
+# Eastings and northings on the earth are smaller.
 _FARTHEST_M = 1e7
-_BROWSER = r"^[0-9a-f]{16,40}\Z"
-_WHO = NAME
+_LARGEST_DBH_M = 10.0
+_BROWSER = r"^[0-9a-f]{16,40}$"
 
-_Id = Annotated[int, Meta(ge=0, le=2**31 - 1)]
-_Number = Annotated[int, Path(ge=0, le=2**31 - 1)]
-_Metres = Annotated[float, Meta(ge=-_FARTHEST_M, le=_FARTHEST_M)]
+_Metres = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited")
 
 
-class _Edit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What every edit says: for which run, from which browser, by whom."""
+class _Edit(Body):
+    """The fields of every edit: the run, the browser, and the person."""
 
-    run: _Id
-    browser: Annotated[str, Meta(pattern=_BROWSER)]
-    who: Annotated[str, Meta(pattern=_WHO)]
+    run: Id
+    browser: Annotated[str, Field(pattern=_BROWSER)]
+    who: UserName
 
     @property
     def author(self) -> Author:
         return Author(self.browser, self.who)
 
 
-class _Add(_Edit, frozen=True, forbid_unknown_fields=True):
+class _Add(_Edit):
     x: _Metres
     y: _Metres
     kind: Literal["tree", "pole", "person", "bush", "other"] = "tree"
-    dbh_cm: Annotated[float, Meta(gt=0.0, le=1000.0)] | None = None
+    dbh_cm: Annotated[float, Field(gt=0.0, le=100.0 * _LARGEST_DBH_M)] | None = None
 
     @property
     def content(self) -> Content:
         return Content(self.x, self.y, self.kind, None if self.dbh_cm is None else self.dbh_cm / 100.0)
 
 
-class _Change(_Add, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    version: _Id
+class _Change(_Add):
+    version: Id
 
 
-class _Delete(_Edit, frozen=True, forbid_unknown_fields=True):
-    version: _Id
+class _Delete(_Edit):
+    version: Id
+
+
+class _Import(_Edit):
+    """A table of trees as text; `dbh_unit` is the unit of a column `dbh` whose header does not name it."""
+
+    table: Annotated[str, Field(max_length=1_000_000)]
+    dbh_unit: Literal["m", "cm", "mm"] | None = None
+
+
+class _Choice(Body):
+    """The ground truth that the map is scored against."""
+
+    against: Against
 
 
 @router.get("/annotations")
 async def read(dashboard: Dash, browser: str = "") -> Response:
-    """All of the run, and how many steps a browser can undo and redo."""
+    """Return the annotations of the run, and how many edits this browser can undo and redo."""
     steps = None
     if re.fullmatch(_BROWSER, browser):
         steps = await dashboard.annotating.read(lambda store, run: store.steps(run, browser))
@@ -74,115 +84,75 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
 
 
 @router.post("/annotations")
-async def add(request: Request, dashboard: Dash) -> Response:
-    """Add one."""
-    wanted: _Add = await body_of(request, _Add)
+async def add(body: _Add, dashboard: Dash) -> Response:
+    """Add an annotation."""
     (added,) = await dashboard.annotating.edit(
-        wanted.run, lambda store: store.add(wanted.run, wanted.author, [wanted.content])
+        body.run, lambda store: store.add(body.run, body.author, [body.content])
     )
-    return await _done(dashboard, wanted, {"id": added}, 201)
+    return await _done(dashboard, body, {"id": added}, 201)
 
 
 @router.patch("/annotations/{number}")
-async def change(request: Request, number: _Number, dashboard: Dash) -> Response:
-    """Change one; refused with 409 where it is not of the given version any more."""
-    wanted: _Change = await body_of(request, _Change)
-    try:
-        await dashboard.annotating.edit(
-            wanted.run,
-            lambda store: store.change(wanted.run, wanted.author, number, wanted.version, wanted.content),
-        )
-    except UnknownError as error:
-        return failure_reply(404, error)
-    return await _done(dashboard, wanted, {"id": number})
+async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
+    """Change an annotation; 409 if it does not have this version any more."""
+    await dashboard.annotating.edit(
+        body.run, lambda store: store.change(body.run, body.author, number, body.version, body.content)
+    )
+    return await _done(dashboard, body, {"id": number})
 
 
 @router.delete("/annotations/{number}")
-async def delete(request: Request, number: _Number, dashboard: Dash) -> Response:
-    """Delete one; refused as a change is."""
-    wanted: _Delete = await body_of(request, _Delete)
-    try:
-        await dashboard.annotating.edit(
-            wanted.run, lambda store: store.delete(wanted.run, wanted.author, number, wanted.version)
-        )
-    except UnknownError as error:
-        return failure_reply(404, error)
-    return await _done(dashboard, wanted, {"id": number})
+async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
+    """Delete an annotation; 409 if it does not have this version any more."""
+    await dashboard.annotating.edit(
+        body.run, lambda store: store.delete(body.run, body.author, number, body.version)
+    )
+    return await _done(dashboard, body, {"id": number})
 
 
 @router.post("/annotations/undo")
-async def undo(request: Request, dashboard: Dash) -> Response:
-    """Undo the browser's last step."""
-    wanted: _Edit = await body_of(request, _Edit)
-    await dashboard.annotating.edit(wanted.run, lambda store: store.undo(wanted.run, wanted.author))
-    return await _done(dashboard, wanted, {})
+async def undo(body: _Edit, dashboard: Dash) -> Response:
+    """Undo the last edit of the browser."""
+    await dashboard.annotating.edit(body.run, lambda store: store.undo(body.run, body.author))
+    return await _done(dashboard, body, {})
 
 
 @router.post("/annotations/redo")
-async def redo(request: Request, dashboard: Dash) -> Response:
-    """Do again what the browser undid last."""
-    wanted: _Edit = await body_of(request, _Edit)
-    await dashboard.annotating.edit(wanted.run, lambda store: store.redo(wanted.run, wanted.author))
-    return await _done(dashboard, wanted, {})
-
-
-class _Import(_Edit, frozen=True, forbid_unknown_fields=True):
-    """A table of trees as text; the unit of a column `dbh` that does not say it."""
-
-    table: str
-    dbh_unit: Literal["m", "cm", "mm"] | None = None
+async def redo(body: _Edit, dashboard: Dash) -> Response:
+    """Repeat the edit that the browser undid last."""
+    await dashboard.annotating.edit(body.run, lambda store: store.redo(body.run, body.author))
+    return await _done(dashboard, body, {})
 
 
 @router.post("/annotations/import")
-async def import_table(request: Request, dashboard: Dash) -> Response:
-    """Add the rows of a CSV in one step; those that stand already are left out and counted."""
-    from pipeline.io.ground_truth import parse_truth_trees
-
-    wanted: _Import = await body_of(request, _Import)
-    try:
-        table = parse_truth_trees(
-            wanted.table.removeprefix("\ufeff"), where="the table", dbh_unit=wanted.dbh_unit
-        )
-    except SourceError as error:
-        remedy = "Say the unit of the diameter" if "unit" in error.what else error.remedy
-        raise BadRequestError(error.what, where=error.where, remedy=remedy) from None
-    contents = contents_of(table)
-    for line, content in enumerate(contents):
-        _check(content, line)
-    if len(contents) > MOST_ANNOTATIONS:
-        raise BadRequestError(f"a run may have {MOST_ANNOTATIONS} annotations")
-    standing = {_key(row.content) for row in dashboard.annotating.rows}
-    new = [content for content in contents if _key(content) not in standing]
+async def import_table(body: _Import, dashboard: Dash) -> Response:
+    """Add the rows of a CSV table in one edit; rows that exist already are skipped and counted."""
+    contents = await asyncio.to_thread(_imported, body)
+    existing = {_key(row.content) for row in dashboard.annotating.rows}
+    new = [content for content in contents if _key(content) not in existing]
     if new:
-        await dashboard.annotating.edit(wanted.run, lambda store: store.add(wanted.run, wanted.author, new))
-    return await _done(dashboard, wanted, {"added": len(new), "left_out": len(contents) - len(new)})
-
-
-class _Choice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the map is scored against."""
-
-    against: Against
+        await dashboard.annotating.edit(body.run, lambda store: store.add(body.run, body.author, new))
+    return await _done(dashboard, body, {"added": len(new), "left_out": len(contents) - len(new)})
 
 
 @router.put("/annotations/against")
-async def score_against(request: Request, dashboard: Dash) -> Response:
-    """Choose what the map is scored against; nothing of it is changed."""
-    wanted: _Choice = await body_of(request, _Choice)
-    dashboard.annotating.score_against(wanted.against)
+async def score_against(body: _Choice, dashboard: Dash) -> Response:
+    """Choose the ground truth that the map is scored against; neither of the two is changed."""
+    dashboard.annotating.score_against(body.against)
     return json_reply(dashboard.annotating.as_plain())
 
 
 @router.get("/annotations.csv")
 async def export_table(dashboard: Dash) -> Response:
-    """The annotations as a table that the import and `stemmap evaluate` take."""
+    """Return the annotations as a table for the import and for `stemmap evaluate`."""
     from pipeline.io.result_files import csv_text
 
-    return table_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
+    return file_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
 
 
 @router.get("/annotations.geojson")
 async def export_geojson(dashboard: Dash) -> Response:
-    """The annotations as a FeatureCollection in the frame of the map, which it declares."""
+    """Return the annotations as a FeatureCollection in the frame of the map, which it declares."""
     from pipeline.io.result_files import ROBOTS_FRAME
 
     features = [_feature(row) for row in _rows(dashboard)]
@@ -191,14 +161,14 @@ async def export_geojson(dashboard: Dash) -> Response:
         "coordinateFrame": dict(ROBOTS_FRAME),
         "features": features,
     }
-    return table_reply(json.dumps(collection, indent=1) + "\n", "truth.geojson", "application/geo+json")
+    return file_reply(json.dumps(collection, indent=1) + "\n", "truth.geojson", "application/geo+json")
 
 
-async def _done(dashboard: Dashboard, edit: _Edit, said: dict[str, Any], status: int = 200) -> Response:
+async def _done(dashboard: Dashboard, edit: _Edit, payload: dict[str, Any], status: int = 200) -> Response:
     serial = dashboard.annotating.serial
     steps = await dashboard.annotating.read(lambda store, run: store.steps(run, edit.browser))
     undo_count, redo_count = steps or (0, 0)
-    return json_reply({**said, "serial": serial, "undo": undo_count, "redo": redo_count}, status)
+    return json_reply({**payload, "serial": serial, "undo": undo_count, "redo": redo_count}, status)
 
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
@@ -221,15 +191,33 @@ def _when(row: dict[str, Any]) -> str:
 
 
 def _key(content: Content) -> tuple[float, float, str]:
-    """What makes two rows the same: kind and place to the millimetre."""
+    """Two rows with the same key are the same: kind, and position to the millimetre."""
     return round(content.x, 3), round(content.y, 3), content.kind
 
 
 def _check(content: Content, row: int) -> None:
-    """Refuse what a person could not have typed in either."""
+    """Apply the bounds of a single annotation to a row of a table."""
     if max(abs(content.x), abs(content.y)) > _FARTHEST_M:
-        raise BadRequestError(f"row {row + 1} lies farther than {_FARTHEST_M:.0f} m away")
-    if content.dbh is not None and content.dbh > 10.0:
+        raise BadRequestError(f"row {row + 1} is farther than {_FARTHEST_M:.0f} m from the origin")
+    if content.dbh is not None and content.dbh > _LARGEST_DBH_M:
         raise BadRequestError(
             f"row {row + 1} has a DBH of {content.dbh:.1f} m", remedy="Check the unit of the diameter"
         )
+
+
+def _imported(body: _Import) -> list[Content]:
+    from pipeline.io.ground_truth import parse_truth_trees
+
+    try:
+        table = parse_truth_trees(
+            body.table.removeprefix("\ufeff"), where="the table", dbh_unit=body.dbh_unit
+        )
+    except SourceError as error:
+        remedy = "Choose the unit of the diameter" if "unit" in error.what else error.remedy
+        raise BadRequestError(error.what, where=error.where, remedy=remedy) from None
+    contents = contents_of(table)
+    for line, content in enumerate(contents):
+        _check(content, line)
+    if len(contents) > MOST_ANNOTATIONS:
+        raise BadRequestError(f"a run can have at most {MOST_ANNOTATIONS} annotations")
+    return contents

@@ -1,4 +1,4 @@
-"""The page, its files, and viser's page."""
+"""The page and its files, the page of viser, and the rights of the link."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 from fastapi import APIRouter, Request
 from starlette.responses import FileResponse, RedirectResponse, Response
 
-from app.web.auth import role_of
+from app.web.auth import role_of, ticket
 from app.web.responses import error_reply, json_reply
 from app.web.static_files import page_folder, plotly_script
 from app.web.viser_proxy import client_page
@@ -37,29 +37,28 @@ _VISER_POLICY = (
 
 @router.get("/")
 def page(request: Request) -> Response:
-    """The dashboard."""
+    """Return the dashboard."""
     return _file(request, page_folder() / "index.html", _PAGE_POLICY)
 
 
 @router.get("/runs")
 def runs_page(request: Request) -> Response:
-    """The page of all runs."""
+    """Return the page of all runs."""
     return _file(request, page_folder() / "runs.html", _PAGE_POLICY)
 
 
 @router.get("/robots")
 def all_robots(request: Request) -> Response:
-    """Lead back to the page of the fleet that this dashboard belongs to."""
+    """Redirect to the page of the fleet that this dashboard belongs to."""
     port = request.app.state.fleet_port
     if port is None:
-        return error_reply(404, "this dashboard stands alone", remedy="Open / in its place")
+        return error_reply(404, "this dashboard belongs to no fleet", remedy="Open / instead")
     return lead_on(request, port)
 
 
 @router.get("/api/access")
 def access(request: Request) -> Response:
-    """What the link allows, for who may change things the link for those who may look, and whether there are
-    other robots."""
+    """Return the role of the link, the view-only link for an owner, and the address of the fleet's page."""
     role = role_of(request.scope)
     link = f"/?token={request.app.state.viewer_token}" if role == "owner" else None
     robots = None if request.app.state.fleet_port is None else "/robots"
@@ -68,13 +67,13 @@ def access(request: Request) -> Response:
 
 @router.get("/static/plotly.min.js")
 def plotly(request: Request) -> Response:
-    """The plots' library, of the installed package."""
+    """Return the plotting library of the installed package."""
     return _file(request, plotly_script(), _PAGE_POLICY)
 
 
 @router.get("/static/{path:path}")
 def page_file(request: Request, path: str) -> Response:
-    """A file of the page."""
+    """Return a file of the page."""
     found = _page_path(path)
     if found is None:
         return error_reply(404, "there is no such file", where=f"/static/{path[:200]}")
@@ -83,28 +82,28 @@ def page_file(request: Request, path: str) -> Response:
 
 @router.get("/viser/")
 def viser_page(request: Request) -> Response:
-    """The 3D scene's page, of the installed viser."""
+    """Return the page of the 3D scene, of the installed viser."""
     return _file(request, client_page(), _VISER_POLICY)
 
 
 def lead_on(request: Request, port: int) -> Response:
-    """On to another port of this host, with the token that who asks may use there."""
-    owner = role_of(request.scope) == "owner"
-    token = request.app.state.token if owner else request.app.state.viewer_token
+    """Redirect to another port of this host, with a ticket that opens it once for the same role: a redirect
+    is kept in histories and logs, so it must not carry the token."""
+    once = ticket(request.app.state.token, port, role_of(request.scope))
     asked = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
     host = f"[{asked}]" if ":" in asked else asked
-    answer = RedirectResponse(f"http://{host}:{port}/?token={token}", 303)
+    answer = RedirectResponse(f"{request.url.scheme}://{host}:{port}/?ticket={once}", 303)
     answer.headers["Cache-Control"] = "no-store"
     return answer
 
 
 def page_answer(request: Request, path: Path) -> Response:
-    """A page of ours, with the policy of a page."""
+    """Return a page of this program with the content security policy of pages."""
     return _file(request, path, _PAGE_POLICY)
 
 
 def _file(request: Request, path: Path, policy: str) -> Response:
-    """The file, or word that the browser has it already."""
+    """Return the file, or 304 if the browser has it already."""
     headers = {**_CHECK_EACH_TIME, "Content-Security-Policy": policy}
     answer = FileResponse(path, headers=headers, stat_result=path.stat())
     known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
@@ -114,7 +113,7 @@ def _file(request: Request, path: Path, policy: str) -> Response:
 
 
 def _page_path(path: str) -> Path | None:
-    """The file of a path below /static/, None if there is none or it is hidden or outside."""
+    """Return the file of a path below /static/; None if it does not exist, is hidden or is outside."""
     wanted = PurePosixPath(path)
     if "\0" in path or any(part.startswith(".") for part in wanted.parts):
         return None
@@ -122,5 +121,5 @@ def _page_path(path: str) -> Path | None:
     try:
         found = (folder / wanted).resolve()
         return found if found.is_relative_to(folder) and found.is_file() else None
-    except OSError:  # a name that no disk takes
+    except OSError:  # a name that no file system accepts
         return None

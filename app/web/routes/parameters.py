@@ -1,108 +1,168 @@
-"""The parameters: read, change, reset, download."""
+"""The parameters and the view: read, change, undo, reset; parameter sets: save, use, delete, in and out as
+files."""
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated
 
-import msgspec
-from fastapi import APIRouter, Request
-from msgspec import Meta
+from fastapi import APIRouter
+from pydantic import Field
 from starlette.responses import Response
 
-from app.dashboard.parameters import file_of
-from app.web.responses import body_of, json_reply, table_reply
+from app.dashboard.parameters import file_of, read_file
+from app.web.responses import Body, UserName, Value, Word, file_reply, json_reply
 from app.web.routes.access import Dash
 
 router = APIRouter(prefix="/api")
 
-_Name = Annotated[str, Meta(max_length=100)]
-_Value = bool | int | float | Annotated[str, Meta(max_length=100)]
+# Letters of any script: readable everywhere, and without characters that steer a terminal or a path.
+SetName = Annotated[str, Field(pattern=r"^\w[\w .+-]{0,39}$", max_length=40)]
+_LONGEST_FILE = 100_000
+_TOML = "application/toml"
 
 
-class _Changes(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    changes: Annotated[dict[_Name, _Value], Meta(min_length=1, max_length=500)]
-    gesture: _Name = ""  # of a slider that is held, see ParameterState.change
+class _Changes(Body):
+    """New values by dotted name. `gesture` names the slider movement that they belong to, see
+    `ParameterState.change`."""
+
+    changes: Annotated[dict[Word, Value], Field(min_length=1, max_length=500)]
+    gesture: Word = ""
 
 
-class _Preset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: _Name
+class _PresetName(Body):
+    name: Word
 
 
-class _Reach(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _Reach(Body):
     whole: bool
 
 
-class _Reset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    names: Annotated[list[_Name], Meta(max_length=500)] = []
+class _Reset(Body):
+    names: list[Word] = Field(default_factory=list, max_length=500)
+
+
+class _Choice(Body):
+    name: Word
+    value: bool | Word
+
+
+class _Save(Body):
+    name: SetName
+    who: UserName = "somebody"
+
+
+class _SetName(Body):
+    name: SetName
+
+
+class _File(Body):
+    file: Word
+    text: Annotated[str, Field(max_length=_LONGEST_FILE)]
 
 
 @router.get("/parameters")
 async def read(dashboard: Dash) -> Response:
-    """Values, what differs from the preset, and how each parameter is declared."""
+    """Return the values, those that differ from the preset, and the declaration of each parameter."""
     return json_reply(dashboard.parameters.as_plain_with_specs())
 
 
 @router.patch("/parameters")
-async def change(request: Request, dashboard: Dash) -> Response:
+async def change(body: _Changes, dashboard: Dash) -> Response:
     """Change values by their dotted names."""
-    wanted: _Changes = await body_of(request, _Changes)
-    await dashboard.change_parameters(wanted.changes, wanted.gesture)
+    await dashboard.change_parameters(dict(body.changes), body.gesture)
     return await read(dashboard)
 
 
 @router.post("/parameters/preset")
-async def use_preset(request: Request, dashboard: Dash) -> Response:
-    """Take all values of a preset."""
-    wanted: _Preset = await body_of(request, _Preset)
-    await dashboard.use_preset(wanted.name)
+async def use_preset(body: _PresetName, dashboard: Dash) -> Response:
+    """Use all values of a preset."""
+    await dashboard.use_preset(body.name)
     return await read(dashboard)
 
 
 @router.put("/parameters/reach")
-async def reach(request: Request, dashboard: Dash) -> Response:
-    """Say what a change acts on: the whole run, or the scans from the standing one on."""
-    wanted: _Reach = await body_of(request, _Reach)
-    await dashboard.reach(whole=wanted.whole)
+async def reach(body: _Reach, dashboard: Dash) -> Response:
+    """Choose whether changes apply to the whole run or from the current scan onwards."""
+    await dashboard.reach(whole=body.whole)
     return await read(dashboard)
 
 
 @router.post("/parameters/undo")
 async def undo(dashboard: Dash) -> Response:
-    """Take back the last step."""
+    """Undo the last change."""
     await dashboard.tune(lambda state: state.undo())
     return await read(dashboard)
 
 
 @router.post("/parameters/redo")
 async def redo(dashboard: Dash) -> Response:
-    """Do again what was undone last."""
+    """Repeat the change that was undone last."""
     await dashboard.tune(lambda state: state.redo())
     return await read(dashboard)
 
 
 @router.post("/parameters/reset")
-async def reset(request: Request, dashboard: Dash) -> Response:
-    """Give the named parameters (none: all) the preset's values again."""
-    wanted: _Reset = await body_of(request, _Reset)
-    await dashboard.reset_parameters(wanted.names)
+async def reset(body: _Reset, dashboard: Dash) -> Response:
+    """Set the named parameters, or all without names, to the values of the preset."""
+    await dashboard.reset_parameters(list(body.names))
     return await read(dashboard)
 
 
-class _Choice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: _Name
-    value: bool | _Name
-
-
 @router.patch("/view")
-async def choose_view(request: Request, dashboard: Dash) -> Response:
-    """Show or hide a layer of the scene, or colour, label or follow otherwise."""
-    wanted: _Choice = await body_of(request, _Choice)
-    await dashboard.choose_view(wanted.name, wanted.value)
+async def choose_view(body: _Choice, dashboard: Dash) -> Response:
+    """Show or hide a layer of the scene, or choose its colours, labels or the camera that follows."""
+    await dashboard.choose_view(body.name, body.value)
     return json_reply(dashboard.scene.view)
 
 
 @router.get("/parameters.toml")
 async def download(dashboard: Dash) -> Response:
-    """All values as a file that `--config` takes."""
+    """Return all values as a file for `--config`."""
     text = file_of(dashboard.parameters.preset, dashboard.parameters.parameters)
-    return table_reply(text, "parameters.toml", "application/toml")
+    return file_reply(text, "parameters.toml", _TOML)
+
+
+@router.get("/sets")
+async def saved_sets(dashboard: Dash) -> Response:
+    """Return the saved parameter sets."""
+    return json_reply(dashboard.sets.as_plain())
+
+
+@router.post("/sets")
+async def save_set(body: _Save, dashboard: Dash) -> Response:
+    """Save the values in force under a name; a set of that name is replaced."""
+    state = dashboard.parameters
+    await dashboard.sets.save(body.name, state.preset, state.parameters, body.who)
+    return json_reply(dashboard.sets.as_plain(), 201)
+
+
+@router.post("/sets/use")
+async def use_set(body: _SetName, dashboard: Dash) -> Response:
+    """Use all values of a saved set or a preset."""
+    preset_name, values = dashboard.sets.named(body.name)
+    await dashboard.tune(lambda state: state.use(preset_name, values))
+    return json_reply({})
+
+
+@router.post("/sets/delete")
+async def delete_set(body: _SetName, dashboard: Dash) -> Response:
+    """Delete a saved set."""
+    await dashboard.sets.delete(body.name)
+    return json_reply(dashboard.sets.as_plain())
+
+
+@router.post("/sets/upload")
+async def upload_set(body: _File, dashboard: Dash) -> Response:
+    """Use the values of a file as `--config` does."""
+    preset_name, values = await asyncio.to_thread(
+        read_file, body.text, body.file, dashboard.parameters.preset
+    )
+    await dashboard.tune(lambda state: state.use(preset_name, values))
+    return json_reply({})
+
+
+@router.get("/sets/{name}.toml")
+async def download_set(name: str, dashboard: Dash) -> Response:
+    """Return a saved set as a file for `--config`."""
+    return file_reply(dashboard.sets.text(name), "parameters.toml", _TOML)

@@ -1,57 +1,82 @@
-"""What came of the run so far: trees, path, score and pair distances."""
+"""The results of the run: trees, path, scores, explanations and pictures."""
 
 from __future__ import annotations
 
 import asyncio
+from typing import Annotated
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Path, Query
 from starlette.responses import Response
 
-from app.dashboard.payload import trees_payload
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.payload import comparison_payload, doubts_of, stages_payload, trees_payload
 from app.dashboard.scores import pairs_payload
-from app.web.responses import json_reply, table_reply
-from app.web.routes.access import Dash
+from app.explain.client import NoStoryError
+from app.web.responses import (
+    LARGEST_NUMBER,
+    Body,
+    Number,
+    Word,
+    block_reply,
+    error_reply,
+    failure_reply,
+    file_reply,
+    json_reply,
+)
+from app.web.routes.access import Bounds, Dash, ViewerTurn
+from pipeline.config import Parameters
 
 router = APIRouter(prefix="/api")
+
+_Scan = Annotated[int | None, Query(ge=0, le=LARGEST_NUMBER)]
+_Stamp = Annotated[int, Path(ge=-(2**63), le=2**63 - 1)]
+
+
+class _Compare(Body):
+    """Names of presets or saved sets; an empty name means the parameters in force."""
+
+    a: Word
+    b: Word
 
 
 @router.get("/trees")
 async def trees(dashboard: Dash) -> Response:
-    """The confirmed trees."""
+    """Return the confirmed trees."""
     shown = dashboard.shown
-    rows = [] if shown is None else trees_payload(shown.frame, dashboard.start_ns)
-    return json_reply({"trees": rows})
+    if shown is None:
+        return json_reply({"trees": []})
+    return json_reply({"trees": await asyncio.to_thread(trees_payload, shown.frame, dashboard.start_ns)})
 
 
 @router.get("/trees.csv")
 def trees_table(dashboard: Dash) -> Response:
-    """The confirmed trees as a table."""
+    """Return the confirmed trees as a table."""
     from pipeline.io.result_files import TREE_COLUMNS, csv_text, tree_rows
 
     shown = dashboard.shown
     rows = [] if shown is None else tree_rows(shown.frame.trees, dashboard.start_ns)
-    return table_reply(csv_text(TREE_COLUMNS, rows), "trees.csv")
+    return file_reply(csv_text(TREE_COLUMNS, rows), "trees.csv")
 
 
 @router.get("/path.csv")
 def path_table(dashboard: Dash) -> Response:
-    """The path, one row a scan."""
+    """Return the path, one row per scan."""
     from pipeline.io.result_files import PATH_COLUMNS, csv_text, path_rows
 
     path = dashboard.path
     rows = [] if path is None else path_rows(path, dashboard.start_ns)
-    return table_reply(csv_text(PATH_COLUMNS, rows), "path.csv")
+    return file_reply(csv_text(PATH_COLUMNS, rows), "path.csv")
 
 
 @router.get("/evaluation")
 async def evaluation(dashboard: Dash) -> Response:
-    """The score against the ground truth; null where there is none."""
+    """Return the score against the ground truth; null without ground truth."""
     return json_reply(dashboard.scores.latest)
 
 
-@router.get("/pairs")
+@router.get("/pairs", dependencies=[ViewerTurn])
 async def pairs(dashboard: Dash) -> Response:
-    """Distances between the trees, and their errors where the truth is known."""
+    """Return the distances between the trees, and their errors where the ground truth is known."""
     shown = dashboard.shown
     if shown is None:
         return json_reply({"numbers": [], "distance_m": [], "error_percent": None, "left_out": 0})
@@ -59,3 +84,76 @@ async def pairs(dashboard: Dash) -> Response:
     return json_reply(
         await asyncio.to_thread(pairs_payload, shown.frame.trees, dashboard.truth, match_distance)
     )
+
+
+@router.get("/doubts")
+async def doubts(dashboard: Dash) -> Response:
+    """Return the votes on each tree, the most uncertain first, and the share that a tree needs."""
+    share = dashboard.parameters.parameters.classification.tree_share
+    shown = dashboard.shown
+    rows = [] if shown is None else await asyncio.to_thread(doubts_of, shown.frame, share)
+    return json_reply({"needed": share, "trees": rows})
+
+
+@router.get("/story/cluster/{number}", dependencies=[ViewerTurn])
+async def cluster_story(number: Number, dashboard: Dash, scan: _Scan = None) -> Response:
+    """Return verdict, checks and fit of a cluster of a recently shown scan, by default the newest."""
+    try:
+        return json_reply(await dashboard.selecting.story(scan, number))
+    except NoStoryError as error:
+        return failure_reply(404, error)
+
+
+@router.get("/story/tree/{number}", dependencies=[ViewerTurn])
+async def tree_story(number: Number, dashboard: Dash) -> Response:
+    """Return votes, DBH, coverage and history of a tree."""
+    try:
+        return json_reply(await dashboard.asking.tree(number))
+    except NoStoryError as error:
+        return failure_reply(404, error)
+
+
+@router.get("/camera", dependencies=[ViewerTurn])
+async def camera(dashboard: Dash) -> Response:
+    """Return which camera picture belongs to the current scan, and where trees and clusters are in it."""
+    if dashboard.shown is None:
+        return _nothing_mapped()
+    return json_reply(await dashboard.camera.look(dashboard.shown.frame, dashboard.path))
+
+
+@router.get("/camera/{stamp_ns}.jpg")
+async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
+    """Return a picture that `GET /api/camera` named."""
+    content = dashboard.camera.jpeg(stamp_ns)
+    if content is None:
+        return error_reply(404, "this picture is not kept any more", remedy="Ask for the newest one")
+    return Response(content, 200, {"Cache-Control": "no-store"}, media_type="image/jpeg")
+
+
+@router.get("/stages", dependencies=[ViewerTurn])
+async def stages(dashboard: Dash) -> Response:
+    """Return the points of the current scan, stage by stage (Fig. 3)."""
+    if dashboard.shown is None:
+        return _nothing_mapped()
+    return block_reply(await asyncio.to_thread(stages_payload, dashboard.shown.frame))
+
+
+@router.post("/compare", dependencies=[ViewerTurn])
+async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
+    """Return the current scan under two parameter sets."""
+    sets = [_parameters_of(dashboard, name) for name in (body.a, body.b)]
+    async with bounds.comparisons.turn():
+        frames = await dashboard.asking.compare(sets)
+    first, second = (each.flat() for each in sets)
+    differences = [[name, value, second[name]] for name, value in first.items() if second[name] != value]
+    distance = dashboard.parameters.parameters.evaluation.match_distance
+    header = {"a": body.a, "b": body.b, "differences": differences}
+    return block_reply(await asyncio.to_thread(comparison_payload, frames, header, dashboard.truth, distance))
+
+
+def _parameters_of(dashboard: Dashboard, name: str) -> Parameters:
+    return dashboard.sets.named(name)[1] if name else dashboard.parameters.parameters
+
+
+def _nothing_mapped() -> Response:
+    return error_reply(409, "nothing is mapped yet", remedy="Press play, or open a run")

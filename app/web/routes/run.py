@@ -1,4 +1,4 @@
-"""The run: how it goes, and what is to be done with it."""
+"""The open run: its status, commands, and the sources that can be opened."""
 
 from __future__ import annotations
 
@@ -10,137 +10,170 @@ from typing import Annotated, Any, Literal
 from urllib.parse import parse_qsl, urlencode
 
 import msgspec
-from fastapi import APIRouter, Request
-from msgspec import Meta
+from fastapi import APIRouter
+from pydantic import Field, field_validator
 from starlette.responses import Response
 
 from app.common.settings import Settings
-from app.sources.request import LONGEST_URI, Role, Seed, SourceRequest, TopicName, mount_of_degrees
+from app.sources.opening import FILE
+from app.sources.request import LARGEST_SEED, LONGEST_URI, Role, SourceRequest, mount_of_degrees
 from app.sources.sandbox import ask
-from app.web.responses import BadRequestError, body_of, error_reply, json_reply
-from app.web.routes.access import Dash
-from app.worker.protocol import LONGEST_S, Advance, Pause, Play, Seek, SetSpeed
+from app.web.responses import BadRequestError, Body, Value, Word, json_reply
+from app.web.routes.access import AnyFile, Dash, Deployment
+from app.worker.protocol import FASTEST, LONGEST_S, MOST_SCANS, Command
 from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api")
 
 _MOST_RECORDINGS = 500
 SHORTEST_LOOP_S = 0.5
-NOT_FROM_AFAR = "from another machine only scenarios and the recordings of the folder can be opened"
+SLOWEST = 0.01
+_ODOMETRY = ("auto", "wheels", "kiss-icp", "static")
 
-_Command = Play | Pause | Advance | Seek | SetSpeed
-
-
-_Length = Annotated[float, Meta(ge=-100.0, le=100.0)]
-_Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
-_Word = Annotated[str, Meta(max_length=100)]
-
-
-class OpenRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a browser may ask to have opened."""
-
-    uri: Annotated[str, Meta(min_length=1, max_length=LONGEST_URI)]
-    odometry: Literal["auto", "wheels", "kiss-icp", "static"] = "auto"
-    seed: Seed = 0
-    topics: dict[Role, TopicName] = {}
-    preset: Annotated[str, Meta(max_length=100)] = ""
-    parameters: Annotated[dict[_Word, bool | int | float | _Word], Meta(max_length=500)] = {}
-    #: x, y, z [m], roll, pitch, yaw [degrees] of the LiDAR on the robot.
-    mount: tuple[_Length, _Length, _Length, _Angle, _Angle, _Angle] | None = None
+_Uri = Annotated[str, Field(min_length=1, max_length=LONGEST_URI)]
+_Seconds = Annotated[float, Field(ge=0.0, le=LONGEST_S)]
+_Length = Annotated[float, Field(ge=-100.0, le=100.0)]
+_Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
 
 
-class _Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is to be looked into."""
+class _Play(Body):
+    type: Literal["play"]
 
-    uri: Annotated[str, Meta(min_length=1, max_length=LONGEST_URI)]
+
+class _Pause(Body):
+    type: Literal["pause"]
+
+
+class _Advance(Body):
+    type: Literal["advance"]
+    scans: Annotated[int, Field(ge=-MOST_SCANS, le=MOST_SCANS)] = 1
+
+
+class _Seek(Body):
+    type: Literal["seek"]
+    time_s: _Seconds
+
+
+class _SetSpeed(Body):
+    """Factor of real time; 0 is as fast as possible."""
+
+    type: Literal["set_speed"]
+    factor: Annotated[float, Field(ge=0.0, le=FASTEST)]
+
+    @field_validator("factor")
+    @classmethod
+    def _not_almost_zero(cls, factor: float) -> float:
+        if 0.0 < factor < SLOWEST:
+            raise ValueError(f"should be 0 or at least {SLOWEST}")
+        return factor
+
+
+_AnyCommand = Annotated[_Play | _Pause | _Advance | _Seek | _SetSpeed, Field(discriminator="type")]
+
+
+class _Span(Body):
+    """The part of the run that is repeated [s since the first scan]; null for both ends the repetition."""
+
+    from_s: _Seconds | None
+    to_s: _Seconds | None
+
+
+class _Source(Body):
+    """A source and how it is mapped, as `SourceRequest` describes it.
+
+    Attributes:
+        mount: x, y, z [m], roll, pitch, yaw [degrees] of the LiDAR on the robot.
+    """
+
+    uri: _Uri
+    odometry: Annotated[str, Field(max_length=LONGEST_URI)] = "auto"
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
+    topics: dict[Role, Annotated[str, Field(max_length=256)]] = Field(default_factory=dict)
+    mount: Annotated[tuple[_Length, _Length, _Length, _Angle, _Angle, _Angle] | None, Field(strict=False)] = (
+        None
+    )
+    preset: Word = ""
+    parameters: dict[Word, Value] = Field(default_factory=dict, max_length=500)
+
+
+class _Uninspected(Body):
+    uri: _Uri
 
 
 @router.get("/status")
 async def status(dashboard: Dash) -> Response:
-    """How the run goes."""
+    """Return the status of the run."""
     return json_reply(dashboard.status)
 
 
 @router.post("/command")
-async def command(request: Request, dashboard: Dash) -> Response:
+async def command(body: _AnyCommand, dashboard: Dash) -> Response:
     """Play, pause, advance, seek or set the speed."""
-    wanted: _Command = await body_of(request, _Command)
-    await dashboard.command(wanted)
+    await dashboard.command(msgspec.convert(body.model_dump(), Command))
     return json_reply({}, 202)
 
 
-class _Loop(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """From where to where the run is played again and again [s since the first scan]; both null: not so."""
-
-    from_s: Annotated[float, Meta(ge=0.0, le=LONGEST_S)] | None
-    to_s: Annotated[float, Meta(ge=0.0, le=LONGEST_S)] | None
-
-
 @router.post("/loop")
-async def loop(request: Request, dashboard: Dash) -> Response:
-    """Play a part of the run again and again, or no more."""
-    wanted: _Loop = await body_of(request, _Loop)
-    if wanted.from_s is None or wanted.to_s is None:
+async def loop(body: _Span, dashboard: Dash) -> Response:
+    """Repeat a part of the run, or end the repetition."""
+    if body.from_s is None or body.to_s is None:
         dashboard.loop.choose(None)
-    elif wanted.to_s - wanted.from_s < SHORTEST_LOOP_S:
+    elif body.to_s - body.from_s < SHORTEST_LOOP_S:
         raise BadRequestError("the loop is too short", remedy=f"Make it {SHORTEST_LOOP_S} s or longer")
     else:
-        dashboard.loop.choose((wanted.from_s, wanted.to_s))
+        dashboard.loop.choose((body.from_s, body.to_s))
     return json_reply({}, 202)
 
 
 @router.post("/open")
-async def open_source(request: Request, dashboard: Dash) -> Response:
-    """Leave the run and open another source; how that went is told by the status."""
-    wanted: OpenRequest = await body_of(request, OpenRequest)
-    settings: Settings = request.app.state.settings
-    uri = what_may_be_opened(wanted.uri, settings)
-    if uri is None:
-        return _not_from_afar(wanted.uri)
-    topics = {str(role): name for role, name in wanted.topics.items()}
-    mount = mount_of_degrees(wanted.mount)
-    request_ = SourceRequest(
-        uri, wanted.odometry, wanted.seed, topics, mount, wanted.preset, wanted.parameters
+async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
+    """Leave the run and open another source, with its parameters if any are given. The status reports the
+    result."""
+    request = permitted_request(
+        SourceRequest(
+            body.uri,
+            body.odometry,
+            body.seed,
+            {str(role): name for role, name in body.topics.items()},
+            mount_of_degrees(body.mount),
+            body.preset,
+            dict(body.parameters),
+        ),
+        settings,
+        any_file,
     )
-    await dashboard.open(request_)
+    await dashboard.open(request)
     return json_reply({}, 202)
 
 
 @router.post("/inside")
-async def inside(request: Request) -> Response:
-    """The topics of a recording or of a robot, and where the LiDAR stands; read by a process of its own."""
-    wanted: _Look = await body_of(request, _Look)
-    uri = what_may_be_opened(wanted.uri, request.app.state.settings)
+async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) -> Response:
+    """Return the topics of a recording or a robot and the mounting of its LiDAR, read by a child process."""
+    uri = permitted_uri(body.uri, settings, any_file)
     if uri is None:
-        return _not_from_afar(wanted.uri)
+        raise not_permitted(body.uri)
     return json_reply(await ask({"ask": "inside", "path": uri}))
 
 
-def _not_from_afar(uri: str) -> Response:
-    remedy = "Put it into the folder of recordings, or open it on the machine itself"
-    return error_reply(403, NOT_FROM_AFAR, where=uri, remedy=remedy)
-
-
 @router.get("/sources")
-async def sources(request: Request, dashboard: Dash) -> Response:
-    """What can be opened; uploaded recordings with the names that they had."""
+async def sources(dashboard: Dash, settings: Deployment) -> Response:
+    """Return scenarios and recordings that can be opened; uploaded recordings with their original names."""
     from pipeline.io.readers.simulated import scenarios
 
-    settings: Settings = request.app.state.settings
     try:
         uploaded = await dashboard.keeper.ask(lambda store: store.book.uploads())
-    except StemmapError:  # they are listed under their made-up names then
+    except StemmapError:  # they are listed under their file names then
         uploaded = {}
     found = await asyncio.to_thread(recordings, settings.data_folders)
     return json_reply(
         {
             "scenarios": [{"uri": uri, "doc": doc} for uri, doc in scenarios().items()],
-            "recordings": [_named(path, uploaded) for path in found],
+            "recordings": [_listed(path, uploaded) for path in found],
         }
     )
 
 
-def _named(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, str]:
+def _listed(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, str]:
     known = uploaded.get(path.name)
     if known is None:
         return str(path)
@@ -148,7 +181,7 @@ def _named(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, s
 
 
 def recordings(folders: Sequence[Path]) -> list[Path]:
-    """Files and folders in the folders of recordings; hidden ones and finished maps are left out."""
+    """Return files and folders in the data folders, without hidden ones and finished maps."""
     found: list[Path] = []
     for folder in folders:
         with contextlib.suppress(OSError):
@@ -156,37 +189,79 @@ def recordings(folders: Sequence[Path]) -> list[Path]:
     return [path for path in found if not (path / "run.json").is_file()][:_MOST_RECORDINGS]
 
 
-def what_may_be_opened(uri: str, settings: Settings) -> str | None:
-    """What is to be opened for a URI; None when it may not be.
+# --- which files may be opened ------------------------------------------------------------------------
 
-    Any file may be opened by who sits at the machine; others must not feel their way in its disk. For
-    them it becomes a path from the root, without links, so that what was looked at is what is opened.
+
+class NotPermittedError(StemmapError):
+    """The request names a file that its sender may not open."""
+
+
+def not_permitted(uri: str) -> NotPermittedError:
+    """The error for a source that the request may not open."""
+    return NotPermittedError(
+        "only scenarios and the recordings of the data folder can be opened here",
+        where=uri,
+        remedy="Put it into the folder of recordings, or start stemmap with STEMMAP_FILES=any",
+    )
+
+
+def permitted_request(request: SourceRequest, settings: Settings, any_file: bool) -> SourceRequest:
+    """Return the request with paths that may be opened.
+
+    Raises:
+        NotPermittedError: A file may not be opened.
+        BadRequestError: The odometry is unknown.
     """
-    if settings.loopback:
+    uri, odometry = permitted_uri(request.uri, settings, any_file), request.odometry
+    if uri is None:
+        raise not_permitted(request.uri)
+    if odometry.startswith(FILE):
+        poses = permitted_uri(odometry.removeprefix(FILE), settings, any_file)
+        if poses is None:
+            raise not_permitted(odometry)
+        odometry = f"{FILE}{poses}"
+    elif odometry not in _ODOMETRY:
+        raise BadRequestError(
+            f"the odometry {odometry[:40]!r} is unknown",
+            where="odometry",
+            remedy=f"Use {', '.join(_ODOMETRY)} or file:PATH",
+        )
+    return msgspec.structs.replace(request, uri=uri, odometry=odometry)
+
+
+def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
+    """Return the source that is opened for a URI, or None where it may not be opened.
+
+    Args:
+        any_file: Whether the request may open any file of this machine; else only simulated sources and
+            files of the data folders. For those the result is an absolute path without links, so that the
+            file that was checked is the file that is opened.
+    """
+    if any_file:
         return uri
     try:
         if uri.startswith("sim:") and not Path(uri).exists():
-            return _simulated_that_may_be_opened(uri, settings)
-        return _path_that_may_be_opened(uri.removeprefix("file://"), settings)
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: a home of nobody
+            return _permitted_simulation(uri, settings)
+        return _permitted_path(uri.removeprefix("file://"), settings)
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: "~name" of an unknown user
         return None
 
 
-def _path_that_may_be_opened(name: str, settings: Settings) -> str | None:
+def _permitted_path(name: str, settings: Settings) -> str | None:
     path = Path(name).expanduser().resolve()
-    inside = any(path.is_relative_to(folder.resolve()) for folder in settings.data_folders)
-    return str(path) if inside else None
+    inside_folder = any(path.is_relative_to(folder.resolve()) for folder in settings.data_folders)
+    return str(path) if inside_folder else None
 
 
-def _simulated_that_may_be_opened(uri: str, settings: Settings) -> str | None:
-    """The files that a virtual scan reads must lie where other files must."""
+def _permitted_simulation(uri: str, settings: Settings) -> str | None:
+    """Apply the same rule to the files that a simulated scan of a cloud reads."""
     name, _, query = uri.removeprefix("sim:").partition("?")
     if name != "cloud":
         return uri
     values = dict(parse_qsl(query, keep_blank_values=True))
     for key in ("file", "truth"):
         if key in values:
-            path = _path_that_may_be_opened(values[key], settings)
+            path = _permitted_path(values[key], settings)
             if path is None:
                 return None
             values[key] = path

@@ -1,4 +1,4 @@
-"""Runs that were mapped before: list, look, compare, rename, delete with an undo, play again."""
+"""Runs that were mapped before: list, inspect, compare, rename, delete with undo, replay."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Annotated, Any
 
-import msgspec
 from fastapi import APIRouter, Path, Query, Request
-from msgspec import Meta
+from pydantic import Field
 from starlette.responses import Response
 
 from app.batch.compare import compare
@@ -19,136 +18,114 @@ from app.dashboard.dashboard import Dashboard
 from app.sources.request import request_of_kept
 from app.store.book import RunBook
 from app.store.records import UnknownError
-from app.web.responses import BadRequestError, body_of, error_reply, failure_reply, json_reply
-from app.web.routes.access import Dash
-from app.web.routes.run import NOT_FROM_AFAR, what_may_be_opened
+from app.web.responses import LARGEST_NUMBER, BadRequestError, Body, Number, error_reply, json_reply
+from app.web.routes.access import AnyFile, Dash, Deployment, ViewerTurn
+from app.web.routes.run import permitted_request
 
 router = APIRouter(prefix="/api/runs")
 
 _FOLDER = "folder:"
-# A record by its number, a finished folder by its name.
+# The number of a record, or the name of a finished folder.
 _Key = Annotated[str, Path(min_length=1, max_length=300)]
-_Asked = Annotated[str, Query(min_length=1, max_length=300)]
-_Number = Annotated[int, Path(ge=0, le=2**31 - 1)]
+_KeyInQuery = Annotated[str, Query(min_length=1, max_length=300)]
+
+
+class _Name(Body):
+    name: Annotated[str, Field(max_length=200)]
 
 
 @router.get("")
-async def listed(request: Request, dashboard: Dash) -> Response:
-    """All runs, the newest first, the finished folders and what is left of killed runs; maps are left out."""
-    settings: Settings = request.app.state.settings
+async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
+    """Return all runs without their maps, the newest first, finished folders, and partial outputs."""
     rows = await dashboard.keeper.ask(lambda store: store.book.listed())
-    folders = await asyncio.to_thread(finished_folders, settings)
-    changed = await asyncio.to_thread(lambda: {name: _changed_s(path) for name, path in folders.items()})
+    folders, changed, remains = await asyncio.to_thread(_folders, settings)
     return json_reply(
         {
             "runs": [_row(row) for row in rows],
             "folders": [
                 {"key": f"{_FOLDER}{name}", "name": name, "changed_s": changed[name]} for name in folders
             ],
-            "unfinished": await asyncio.to_thread(partial_outputs, settings),
+            "unfinished": remains,
             "open": dashboard.logbook.record,
         }
     )
 
 
-@router.get("/compare")
-async def compared(request: Request, dashboard: Dash, a: _Asked, b: _Asked) -> Response:
-    """Two runs, with the map of the second in the frame of the first."""
-    try:
-        first, second = await _whole(a, request, dashboard), await _whole(b, request, dashboard)
-    except UnknownError as error:
-        return failure_reply(404, error)
+@router.get("/compare", dependencies=[ViewerTurn])
+async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b: _KeyInQuery) -> Response:
+    """Return two runs, with the map of the second in the frame of the first."""
+    first, second = await _whole(a, settings, dashboard), await _whole(b, settings, dashboard)
     same = first["source"] == second["source"] and bool(first["source"])
     return json_reply({"a": first, "b": second, **await compare(first, second, same_source=same)})
 
 
-@router.get("/{key}")
-async def whole(key: _Key, request: Request, dashboard: Dash) -> Response:
-    """A run with its map, its parameters and who changed them when."""
-    try:
-        return json_reply(await _whole(key, request, dashboard))
-    except UnknownError as error:
-        return failure_reply(404, error)
-
-
-class _Name(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: Annotated[str, Meta(max_length=200)]
+@router.get("/{key}", dependencies=[ViewerTurn])
+async def read_run(key: _Key, dashboard: Dash, settings: Deployment) -> Response:
+    """Return a run with its map, its parameters and their history."""
+    return json_reply(await _whole(key, settings, dashboard))
 
 
 @router.patch("/{number}")
-async def rename(request: Request, number: _Number, dashboard: Dash) -> Response:
-    """Give it another name."""
-    wanted: _Name = await body_of(request, _Name)
-    name = " ".join(wanted.name.split())
+async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
+    """Rename a run."""
+    name = " ".join(body.name.split())
     if not name or not name.isprintable():
-        raise BadRequestError("the name is empty or has odd characters", remedy="Give it some letters")
+        raise BadRequestError("the name is empty or has characters that cannot be shown", where="name")
     return await _done(dashboard, number, lambda book: book.rename(number, name))
 
 
 @router.delete("/unfinished")
-async def take_away(request: Request, name: _Asked) -> Response:
-    """Delete what a killed run left in the data folder; nothing brings it back, and nothing is lost by it."""
-    try:
-        await asyncio.to_thread(delete_partial_output, name, request.app.state.settings)
-    except UnknownError as error:
-        return failure_reply(404, error)
+async def delete_remains(name: _KeyInQuery, settings: Deployment) -> Response:
+    """Delete what an ended run left in the data folder. This cannot be undone."""
+    await asyncio.to_thread(delete_partial_output, name, settings)
     return json_reply({"name": name})
 
 
 @router.delete("/{number}")
-async def delete(request: Request, number: _Number, dashboard: Dash) -> Response:
-    """Take it away; `restore` brings it back."""
+async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
+    """Delete a run; `restore` brings it back."""
     if number in request.app.state.open_records():
-        own = number == dashboard.logbook.record
-        what = "this run is open" if own else "this run is open in the dashboard of another robot"
-        remedy = "Open another one first, then delete it" if own else "Open another one there, then delete it"
+        here = number == dashboard.logbook.record
+        what = "this run is open" if here else "this run is open in the dashboard of another robot"
+        remedy = (
+            "Open another one first, then delete it" if here else "Open another one there, then delete it"
+        )
         return error_reply(409, what, where=f"run {number}", remedy=remedy)
     return await _done(dashboard, number, lambda book: book.delete(number))
 
 
 @router.post("/{number}/restore")
-async def restore(number: _Number, dashboard: Dash) -> Response:
+async def restore(number: Number, dashboard: Dash) -> Response:
     """Undo a deletion."""
     return await _done(dashboard, number, lambda book: book.bring_back(number))
 
 
 @router.post("/{key}/replay")
-async def replay(key: _Key, request: Request, dashboard: Dash) -> Response:
-    """Open its source again, with its topics and mounting and the parameters that it ended with."""
-    settings: Settings = request.app.state.settings
-    try:
-        run = await _whole(key, request, dashboard)
-    except UnknownError as error:
-        return failure_reply(404, error)
-    uri = what_may_be_opened(run["uri"], settings)
-    if uri is None:
-        return error_reply(403, NOT_FROM_AFAR, where=run["uri"])
-    await dashboard.open(
-        request_of_kept(
-            uri,
-            odometry=run.get("odometry") or "auto",
-            seed=run["seed"],
-            choices=run.get("chosen"),
-            preset=run["preset"],
-            parameters=run["parameters"],
-        )
+async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
+    """Open the source of a run again, with its topics, mounting and final parameters."""
+    run = await _whole(key, settings, dashboard)
+    request = request_of_kept(
+        run["uri"],
+        odometry=run.get("odometry") or "auto",
+        seed=run["seed"],
+        choices=run.get("chosen"),
+        preset=run["preset"],
+        parameters=run["parameters"],
     )
+    await dashboard.open(permitted_request(request, settings, any_file))
     return json_reply({}, 202)
 
 
 async def _done(dashboard: Dashboard, number: int, work: Callable[[RunBook], None]) -> Response:
-    try:
-        await dashboard.keeper.ask(lambda store: work(store.book))
-    except UnknownError as error:
-        return failure_reply(404, error)
+    await dashboard.keeper.ask(lambda store: work(store.book))
     return json_reply({"id": number})
 
 
-async def _whole(key: str, request: Request, dashboard: Dashboard) -> dict[str, Any]:
+async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str, Any]:
     if key.startswith(_FOLDER):
         name = key.removeprefix(_FOLDER)
-        return {"key": key, "revisions": [], **await read_folder(name, request.app.state.settings)}
-    if not key.isdecimal() or int(key) >= 2**31:
+        return {"key": key, "revisions": [], **await read_folder(name, settings)}
+    if not key.isdecimal() or int(key) > LARGEST_NUMBER:
         raise UnknownError("there is no such run", where=key[:100])
     row = await dashboard.keeper.ask(lambda store: store.book.whole(int(key)))
     return {**_row(row), "map": row["map"], "revisions": [_revision(each) for each in row["revisions"]]}
@@ -170,5 +147,14 @@ def _revision(row: dict[str, Any]) -> dict[str, Any]:
 def _changed_s(folder: FilePath) -> int | None:
     try:
         return int((folder / "run.json").stat().st_mtime)
-    except OSError:  # it went just now
+    except OSError:  # it was removed a moment ago
         return None
+
+
+def _folders(settings: Settings) -> tuple[dict[str, FilePath], dict[str, int | None], list[Any]]:
+    folders = finished_folders(settings)
+    return (
+        folders,
+        {name: _changed_s(path) for name, path in folders.items()},
+        list(partial_outputs(settings)),
+    )

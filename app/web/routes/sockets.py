@@ -1,4 +1,4 @@
-"""The two websockets: what the page is told, and the bridge to viser."""
+"""The two websockets: the live states of the page, and the bridge to viser."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from fastapi import APIRouter
 from msgspec import Meta
 from starlette.websockets import WebSocket
 
+from app.common.user import current_user
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.user import hand
-from app.web.auth import role_of
-from app.web.routes.access import Dash
+from app.web.responses import LARGEST_NUMBER
+from app.web.routes.access import Bounds, CallerRole, Dash
 from app.web.viser_proxy import bridge
 from app.web.websocket_feed import telling
 
@@ -21,18 +21,17 @@ router = APIRouter()
 _REFUSED = 1003
 _TRY_AGAIN_LATER = 1013
 
-
-_Number = Annotated[int, Meta(ge=0, lt=2**31)]
+_Number = Annotated[int, Meta(ge=0, le=LARGEST_NUMBER)]
 
 
 class _Select(msgspec.Struct, frozen=True, tag="select"):
-    """Select a tree everywhere; null selects nothing."""
+    """Select a tree for everybody; null selects nothing."""
 
     tree: _Number | None
 
 
 class _SelectCluster(msgspec.Struct, frozen=True, tag="select_cluster"):
-    """Select a cluster of a scan everywhere, with the tree that it is a view of."""
+    """Select a cluster of a scan for everybody, with the tree that it belongs to."""
 
     scan: _Number
     cluster: _Number
@@ -42,26 +41,25 @@ _decoder: msgspec.json.Decoder[_Select | _SelectCluster] = msgspec.json.Decoder(
 
 
 @router.websocket("/api/live")
-async def live(browser: WebSocket, dashboard: Dash) -> None:
-    """States as they change, newest wins; takes selections."""
-    role = role_of(browser.scope)
-    with dashboard.pages.place(role) as free:
+async def live(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
+    """Send states as they change, the newest of each kind; receive selections."""
+    with bounds.pages.place(role) as free:
         if not free:
             await browser.close(_TRY_AGAIN_LATER)
             return
         await browser.accept()
         async with telling(browser, dashboard.live):
-            await _receive(browser, dashboard, may_touch=role == "owner")
+            await _receive(browser, dashboard, may_select=role == "owner")
 
 
-async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_touch: bool) -> None:
+async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool) -> None:
     while (event := await browser.receive())["type"] != "websocket.disconnect":
         try:
             wanted = _decoder.decode(event.get("text") or b"")
         except (msgspec.MsgspecError, UnicodeDecodeError):
             await browser.close(_REFUSED, "not a message of the page")
             return
-        if not may_touch:  # a selection is everybody's
+        if not may_select:  # the selection is shared by everybody
             continue
         if isinstance(wanted, _SelectCluster):
             dashboard.selecting.cluster_soon(wanted.scan, wanted.cluster)
@@ -71,15 +69,10 @@ async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_touch: bool)
 
 @router.websocket("/viser")
 @router.websocket("/viser/")
-async def viser(browser: WebSocket, dashboard: Dash) -> None:
-    """The 3D scene."""
-    role, name = role_of(browser.scope), hand.get()
-
-    def sign() -> None:
-        dashboard.scene_hand = name
-
-    with dashboard.scenes.place(role) as free:
+async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
+    """Connect the browser with the 3D scene."""
+    with bounds.scenes.place(role) as free:
         if not free:
             await browser.close(_TRY_AGAIN_LATER)
             return
-        await bridge(browser, dashboard.scene, looks_only=role != "owner", touched=sign)
+        await bridge(browser, dashboard.scene, user=current_user.get(), looks_only=role != "owner")

@@ -1,42 +1,60 @@
-"""The search for parameters on the page: start, stop, go on, use and save what it found."""
+"""Search for parameters, their sensitivity, and decision trees that learn from annotations."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated
+from typing import Annotated, Literal
 
-import msgspec
 from fastapi import APIRouter, Request
-from msgspec import Meta
+from pydantic import Field
 from starlette.responses import Response
 
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.user import NAME
+from app.dashboard.learning import Learning
 from app.tuning.goal import GOALS
 from app.tuning.plan import Plan
 from app.tuning.request import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
 from app.tuning.search_space import SENSIBLE
-from app.web.responses import body_of, json_reply
-from app.web.routes.access import Dash
-from app.web.routes.parameter_sets import SET_NAME
-from app.web.routes.run import what_may_be_opened
+from app.tuning.sweep.sensitivity import MOST_VALUES
+from app.web.responses import Body, Id, UserName, Value, Word, json_reply
+from app.web.routes.access import AnyFile, Dash, Deployment
+from app.web.routes.parameters import SetName
+from app.web.routes.run import permitted_uri
 from pipeline.errors import StemmapError
 
-router = APIRouter(prefix="/api/search")
+router = APIRouter(prefix="/api")
 
 
-class _Save(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: Annotated[str, Meta(pattern=SET_NAME)]
-    who: Annotated[str, Meta(pattern=NAME)] = "somebody"
+class _Search(Body):
+    """A search: `over` as after `stemmap tune --over`; `also` and `held_out` are numbers of recorded runs
+    that are searched over besides the open run, or only scored."""
+
+    over: Annotated[list[Annotated[str, Field(max_length=200)]], Field(min_length=1, max_length=30)]
+    goal: Literal["f1", "ta", "position", "pairs"] = "f1"
+    false_max: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
+    trials: Annotated[int, Field(ge=1, le=5000)] = 200
+    minutes: Annotated[float, Field(gt=0.0, le=24 * 60.0)] = 10.0
+    also: list[Id] = Field(default_factory=list, max_length=MOST_OTHERS)
+    held_out: list[Id] = Field(default_factory=list, max_length=MOST_OTHERS)
 
 
-@router.get("")
-async def read(request: Request, dashboard: Dash) -> Response:
-    """How the search goes, what can be searched for, and over which other runs."""
+class _Save(Body):
+    name: SetName
+    who: UserName = "somebody"
+
+
+class _Sensitivity(Body):
+    name: Word
+    values: Annotated[list[Value], Field(min_length=1, max_length=MOST_VALUES)]
+
+
+@router.get("/search")
+async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
+    """Return the progress of the search, what can be searched for, and the other runs."""
     try:
-        runs = [run.as_plain() for run in await _others(request, dashboard)]
-    except StemmapError:  # the run that is open can be searched over all the same
+        runs = [run.as_plain() for run in await _others(dashboard, settings, any_file)]
+    except StemmapError:  # the open run can still be searched over
         runs = []
     choices = {
         "sensible": SENSIBLE,
@@ -47,64 +65,112 @@ async def read(request: Request, dashboard: Dash) -> Response:
     return json_reply({**dashboard.search.as_plain(), **choices})
 
 
-@router.post("")
-async def start(request: Request, dashboard: Dash) -> Response:
-    """Search over the run that is open, from its first scan to its last, and over others of the list."""
-    wanted: SearchRequest = await body_of(request, SearchRequest)
-    await dashboard.search.start(await _plan(request, dashboard, wanted), wanted)
+@router.post("/search")
+async def start_search(body: _Search, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
+    """Search over the open run, from its first scan to its last, and over other recorded runs."""
+    wanted = SearchRequest(**body.model_dump())
+    await dashboard.search.start(await _plan(dashboard, settings, any_file, wanted), wanted)
     return json_reply(dashboard.search.as_plain(), 202)
 
 
-@router.post("/stop")
-async def stop(dashboard: Dash) -> Response:
-    """End the search; what it found stays."""
+@router.post("/search/stop")
+async def stop_search(dashboard: Dash) -> Response:
+    """Stop the search; its results stay."""
     await dashboard.search.stop()
     return json_reply(dashboard.search.as_plain(), 202)
 
 
-@router.post("/go-on")
-async def go_on(request: Request, dashboard: Dash) -> Response:
-    """Go on with the search that was stopped, with the same choices."""
+@router.post("/search/go-on")
+async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
+    """Continue the search that was stopped, with the same choices."""
     search = dashboard.search
     if search.asked is None:
-        raise StemmapError("there is no stopped search", remedy="Search")
-    await search.go_on(await _plan(request, dashboard, search.asked))
+        raise StemmapError("there is no stopped search", remedy="Start a search")
+    await search.go_on(await _plan(dashboard, settings, any_file, search.asked))
     return json_reply(search.as_plain(), 202)
 
 
-@router.post("/use")
-async def use(dashboard: Dash) -> Response:
-    """Take the values of the best set, as one step that can be undone."""
+@router.post("/search/use")
+async def use_found(dashboard: Dash) -> Response:
+    """Use the values of the best set, as one change that can be undone."""
     preset_name, values, _ = dashboard.search.found()
     await dashboard.tune(lambda state: state.use(preset_name, values))
     return json_reply({})
 
 
-@router.post("/save")
-async def save(request: Request, dashboard: Dash) -> Response:
-    """Keep the best set under a name, with where it comes from."""
-    wanted: _Save = await body_of(request, _Save)
+@router.post("/search/save")
+async def save_found(body: _Save, dashboard: Dash) -> Response:
+    """Save the best set under a name, with its provenance."""
     preset_name, values, text = dashboard.search.found()
-    await dashboard.sets.save(wanted.name, preset_name, values, wanted.who, text)
+    await dashboard.sets.save(body.name, preset_name, values, body.who, text)
     return json_reply(dashboard.sets.as_plain(), 201)
 
 
-async def _plan(request: Request, dashboard: Dashboard, wanted: SearchRequest) -> Plan:
-    others = await _others(request, dashboard) if wanted.also or wanted.held_out else []
+@router.post("/sensitivity")
+async def start_sensitivity(body: _Sensitivity, dashboard: Dash) -> Response:
+    """Score the whole run over values of a parameter, in their order, and broadcast each score."""
+    dashboard.how_much_matters(body.name, list(body.values))
+    return json_reply({}, 202)
+
+
+@router.delete("/sensitivity")
+async def stop_sensitivity(dashboard: Dash) -> Response:
+    """Stop the sensitivity analysis."""
+    await dashboard.sensitivity.leave()
+    return json_reply({})
+
+
+@router.get("/learning")
+async def learning_state(request: Request, dashboard: Dash) -> Response:
+    """Return what there is to learn from, and the progress."""
+    in_force = dashboard.parameters.parameters.classification.forest
+    return json_reply(await _learning(request).known(in_force))
+
+
+@router.post("/learning")
+async def start_learning(request: Request, dashboard: Dash) -> Response:
+    """Grow new decision trees from all annotations; they are not used before `POST /api/learning/use`."""
+    await _learning(request).begin(dashboard.parameters.parameters)
+    return json_reply(_learning(request).as_plain(), 202)
+
+
+@router.delete("/learning")
+async def stop_learning(request: Request) -> Response:
+    """Stop learning, or discard its result; the decision trees in force stay."""
+    await _learning(request).forget()
+    return json_reply(_learning(request).as_plain())
+
+
+@router.post("/learning/use")
+async def use_learned(request: Request, dashboard: Dash) -> Response:
+    """Classify with the new decision trees from now on."""
+    learned = _learning(request).learned
+    if learned is None:
+        raise StemmapError("no decision trees were grown", remedy="Grow them first")
+    await dashboard.change_parameters({"classification.forest": learned["name"]})
+    return json_reply(_learning(request).as_plain())
+
+
+def _learning(request: Request) -> Learning:
+    learning: Learning = request.app.state.learning
+    return learning
+
+
+async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted: SearchRequest) -> Plan:
+    others = await _others(dashboard, settings, any_file) if wanted.also or wanted.held_out else []
     state = dashboard.parameters
     source, digest, truth = dashboard.source, dashboard.digest, dashboard.truth
     return plan_of(wanted, source, digest, truth, state.parameters, state.preset, others)
 
 
-async def _others(request: Request, dashboard: Dashboard) -> list[OtherRun]:
-    """The other runs of the list.
+async def _others(dashboard: Dashboard, settings: Settings, any_file: bool) -> list[OtherRun]:
+    """Return the recorded runs besides the open one.
 
     Raises:
-        StemmapError: It cannot be read.
+        StemmapError: The store cannot be read.
     """
-    settings: Settings = request.app.state.settings
     rows, annotated = await dashboard.keeper.ask(lambda s: (s.book.listed(), s.annotated_sources()))
     digest = dashboard.digest
     return await asyncio.to_thread(
-        lambda: other_runs(rows, annotated, digest, lambda uri: what_may_be_opened(uri, settings))
+        lambda: other_runs(rows, annotated, digest, lambda uri: permitted_uri(uri, settings, any_file))
     )

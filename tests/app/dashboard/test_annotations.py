@@ -26,7 +26,7 @@ from app.worker.internal_protocol import Shown
 from pipeline.io.ground_truth import parse_truth_trees
 from pipeline.types.records import TruthTrees
 from tests.app.fakes import frame, opened, path, truth_trees
-from tests.app.server_for_tests import BEARER, TOKEN, Running, running, served
+from tests.app.server_for_tests import BEARER, ENDS, TOKEN, Running, running, served
 
 ANN = {"browser": "a" * 16, "who": "Ann"}
 BOB = {"browser": "b" * 16, "who": "Bob"}
@@ -130,7 +130,7 @@ async def test_an_edit_for_a_run_that_was_left_does_not_land_in_the_next(both: R
         ({"x": True, "y": 0.0}, "x"),
         ({"x": 1e9, "y": 0.0}, "x"),
         ({"y": 0.0}, "x"),
-        ({"x": 0.0, "y": 0.0, "kind": "shrub"}, "shrub"),
+        ({"x": 0.0, "y": 0.0, "kind": "shrub"}, "kind"),
         ({"x": 0.0, "y": 0.0, "dbh_cm": 0.0}, "dbh_cm"),
         ({"x": 0.0, "y": 0.0, "dbh_cm": 1001.0}, "dbh_cm"),
         ({"x": 0.0, "y": 0.0, "more": 1}, "more"),
@@ -302,7 +302,7 @@ async def test_every_browser_is_told() -> None:
     async with served() as (host, dashboard):
         await show(dashboard)
         port = int(host.rpartition(":")[2])
-        cookie = {"Cookie": f"stemmap_{port}={session_value(TOKEN, port)}"}
+        cookie = {"Cookie": f"stemmap_{port}={session_value(TOKEN, port, ENDS)}"}
         listen = partial(
             connect,
             f"ws://{host}/api/live",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -82,10 +84,10 @@ async def test_the_page_is_told_what_stood_before_a_change(both: Running) -> Non
     await dashboard.receive(opened(truth=truth_trees()))
     picture = frame(2, 5_200_000_000, x=1.0, n_trees=4)
     await dashboard.receive(Shown(1, 0.2, picture, 0, path([0.0, 0.5, 1.0])))
-    assert dashboard.live.map_after(0)[1]["before"] is None  # type: ignore[index]
+    assert json.loads(dashboard.live.map_after(0)[1])["before"] is None  # type: ignore[index]
     await client.patch("/api/parameters", json={"changes": {"clustering.eps": 0.5}})
     await dashboard.receive(Shown(1, 0.2, picture, 0, path([0.0, 0.5, 1.0])))
-    told = dashboard.live.map_after(0)[1]  # type: ignore[index]
+    told = json.loads(dashboard.live.map_after(0)[1])  # type: ignore[index]
     assert told["before"]["verdicts"] == told["verdicts"]
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from app.explain.client import NoStoryError, WorkerClient
 from app.worker.internal_protocol import Answer
+from app.worker.protocol import WorkerBusyError
 from tests.app.explain.stories import cluster_story, tree_story
 
 
@@ -41,7 +42,7 @@ async def test_a_refusal_and_a_missing_answer_raise_an_error_with_the_reason():
     async def swallow(_question: Any) -> None: ...
 
     silent = WorkerClient(swallow, lambda: 1, patience_s=0.01)
-    with pytest.raises(NoStoryError, match="busy"):
+    with pytest.raises(WorkerBusyError, match="busy"):
         await silent.cluster(0, 0)
     assert silent._waiting == {}
 

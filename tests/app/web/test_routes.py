@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,27 @@ import httpx
 import msgspec
 import pytest
 
-from app.common.settings import Settings
+from app.common.settings import Files, Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.map_changes import MapChanges
-from app.web.routes.run import what_may_be_opened
+from app.web.auth import viewer_token
+from app.web.routes.run import permitted_uri
 from app.worker.internal_protocol import Answer, AskCluster, Remapped, Report, Rough, Shown
-from app.worker.protocol import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
+from app.worker.protocol import (
+    Advance,
+    Open,
+    Pause,
+    Play,
+    Seek,
+    SetParameters,
+    SetSpeed,
+    Status,
+    WorkerBusyError,
+)
 from pipeline.config import field_specs, preset
 from tests.app.explain.stories import cluster_story
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
-from tests.app.server_for_tests import BEARER, Running, running
+from tests.app.server_for_tests import BEARER, PORT, TOKEN, Running, running
 
 
 def told(dashboard: Dashboard) -> list[Any]:
@@ -76,6 +88,8 @@ async def test_commands_reach_the_worker(both: Running, body: dict[str, Any], co
         (b'{"type": "seek", "time_s": 1e999}', "time_s"),
         (b'{"type": "seek", "time_s": -1}', "time_s"),
         (b'{"type": "set_speed", "factor": -1}', "factor"),
+        (b'{"type": "set_speed", "factor": 1e-300}', "factor"),
+        (b'{"type": "set_speed", "factor": true}', "factor"),
         (b'{"type": "set_speed", "factor": 1e9}', "factor"),
         (b'{"type": "set_speed", "factor": 1e999}', "factor"),
         (b'{"type": "set_speed", "factor": NaN}', "does not fit"),
@@ -83,7 +97,7 @@ async def test_commands_reach_the_worker(both: Running, body: dict[str, Any], co
         (b'{"type": "advance", "scans": 1.5}', "scans"),
         (b'{"type": "advance", "scans": 100000000000000000000000}', "scans"),
         (b'{"type": "advance", "scans": -1000000001}', "scans"),
-        (b"[" * 5000, "does not fit"),
+        (b"[" * 5000, "parsing the body"),
         (b"\xff\xfe", "does not fit"),
     ],
 )
@@ -91,7 +105,7 @@ async def test_what_is_no_command_is_refused(both: Running, body: bytes, words: 
     client, dashboard = both
     before = list(told(dashboard))
     answer = await client.post("/api/command", content=body, headers={"Content-Type": "application/json"})
-    assert answer.status_code == 422
+    assert answer.status_code in (400, 422)
     assert words in answer.json()["error"]["what"]
     assert told(dashboard) == before
 
@@ -195,7 +209,7 @@ async def test_a_bad_change_names_parameter_and_bound(
     client, dashboard = both
     before = dashboard.parameters.as_plain()
     answer = await client.patch("/api/parameters", json={"changes": changes})
-    assert answer.status_code == 422
+    assert answer.status_code in (400, 422)
     assert words in answer.json()["error"]["what"]
     assert dashboard.parameters.as_plain() == before
 
@@ -267,10 +281,10 @@ async def test_a_home_in_the_working_folder_is_not_the_home(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", "/elsewhere")
     settings = Settings(host="0.0.0.0", recordings=tmp_path)  # noqa: S104
-    assert what_may_be_opened("~/x", settings) is None
-    assert what_may_be_opened("file:///etc/passwd", settings) is None
-    assert what_may_be_opened("sim:stand", settings) == "sim:stand"
-    assert what_may_be_opened("~/x", Settings()) == "~/x"
+    assert permitted_uri("~/x", settings, any_file=False) is None
+    assert permitted_uri("file:///etc/passwd", settings, any_file=False) is None
+    assert permitted_uri("sim:stand", settings, any_file=False) == "sim:stand"
+    assert permitted_uri("~/x", Settings(), any_file=True) == "~/x"
 
 
 async def test_sources_offer_scenarios_and_recordings(tmp_path: Path) -> None:
@@ -428,3 +442,112 @@ async def test_a_loop_is_set_and_left_and_a_wrong_one_refused(both: Running) -> 
     assert dashboard.loop.span == (1.0, 4.0)
     assert (await client.post("/api/loop", json={"from_s": None, "to_s": None})).status_code == 202
     assert dashboard.loop.span is None
+
+
+def numbers_of(schema: Any, where: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every numeric schema, with its place."""
+    if isinstance(schema, dict):
+        if schema.get("type") in ("integer", "number") and "const" not in schema and "enum" not in schema:
+            yield where, schema
+        for key, part in schema.items():
+            yield from numbers_of(part, f"{where}/{key}")
+    elif isinstance(schema, list):
+        for k, part in enumerate(schema):
+            yield from numbers_of(part, f"{where}/{k}")
+
+
+async def test_every_numeric_field_of_every_route_is_bounded_by_declaration() -> None:
+    async with running() as (client, _):
+        described = (await client.get("/api/openapi.json", headers=BEARER)).json()
+        assert (await client.get("/api/openapi.json")).status_code == 401
+    paths = {
+        path: {
+            method: {k: v for k, v in each.items() if k != "responses"} for method, each in methods.items()
+        }
+        for path, methods in described["paths"].items()
+    }
+    schemas = {name: s for name, s in described["components"]["schemas"].items() if "Validation" not in name}
+    found = list(numbers_of({"paths": paths, "schemas": schemas}))
+    assert len(found) > 20
+    lower, upper = ("minimum", "exclusiveMinimum"), ("maximum", "exclusiveMaximum")
+    unbounded = [
+        place
+        for place, schema in found
+        if not (any(k in schema for k in lower) and any(k in schema for k in upper))
+    ]
+    assert unbounded == []
+
+
+async def test_a_command_while_the_worker_restarts_is_answered_503(both: Running) -> None:
+    client, dashboard = both
+
+    async def refuse(_: object) -> None:
+        raise WorkerBusyError("the mapping process is not ready for commands")
+
+    dashboard.worker.send = refuse  # type: ignore[method-assign]
+    answer = await client.post("/api/command", json={"type": "seek", "time_s": 1.0})
+    assert (answer.status_code, answer.headers["Retry-After"]) == (503, "3")
+
+
+async def test_of_two_quick_opens_the_last_is_open(both: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, dashboard = both
+    leave, entered, go = dashboard.search.leave, asyncio.Event(), asyncio.Event()
+
+    async def slow_leave() -> None:
+        entered.set()
+        await go.wait()
+        await leave()
+
+    monkeypatch.setattr(dashboard.search, "leave", slow_leave)
+    first = asyncio.create_task(dashboard.open(Open("a:")))
+    await entered.wait()
+    monkeypatch.setattr(dashboard.search, "leave", leave)
+    second = asyncio.create_task(dashboard.open(Open("b:")))
+    await asyncio.sleep(0)
+    go.set()
+    await asyncio.gather(first, second)
+    assert told(dashboard)[-1] == Open("b:")
+    assert (dashboard.source.uri, dashboard.status.source) == ("b:", "b:")
+
+
+async def test_viewers_wait_for_one_another_and_a_long_queue_is_refused(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    viewer = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
+    answers = await asyncio.gather(*(client.get("/api/pairs", headers=viewer) for _ in range(12)))
+    statuses = [answer.status_code for answer in answers]
+    assert set(statuses) == {200, 429}
+    assert all(answer.headers["Retry-After"] for answer in answers if answer.status_code == 429)
+    assert (await client.get("/api/pairs")).status_code == 200  # an owner does not wait
+
+
+@pytest.mark.parametrize(
+    ("files", "headers", "status"),
+    [
+        ("", {}, 202),
+        ("", {"X-Forwarded-For": "1.2.3.4"}, 403),
+        ("", {"Forwarded": "for=1.2.3.4"}, 403),
+        ("", {"Host": f"forest.example:{PORT}"}, 403),
+        ("folders", {}, 403),
+        ("any", {"X-Forwarded-For": "1.2.3.4"}, 202),
+    ],
+)
+async def test_any_file_is_opened_from_this_machine_or_by_an_explicit_setting(
+    files: Files, headers: dict[str, str], status: int
+) -> None:
+    async with running(Settings(files=files, hosts=("forest.example",))) as (client, _):
+        body = {"uri": "/etc/hostname"}
+        answer = await client.post("/api/open", headers={**BEARER, **headers}, json=body)
+        assert answer.status_code == status
+        poses = {"uri": "sim:stand", "odometry": "file:/etc/hostname"}
+        assert (
+            await client.post("/api/open", headers={**BEARER, **headers}, json=poses)
+        ).status_code == status
+
+
+async def test_a_set_with_deeply_nested_names_is_refused_at_once(both: Running) -> None:
+    client, _ = both
+    for text in (f"{'a.' * 30_000}a = 1", f"[{'a.' * 30_000}a]", f"x = {{{'a.' * 30_000}a = 1}}"):
+        answer = await client.post("/api/sets/upload", json={"file": "deep.toml", "text": text})
+        assert answer.status_code == 422
+        assert "nested" in answer.json()["error"]["what"]

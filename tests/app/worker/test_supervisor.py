@@ -14,7 +14,7 @@ import pytest
 import pytest_asyncio
 
 from app.worker.internal_protocol import FromWorker, Opened, Report, Shown
-from app.worker.protocol import Advance, Open, Play, SetParameters, SetSpeed
+from app.worker.protocol import Advance, Open, Play, SetParameters, SetSpeed, WorkerBusyError
 from app.worker.supervisor import WorkerProcess
 from pipeline.config import Parameters
 
@@ -144,12 +144,12 @@ def worker_pauses_shortened(worker: WorkerProcess) -> None:
     worker._pauses_s = (0.0,) * 5
 
 
-async def test_gibberish_ends_it() -> None:
+async def test_a_protocol_error_ends_it() -> None:
     said = Said()
     worker = WorkerProcess(said, (sys.executable, "-c", "print('hello ' * 5, flush=True)"))
     await worker.start()
     try:
-        assert "gibberish" in (await said.state("failed")).detail
+        assert "protocol error" in (await said.state("failed")).detail
     finally:
         await worker.close()
 
@@ -167,6 +167,8 @@ async def test_a_fault_of_the_listener_does_not_end_the_watch(caplog: pytest.Log
     try:
         await worker.send(Open("fake:5"))
         await said.opened()
+        status = await said.state("failed")
+        assert "A result could not be shown: KeyError" in status.detail
         await worker.send(Advance(1))
         await said.scan(0)
         assert "a fault on purpose" in caplog.text
@@ -195,6 +197,62 @@ async def test_a_live_run_has_time_to_finish_its_recording(
     await worker.send(Open("zenoh:tcp/127.0.0.1:1"))
     await worker.close()
     assert (tmp_path / "finished").exists()
+
+
+async def test_a_source_that_never_finishes_opening_is_ended_and_reported() -> None:
+    said = Said()
+    worker = WorkerProcess(said, FAKE, opening_limit_s=4.0)
+    await worker.start()
+    try:
+        await worker.send(Open("hangs:"))
+        assert "took longer than 4 s" in (await said.state("failed")).detail
+        await worker.send(Open("fake:5"))
+        await said.opened()
+        assert worker.restarts == 0
+    finally:
+        await worker.close()
+
+
+async def test_another_source_replaces_one_that_does_not_finish_opening(
+    both: tuple[WorkerProcess, Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("app.worker.supervisor._REPLACE_AFTER_S", 0.1)
+    worker, said = both
+    await worker.send(Open("hangs:"))
+    await said.wait(lambda m: isinstance(m, Report) and m.status.source == "hangs:")
+    await asyncio.sleep(0.2)
+    await worker.send(Open("fake:5"))
+    assert (await said.opened()).uri == "fake:5"
+    assert worker.restarts == 0
+
+
+async def test_a_command_while_the_worker_restarts_is_refused_and_not_lost(
+    both: tuple[WorkerProcess, Said],
+) -> None:
+    worker, said = both
+    await worker.send(Open("fake:5"))
+    await said.opened()
+    assert worker.pid is not None
+    os.kill(worker.pid, signal.SIGKILL)
+    await said.state("failed")
+    with pytest.raises(WorkerBusyError):
+        await worker.send(Advance(1))
+    await worker.send(SetSpeed(2.0))  # remembered
+    await said.opened()
+    await worker.send(Advance(1))
+    await said.scan(0)
+
+
+async def test_a_speed_that_ends_the_worker_is_dropped() -> None:
+    said = Said()
+    worker = WorkerProcess(said, (sys.executable, "-c", "raise SystemExit(7)"))
+    worker_pauses_shortened(worker)
+    await worker.send(SetSpeed(1.0))
+    await worker.start()
+    try:
+        await said.wait(lambda m: isinstance(m, Report) and "speed was reset" in m.status.detail)
+    finally:
+        await worker.close()
 
 
 async def test_it_does_not_outlive_the_web_process() -> None:

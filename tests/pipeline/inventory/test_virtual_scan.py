@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.common.settings import Settings
-from app.web.routes.run import what_may_be_opened
+from app.web.routes.run import permitted_uri
 from pipeline.errors import SourceError
 from pipeline.io.readers.simulated import open_simulated as open_source
 from pipeline.simulation import cloud_run
@@ -149,12 +149,12 @@ def test_a_cloud_without_a_free_way_is_refused(files):
 
 def test_from_another_machine_a_cloud_is_read_only_from_the_folder_of_recordings(files, tmp_path):
     far = replace(Settings(), host="0.0.0.0", recordings=files)  # noqa: S104
-    assert what_may_be_opened(f"sim:cloud?file={files / 'plot.laz'}", far) is not None
-    assert what_may_be_opened("sim:stand", far) == "sim:stand"
-    assert what_may_be_opened(f"sim:cloud?file={tmp_path / 'other.laz'}", far) is None
+    assert permitted_uri(f"sim:cloud?file={files / 'plot.laz'}", far, any_file=False) is not None
+    assert permitted_uri("sim:stand", far, any_file=False) == "sim:stand"
+    assert permitted_uri(f"sim:cloud?file={tmp_path / 'other.laz'}", far, any_file=False) is None
     inside = f"file={files / 'plot.laz'}"
-    assert what_may_be_opened(f"sim:cloud?{inside}&truth=/etc/passwd", far) is None
-    assert what_may_be_opened(f"sim:cloud?{inside}/../../other.laz", far) is None
+    assert permitted_uri(f"sim:cloud?{inside}&truth=/etc/passwd", far, any_file=False) is None
+    assert permitted_uri(f"sim:cloud?{inside}/../../other.laz", far, any_file=False) is None
     for again in ("sim:", "sim:sim:", "sim:file://"):
-        assert what_may_be_opened(f"sim:cloud?file={again}{tmp_path / 'other.laz'}", far) is None
-    assert what_may_be_opened("sim:cloud?file=/etc/passwd", replace(far, recordings=None)) is None
+        assert permitted_uri(f"sim:cloud?file={again}{tmp_path / 'other.laz'}", far, any_file=False) is None
+    assert permitted_uri("sim:cloud?file=/etc/passwd", replace(far, recordings=None), any_file=False) is None
