@@ -13,6 +13,7 @@ import hashlib
 import json
 import os
 import shutil
+import weakref
 import zlib
 from collections import OrderedDict
 from functools import cache
@@ -79,6 +80,7 @@ class ScanCache:
         if file is None:
             self._refuse("no folder can be written to")
             return
+        weakref.finalize(self, file.close)
         try:
             self._open(header)
         except OSError as error:
