@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from app.common.text import count
-from app.worker.run_health import RunHealth
+from app.batch.run_health import RunHealth
 from pipeline.evaluation import Evaluation, PathError, Rate
 from pipeline.types.records import Frame, Path, Verdict
 

@@ -130,7 +130,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     from app.cli.live_commands import begin_recording, heard, recording_of, told_of_frames
     from app.common.compile_ahead import compile_ahead
     from app.sources.opening import open_any
-    from app.worker.replaying import recorded_parameters
+    from app.worker.run_factory import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None

@@ -21,6 +21,7 @@ from app.dashboard.annotations import Annotating
 from app.dashboard.broadcast import Live
 from app.dashboard.camera_view import CameraDesk
 from app.dashboard.events import Events
+from app.dashboard.loop_playback import Loop
 from app.dashboard.map_changes import MapChanges
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, Counts, counts_of, map_payload, truth_payload
@@ -43,7 +44,6 @@ from app.worker.internal_protocol import (
     Shown,
     ToWorker,
 )
-from app.worker.loop_playback import Loop
 from app.worker.outbox import joined
 from app.worker.protocol import Open, Play, SetParameters, Status, WorkerBusyError
 from pipeline.config import Parameters, preset

@@ -1,5 +1,5 @@
-"""The worker's loop: takes commands between two scans, keeps the time of the replay, tells the web
-process what came of it.
+"""Main loop of the mapping process: it takes commands between two scans, keeps the time of the replay, and
+sends results to the web process.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from app.worker.internal_protocol import (
     ToWorker,
 )
 from app.worker.protocol import Advance, Command, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
-from app.worker.queries import Answering
-from app.worker.replay_clock import Pacer
+from app.worker.queries import QueryAnswerer
+from app.worker.replay_clock import ReplayClock
 from app.worker.session import Session
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError
@@ -41,31 +41,31 @@ from pipeline.types.records import Frame
 Put = Callable[[FromWorker], None]
 T = TypeVar("T")
 
-# How often figures are told while a run plays, and how often a picture is shown on the way to a scan
-# that is sought: rarely enough that a short way shows no flicker.
+# Interval of status reports while a run plays, and of frames on the way to a sought scan; on a short way none
+# is shown, so that nothing flickers.
 _REPORT_S = 0.25
 _GLIMPSE_S = 0.5
 _COMPILING = COMPILING.capitalize()
-_COMPILES_ON_S = 60.0  # a kernel compiled so soon after another is of the same wait
-# How often a robot is asked for what came: a little of a scan's time, and less than 1 % of a core.
+_COMPILES_ON_S = 60.0  # kernels that are compiled so soon after one another count as one wait
+# Interval at which messages of a live source are taken; it costs less than 1 % of a core.
 _LISTEN_S = 0.005
-# About how long scans are mapped again between two looks at the commands, and how many scans of a run that
-# plays are mapped before it is done once, however late the run is.
+# Time of a rerun between two checks for commands, and number of scans of a playing run that are mapped before
+# a rerun gets its turn, however late the run is.
 _REMAP_S = 0.02
 _SCANS_A_REMAP = 4
-# Scans mapped again in one go: two halves of the work begin and end apart. Fewer where looking takes long.
+# Scans that a rerun maps in one call; fewer where a scan takes long.
 _AT_ONCE = 8
 
 
-class Driver:
-    """Drives a session until the commands end.
+class WorkerLoop:
+    """Runs a session until the commands end.
 
     Args:
-        session: Where the run is.
-        commands: Filled by another thread; None ends the loop.
+        session: The session with the run.
+        commands: Commands; another thread fills the queue. None ends the loop.
         put: Sends a message to the web process without waiting.
-        clock: Seconds from any start.
-        recent: The pictures that were sent, of which people may ask.
+        clock: Returns seconds from any start.
+        recent: The frames that were sent last, for questions about them.
     """
 
     def __init__(
@@ -82,9 +82,9 @@ class Driver:
         self._put = put
         self._clock = clock
         self._recent = recent or RecentScans()
-        self._answering = Answering(session, self._recent)
+        self._queries = QueryAnswerer(session, self._recent)
         self._taken: deque[ToWorker | None] = deque()
-        self._pacer = Pacer()
+        self._replay = ReplayClock()
         self._run, self._asked = 0, ""
         self._held = False
         self._prepared = False
@@ -96,7 +96,7 @@ class Driver:
         self._at_once = 1
 
     def run(self) -> None:
-        """Work until None comes as a command."""
+        """Take commands and map scans until the command None comes."""
         self._report()
         while True:
             try:
@@ -108,14 +108,14 @@ class Driver:
                 self._session.close()
                 return
             if isinstance(command, Question):
-                self._put(self._answering.answer(command, self._run))
-                if self._says_compiling:  # an answer may need other code than the run
+                self._put(self._queries.answer(command, self._run))
+                if self._says_compiling:  # an answer may compile other kernels than the run
                     self._report()
             else:
                 self._obey(command)
 
     def _next_command(self) -> ToWorker | None:
-        """The next command; of parameters that follow one another (a slider that moves) the last."""
+        """The next command; the last one of successive parameter changes, as of a slider that moves."""
         if not self._taken:
             self._taken.append(self._commands.get(timeout=self._patience()))
         with contextlib.suppress(queue.Empty):
@@ -129,7 +129,7 @@ class Driver:
         return command
 
     def _patience(self) -> float | None:
-        """Seconds until the next scan is to be mapped; None when only a command can start work."""
+        """Seconds until the next scan is due; None when only a command can start work."""
         pace = self._session.pace
         if self._session.is_remapping:
             return 0.0
@@ -140,9 +140,10 @@ class Driver:
         if pace == "hurry" or not self._prepared:
             return 0.0
         stamp_ns = self._guarded(self._session.next_ns)
-        return 0.0 if stamp_ns is None else self._pacer.delay(stamp_ns, self._clock())
+        return 0.0 if stamp_ns is None else self._replay.delay(stamp_ns, self._clock())
 
     def _map(self) -> None:
+        """Do the next piece of work: rerun, live messages, preparation or a scan."""
         if self._session.is_remapping:
             if self._mapped >= _SCANS_A_REMAP or not self._is_due():
                 self._mapped = 0
@@ -159,9 +160,9 @@ class Driver:
         frame = self._session.work()
         now = self._clock()
         if frame is not None:
-            self._pacer.mapped(frame.stamp_ns, now)
+            self._replay.mapped(frame.stamp_ns, now)
         if hurried and self._session.pace != "hurry":  # arrived: time counts from here
-            self._pacer.release()
+            self._replay.release()
         if hurried and self._session.pace == "hurry" and now < self._glimpse_at:
             return
         self._glimpse_at = now + _GLIMPSE_S
@@ -173,17 +174,17 @@ class Driver:
             self._report_when_due(now)
 
     def _is_due(self) -> bool:
-        """Whether a scan is to be mapped now."""
+        """Whether a scan is due now."""
         pace = self._session.pace
         if pace == "idle":
             return False
         stamp_ns = self._session.next_ns()
         if pace == "live":
             return stamp_ns is not None
-        return not self._prepared or stamp_ns is None or self._pacer.delay(stamp_ns, self._clock()) <= 0.0
+        return not self._prepared or stamp_ns is None or self._replay.delay(stamp_ns, self._clock()) <= 0.0
 
     def _remap(self) -> None:
-        """Use the time between two scans, or while the run stands, to map it again."""
+        """Go on with a rerun in the time between two scans, or while the run is paused."""
         begun = self._clock()
         while True:
             asked = self._clock()
@@ -199,7 +200,7 @@ class Driver:
             self._report_when_due(self._clock())
             return
         frame, changes = done
-        self._recent.forget()  # they were judged with other parameters
+        self._recent.forget()  # their verdicts are of other parameters
         self._put(Remapped(self._run, changes))
         self._show(frame)
         self._report()
@@ -209,14 +210,14 @@ class Driver:
             self._report()
 
     def _listen(self) -> None:
-        """Nothing is to be mapped of a robot: look what is heard of it."""
+        """No scan of a live source waits: open the run once its first messages are here."""
         opened = self._session.listen()
         if opened is not None:
             self._tell_opened(opened)
         self._report_when_due(self._clock())
 
     def _obey(self, command: Command | Begin) -> None:
-        self._pacer.release()
+        self._replay.release()
         self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
         self._guarded(lambda: self._carry_out(command))
         self._report()
@@ -235,7 +236,7 @@ class Driver:
             case Seek(time_s=time_s):
                 session.seek(time_s)
             case SetSpeed(factor=factor):
-                self._pacer.speed = factor
+                self._replay.speed = factor
             case SetParameters(values=values, revision=revision, whole=whole, step=step):
                 self._show(session.set_parameters(validated(values), revision, whole=whole, step=step))
             case Open():
@@ -270,10 +271,10 @@ class Driver:
         self._put(msgspec.structs.replace(opened, run=self._run, asked=self._asked))
 
     def _begin(self, command: Begin) -> None:
-        if command.run != self._run:  # another was opened since
+        if command.run != self._run:  # another run was opened since
             return
         self._show(self._session.set_parameters(validated(command.values), command.revision))
-        if self._held:  # a person, or a failure, was faster than this answer
+        if self._held:  # a user has paused, or an error has stopped the run, since the opening
             return
         if command.play:
             self._session.play()
@@ -281,18 +282,18 @@ class Driver:
             self._session.advance(1)
 
     def _prepare(self) -> None:
-        """Before the first scan, and not when opening: only now are the parameters those of the run."""
+        """Compile kernels before the first scan; at opening the parameters are not known yet."""
         self._tell(self._preparing(), self._clock())
         self._prepared = True
         self._session.prepare()
-        self._pacer.release()
+        self._replay.release()
         self._report()
 
     def _preparing(self) -> Status:
         return replace(self._session.status(), state="starting", detail="Preparing the mapper")
 
     def compiling(self) -> None:
-        """Say that work waits for a kernel that is being compiled; called while it works."""
+        """Report that work waits for a kernel that is compiled; called during the compilation."""
         self._session.disturb()
         now = self._clock()
         if now > self._compiled_at + _COMPILES_ON_S:
@@ -300,11 +301,11 @@ class Driver:
         self._compiled_at = now
         if self._reported is None or self._says_compiling:
             return
-        # What was told last, because the session is in the middle of its work.
+        # The last status, because the session is in the middle of its work.
         status = replace(self._reported[0], detail=_COMPILING, compiling_since_s=self._compiling_since_s)
         if status.state == "playing":
             status = replace(status, state="waiting")
-        self._reported = (status, -math.inf)  # so that what comes of it is told at once
+        self._reported = (status, -math.inf)  # so that the next status is sent at once
         self._put(Report(status))
 
     @property
@@ -320,17 +321,17 @@ class Driver:
     def _report(self) -> None:
         now = self._clock()
         if self._session.pace not in ("idle", "live") and not self._prepared:
-            # Nothing plays yet: the first scan is read, and on a new machine all is compiled, before.
+            # Nothing plays yet: the first scan is read and the kernels are compiled before.
             self._tell(self._preparing(), now)
             return
         playing = self._session.pace in ("replay", "live")
         status = self._session.status()
-        if status.going_to and now >= self._long_way_at:  # a short way would only flicker
+        if status.going_to and now >= self._long_way_at:  # not on a short way, which would flicker
             status = replace(status, detail=f"Going to {status.going_to} …", going_far=True)
         status = replace(
             status,
-            speed=self._pacer.speed,
-            scan_rate_hz=round(self._pacer.rate_hz, 2) if playing and status.state != "waiting" else 0.0,
+            speed=self._replay.speed,
+            scan_rate_hz=round(self._replay.rate_hz, 2) if playing and status.state != "waiting" else 0.0,
             scans_behind=self._behind(status, now) if playing else 0,
         )
         self._tell(status, now)
@@ -342,11 +343,11 @@ class Driver:
     def _behind(self, status: Status, now: float) -> int:
         if status.live:
             return status.scans_behind
-        behind = self._pacer.behind(now)
+        behind = self._replay.behind(now)
         return behind if status.scans is None else min(behind, status.scans - 1 - status.scan_index)
 
     def _guarded(self, work: Callable[[], T]) -> T | None:
-        """Do some work; what goes wrong becomes the state "failed", and the worker lives on."""
+        """Do some work. An error becomes the state "failed"; the process goes on."""
         try:
             return work()
         except StemmapError as error:

@@ -23,7 +23,7 @@ from app.common.timers import Stopwatch
 from app.explain.history import RecentScans
 from app.worker.codec import WireError, to_worker
 from app.worker.internal_protocol import ToWorker
-from app.worker.loop import Driver
+from app.worker.loop import WorkerLoop
 from app.worker.outbox import Mailbox
 from app.worker.run_factory import caches_in, unnamed_caches
 from app.worker.session import Session
@@ -81,7 +81,7 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     reader.start()
     recent = RecentScans()
     mailbox = Mailbox(outgoing, recent)
-    driver = Driver(session, commands, mailbox.put, recent=recent)
+    driver = WorkerLoop(session, commands, mailbox.put, recent=recent)
     with on_compiling(_said_once(driver.compiling)):
         driver.run()
     mailbox.close()

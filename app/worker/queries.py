@@ -14,7 +14,7 @@ from pipeline.config.model import validated
 from pipeline.errors import StemmapError
 
 
-class Answering:
+class QueryAnswerer:
     """Answers from a session.
 
     Args:

@@ -12,8 +12,9 @@ from app.sources.opening import with_odometry
 from app.worker.cursor import Cursor, LiveCursor, Synchroniser
 from app.worker.run import MakeMapper, Run
 from pipeline.config import Parameters
-from pipeline.errors import SourceError
-from pipeline.io.readers.base import Source
+from pipeline.config.model import validated
+from pipeline.errors import ParameterError, SourceError
+from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.remapping import ScanCaches
 
 MakeSynchroniser = Callable[[str], Synchroniser]
@@ -88,3 +89,20 @@ class RunFactory:
             caches=self.open_caches(source, chosen.words, seed),
         )
         return run, (*source.description.warnings, *([chosen.warning] if chosen.warning else []))
+
+
+def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Parameters], ...]:
+    """The sets of parameters that a recorded live run was mapped with, each with its first scan, in order.
+
+    A set that the whole run was mapped again with replaces those before it. The result is empty where no
+    parameters are recorded, or parameters of another version of stemmap.
+    """
+    sets: list[tuple[int, Parameters]] = []
+    try:
+        for each in description.revisions:
+            values = validated(each.values)
+            sets = [known for known in sets if known[0] < each.from_scan]
+            sets.append((each.from_scan, values))
+    except ParameterError:
+        return ()
+    return tuple(sets)

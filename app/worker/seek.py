@@ -1,15 +1,14 @@
-"""The way to a scan that a person seeks."""
+"""The scan that a user seeks."""
 
 from __future__ import annotations
 
 from app.worker.run import Run
-from app.worker.session_status import clock
 
 _NS = 1_000_000_000
 
 
-class Way:
-    """Where a run is to go: to a scan by its number, to the last one not later than a time, or nowhere."""
+class SeekTarget:
+    """The scan to which a run goes: given by its number, by a time that it is not later than, or none."""
 
     def __init__(self) -> None:
         self._index: int | None = None
@@ -18,12 +17,12 @@ class Way:
 
     @property
     def sought(self) -> bool:
-        """Whether it leads anywhere."""
+        """Whether a scan is sought."""
         return self._index is not None or self._stamp_ns is not None
 
     @property
     def index(self) -> int | None:
-        """Of the sought scan, where it is sought by its number."""
+        """Number of the sought scan; None where a time is sought."""
         return self._index
 
     def to_scan(self, index: int) -> None:
@@ -43,8 +42,8 @@ class Way:
         self._index, self._stamp_ns, self._under_way = None, None, False
 
     def set_out(self, run: Run) -> None:
-        """Begin the way, if it was not begun: not before work begins, so that targets that are overtaken by
-        another while a person drags the timeline cost nothing and leave no trace."""
+        """Return to a state before the target, once. This happens when work begins, so that targets that
+        another one replaces while the timeline is dragged cost nothing."""
         if self._under_way or not self.sought:
             return
         self._under_way = True
@@ -54,7 +53,7 @@ class Way:
             run.approach(self._index)
 
     def is_at_end(self, run: Run) -> bool:
-        """Whether the run stands at the sought scan."""
+        """Whether the run has reached the sought scan."""
         if self._index is not None:
             return run.standing >= self._index
         if self._stamp_ns is None or run.standing < 0:
@@ -63,14 +62,14 @@ class Way:
         return following is not None and following > self._stamp_ns
 
     def words(self, run: Run | None) -> str:
-        """The sought scan in words; empty when none is."""
+        """The sought scan in words; empty without one."""
         if run is None or not self.sought:
             return ""
         time_s = self.time_s(run)
         return f"scan {self._index}" if time_s is None else clock(time_s)
 
     def time_s(self, run: Run | None) -> float | None:
-        """Of the sought scan, since the run's first one; None when none is, or nobody knows."""
+        """Time of the sought scan [s since the first scan]; None without one, or where it is not known."""
         if run is None:
             return None
         if self._stamp_ns is not None:
@@ -78,3 +77,9 @@ class Way:
         if self._index is not None and self._index < run.known:
             return (run.stamp_ns(self._index) - run.start_ns) / _NS
         return None
+
+
+def clock(seconds: float) -> str:
+    """A time in minutes and seconds."""
+    whole = int(seconds)
+    return f"{whole // 60}:{whole % 60:02d}"

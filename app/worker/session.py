@@ -10,18 +10,22 @@ from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Literal
 
+import numpy as np
+
+from app.batch.summary import driven
 from app.dashboard.map_changes import MapChanges
+from app.dashboard.payload import health_word
 from app.explain import build as stories
 from app.explain.records import ClusterStory, TreeStory
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
+from app.worker.camera import has_camera
 from app.worker.internal_protocol import Opened
 from app.worker.protocol import LONGEST_S, State, Status
 from app.worker.remap import MapComparison
 from app.worker.run import MakeMapper, Run
 from app.worker.run_factory import MakeSynchroniser, OpenCaches, RunFactory, unnamed_caches
-from app.worker.seek import Way
-from app.worker.session_status import Said, describe, opened_of
+from app.worker.seek import SeekTarget
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import Source, SourceOptions
@@ -76,7 +80,7 @@ class Session:
         self._robot: LiveSource | None = None
         self._state: State = "starting"
         self._detail = ""
-        self._way = Way()
+        self._target = SeekTarget()
         self._comparison = MapComparison()
         self._remaps_on_arrival = False
         self._warnings: dict[str, None] = {}
@@ -90,7 +94,7 @@ class Session:
             return "idle"
         if self._robot is not None:
             return "live" if self._run is None or self._state == "playing" else "idle"
-        if self._way.sought:
+        if self._target.sought:
             return "hurry"
         return "replay" if self._state == "playing" else "idle"
 
@@ -194,17 +198,17 @@ class Session:
         run = self._run
         if run is None or self.pace == "idle":
             return None
-        self._way.set_out(run)
-        if self._way.is_at_end(run):
+        self._target.set_out(run)
+        if self._target.is_at_end(run):
             return self._arrive(run)
-        frame = run.map_next(hurried=self._way.sought)
+        frame = run.map_next(hurried=self._target.sought)
         if frame is None:
             self._state = "finished" if self._robot is None else self._state
         else:
             self._warn(frame.warnings)
             if self._robot is not None:
                 self._robot.mapped(frame, run.path)
-        if self._way.is_at_end(run) or (frame is None and self._way.sought):
+        if self._target.is_at_end(run) or (frame is None and self._target.sought):
             return self._arrive(run)
         return frame
 
@@ -223,7 +227,7 @@ class Session:
         if self._run is None or self._state == "failed":
             opened = self._open_again()
         elif self._state == "finished":
-            self._way.to_scan(0)
+            self._target.to_scan(0)
         if self._run is not None:
             self._state, self._detail = "playing", ""
         return opened
@@ -237,9 +241,9 @@ class Session:
         """Pause, and stand so many scans further or back."""
         if self._run is None or self._is_live():
             return
-        here = self._run.standing if self._way.index is None else self._way.index
+        here = self._run.standing if self._target.index is None else self._target.index
         self._settle()
-        self._way.to_scan(max(0, here + scans))
+        self._target.to_scan(max(0, here + scans))
 
     def seek(self, time_s: float) -> None:
         """Stand at the last scan not later than a time; the run then goes on as it did before."""
@@ -248,7 +252,7 @@ class Session:
         if self._state != "playing":
             self._settle()
         seconds = min(max(time_s, 0.0), LONGEST_S)
-        self._way.to_time(self._run, self._run.start_ns + round(seconds * _NS))
+        self._target.to_time(self._run, self._run.start_ns + round(seconds * _NS))
 
     def set_parameters(
         self, parameters: Parameters, revision: int, *, whole: bool = False, step: int | None = None
@@ -266,7 +270,7 @@ class Session:
         if run is None:
             return None
         run.stay()
-        if self._way.sought:  # see `_arrive`
+        if self._target.sought:  # see `_arrive`
             self._remaps_on_arrival = whole
             return None
         stands = self._state != "playing" and run.standing >= 0
@@ -282,7 +286,7 @@ class Session:
     @property
     def is_remapping(self) -> bool:
         """Whether `remap` has work that can be done now."""
-        return self._run is not None and self._run.remapped is not None and not self._way.sought
+        return self._run is not None and self._run.remapped is not None and not self._target.sought
 
     def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
         """Map so many scans of the run again. Once all are, the map is another one: gives the standing scan
@@ -332,23 +336,25 @@ class Session:
     def fail(self, detail: str) -> None:
         """Say that the run cannot go on, and why."""
         self._state, self._detail = "failed", detail
-        self._way.forget()
+        self._target.forget()
         if self._run is not None:
             self._run.stay()
 
     def status(self) -> Status:
-        """How the run goes; what only a clock can tell is left at 0."""
-        said = Said(
+        """The status of the run; speed, rate and scans behind are left at 0."""
+        run, robot = self._run, self._robot
+        status = Status(
             state=self._state,
             detail=self._detail,
-            uri=self._asked[0] if self._asked else "",
+            source=self._asked[0] if self._asked else "",
             time_s=self.time_s,
-            warnings=tuple(self._warnings),
+            warnings=list(self._warnings),
             revision=self._revision,
-            going_to=self._way.words(self._run),
-            going_to_s=self._way.time_s(self._run),
+            going_to=self._target.words(run),
+            going_to_s=self._target.time_s(run),
         )
-        return describe(self._run, self._robot, said)
+        status = status if run is None else _with_run(status, run)
+        return status if robot is None else with_robot(status, robot)
 
     def close(self) -> None:
         """Let go of the source."""
@@ -373,7 +379,7 @@ class Session:
     def _arrive(self, run: Run) -> Frame | None:
         """Stand at the sought scan. The map before it is as it was; the parameters in force now act
         from this scan on, whenever on the way they came."""
-        self._way.forget()
+        self._target.forget()
         changed = run.use(self._parameters, run.standing)
         if self._remaps_on_arrival:
             self._remaps_on_arrival = False
@@ -392,7 +398,7 @@ class Session:
         self._run, self._robot, self._comparison = None, None, MapComparison()
         self._remaps_on_arrival = False
         self._warnings.clear()
-        self._way.forget()
+        self._target.forget()
 
     def _warn(self, warnings: Iterable[str]) -> None:
         for warning in warnings:
@@ -400,3 +406,61 @@ class Session:
             self._warnings[warning] = None
         while len(self._warnings) > _MOST_WARNINGS:
             del self._warnings[next(iter(self._warnings))]
+
+
+def with_robot(status: Status, robot: LiveSource) -> Status:
+    """The status with that of the robot of a live run."""
+    # While scans wait the robot was heard, whatever its link had no time to note while a machine compiled.
+    is_asked = status.state in ("playing", "waiting") and not robot.scans_waiting
+    silent = robot.waiting_for() if is_asked else ""
+    return replace(
+        status,
+        state="waiting" if silent else status.state,
+        detail=silent or status.detail,
+        live=True,
+        robot=robot.robot,
+        robots=robot.robots,
+        scans_behind=robot.scans_waiting,
+        recording=robot.recording,
+    )
+
+
+def _with_run(status: Status, run: Run) -> Status:
+    """The status with the figures of a run."""
+    description = run.source.description
+    losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
+    frame = run.frame
+    return replace(
+        status,
+        kind=description.kind,
+        odometry=run.odometry,
+        end_s=None if description.end_ns is None else (description.end_ns - run.start_ns) / _NS,
+        scan_index=-1 if frame is None else frame.index,
+        scans=description.scans,
+        mapping_ms=round(run.stopwatch.scan_ms, 3),
+        stage_ms={stage: round(ms, 3) for stage, ms in run.stopwatch.stage_ms.items()},
+        trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
+        distance_m=round(driven(run.path)[1], 3),
+        health=health_word(frame),
+        warnings=[*status.warnings, *losses, *([run.cache_notice] if run.cache_notice else [])],
+        camera=has_camera(description),
+        remapped=run.remapped,
+    )
+
+
+def opened_of(run: Run) -> Opened:
+    """The message that a source is opened."""
+    description = run.source.description
+    truth = run.source.truth()
+    end_s = None
+    if description.start_ns is not None and description.end_ns is not None:
+        end_s = (description.end_ns - description.start_ns) / _NS
+    return Opened(
+        uri=description.uri,
+        kind=description.kind,
+        preset=description.preset,
+        scans=description.scans,
+        end_s=end_s,
+        truth=truth.trees if truth else None,
+        digest=description.digest,
+    )

@@ -11,7 +11,7 @@ import pytest
 
 from app.dashboard.payload import in_centimetres, packed, stages_payload
 from app.worker.internal_protocol import Answer, AskCompare, FromWorker, Shown, ToWorker
-from app.worker.loop import Driver
+from app.worker.loop import WorkerLoop
 from app.worker.process import new_session
 from app.worker.session import Session
 from pipeline.config import Parameters, preset
@@ -86,7 +86,7 @@ def test_the_worker_answers_with_pictures_without_raw_points():
     values = [Parameters().model_dump(), {**Parameters().model_dump(), "slam": {"particles": -1}}]
     for message in (AskCompare(1, 0, values[:1]), AskCompare(2, 0, values), AskCompare(3, 5, []), None):
         waiting.put(message)
-    Driver(session, waiting, said.append).run()
+    WorkerLoop(session, waiting, said.append).run()
     answers = {message.ticket: message for message in said if isinstance(message, Answer)}
     assert [(len(f.raw), f.index) for f in answers[1].frames or []] == [(0, 1)]
     assert "slam.particles" in answers[2].missing

@@ -16,7 +16,7 @@ from app.robot.inbox import Inbox
 from app.robot.ros_graph import Publisher
 from app.robot.source import LiveSource
 from app.worker.internal_protocol import Begin, FromWorker, Opened, Report, Shown, ToWorker
-from app.worker.loop import Driver
+from app.worker.loop import WorkerLoop
 from app.worker.protocol import Advance, Open, Pause, Seek
 from app.worker.session import Session
 from pipeline.config import Parameters
@@ -99,7 +99,7 @@ class Stage:
 @contextmanager
 def stage() -> Iterator[Stage]:
     made = Stage()
-    thread = threading.Thread(target=Driver(made.session, made.commands, made.said.append).run)
+    thread = threading.Thread(target=WorkerLoop(made.session, made.commands, made.said.append).run)
     thread.start()
     try:
         yield made

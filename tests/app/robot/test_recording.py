@@ -22,7 +22,7 @@ from app.robot.address import parse_address
 from app.robot.inbox import SKIPPED
 from app.robot.recorder import NOT_RECORDED, RawFile, Recorder
 from app.robot.source import LiveSource
-from app.worker.replaying import recorded_parameters
+from app.worker.run_factory import recorded_parameters
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.io.readers import SourceOptions, open_source

@@ -28,7 +28,7 @@ from app.worker.internal_protocol import (
     Shown,
     ToWorker,
 )
-from app.worker.loop import Driver
+from app.worker.loop import WorkerLoop
 from app.worker.outbox import Mailbox, joined, rows_in_common
 from app.worker.protocol import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
 from app.worker.thin_frame import MOST_POINTS, picture_of
@@ -57,7 +57,7 @@ def driven(source: FakeSource, *commands: ToWorker) -> list[FromWorker]:
         now[0] += 0.001
         return now[0]
 
-    thread = threading.Thread(target=Driver(session, waiting, put, clock).run, daemon=True)
+    thread = threading.Thread(target=WorkerLoop(session, waiting, put, clock).run, daemon=True)
     thread.start()
     thread.join(20)
     assert not thread.is_alive()
@@ -106,7 +106,7 @@ def test_a_kernel_that_is_compiled_is_said_once_and_no_silence_follows() -> None
         if isinstance(message, Report) and message.status.state == "finished":
             commands.put(None)
 
-    driver = Driver(session, commands, put, itertools.count().__next__)
+    driver = WorkerLoop(session, commands, put, itertools.count().__next__)
     for command in (Open("fake:"), SetSpeed(0.0), Play()):
         commands.put(command)
     driver.run()
@@ -124,7 +124,7 @@ def test_an_answer_that_compiled_leaves_nothing_to_wait_for(monkeypatch: pytest.
     waiting: queue.Queue[ToWorker | None] = queue.Queue()
     for message in (Open("fake:"), AskTree(1, 1, 1), None):
         waiting.put(message)
-    driver = Driver(session, waiting, said.append)
+    driver = WorkerLoop(session, waiting, said.append)
 
     def compile_first(number: int) -> None:
         driver.compiling()
@@ -212,7 +212,7 @@ def test_of_a_slider_that_moves_only_the_last_value_is_mapped() -> None:
         values = Parameters().replace({"clustering.eps": 0.1 * k}).model_dump()
         commands.put(SetParameters(values, k))
     commands.put(None)
-    Driver(session, commands, said.append).run()
+    WorkerLoop(session, commands, said.append).run()
     assert shown(said) == [0]
     assert last_status(said).revision == 39
 
@@ -377,7 +377,7 @@ def test_who_asks_is_answered_and_the_run_goes_on_as_it_did() -> None:
     for message in (SetSpeed(0.0), Open("fake:"), begin, AskTree(1, 1, 9), AskCluster(2, 1, 0, 0)):
         waiting.put(message)
     waiting.put(AskCluster(3, 7, 0, 0))
-    Driver(make_session(FakeSource(6)), waiting, put).run()
+    WorkerLoop(make_session(FakeSource(6)), waiting, put).run()
     assert sorted(set(shown(said))) == list(range(6))
     answers = {message.ticket: message for message in said if isinstance(message, Answer)}
     assert set(answers) == {1, 2, 3}
@@ -397,7 +397,7 @@ def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None
     for message in (Open("fake:"), AskCluster(1, 1, 0, 0), AskCluster(2, 1, 0, 7), None):
         waiting.put(message)
     monkeypatch.setattr("app.explain.build.cluster_of_frame", lambda *_: cluster_story())
-    Driver(make_session(FakeSource(3)), waiting, said.append, recent=recent).run()
+    WorkerLoop(make_session(FakeSource(3)), waiting, said.append, recent=recent).run()
     answers = [message for message in said if isinstance(message, Answer)]
     assert answers[0].cluster == cluster_story()
     assert "no cluster 7" in answers[1].missing
@@ -415,7 +415,7 @@ def test_a_story_that_fails_is_logged_and_stops_nothing(
     said: list[FromWorker] = []
     for message in (Open("fake:"), AskTree(1, 1, 1), None):
         waiting.put(message)
-    Driver(session, waiting, said.append).run()
+    WorkerLoop(session, waiting, said.append).run()
     (answer,) = [message for message in said if isinstance(message, Answer)]
     assert "fault in stemmap" in answer.missing
     assert "on purpose" in capsys.readouterr().err
@@ -423,7 +423,7 @@ def test_a_story_that_fails_is_logged_and_stops_nothing(
 
 
 def test_no_more_scans_are_behind_than_the_run_has_left(monkeypatch):
-    driver = Driver(make_session(FakeSource(8)), queue.Queue(), lambda _: None)
+    driver = WorkerLoop(make_session(FakeSource(8)), queue.Queue(), lambda _: None)
     monkeypatch.setattr(driver._pacer, "behind", lambda _: 696)
     status = Status("playing", source="sim:stand", kind="simulation", scans=750, scan_index=545)
     assert driver._behind(status, 0.0) == 204

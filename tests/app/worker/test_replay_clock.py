@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.worker.replay_clock import Pacer
+from app.worker.replay_clock import LONGEST_DELAY_S, ReplayClock
 
 NS = 1_000_000_000
 
 
 @given(st.floats(0.1, 16.0), st.lists(st.integers(1, 10**9), min_size=1, max_size=20))
 def test_scans_are_due_in_the_time_of_the_data(speed: float, gaps_ns: list[int]) -> None:
-    pacer, stamp, now = Pacer(), 7 * NS, 100.0
+    pacer, stamp, now = ReplayClock(), 7 * NS, 100.0
     pacer.speed = speed
     assert pacer.delay(stamp, now) == 0.0
     for gap in gaps_ns:
@@ -24,7 +24,7 @@ def test_scans_are_due_in_the_time_of_the_data(speed: float, gaps_ns: list[int])
 
 
 def test_speed_0_waits_for_nothing() -> None:
-    pacer = Pacer()
+    pacer = ReplayClock()
     pacer.speed = 0.0
     assert [pacer.delay(k * NS, 5.0) for k in range(3)] == [0.0] * 3
     pacer.mapped(0, 5.0)
@@ -33,7 +33,7 @@ def test_speed_0_waits_for_nothing() -> None:
 
 
 def test_late_scans_are_counted() -> None:
-    pacer = Pacer()
+    pacer = ReplayClock()
     for k in range(5):
         pacer.delay(k * NS // 10, 0.0)
         pacer.mapped(k * NS // 10, 0.3 * (k + 1))  # each takes three times its time
@@ -43,7 +43,7 @@ def test_late_scans_are_counted() -> None:
 
 
 def test_on_time_is_not_behind() -> None:
-    pacer = Pacer()
+    pacer = ReplayClock()
     for k in range(5):
         pacer.delay(k * NS // 10, 0.1 * k)
         pacer.mapped(k * NS // 10, 0.1 * k + 0.01)
@@ -51,7 +51,7 @@ def test_on_time_is_not_behind() -> None:
 
 
 def test_a_pause_is_not_made_up_for() -> None:
-    pacer = Pacer()
+    pacer = ReplayClock()
     pacer.delay(0, 0.0)
     pacer.release()
     assert pacer.delay(NS, 60.0) == 0.0
@@ -59,8 +59,19 @@ def test_a_pause_is_not_made_up_for() -> None:
 
 
 def test_scans_of_equal_time_do_not_divide_by_zero() -> None:
-    pacer = Pacer()
+    pacer = ReplayClock()
     for _ in range(3):
         pacer.delay(NS, 1.0)
         pacer.mapped(NS, 1.0)
     assert (pacer.behind(9.0), pacer.rate_hz) == (0, 0.0)
+
+
+@pytest.mark.parametrize("speed", [5e-324, 1e-300, 1e-9])
+def test_a_tiny_speed_gives_delays_that_a_clock_can_wait_for(speed: float) -> None:
+    clock = ReplayClock()
+    clock.speed = speed
+    assert clock.delay(0, 5.0) == 0.0
+    assert 0.0 < clock.delay(10**18, 5.0) <= LONGEST_DELAY_S
+    clock.mapped(10**17, 5.0)
+    clock.mapped(10**18, 5.1)
+    assert clock.behind(6.0) == 0

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from app.worker.session import Session
-from app.worker.session_status import Said, describe
+from app.worker.protocol import Status
+from app.worker.session import Session, with_robot
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.types.records import Frame, Step
@@ -470,5 +470,5 @@ def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str)
         robots=["a"],
         recording="",
     )
-    told = describe(None, cast(Any, robot), Said("playing", "", "zenoh:", 0.0, (), 0, "", None))
+    told = with_robot(Status(state="playing", source="zenoh:"), cast(Any, robot))
     assert (told.state, told.detail) == (state, "" if waiting else "Nothing heard for 3 s")

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.batch.run_health import MOST_SPANS, RunHealth
 from app.dashboard.payload import JUST_BEGUN, health_payload, health_word
-from app.worker.run_health import MOST_SPANS, RunHealth
 from pipeline.types.pose_health import Health, HealthState
 from pipeline.types.records import Frame
 from tests.app import fakes
