@@ -424,7 +424,7 @@ def test_a_story_that_fails_is_logged_and_stops_nothing(
 
 def test_no_more_scans_are_behind_than_the_run_has_left(monkeypatch):
     driver = WorkerLoop(make_session(FakeSource(8)), queue.Queue(), lambda _: None)
-    monkeypatch.setattr(driver._pacer, "behind", lambda _: 696)
+    monkeypatch.setattr(driver._replay, "behind", lambda _: 696)
     status = Status("playing", source="sim:stand", kind="simulation", scans=750, scan_index=545)
     assert driver._behind(status, 0.0) == 204
     assert driver._behind(replace(status, scans=None), 0.0) == 696  # nobody knows how many there are
