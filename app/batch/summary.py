@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.common.text import count
 from app.batch.run_health import RunHealth
+from app.common.text import count
 from pipeline.evaluation import Evaluation, PathError, Rate
 from pipeline.types.records import Frame, Path, Verdict
 
