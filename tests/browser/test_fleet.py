@@ -109,8 +109,8 @@ def test_a_robot_keeps_its_letter_and_colour_when_another_leaves(chromium: Brows
         assert (letter("red"), letter("blue")) == ("A", "B")
         tell("blue")
         assert letter("blue") == "B"
-        assert page.evaluate("window.letters") == ["B"]
+        assert set(page.evaluate("window.letters")) == {"B"}
         tell("green", "blue", "red")
         assert [letter(name) for name in ("green", "blue", "red")] == ["C", "B", "A"]
-        assert sorted(page.evaluate("window.letters")) == ["A", "B", "C"]
+        assert set(page.evaluate("window.letters")) == {"A", "B", "C"}
     context.close()

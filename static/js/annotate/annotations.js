@@ -26,7 +26,8 @@ export const draft = {
   undo: 0,
   redo: 0,
 };
-let votes = { needed: 0, of: new Map() }; // of the decision trees for each found tree, by its number
+const NO_VOTES = { needed: 0, of: new Map(), known: false };
+let votes = NO_VOTES; // of the decision trees for each found tree, by its number
 let skipped = []; // numbers of skipped trees, the one skipped last at the end
 const versions = new Map(); // "id:version" of a row as it was shown, to the version that an own edit made of it
 let last = Promise.resolve(), nudging = 0;
@@ -146,10 +147,9 @@ export function votesText({ number }) {
 }
 
 const updateVotes = throttled(async () => {
-  if (!annotating()) return;
   const answer = await attempted(() => get("/api/doubts"));
   if (!answer) return;
-  votes = { needed: answer.needed, of: new Map(answer.trees.map((each) => [each.tree, each])) };
+  votes = { needed: answer.needed, of: new Map(answer.trees.map((each) => [each.tree, each])), known: true };
   news();
 }, VOTES_EVERY);
 
@@ -163,11 +163,13 @@ export async function review(kind) {
   const row = annotationOf(tree);
   if (row) await change(row, { kind });
   else await add({ x: tree.x, y: tree.y, kind });
-  if (!draft.error && state.selected === tree.number) next();
+  if (!draft.error && state.selected === tree.number) await next();
 }
 
-// Selects the most doubtful tree without annotation other than the selected one, which counts as skipped.
-export function next() {
+// Selects the most doubtful tree without annotation other than the selected one, which counts as skipped. The order needs the
+// votes: a key pressed before they have arrived waits for them.
+export async function next() {
+  if (!votes.known) await updateVotes.now();
   const left = unreviewed();
   if (left.some(({ number }) => number === state.selected)) skipped = [...skipped.filter((number) => number !== state.selected), state.selected];
   const [tree = null] = unreviewed().filter(({ number }) => number !== state.selected || left.length === 1);
@@ -243,11 +245,12 @@ export function startAnnotating() {
       Object.assign(draft, { moved: null, error: "" });
       versions.clear();
       skipped = [];
+      votes = NO_VOTES;
       updateUndo();
     }
     news();
   });
-  on("remapped", () => { skipped = []; }); // numbers may belong to other trees now
-  on("map tab", updateVotes);
+  on("remapped", () => { skipped = []; votes = NO_VOTES; }); // numbers may belong to other trees now
+  on("map tab", () => { if (annotating()) updateVotes(); });
   on("tab", () => annotating() || !draft.adding || toggleAdding(false));
 }

@@ -32,7 +32,7 @@ export const state = {
 // --- selectors ---------------------------------------------------------------------------------
 
 export const trees = () => state.map?.trees ?? [];
-export const treeOf = (number) => trees().find((tree) => tree.number === number) ?? null;
+const treeOf = (number) => trees().find((tree) => tree.number === number) ?? null;
 export const selectedTree = () => treeOf(state.selected);
 export const isPlaying = () => state.status?.state === "playing";
 
