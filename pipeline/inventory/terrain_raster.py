@@ -12,10 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int32
+
+UInt64 = NDArray[np.uint64]
 
 CELL = 0.5  # m
 KEPT = 8  # lowest returns of a cell
@@ -63,16 +66,17 @@ class LowestReturns:
         self._low = low.astype(np.float64)
         self._lowest = np.full((shape[0], shape[1], KEPT, 3), np.inf, np.float32)
         self._count = np.zeros((shape[0], shape[1]), np.int32)
+        self._occupied = np.zeros((shape[0], shape[1]), np.uint64)  # a bit per height bin, modulo 64
 
     @staticmethod
     def room(low: Float, high: Float) -> int:
         """Bytes that a raster between two corners takes."""
         columns, rows = (max(int(np.ceil(v / CELL)), 1) for v in (high - low).tolist())
-        return columns * rows * (12 * KEPT + 4)
+        return columns * rows * (12 * KEPT + 4 + 8)
 
     def add(self, points: Float32) -> None:
         """Take points of shape (N, 3) [m]."""
-        _keep_lowest(points, self._low, self._lowest, self._count)
+        _keep_lowest(points, self._low, self._lowest, self._count, self._occupied)
 
     def ground(self, slope_max: float) -> HeightMap:
         """The ground under all points so far.
@@ -81,11 +85,12 @@ class LowestReturns:
             slope_max: The terrain never rises steeper than this against the plane of the plot [rad].
         """
         ground = _supported(self._lowest, self._count)
+        continuous = _continues_upwards(ground, self._occupied)
         trend = _trend(ground)
         ground[:, :, 2] -= ground[:, :, 0] * trend[0] + ground[:, :, 1] * trend[1] + trend[2]
         for _ in range(2):
-            _forget_pits(ground)
-        _forget_what_overhangs(ground, float(np.tan(slope_max)))
+            _remove_pits(ground, continuous)
+        _remove_overhanging(ground, float(np.tan(slope_max)))
         height, seen = _planes(ground, self._low)
         _fill(height)
         x = self._low[0] + (np.arange(height.shape[0]) + 0.5) * CELL
@@ -100,7 +105,7 @@ def heights_above(points: Float32, ground: HeightMap) -> Float32:
 
 
 @compiled
-def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32) -> None:
+def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occupied: UInt64) -> None:
     columns, rows = count.shape
     for i in range(points.shape[0]):
         a = int(np.floor((points[i, 0] - low[0]) / CELL))
@@ -110,6 +115,7 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32) -> 
         cell = lowest[a, b]
         count[a, b] += 1
         z = points[i, 2]
+        occupied[a, b] |= _height_bit(z, 0)
         if z >= cell[KEPT - 1, 2]:
             continue
         k = KEPT - 1
@@ -122,9 +128,18 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32) -> 
 
 
 @compiled
+def _height_bit(z: float, bins_above: int) -> np.uint64:
+    """Return the bit of the height bin of z, or of a bin above it; bins are half of PIT high."""
+    return np.uint64(1) << np.uint64((int(np.floor(z / (0.5 * PIT))) + bins_above) & 63)
+
+
+@compiled
 def _supported(lowest: Float32, count: Int32) -> Float:
-    """Of each cell the lowest return that has two more close above it; where there are fewer than three
-    returns, the lowest. Shape (columns, rows, 3), z inf where nothing was seen."""
+    """Return the lowest return of each cell that has two more returns close above it.
+
+    Cells with fewer than three returns give their lowest return. Shape (columns, rows, 3) [m]; an empty cell
+    has infinite z.
+    """
     columns, rows = count.shape
     ground = np.full((columns, rows, 3), np.inf)
     for a in range(columns):
@@ -175,14 +190,22 @@ def _trend(ground: Float) -> Float:
 
 
 @compiled
-def _forget_pits(ground: Float) -> None:
-    """Take away cells that lie far below nearly all of their neighbours: noise below the ground."""
+def _remove_pits(ground: Float, continuous: Bool) -> None:
+    """Remove isolated returns far below nearly all neighbouring cells: noise below the ground.
+
+    Returns that continue upwards without a gap for the depth of a pit are not noise but, for example, the
+    foot of a stem. In a cloud with little ground, the neighbours of such a cell are crowns.
+
+    Args:
+        ground: Lowest returns, shape (columns, rows, 3) [m]; removed cells get infinite z.
+        continuous: Result of `_continues_upwards`, shape (columns, rows).
+    """
     columns, rows = ground.shape[0], ground.shape[1]
     before = ground[:, :, 2].copy()
     around = np.empty(25)
     for a in range(columns):
         for b in range(rows):
-            if before[a, b] == np.inf:
+            if before[a, b] == np.inf or continuous[a, b]:
                 continue
             n = 0
             for i in range(max(a - 2, 0), min(a + 3, columns)):
@@ -196,9 +219,27 @@ def _forget_pits(ground: Float) -> None:
 
 
 @compiled
-def _forget_what_overhangs(ground: Float, slope: float) -> None:
-    """Take away cells that rise steeper than `slope` above a lower cell: the cone of each cell is carried
-    over the raster by two sweeps there and back (a chamfer distance)."""
+def _continues_upwards(ground: Float, occupied: UInt64) -> Bool:
+    """Return whether the height bins above the lowest return of each cell are occupied for the depth of a
+    pit."""
+    columns, rows = occupied.shape
+    continuous = np.zeros((columns, rows), np.bool_)
+    for a in range(columns):
+        for b in range(rows):
+            z = ground[a, b, 2]
+            if z < np.inf:
+                first, second = occupied[a, b] & _height_bit(z, 1), occupied[a, b] & _height_bit(z, 2)
+                continuous[a, b] = first != 0 and second != 0
+    return continuous
+
+
+@compiled
+def _remove_overhanging(ground: Float, slope: float) -> None:
+    """Remove cells that are steeper than `slope` above a lower cell.
+
+    The cone of the maximum slope of each cell is propagated over the raster by two passes in each direction
+    (a chamfer distance).
+    """
     columns, rows = ground.shape[0], ground.shape[1]
     cone = ground[:, :, 2].copy()
     straight, across = slope * CELL, slope * CELL * np.sqrt(2.0)

@@ -30,6 +30,21 @@ def test_stems_of_known_places_and_diameters_are_found(slope, sigma):
     assert np.abs(m.trees.dbh[row] - 2.0 * PLACES[:, 2]).max() < 4.0 * np.nanmax(m.trees.dbh_sigma)
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.35])
+def test_stems_are_found_in_a_cloud_without_ground_returns(slope):
+    """Only the feet of the stems show the ground; everywhere else, the lowest returns are crowns."""
+    rng = np.random.default_rng(7)
+    parts = [stem(x, y, r, rng, slope=slope, height=10.0, per_m2=3000) for x, y, r in PLACES]
+    x, y = rng.uniform(0.0, 15.0, (2, 60_000))
+    parts.append(np.column_stack([x, y, hill(x, y, slope) + rng.uniform(7.0, 10.0, len(x))]))
+    m = map_plot(Made(np.concatenate(parts)), FOREST)
+    thick = PLACES[PLACES[:, 2] > 0.09]  # a thin stem without branches counts as a pole
+    row, away = errors(m.trees.position, thick)
+    assert len(m.trees.number) == len(thick)
+    assert away.max() < 0.03
+    assert np.abs(m.trees.dbh[row] - 2.0 * thick[:, 2]).max() < 0.012
+
+
 def test_lean_and_taper_are_told():
     rng = np.random.default_rng(2)
     points = np.concatenate(
