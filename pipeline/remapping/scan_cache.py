@@ -65,7 +65,7 @@ class ScanCache:
         most: Size that the file may reach. A scan that does not fit is not stored.
 
     Attributes:
-        refusal: Why scans are not stored, for people; empty while they are.
+        refusal: Why some scans are not stored, for people; empty where all are.
         notice: What is wrong with the file that was found, for people; empty where nothing is.
     """
 
@@ -121,7 +121,6 @@ class ScanCache:
             return
         self._rows[step.index] = (self._end + ROW.itemsize, row)
         self._end += ROW.itemsize + len(block)
-        self.refusal = ""
 
     def read(self, index: int, stamp_ns: int | None = None) -> tuple[Step, SegmentedScan] | None:
         """A scan without its raw points; None where it is not stored.
