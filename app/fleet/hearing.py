@@ -15,7 +15,7 @@ import time
 from app.fleet.results import TOPICS, UNREADABLE, Results
 from app.robot.address import ZenohAddress, parse_address
 from app.robot.inbox import Inbox
-from app.robot.zenoh_link import ZenohLink
+from app.robot.zenoh import ZenohLink
 from pipeline.io.readers.container import Channel
 from pipeline.io.recording import outputs
 

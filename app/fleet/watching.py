@@ -12,7 +12,7 @@ from app.fleet.names import NAMELESS, address_of, recorded_apart
 from app.fleet.tasks import end
 from app.robot.address import ZenohAddress
 from app.robot.inbox import Inbox
-from app.robot.zenoh_link import ZenohLink
+from app.robot.zenoh import ZenohLink
 from app.worker.protocol import Open
 
 _LOOK_S = 0.5

@@ -4,27 +4,63 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, Protocol
 
 from app.robot.address import ALL_ROBOTS, DdsAddress, VelodyneAddress, ZenohAddress, parse_address
-from app.robot.choosing import SCAN_TYPES, Choice, choose
+from app.robot.dds import DdsLink
 from app.robot.inbox import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox
-from app.robot.kept_pictures import KeptPictures
-from app.robot.links import KIND, Link, link_for
+from app.robot.picture_store import PictureStore
+from app.robot.publisher import RosPublisher
 from app.robot.recorder import Recorder
-from app.robot.ros_graph import Publisher
-from app.robot.ros_publisher import RosPublisher
-from app.robot.zenoh_link import ZenohLink
+from app.robot.topics import SCAN_TYPES, Choice, Publisher, choose
+from app.robot.velodyne import VelodyneLink
+from app.robot.zenoh import ZenohLink
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
+from pipeline.io.readers.container import Channel
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
 from pipeline.io.recording import outputs
 from pipeline.types.records import Frame, Path, Record, Truth
+
+KIND, VELODYNE_KIND, DDS_KIND = "ROS 2 over Zenoh", "Velodyne sensor", "ROS 2 over DDS"
+
+
+class Link(Protocol):
+    """What a source needs of `ZenohLink`."""
+
+    problem: str
+    losses: dict[str, int]
+    scans: int
+    version: int
+
+    @property
+    def session(self) -> Any: ...  # noqa: ANN401
+    @property
+    def place(self) -> str: ...
+    @property
+    def nothing(self) -> str: ...
+    @property
+    def silence_s(self) -> float | None: ...
+    def publishers(self) -> list[Publisher]: ...
+    def robots(self) -> list[str]: ...
+    def subscribe(self, channels: Sequence[Channel]) -> None: ...
+    def close(self) -> None: ...
+
+
+MakeLink = Callable[[Any, Inbox], Link]
+
+
+def link_for(address: ZenohAddress | VelodyneAddress | DdsAddress) -> tuple[MakeLink, str]:
+    """What connects to an address, given it and an inbox; and the kind of such a source for people."""
+    if isinstance(address, VelodyneAddress):
+        return VelodyneLink, VELODYNE_KIND
+    return (DdsLink, DDS_KIND) if isinstance(address, DdsAddress) else (ZenohLink, KIND)
+
 
 #: A robot's nodes start one after another: its topics are chosen this long after the first scan topic [s].
 _SETTLE_S = 1.0
@@ -74,7 +110,7 @@ class LiveSource:
         self._publisher: RosPublisher | None = None
         self._map_at_s = -_MAP_PAUSE_S
         self._camera: LiveCamera | None = None
-        self._kept: KeptPictures | None = None
+        self._kept: PictureStore | None = None
         self._failure: SourceError | None = None
         self._watch: threading.Thread | None = None
 
@@ -188,7 +224,7 @@ class LiveSource:
         Raises:
             OSError: The file for them cannot be made.
         """
-        self._kept = KeptPictures(folder)
+        self._kept = PictureStore(folder)
 
     # --- as something live -----------------------------------------------------------------------
 

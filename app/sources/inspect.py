@@ -9,9 +9,9 @@ from math import degrees
 from typing import Any
 
 from app.robot.address import parse_address
-from app.robot.counting import CountingInbox, Heard, countable
-from app.robot.links import link_for
-from app.robot.ros_graph import Publisher
+from app.robot.inbox import CountingInbox, Heard
+from app.robot.source import link_for
+from app.robot.topics import Publisher, countable
 from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.base import RecordedTopic

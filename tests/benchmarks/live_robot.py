@@ -17,8 +17,7 @@ from typing import Any
 import zenoh
 from zenoh import ext
 
-from app.robot.ros_graph import ADMIN, PUBLISHER, data_key
-from app.robot.zenoh_link import configuration
+from app.robot.zenoh import ADMIN, PUBLISHER, configuration, data_key
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.ros_messages import POINT_CLOUD
 

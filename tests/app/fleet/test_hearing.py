@@ -13,8 +13,8 @@ import pytest
 from app.fleet.hearing import Hearing
 from app.fleet.results import UNREADABLE, Results
 from app.robot.inbox import Inbox
-from app.robot.ros_graph import Publisher
-from app.robot.zenoh_link import ZenohLink
+from app.robot.topics import Publisher
+from app.robot.zenoh import ZenohLink
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.recording import outputs
 from pipeline.types.clearance import Clearance, Zone

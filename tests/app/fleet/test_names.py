@@ -7,8 +7,7 @@ import pytest
 from app.fleet.names import NAMELESS, address_of, recorded_apart
 from app.fleet.watching import Watching
 from app.robot.address import ROOT, ZenohAddress, parse_address
-from app.robot.choosing import choose
-from app.robot.ros_graph import Publisher
+from app.robot.topics import Publisher, choose
 from app.worker.protocol import Open
 from pipeline.io.readers.ros_messages import POINT_CLOUD
 from tests.app.fleet.test_fleet import make

@@ -13,9 +13,8 @@ import pytest
 
 from app.fleet.names import address_of
 from app.robot.address import ZenohAddress, parse_address
-from app.robot.ros_graph import data_key
 from app.robot.source import LiveSource, open_live
-from app.robot.zenoh_link import configuration
+from app.robot.zenoh import configuration, data_key
 from pipeline.errors import SourceError
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.recording import outputs

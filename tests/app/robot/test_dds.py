@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from app.robot.address import DdsAddress, parse_address
-from app.robot.dds_discovery import DdsGraph, Offer
-from app.robot.ros_graph import Publisher
+from app.robot.dds import DdsGraph, Offer
 from app.robot.source import LiveSource, open_live
+from app.robot.topics import Publisher
 from pipeline.errors import SourceError
 from pipeline.io.readers.ros_messages import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
 from pipeline.types.records import Odometry, Record, Scan
@@ -87,7 +87,7 @@ def test_a_reader_asks_for_no_more_than_all_writers_offer():
 
 def test_the_types_are_those_that_recordings_are_written_with(drive: Path):
     idl = pytest.importorskip("cyclonedds.idl", reason="cyclonedds, an extra, is not installed")
-    from app.robot.dds_types import idl_type
+    from app.robot.dds import idl_type
 
     for msgtype in set(READ_TYPES) - {ROS1_TRANSFORMS}:
         package, _, name = msgtype.split("/")
@@ -155,7 +155,7 @@ def test_a_writer_in_cdr_is_heard(drive: Path):
     from cyclonedds.pub import DataWriter
     from cyclonedds.topic import Topic
 
-    from app.robot.dds_types import idl_type
+    from app.robot.dds import idl_type
 
     with closing(open_live(f"dds:?domain={DOMAIN}")) as source:
         until(lambda: not source.listen() and "no scans are announced" in source.waiting_for())

@@ -11,7 +11,6 @@ import pytest
 
 from app.batch.tree_pictures import keep_pictures
 from app.robot.address import parse_address
-from app.robot.choosing import PICTURE_TYPES, choose
 from app.robot.inbox import (
     LARGEST_PICTURE,
     MAX_PICTURE_BYTES,
@@ -21,10 +20,10 @@ from app.robot.inbox import (
     PICTURES_TOO_LARGE,
     Inbox,
 )
-from app.robot.kept_pictures import FULL, REFUSED, SPARED, KeptPictures
+from app.robot.picture_store import FULL, REFUSED, SPARED, PictureStore
 from app.robot.recorder import Recorder
-from app.robot.ros_graph import Publisher
 from app.robot.source import LiveSource, open_live
+from app.robot.topics import PICTURE_TYPES, Publisher, choose
 from app.worker.camera import camera_picture, has_camera
 from pipeline.errors import StemmapError
 from pipeline.io.readers import SourceOptions, open_source
@@ -172,8 +171,8 @@ def test_each_tree_gets_a_picture_of_those_that_were_put_aside(run: Path, tmp_pa
 
 
 def test_what_is_put_aside_is_bounded_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("app.robot.kept_pictures.MOST_BYTES", 25)
-    with closing(KeptPictures(tmp_path)) as kept:
+    monkeypatch.setattr("app.robot.picture_store.MOST_BYTES", 25)
+    with closing(PictureStore(tmp_path)) as kept:
         for k in range(1, 5):
             assert kept.is_due(way(list(range(1, 3 * k))))
             kept.add(Picture(k, "", 0, 0, 0, bytes([k]) * 10), way(list(range(1, 3 * k))))
@@ -185,8 +184,8 @@ def test_what_is_put_aside_is_bounded_and_counted(tmp_path: Path, monkeypatch: p
 
 def test_the_disk_keeps_its_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     free = [SPARE_BYTES + 10, SPARE_BYTES + 9]
-    monkeypatch.setattr("app.robot.kept_pictures.free_space", lambda _: free.pop(0))
-    with closing(KeptPictures(tmp_path)) as kept:
+    monkeypatch.setattr("app.robot.picture_store.free_space", lambda _: free.pop(0))
+    with closing(PictureStore(tmp_path)) as kept:
         for stamp_ns in (1, 2):
             kept.add(Picture(stamp_ns, "", 0, 0, 0, bytes(10)), way([1]))
         assert kept.stamps() == [1]
@@ -199,8 +198,8 @@ def test_a_full_disk_costs_pictures_and_nothing_else(tmp_path: Path, monkeypatch
         del dir
         return Path("/dev/full").open("w+b", **how)
 
-    monkeypatch.setattr("app.robot.kept_pictures.tempfile.TemporaryFile", full)
-    with closing(KeptPictures(tmp_path)) as kept:
+    monkeypatch.setattr("app.robot.picture_store.tempfile.TemporaryFile", full)
+    with closing(PictureStore(tmp_path)) as kept:
         kept.add(Picture(1, "", 0, 0, 0, bytes(10)), way([1]))
         assert kept.losses == {REFUSED: 1}
         assert list(kept.at(kept.stamps())) == []
@@ -284,7 +283,7 @@ def test_pictures_arrived_over_plain_dds(run: Path):
     from cyclonedds.pub import DataWriter
     from cyclonedds.topic import Topic
 
-    from app.robot.dds_types import idl_type
+    from app.robot.dds import idl_type
 
     with closing(open_live(f"dds:?domain={DOMAIN}")) as source:
         participant, writers = DomainParticipant(DOMAIN), dict[str, Any]()

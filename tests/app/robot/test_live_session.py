@@ -13,8 +13,8 @@ import pytest
 
 from app.robot.address import ZenohAddress, parse_address
 from app.robot.inbox import Inbox
-from app.robot.ros_graph import Publisher
 from app.robot.source import LiveSource
+from app.robot.topics import Publisher
 from app.worker.internal_protocol import Begin, FromWorker, Opened, Report, Shown, ToWorker
 from app.worker.loop import WorkerLoop
 from app.worker.protocol import Advance, Open, Pause, Seek

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import socket
 import threading
+from contextlib import closing
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.robot.address import VelodyneAddress, ZenohAddress, is_live, parse_address
-from app.robot.choosing import choose
 from app.robot.inbox import MAX_BYTES, MAX_OTHERS, MAX_SCANS, SKIPPED, Inbox
-from app.robot.ros_graph import Publisher, RosGraph, data_key, publisher_of
-from app.robot.zenoh_link import ZenohLink
+from app.robot.topics import Publisher, choose
+from app.robot.velodyne import VelodyneLink
+from app.robot.zenoh import RosGraph, ZenohLink, data_key, publisher_of
 from pipeline.errors import SourceError
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.ros_messages import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, TRANSFORMS
+from tests.app.robot.conftest import free_port, until
 
 NAMES = st.from_regex(r"\A[a-z][a-z0-9_]{0,8}\Z")
 
@@ -90,7 +93,7 @@ def test_any_text_is_a_token_or_none(text: str):
 
 
 def test_a_network_with_too_many_topics_is_told_of_and_room_comes_back(monkeypatch):
-    monkeypatch.setattr("app.robot.ros_graph.MOST_ENDPOINTS", 2)
+    monkeypatch.setattr("app.robot.zenoh.MAX_ENDPOINTS", 2)
     token = "@ros2_lv/0/abc/0/{}/MP/%/%/driver/%topic{}/std_msgs::msg::dds_::Empty_/RIHS01_00/::,10:,:,:,,"
     first, second, third = (token.format(k, k) for k in range(3))
     graph = RosGraph()
@@ -144,6 +147,77 @@ def test_a_session_that_opens_after_the_end_is_closed(monkeypatch: pytest.Monkey
     assert closed.wait(60)
     link._thread.join(60)
     assert link.session is None
+
+
+def test_a_connection_that_fails_half_way_is_tried_again(monkeypatch: pytest.MonkeyPatch):
+    zenoh = pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed")
+    sessions: list[FailingSession] = []
+
+    class FailingSession:
+        closed = False
+        routers: list[str] = ["router"]  # noqa: RUF012
+
+        @property
+        def info(self) -> FailingSession:
+            return self
+
+        def routers_zid(self) -> list[str]:
+            return self.routers
+
+        def liveliness(self) -> FailingSession:
+            return self
+
+        def declare_subscriber(self, *_arguments: object, **_named: object) -> None:
+            if len(sessions) == 1:
+                raise RuntimeError("refused half way")
+
+        def close(self) -> None:
+            self.closed = True
+
+    def opened(_configuration: object) -> FailingSession:
+        sessions.append(FailingSession())
+        return sessions[-1]
+
+    monkeypatch.setattr("app.robot.zenoh._RETRY_S", 0.05)
+    monkeypatch.setattr(zenoh, "open", opened)
+    address = parse_address("zenoh:tcp/127.0.0.1:9")
+    assert isinstance(address, ZenohAddress)
+    problems: list[str] = []
+    monkeypatch.setattr(
+        ZenohLink, "problem", property(lambda _: problems[-1], lambda _, p: problems.append(p))
+    )
+    link = ZenohLink(address, Inbox())
+    until(lambda: link.problem == "")
+    assert "no connection to tcp/127.0.0.1:9: refused half way" in problems
+    assert sessions[0].closed
+    sessions[1].routers = []
+    until(lambda: link.problem == "no connection to tcp/127.0.0.1:9")
+    link.close()
+    assert sessions[1].closed
+
+
+def test_a_sensor_link_goes_on_after_an_error_of_any_kind(monkeypatch: pytest.MonkeyPatch):
+    address = parse_address(f"velodyne:127.0.0.1:{free_port()}")
+    assert isinstance(address, VelodyneAddress)
+    failures = ["out of order"]
+
+    def take(_link: VelodyneLink, packet: bytes, _sender: str) -> None:
+        if failures:
+            raise ValueError(failures.pop())
+        taken.append(packet)
+
+    taken: list[bytes] = []
+    monkeypatch.setattr(VelodyneLink, "_take", take)
+    monkeypatch.setattr("app.robot.velodyne._RETRY_S", 0.05)
+    link = VelodyneLink(address, Inbox())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender, closing(link):
+
+        def sent() -> bool:
+            sender.sendto(b"packet", (address.host, address.port))
+            return bool(taken)
+
+        until(sent)
+        until(lambda: link.problem == "")
 
 
 def there(*topics: tuple[str, str, str]) -> list[Publisher]:

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from app.robot.inbox import SKIPPED
 from app.robot.source import open_live
-from app.robot.sweeps import Sweeps
-from app.robot.velodyne_link import NO_DATA, OTHERS
+from app.robot.velodyne import NO_DATA, OTHERS, Sweeps
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import ArrivalReader

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from app.robot.source import LiveSource, open_live
-from app.robot.zenoh_link import LOST_SCANS
+from app.robot.zenoh import LOST_SCANS
 from pipeline.io.recording import outputs
 from pipeline.types.clearance import Clearance, Zone
 from pipeline.types.records import Odometry, Record, Scan

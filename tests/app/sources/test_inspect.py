@@ -12,7 +12,7 @@ import pytest
 
 from app.common.settings import Settings
 from app.robot.inbox import Inbox
-from app.robot.ros_graph import Publisher
+from app.robot.topics import Publisher
 from app.sources import inspect
 from app.sources.opening import open_any
 from app.sources.request import SourceRequest

@@ -1,4 +1,4 @@
-"""ROS 2 over plain DDS, by CycloneDDS (an extra): topics by discovery, messages as they came, in CDR."""
+"""ROS 2 over plain DDS, by CycloneDDS (an extra): topics by discovery, messages as CDR bytes."""
 
 from __future__ import annotations
 
@@ -6,17 +6,126 @@ import os
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
+from rosbags.interfaces import Nodetype
+
 from app.robot.address import DdsAddress
-from app.robot.choosing import PICTURE_TYPES, SCAN_TYPES
-from app.robot.dds_discovery import DdsGraph, Offer
-from app.robot.dds_types import idl_type
 from app.robot.inbox import ArrivalTimes, Inbox
-from app.robot.ros_graph import Publisher
-from app.robot.zenoh_link import LOST_SCANS, MESSAGE_LIMIT
+from app.robot.topics import MAX_ENDPOINTS, NAME, PICTURE_TYPES, SCAN_TYPES, TYPE, Publisher
+from app.robot.zenoh import LOST_SCANS, MESSAGE_LIMIT, TOO_MANY, first_line
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
+from pipeline.io.readers.ros_messages import standard_types
+
+_STRING = "string"
+
+
+@cache
+def idl_type(msgtype: str) -> Any:  # noqa: ANN401 - cyclonedds is an extra, and imported where it is used
+    """The IDL structure of a message, under the name that ROS 2 gives it on the network.
+
+    Args:
+        msgtype: In the ROS 2 spelling, e.g. "sensor_msgs/msg/PointCloud2".
+
+    Returns:
+        A class of cyclonedds, named e.g. "sensor_msgs.msg.dds_.PointCloud2_".
+    """
+    from cyclonedds.idl import make_idl_struct
+
+    package, _, name = msgtype.split("/")
+    fields = standard_types("cdr").fielddefs[msgtype][1]
+    members = {field: _kind(kind) for field, kind in fields}
+    return make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", members)
+
+
+def _kind(described: Any) -> Any:  # noqa: ANN401 - as rosbags describes a field
+    from cyclonedds.idl import types
+
+    node, detail = described
+    if node == Nodetype.BASE:
+        plain = {"bool": bool, _STRING: str, "byte": types.uint8, "octet": types.uint8, "char": types.uint8}
+        return plain.get(detail[0]) or getattr(types, detail[0])
+    if node == Nodetype.NAME:
+        return idl_type(detail)
+    inner, length = detail
+    if node == Nodetype.ARRAY:
+        return types.array[_kind(inner), length]
+    return types.sequence[_kind(inner), length] if length else types.sequence[_kind(inner)]
+
+
+_PREFIX, _LONGEST = "rt/", 256
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """What a writer says of itself.
+
+    Attributes:
+        topic, msgtype: In the ROS 2 spelling.
+        reliable: Whether it sends again what got lost.
+        latched: Whether it keeps what it said for who comes late.
+    """
+
+    topic: str
+    msgtype: str
+    reliable: bool
+    latched: bool
+
+    @classmethod
+    def of(cls, topic: str, type_name: str, *, reliable: bool, latched: bool) -> Offer | None:
+        """A writer by the names that it announces; None where it writes no topic of ROS."""
+        if len(topic) > _LONGEST or len(type_name) > _LONGEST or not topic.startswith(_PREFIX):
+            return None
+        name, kind = topic[len(_PREFIX) - 1 :], TYPE.fullmatch(type_name)
+        if kind is None or not NAME.fullmatch(name):
+            return None
+        return cls(name, f"{kind[1]}/msg/{kind[2]}", reliable, latched)
+
+
+class DdsGraph:
+    """The writers that are alive now.
+
+    Args:
+        robot: Its topics alone count, those below `/robot/`; "" takes all as those of one robot.
+    """
+
+    def __init__(self, robot: str) -> None:
+        self._robot = robot
+        self._alive: dict[str, Offer] = {}
+
+    def add(self, key: str, offer: Offer | None, losses: dict[str, int]) -> bool:
+        """A writer was announced; whether that changes anything."""
+        if offer is None or self._alive.get(key) == offer:
+            return False
+        if len(self._alive) >= MAX_ENDPOINTS:
+            count_loss(losses, TOO_MANY)
+            return False
+        self._alive[key] = offer
+        return True
+
+    def remove(self, key: str) -> bool:
+        """A writer is gone; whether it was known."""
+        return self._alive.pop(key, None) is not None
+
+    def publishers(self) -> list[Publisher]:
+        """All topics that are written, each once, by name."""
+        found = {(self._owner(offer.topic), offer.topic, offer.msgtype) for offer in self._alive.values()}
+        return [Publisher(*each) for each in sorted(found)]
+
+    def common(self, topic: str, msgtype: str) -> Offer | None:
+        """What all writers of a topic offer, None where there is none."""
+        there = [o for o in self._alive.values() if (o.topic, o.msgtype) == (topic, msgtype)]
+        if not there:
+            return None
+        reliable = all(offer.reliable for offer in there)
+        return Offer(topic, msgtype, reliable, reliable and all(offer.latched for offer in there))
+
+    def _owner(self, topic: str) -> str:
+        return self._robot if self._robot and topic.startswith(f"/{self._robot}/") else ""
+
 
 _RETRY_S = 1.0
 _WAIT_NS = 50_000_000
@@ -115,7 +224,7 @@ class DdsLink:
             try:
                 self._take_part()
             except Exception as error:  # whatever CycloneDDS says of networks, interfaces and itself
-                self.problem = f"cannot take part in DDS domain {self._address.domain}: {_short(error)}"
+                self.problem = f"cannot take part in DDS domain {self._address.domain}: {first_line(error)}"
                 self._closing.wait(_RETRY_S)
 
     def _take_part(self) -> None:
@@ -262,7 +371,3 @@ class _Reader:
         """What came since, each in CDR."""
         found = self._reader.take(self.depth)
         return [sample.payload for sample in found if isinstance(sample, _Sample)]
-
-
-def _short(error: Exception) -> str:
-    return str(error).partition("\n")[0][:200] or type(error).__name__

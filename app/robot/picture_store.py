@@ -29,7 +29,7 @@ class _Kept(NamedTuple):
     length: int
 
 
-class KeptPictures:
+class PictureStore:
     """A file without a name, which goes with the process.
 
     Args:

@@ -1,4 +1,4 @@
-"""A Velodyne sensor's UDP packets, from one sender alone."""
+"""A Velodyne sensor without ROS: UDP packets of one sender, joined to sweeps."""
 
 from __future__ import annotations
 
@@ -6,21 +6,85 @@ import socket
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from app.robot.address import VelodyneAddress
 from app.robot.inbox import ArrivalTimes, Inbox
-from app.robot.ros_graph import Publisher
-from app.robot.sweeps import Sweeps
+from app.robot.topics import Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.ros_messages import VELODYNE_SCAN
+from pipeline.io.readers.ros_messages import VELODYNE_SCAN, standard_types
 from pipeline.io.readers.velodyne import PACKET_BYTES, PRODUCT, is_data_packet
 
+#: A longer silence between packets ends a sweep.
+GAP_NS = 50_000_000
+#: The fastest sensor (VLS-128, dual return) sends fewer packets in the slowest turn.
+MOST_PACKETS = 4000
+FRAME = "velodyne"
+_SECOND = 1_000_000_000
+_TURN, _HALF = 36_000, 18_000
+
+
+class Sweeps:
+    """Joins packets of one sensor to sweeps of one turn. A sweep has the time of its last packet."""
+
+    def __init__(self) -> None:
+        self._packets: list[tuple[int, bytes]] = []
+        self._azimuth = 0
+        self._turned = 0
+
+    def add(self, stamp_ns: int, packet: bytes) -> bytes | None:
+        """Add a data packet; return the sweep that it ends as velodyne_msgs/VelodyneScan in CDR, else None.
+
+        Args:
+            stamp_ns: Time of arrival, not before that of the packet before [ns].
+            packet: 1206 bytes that pass `is_data_packet`.
+        """
+        azimuth = packet[2] + 256 * packet[3]
+        step = (azimuth - self._azimuth) % _TURN if self._packets else 0
+        # A small step back is jitter of the motor, not most of a turn.
+        self._turned += step if step < _HALF else 0
+        over = self._turned >= _TURN or len(self._packets) >= MOST_PACKETS or self.is_stale(stamp_ns)
+        ended = self.end() if over else None
+        self._azimuth = azimuth
+        self._packets.append((stamp_ns, packet))
+        return ended
+
+    def is_stale(self, now_ns: int) -> bool:
+        """Whether the pause since the last packet ends the sweep."""
+        return bool(self._packets) and now_ns - self._packets[-1][0] > GAP_NS
+
+    def end(self) -> bytes | None:
+        """End the sweep and return it as a message; None if there is no packet."""
+        packets, self._packets, self._turned = self._packets, [], 0
+        return _message(packets) if packets else None
+
+
+def _message(packets: list[tuple[int, bytes]]) -> bytes:
+    import numpy as np
+
+    store: Any = standard_types("cdr")
+    packet_type = store.types["velodyne_msgs/msg/VelodynePacket"]
+    header = store.types["std_msgs/msg/Header"](stamp=_time(store, packets[-1][0]), frame_id=FRAME)
+    scan = store.types[VELODYNE_SCAN](
+        header=header,
+        packets=[
+            packet_type(stamp=_time(store, stamp_ns), data=np.frombuffer(data, np.uint8, PACKET_BYTES))
+            for stamp_ns, data in packets
+        ],
+    )
+    return bytes(store.serialize_cdr(scan, VELODYNE_SCAN))
+
+
+def _time(store: Any, stamp_ns: int) -> Any:  # noqa: ANN401
+    return store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // _SECOND, nanosec=stamp_ns % _SECOND)
+
+
 TOPIC = "/velodyne_packets"
-#: The kernel keeps a second of the fastest sensor's packets while Python is busy.
+#: The kernel buffers a second of the fastest sensor's packets while Python is busy.
 _RECEIVE_BUFFER = 8 << 20
 _WAIT_S = 0.05
-#: A sender that is silent for so long is lost.
+#: After this silence the sensor counts as gone [s].
 _LOST_S = 3.0
 _RETRY_S = 1.0
 
@@ -30,11 +94,11 @@ OTHER_SENSOR = "packets of other sensors"
 
 
 class VelodyneLink:
-    """Listens in a thread of its own. What the rest sees is a robot with one topic of packets.
+    """Receiver of a sensor's packets, in a thread of its own. It looks like a robot with one topic.
 
     Args:
-        address: Where to listen, and to whom.
-        inbox: For the sweeps.
+        address: Where to listen, and to which sender.
+        inbox: Gets the sweeps.
 
     Attributes:
         problem, losses, scans, version: As of `ZenohLink`.
@@ -59,20 +123,20 @@ class VelodyneLink:
 
     @property
     def place(self) -> str:
-        """Where it listens, in words."""
+        """The connection in words, for the user."""
         sender = self._address.sender or "this machine"
         return f"listening on {self._address.host}:{self._address.port} to {sender}"
 
     @property
     def nothing(self) -> str:
-        """Why there is nothing, in words."""
+        """Why there are no scans, in words."""
         refused = self.losses.get(OTHERS, 0)
         others = f"; {refused} packets of other senders were refused" if refused else ""
         return f"no data packet of a known sensor came{others}"
 
     @property
     def silence_s(self) -> float | None:
-        """Seconds since the last packet came, None before the first."""
+        """Seconds since the last packet arrived, None before the first."""
         return None if self._heard_s is None else time.monotonic() - self._heard_s
 
     def publishers(self) -> list[Publisher]:
@@ -84,7 +148,7 @@ class VelodyneLink:
         return [""] if self._there else []
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """From now on sweeps go into the inbox."""
+        """Put sweeps into the inbox from now on."""
         self._number = channels[0].number
 
     def close(self) -> None:
@@ -98,9 +162,10 @@ class VelodyneLink:
                 with self._bound() as listening:
                     self.problem = ""
                     self._receive(listening)
-            except OSError as error:
+            except Exception as error:  # after any error it listens again: the thread must not end silently
                 where = f"{self._address.host}:{self._address.port}"
-                self.problem = f"cannot listen on {where}: {error.strerror or error}"
+                reason = (error.strerror if isinstance(error, OSError) else "") or repr(error)
+                self.problem = f"cannot listen on {where}: {reason}"
                 self._closing.wait(_RETRY_S)
 
     def _bound(self) -> socket.socket:
@@ -124,7 +189,7 @@ class VelodyneLink:
             self._take(packet, sender)
 
     def _pause(self) -> None:
-        """No packet for a while: the sweep is over, and after long the sensor is gone."""
+        """Handle a silence: a short one ends the sweep, after a long one the sensor counts as gone."""
         if self._sweeps.is_stale(self._times.now_ns()):
             self._hand_over(self._sweeps.end())
         silence_s = self.silence_s

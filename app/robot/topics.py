@@ -1,12 +1,12 @@
-"""Which of a robot's topics are read: found by type, as in recordings, before any message came."""
+"""Topics of a robot: who publishes them, and which of them are read (chosen by type, as in recordings)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from app.robot.address import ROOT
-from app.robot.ros_graph import Publisher
 from pipeline.errors import SourceError
 from pipeline.io.readers.camera import shared_parts
 from pipeline.io.readers.container import Channel
@@ -17,10 +17,33 @@ from pipeline.io.readers.ros_messages import (
     LASER_SCAN,
     NAV_SAT_FIX,
     ODOMETRY,
+    READ_TYPES,
     TRANSFORMS,
     VELODYNE_SCAN,
 )
 from pipeline.io.readers.topics import TYPES_BY_ROLE
+
+TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)::msg::dds_::([A-Za-z][A-Za-z0-9_]*)_")
+#: A name of ROS that is also a valid Zenoh key: no empty parts, no wildcards.
+NAME = re.compile(r"(?:/[A-Za-z0-9_.~-]+)+")
+#: More endpoints than this are not a robot's network; the rest are counted and left out.
+MAX_ENDPOINTS = 5000
+
+
+@dataclass(frozen=True, slots=True)
+class Publisher:
+    """A topic that somebody publishes.
+
+    Attributes:
+        robot: The publisher's namespace without slashes at its ends, "" for none.
+        topic: With its leading slash.
+        msgtype: In the ROS 2 spelling, e.g. "sensor_msgs/msg/PointCloud2".
+    """
+
+    robot: str
+    topic: str
+    msgtype: str
+
 
 SCAN_TYPES, PICTURE_TYPES = TYPES_BY_ROLE["scan"], TYPES_BY_ROLE["camera"]
 #: As `?camera=`: pictures stay on the robot, where the radio link is thin.
@@ -184,3 +207,13 @@ def _warnings(scans: list[Publisher], scan: Publisher, robot: str, named: str | 
             "chooses another"
         )
     return warnings
+
+
+def countable(publishers: Sequence[Publisher], most: int) -> list[Channel]:
+    """A channel for each topic that something can be made of, by the number of its publisher. The others may
+    be of any size, and are not listened to."""
+    return [
+        Channel(k, each.topic, each.msgtype, "cdr", "", "", 0)
+        for k, each in enumerate(publishers[:most])
+        if each.msgtype in READ_TYPES
+    ]

@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from app.robot.ros_graph import ADMIN, PUBLISHER, data_key
+from app.robot.zenoh import ADMIN, PUBLISHER, data_key
 from pipeline.io.recording import outputs
 
 NODE = "stemmap"

@@ -1,0 +1,290 @@
+"""ROS 2 over Zenoh: one session to one router. Publishers are found by the liveliness tokens of rmw_zenoh."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from app.robot.address import ROOT, ZenohAddress
+from app.robot.inbox import ArrivalTimes, Inbox
+from app.robot.topics import MAX_ENDPOINTS, NAME, PICTURE_TYPES, SCAN_TYPES, TYPE, Publisher
+from pipeline.io.readers.base import count_loss
+from pipeline.io.readers.container import Channel, Message
+
+ADMIN = "@ros2_lv"
+PUBLISHER = "MP"
+_LONGEST_TOKEN = 1000
+
+
+def publisher_of(token: str) -> Publisher | None:
+    """Parse a token; None if it is not that of a publisher.
+
+    Its form is `@ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>`, and for an
+    endpoint `/<topic>/<type>/<hash>/<qos>` after it. A slash inside of a part is written `%`.
+    """
+    parts = token.split("/")
+    if len(token) > _LONGEST_TOKEN or len(parts) != 13 or parts[0] != ADMIN or parts[5] != PUBLISHER:
+        return None
+    msgtype = TYPE.fullmatch(parts[10])
+    topic = parts[9].replace("%", "/")
+    namespace = parts[7].replace("%", "/")
+    if msgtype is None or not NAME.fullmatch(topic) or not (namespace == "/" or NAME.fullmatch(namespace)):
+        return None
+    return Publisher(namespace.strip("/"), topic, f"{msgtype[1]}/msg/{msgtype[2]}")
+
+
+def data_key(domain: int, topic: str, msgtype: str, type_hash: str = "*") -> str:
+    """The key of a topic's messages; any hash of the type unless one is given."""
+    package, _, name = msgtype.split("/")
+    return f"{domain}/{topic.lstrip('/')}/{package}::msg::dds_::{name}_/{type_hash}"
+
+
+class RosGraph:
+    """The publishers that are alive now, by liveliness token."""
+
+    def __init__(self) -> None:
+        self._alive: dict[str, Publisher] = {}
+
+    def add(self, token: str) -> bool:
+        """Add a token. Returns False if there is no room; a token that is not a publisher's needs none."""
+        publisher = publisher_of(token)
+        if publisher is None or token in self._alive:
+            return True
+        if len(self._alive) >= MAX_ENDPOINTS:
+            return False
+        self._alive[token] = publisher
+        return True
+
+    def remove(self, token: str) -> None:
+        """Remove a token."""
+        self._alive.pop(token, None)
+
+    def publishers(self) -> list[Publisher]:
+        """All publishers, each once, sorted by robot and topic."""
+        return sorted(set(self._alive.values()), key=lambda p: (p.robot, p.topic, p.msgtype))
+
+    def robots(self, scan_types: tuple[str, ...]) -> list[str]:
+        """The namespaces that publish scans, sorted."""
+        return sorted({p.robot for p in self._alive.values() if p.msgtype in scan_types})
+
+
+#: Largest message that is assembled; a cloud of 2 million points is smaller.
+MESSAGE_LIMIT = 64 << 20
+_RETRY_S = 1.0
+_ATTACHMENT = struct.Struct("<QQB")
+
+LOST_SCANS, LOST_OTHERS = "scans lost on the network", "other messages lost on the network"
+TOO_LARGE = "messages larger than 64 MB"
+TOO_MANY = f"topics beyond the first {MAX_ENDPOINTS:,}"
+
+
+#: Zenoh's names of the certificate files.
+_TLS = {"ca": "root_ca_certificate", "cert": "connect_certificate", "key": "connect_private_key"}
+
+
+def configuration(endpoint: str, files: Mapping[str, str] | None = None) -> str:
+    """The session's configuration as JSON: a client of one router that neither listens nor scouts.
+
+    Args:
+        endpoint: Of the router.
+        files: Paths of certificates by role, see `ZenohAddress`.
+    """
+    tls: dict[str, Any] = {_TLS[name]: path for name, path in (files or {}).items()}
+    if "connect_certificate" in tls:
+        tls["enable_mtls"] = True
+    return json.dumps(
+        {
+            "mode": "client",
+            "connect": {"endpoints": [endpoint]},
+            "listen": {"endpoints": []},
+            "timestamping": {"enabled": True},  # latched messages need a time
+            "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+            "transport": {
+                "link": {"rx": {"max_message_size": MESSAGE_LIMIT}, **({"tls": tls} if tls else {})},
+                "shared_memory": {"enabled": False},
+            },
+        }
+    )
+
+
+class ZenohLink:
+    """Connection to a router, in a thread of its own that tries again until `close`.
+
+    Args:
+        address: Of the router.
+        inbox: Gets the messages.
+
+    Attributes:
+        problem: Why there is no connection, "" while there is one.
+        losses: Number of messages lost before the inbox, by reason.
+        scans: Number of scans that arrived.
+        version: Grows with every change among the publishers.
+    """
+
+    def __init__(self, address: ZenohAddress, inbox: Inbox) -> None:
+        self.problem = "not connected yet"
+        self.losses: dict[str, int] = {}
+        self.scans = 0
+        self.version = 0
+        self._address, self._inbox = address, inbox
+        self._graph = RosGraph()
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._session: Any = None
+        self._channels: Sequence[Channel] = ()
+        self._subscriptions: list[Any] = []
+        self._sequences: dict[int, tuple[bytes, int]] = {}
+        self._times = ArrivalTimes()
+        self._heard_s: float | None = None
+        self._thread = threading.Thread(target=self._run, name="zenoh", daemon=True)
+        self._thread.start()
+
+    @property
+    def place(self) -> str:
+        """The connection in words, for the user."""
+        return f"connected to {self._address.endpoint}"
+
+    @property
+    def nothing(self) -> str:
+        """Why no scan topic is chosen, in words."""
+        if self.robots() and not self._address.robot and not self._address.topics:
+            return "a robot was found, its topics are being chosen"
+        robot = self._address.robot
+        wanted = "a robot without a namespace" if robot == ROOT else f"robot {robot}" if robot else "a robot"
+        others = [robot or "(no namespace)" for robot in self.robots()]
+        there = f" (there are: {', '.join(others[:10])})" if others else ""
+        return f"no scans of {wanted} are announced in ROS domain {self._address.domain}{there}"
+
+    @property
+    def silence_s(self) -> float | None:
+        """Seconds since the last scan arrived, None before the first."""
+        return None if self._heard_s is None else time.monotonic() - self._heard_s
+
+    def publishers(self) -> list[Publisher]:
+        """All publishers that are alive."""
+        with self._lock:
+            return self._graph.publishers()
+
+    def robots(self) -> list[str]:
+        """The namespaces from which scans are published."""
+        with self._lock:
+            return self._graph.robots(SCAN_TYPES)
+
+    @property
+    def session(self) -> Any:  # noqa: ANN401 - zenoh is imported where it is used
+        """The Zenoh session, None while there is none."""
+        return self._session
+
+    def subscribe(self, channels: Sequence[Channel]) -> None:
+        """Receive the messages of these topics; publishers of fixed transforms repeat their last ones."""
+        self._channels = tuple(channels)
+        if self._session is not None:
+            self._subscriptions += [self._subscribe_to(channel) for channel in channels]
+
+    def close(self) -> None:
+        """Leave the router."""
+        self._closing.set()
+        self._thread.join(timeout=5.0)
+
+    def _subscribe_to(self, channel: Channel) -> Any:  # noqa: ANN401 - zenoh is imported where it is used
+        from zenoh import ext
+
+        is_latched = channel.topic.endswith("tf_static")
+        return ext.declare_advanced_subscriber(
+            self._session,
+            data_key(self._address.domain, channel.topic, channel.msgtype),
+            lambda sample: self._take(sample, channel),
+            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=100) if is_latched else None,
+        )
+
+    def _run(self) -> None:
+        """Connect, try again after any error, and watch the connection until `close`."""
+        while not self._closing.is_set():
+            try:
+                self._connect()
+                self._watch()
+            except Exception as error:  # zenoh has one class for all errors, and does not promise it
+                self.problem = f"no connection to {self._address.endpoint}: {first_line(error)}"
+            self._disconnect()
+            self._closing.wait(_RETRY_S)
+
+    def _connect(self) -> None:
+        import zenoh
+
+        config = configuration(self._address.endpoint, self._address.files)
+        session: Any = zenoh.open(zenoh.Config.from_json5(config))
+        with self._lock:
+            self._session = session
+            self._graph = RosGraph()
+        if self._closing.is_set():
+            return
+        key = f"{ADMIN}/{self._address.domain}/**"
+        self._subscriptions = [
+            session.liveliness().declare_subscriber(key, self._note_token, history=True),
+            *(self._subscribe_to(channel) for channel in self._channels),
+        ]
+
+    def _watch(self) -> None:
+        """Report whether the router is there, until `close`; zenoh reconnects by itself."""
+        while not self._closing.is_set():
+            is_connected = bool(self._session.info.routers_zid())
+            self.problem = "" if is_connected else f"no connection to {self._address.endpoint}"
+            self._closing.wait(_RETRY_S)
+
+    def _disconnect(self) -> None:
+        with self._lock:
+            session, self._session = self._session, None
+        if session is not None:
+            with contextlib.suppress(Exception):  # a session that is broken needs no closing
+                session.close()
+
+    def _note_token(self, sample: Any) -> None:  # noqa: ANN401
+        import zenoh
+
+        with self._lock:
+            self.version += 1
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._graph.remove(str(sample.key_expr))
+            elif not self._graph.add(str(sample.key_expr)):
+                count_loss(self.losses, TOO_MANY)
+
+    def _take(self, sample: Any, channel: Channel) -> None:  # noqa: ANN401
+        payload, attachment = sample.payload, sample.attachment
+        is_scan = channel.msgtype in SCAN_TYPES
+        size = len(payload)
+        with self._lock:
+            if is_scan:
+                self._heard_s = time.monotonic()
+                self.scans += 1
+            if attachment is not None:
+                self._count_gap(channel.number, attachment.to_bytes(), LOST_SCANS if is_scan else LOST_OTHERS)
+            if size > MESSAGE_LIMIT:
+                count_loss(self.losses, TOO_LARGE)
+                return
+            arrival_ns = self._times.next_ns()
+            if channel.msgtype not in PICTURE_TYPES:
+                self._inbox.put(Message(channel.number, arrival_ns, payload.to_bytes()), is_scan=is_scan)
+            elif self._inbox.wants_picture(arrival_ns, size):
+                self._inbox.put_picture(Message(channel.number, arrival_ns, payload.to_bytes()))
+
+    def _count_gap(self, number: int, attachment: bytes, reason: str) -> None:
+        """Count lost messages: rmw_zenoh numbers the messages of a publisher, so a gap is a loss."""
+        if len(attachment) < _ATTACHMENT.size:
+            return
+        sequence, _stamp, _length = _ATTACHMENT.unpack_from(attachment)
+        gid = attachment[_ATTACHMENT.size :]
+        known = self._sequences.get(number)
+        self._sequences[number] = (gid, sequence)
+        if known is not None and known[0] == gid and sequence > known[1] + 1:
+            count_loss(self.losses, reason, sequence - known[1] - 1)
+
+
+def first_line(error: Exception) -> str:
+    """The first line of a library's error, without places in its source code."""
+    first = str(error).partition("\n")[0].partition(" at ")[0].rstrip("!; ")
+    return first[:200] or type(error).__name__
