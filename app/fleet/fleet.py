@@ -1,42 +1,207 @@
-"""All robots: starts a dashboard for each, keeps what the page of the fleet is told."""
+"""A fleet: a dashboard for each robot on a port of its own, and the states and maps that its page shows."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import errno
 import logging
-from collections.abc import Awaitable, Callable
+import socket
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import uvicorn
+from fastapi import FastAPI
+
 from app.common.settings import Settings
 from app.dashboard.broadcast import Live
+from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
+from app.dashboard.payload import clearance_payload, trees_payload
 from app.fleet.frames import Frames
-from app.fleet.member import Member, next_port
-from app.fleet.payload import card, drawn, shown_map
-from app.fleet.tasks import end
-from app.fleet.warming import COMPILING
 from app.web.app import MakeScene, MakeWorker, OfFleet, build
 from app.web.connection_limits import Places
+from app.web.serving import bound, uvicorn_config
 from app.worker.protocol import Open
 from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Pose2
 
 _log = logging.getLogger(__name__)
 
-#: A worker and a port each: more than this no machine serves.
+
+async def end(task: asyncio.Task[Any] | None) -> None:
+    """Cancel a task and wait for its end. An error that it raised is logged and not raised again."""
+    if task is None:
+        return
+    task.cancel()
+    try:
+        await task
+    except asyncio.CancelledError:
+        pass
+    except Exception:
+        _log.exception("%s had ended with a fault", task.get_name())
+
+
+#: Points of a path: enough for a picture of some hundred pixels.
+MOST_POINTS = 400
+
+
+def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
+    """State and key figures of a robot, as JSON values."""
+    status = dashboard.status
+    clearance = None if dashboard.shown is None else dashboard.shown.frame.clearance
+    return {
+        "name": name,
+        "source": status.source or dashboard.source.uri,
+        "state": status.state,
+        "detail": status.detail,
+        "live": status.live,
+        "time_s": round(status.time_s, 1),
+        "rate_hz": round(status.scan_rate_hz, 1),
+        "mapping_ms": round(status.mapping_ms, 1),
+        "behind": status.scans_behind,
+        "health": status.health,
+        "trees": status.trees,
+        "distance_m": round(status.distance_m, 1),
+        "recording": status.recording,
+        "warnings": len(status.warnings),
+        "clearance": clearance_payload(clearance),
+    }
+
+
+def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
+    """Trees, path and pose of a robot in the frame of its map, as JSON values; None before the first scan."""
+    shown = dashboard.shown
+    if shown is None:
+        return None
+    pose = shown.frame.estimate.T_map_base
+    step = max(1, -(-len(dashboard.path_xy) // MOST_POINTS))
+    path = np.vstack([dashboard.path_xy[::step], dashboard.path_xy[-1:]])
+    return {
+        "trees": trees_payload(shown.frame, start_ns=dashboard.start_ns),
+        "path": np.round(path, 2).tolist(),
+        "pose": [round(pose.x, 3), round(pose.y, 3), round(pose.yaw, 4)],
+    }
+
+
+def drawn(own: dict[str, Any], pose: Pose2 | None, how: str) -> dict[str, Any]:
+    """A map as the page draws it: [x, y, DBH in cm or None] of each tree, and the pose of its frame in the
+    common one."""
+    return {
+        "trees": [[round(t["x"], 2), round(t["y"], 2), t["dbh_cm"]] for t in own["trees"]],
+        "path": own["path"],
+        "pose": own["pose"],
+        "common": None if pose is None else [pose.x, pose.y, pose.yaw],
+        "how": how,
+    }
+
+
+#: Ports after that of the fleet that are tried, so that a firewall can be opened for a known range.
+PORTS_TRIED = 100
+
+
+class Member:
+    """The dashboard of one robot or run, with its server.
+
+    Args:
+        name: Of the robot or run, as the page shows it.
+        source: The run that the dashboard opens.
+        listening: The socket of its port.
+        app: The application of the dashboard.
+        settings: Of the deployment.
+    """
+
+    def __init__(
+        self, name: str, source: Open, listening: socket.socket, app: FastAPI, settings: Settings
+    ) -> None:
+        self.name, self.source = name, source
+        self.port = int(listening.getsockname()[1])
+        self.dashboard: Dashboard = app.state.dashboard
+        self._listening = listening
+        self._server = _Server(uvicorn_config(app, settings))
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Start the server."""
+        self._task = asyncio.create_task(self._server.serve([self._listening]), name=f"serve {self.name}")
+
+    @property
+    def started(self) -> bool:
+        """Whether the server answers."""
+        return self._server.started
+
+    @property
+    def ended(self) -> bool:
+        """Whether the server ended by itself, which is a fault."""
+        return self._task is not None and self._task.done()
+
+    @property
+    def answers(self) -> bool:
+        """Whether the page can be opened now. The port accepts connections earlier and lets them wait."""
+        return self.started and not self.ended
+
+    async def close(self) -> None:
+        """End the server and the worker."""
+        self._server.should_exit = True
+        if self._task is not None:
+            with contextlib.suppress(Exception):
+                await self._task
+        self._listening.close()
+
+
+class _Server(uvicorn.Server):
+    """A server that leaves the signals to that of the fleet."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture no signal."""
+        yield
+
+
+def next_port(settings: Settings, after: int) -> socket.socket:
+    """A listening socket on the first free port after a given one.
+
+    Raises:
+        StemmapError: No port is free.
+    """
+    reason = OSError("no port was tried")
+    for port in range(after + 1, min(after + 1 + PORTS_TRIED, 1 << 16)):
+        try:
+            return bound(settings.host, port)
+        except OSError as error:
+            reason = error
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                break
+    where = f"{settings.host}, ports after {after}"
+    raise StemmapError(
+        "no port is free for another robot", where=where, remedy=str(reason.strerror or reason)
+    )
+
+
+COMPILING = "Getting ready; on a new machine this compiles for some minutes, and only the first time"
+#: Each robot needs a worker process and a port.
 MOST_ROBOTS = 16
 _CARDS_S, _MAPS_EACH, _FRAMES_EACH = 0.5, 2, 10  # maps and frames every so many rounds
 
 
 class Fleet:
-    """The members, by name, in the order in which they came.
+    """The dashboards of all robots, by name, in the order in which they were added.
 
     Args:
-        settings: Of the deployment; port: of the fleet's own page.
-        token: That browsers must show; the dashboards take the same.
-        make_parameters: The parameters that a dashboard begins with.
-        make_scene, make_worker: Stand in for viser and for the worker's process in tests.
-        warm: The robots begin when this is done; None begins at once.
+        settings: Of the deployment.
+        port: Of the fleet's page.
+        token: Access token of browsers, also for the dashboards.
+        make_parameters: Makes the initial parameters of a dashboard.
+        make_scene, make_worker: Replacements of viser and of the worker process, for tests.
+        warm: The dashboards start after it; None starts them at once.
+
+    Attributes:
+        live: States and maps for the connected pages.
+        members: Dashboard by name.
+        remote: Card and map by name, of robots that map by themselves.
+        notice: A message for the page, "" for none.
     """
 
     def __init__(
@@ -60,10 +225,10 @@ class Fleet:
         self._warm, self._is_warm = warm, warm is None
         self._warming: asyncio.Task[None] | None = None
         self._task: asyncio.Task[None] | None = None
-        self._laying: asyncio.Task[None] | None = None
+        self._aligning: asyncio.Task[None] | None = None
 
     def add(self, name: str, source: Open) -> bool:
-        """Begin with another robot; False when there is no room for it, which the page says."""
+        """Add a robot; False if there is no room for it, which the page reports."""
         if name in self.members:
             return True
         if len(self.members) >= MOST_ROBOTS:
@@ -91,48 +256,48 @@ class Fleet:
         return True
 
     def start(self) -> None:
-        """Begin to tell what becomes of them."""
-        self._task = asyncio.create_task(self._tell_for_ever(), name="fleet")
+        """Start to send states and maps to the pages."""
+        self._task = asyncio.create_task(self._send_states(), name="fleet")
         if self._warm is not None:
             self._warming = asyncio.create_task(self._begin_when_warm(self._warm()), name="warm")
 
     async def close(self) -> None:
-        """End all of them at once."""
-        for task in (self._warming, self._task, self._laying):
+        """Close all dashboards at the same time."""
+        for task in (self._warming, self._task, self._aligning):
             await end(task)
         await asyncio.gather(*(member.close() for member in self.members.values()))
 
     async def _begin_when_warm(self, warming: Awaitable[None]) -> None:
         try:
             await warming
-        except OSError:  # no process for it: the workers compile
-            _log.exception("nothing was compiled before")
+        except OSError:  # the workers compile then
+            _log.exception("the kernels were not compiled before the workers start")
         self._is_warm = True
         for member in self.members.values():
             member.start()
 
-    async def _tell_for_ever(self) -> None:
+    async def _send_states(self) -> None:
         rounds = 0
         while True:
             try:
-                self.tell_cards()
+                self.send_cards()
                 if rounds % _MAPS_EACH == 0:
-                    self.tell_maps()
-                if rounds % _FRAMES_EACH == 0 and (self._laying is None or self._laying.done()):
-                    self._laying = asyncio.create_task(self._lay(), name="frames")
-            except Exception:  # a fault in showing must not end the fleet
-                _log.exception("the fleet could not be shown")
+                    self.send_maps()
+                if rounds % _FRAMES_EACH == 0 and (self._aligning is None or self._aligning.done()):
+                    self._aligning = asyncio.create_task(self._align(), name="frames")
+            except Exception:  # an error in showing must not end the fleet
+                _log.exception("the states of the fleet could not be sent")
             rounds += 1
             await asyncio.sleep(_CARDS_S)
 
-    async def _lay(self) -> None:
+    async def _align(self) -> None:
         try:
             await self._frames.try_one(self._maps())
-        except Exception:  # the others are still to be laid
-            _log.exception("a map could not be laid on the common one")
+        except Exception:  # the other maps are still to be aligned
+            _log.exception("a map could not be aligned with the common one")
 
-    def tell_cards(self) -> None:
-        """Tell the browsers how the robots are."""
+    def send_cards(self) -> None:
+        """Send the states of the robots to the pages."""
         cards = [card(name, m.dashboard) | {"answers": m.answers} for name, m in self.members.items()]
         for shown, member in zip(cards, self.members.values(), strict=True):
             if not self._is_warm:
@@ -145,8 +310,8 @@ class Fleet:
     def _open_records(self) -> set[int | None]:
         return {member.dashboard.logbook.record for member in self.members.values()}
 
-    def tell_maps(self) -> None:
-        """Tell the browsers the maps."""
+    def send_maps(self) -> None:
+        """Send the maps to the pages."""
         maps = {
             name: drawn(own, self._frames.pose(name), self._frames.how(name))
             for name, (_, own) in self._maps().items()
@@ -154,7 +319,7 @@ class Fleet:
         self.live.tell("maps", {"maps": maps})
 
     def _maps(self) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Digest and map of each robot that has one."""
+        """Digest and map of each robot that has a map."""
         found = {name: (m.dashboard.digest, shown_map(m.dashboard)) for name, m in self.members.items()}
         maps = {name: (digest, own) for name, (digest, own) in found.items() if own is not None}
         return maps | {name: (f"remote:{name}", own) for name, (_, own) in self.remote.items()}

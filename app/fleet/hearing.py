@@ -1,28 +1,177 @@
-"""Hears what robots publish of their own maps: `python -m app.fleet.hearing ADDRESS`.
+"""Receives the maps that robots make and publish: `python -m app.fleet.hearing ADDRESS`, a child process.
 
-A process of its own, because it takes apart what strangers send. Twice a second it says in a line of JSON
-what it knows; it ends when its standard input does.
+The process decodes messages of unknown senders, so it is apart from the server. Twice a second it sends a
+report in a line of JSON. It ends when its standard input does.
 """
 
 from __future__ import annotations
 
-import json
 import logging
+import math
 import sys
 import threading
 import time
+from collections import deque
+from functools import partial
+from typing import Any
 
-from app.fleet.results import TOPICS, UNREADABLE, Results
+import msgspec
+import numpy as np
+
+from app.common.child_process import ParentConnection, run_child
 from app.robot.address import ZenohAddress, parse_address
 from app.robot.inbox import Inbox
 from app.robot.zenoh import ZenohLink
 from pipeline.io.readers.container import Channel
 from pipeline.io.recording import outputs
+from pipeline.types.clearance import Zone
 
 _log = logging.getLogger(__name__)
 
 MOST_ROBOTS = 16
-SAY_S, _POLL_S = 0.5, 0.01
+REPORT_S, _POLL_S = 0.5, 0.01
+#: Trees and poses that are read of a message: no page shows more.
+MOST_TREES, MOST_POSES = 5000, 400
+_RATE_OVER = 20
+#: The topics that are listened to.
+TOPICS = (outputs.ODOMETRY, outputs.PATH, outputs.DETECTIONS, outputs.CLEARANCE, outputs.ZONE)
+UNREADABLE = "messages that could not be read"
+
+
+class RobotReport(msgspec.Struct, frozen=True):
+    """State and map of one robot.
+
+    Attributes:
+        silence_s: Age of the newest pose [s]; None before the first.
+        unreadable: Number of messages that could not be read.
+        map: Trees, path and pose as `app.fleet.fleet.shown_map` gives them.
+        alive: Whether its results are announced now.
+    """
+
+    silence_s: float | None
+    rate_hz: float
+    distance_m: float
+    clearance: dict[str, Any] | None
+    unreadable: int
+    map: dict[str, Any]
+    alive: bool
+
+
+class Report(msgspec.Struct, frozen=True):
+    """Message to the server: the connection in words, and the robots by namespace."""
+
+    problem: str
+    place: str
+    robots: dict[str, RobotReport]
+
+
+class Results:
+    """The newest results of one robot.
+
+    Args:
+        unreadable: Number of messages that could not be read before.
+
+    Attributes:
+        losses: Number of messages that were left out, by reason.
+    """
+
+    def __init__(self, unreadable: int = 0) -> None:
+        self.losses: dict[str, int] = {UNREADABLE: unreadable} if unreadable else {}
+        self._pose = [0.0, 0.0, 0.0]
+        self._path: list[list[float]] = []
+        self._trees: list[dict[str, Any]] = []
+        self._ahead: float | None = None
+        self._zone: str | None = None
+        self._within = 0.0
+        self._came_s: deque[float] = deque(maxlen=_RATE_OVER)
+
+    def take(self, topic: str, payload: bytes, now_s: float) -> None:
+        """Read a message of one of TOPICS; count it if it cannot be read."""
+        try:
+            message = outputs.store().deserialize_cdr(payload, outputs.TYPES[topic])
+            self._take(topic, message, now_s)
+        except Exception:  # any error that a stranger's bytes can cause in a decoder
+            self.losses[UNREADABLE] = self.losses.get(UNREADABLE, 0) + 1
+
+    def _take(self, topic: str, message: Any, now_s: float) -> None:  # noqa: ANN401
+        match topic:
+            case outputs.ODOMETRY:
+                self._pose = _finite(*_placed(message.pose.pose))
+                self._came_s.append(now_s)
+            case outputs.PATH:
+                step = max(1, -(-len(message.poses) // MOST_POSES))
+                self._path = [_finite(*_placed(each.pose)[:2]) for each in message.poses[::-step][::-1]]
+            case outputs.DETECTIONS:
+                self._trees = [_tree(each) for each in message.detections[:MOST_TREES]]
+            case outputs.CLEARANCE:
+                ahead, (within,) = float(message.range), _finite(float(message.max_range))
+                self._ahead = round(ahead, 3) if math.isfinite(ahead) else None
+                self._within = within
+            case outputs.ZONE:
+                self._zone = Zone(int(message.data)).label
+
+    def report(self, now_s: float, *, alive: bool) -> RobotReport:
+        """State and map for the page.
+
+        Raises:
+            msgspec.MsgspecError: A figure is not finite.
+        """
+        path = np.array([*self._path, self._pose[:2]])
+        steps = np.diff(path, axis=0)
+        heard = self._came_s
+        since = now_s - heard[-1] if heard else None
+        rate = (len(heard) - 1) / max(heard[-1] - heard[0], 1e-3) if len(heard) > 1 else 0.0
+        clearance = {
+            "zone": self._zone,
+            "ahead_m": self._ahead,
+            "beside_m": None,
+            "within_m": self._within,
+        }
+        report = RobotReport(
+            silence_s=since,
+            rate_hz=round(rate, 1),
+            distance_m=round(float(np.hypot(steps[:, 0], steps[:, 1]).sum()), 1),
+            clearance=clearance if self._zone is not None else None,
+            unreadable=self.losses.get(UNREADABLE, 0),
+            map={"trees": self._trees, "path": self._path, "pose": self._pose},
+            alive=alive,
+        )
+        return msgspec.json.decode(msgspec.json.encode(report), type=RobotReport)  # JSON has no infinity
+
+
+def _placed(pose: Any) -> tuple[float, float, float]:  # noqa: ANN401
+    """x, y and yaw of a geometry_msgs/Pose."""
+    q = pose.orientation
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    return float(pose.position.x), float(pose.position.y), yaw
+
+
+def _finite(*values: float) -> list[float]:
+    """The values, rounded to millimetres.
+
+    Raises:
+        ValueError: A value is not finite, or beyond 1e7.
+    """
+    if not all(math.isfinite(value) and abs(value) < 1e7 for value in values):
+        raise ValueError("not a place")
+    return [round(value, 3) for value in values]
+
+
+def _tree(detection: Any) -> dict[str, Any]:  # noqa: ANN401
+    """The tree of a vision_msgs/Detection3D, as JSON values for the page."""
+    centre, width = detection.bbox.center.position, float(detection.bbox.size.x)
+    x, y = _finite(float(centre.x), float(centre.y))
+    covariance = np.asarray(detection.results[0].pose.covariance, np.float64)
+    sigma = _finite(math.sqrt(max(float(max(covariance[0], covariance[7])), 0.0)))[0]
+    return {
+        "x": x,
+        "y": y,
+        "ellipse": [sigma, sigma, 0.0],
+        "dbh_cm": round(100.0 * width, 1) if 0.0 < width < 10.0 else None,
+        "sigma_dbh_cm": None,
+    }
+
+
 _BY_TYPE = {topic: outputs.TYPES[topic] for topic in TOPICS}
 
 
@@ -30,7 +179,7 @@ class Hearing:
     """The results of all robots at a router.
 
     Args:
-        link: To the router, and the inbox that it fills.
+        link: Connection to the router.
         inbox: Of the link.
     """
 
@@ -41,8 +190,8 @@ class Hearing:
         self._known: set[str] = set()
         self._version = -1
 
-    def look_around(self) -> None:
-        """Subscribe to the results that were not heard of before."""
+    def subscribe_to_new(self) -> None:
+        """Subscribe to results that were not announced before."""
         if self._version == self._link.version:
             return
         self._version = self._link.version
@@ -59,60 +208,60 @@ class Hearing:
             self._link.subscribe([Channel(number, publisher.topic, publisher.msgtype, "cdr", "", "", 0)])
 
     def take(self, now_s: float) -> None:
-        """Take all messages that came."""
+        """Read all messages that arrived."""
         while (message := self._inbox.take()) is not None:
             robot, topic = self._topics[message.channel]
             self._robots[robot].take(topic, message.payload, now_s)
 
-    def said(self, now_s: float) -> str:
-        """What is known, as JSON in one line."""
+    def report(self, now_s: float) -> Report:
+        """The present state of all robots."""
         alive = {found[0] for p in self._link.publishers() if (found := results_topic(p.topic)) is not None}
-        robots = [f"{json.dumps(name)}: {self._of(name, name in alive, now_s)}" for name in self._robots]
-        problem, place = json.dumps(self._link.problem), json.dumps(self._link.place)
-        return f'{{"problem": {problem}, "place": {place}, "robots": {{{", ".join(robots)}}}}}'
+        robots = {name: self._report_of(name, name in alive, now_s) for name in self._robots}
+        return Report(self._link.problem, self._link.place, robots)
 
-    def _of(self, name: str, alive: bool, now_s: float) -> str:
-        """One robot. What cannot be said of it is forgotten and counted: the others are heard on."""
+    def _report_of(self, name: str, alive: bool, now_s: float) -> RobotReport:
+        """Report of one robot. Results that cannot be reported are dropped and counted."""
         try:
-            return json.dumps({**self._robots[name].as_plain(now_s), "alive": alive}, allow_nan=False)
-        except Exception:  # whatever a stranger's figures come to
-            _log.exception("what %s published could not be shown", name or "the robot")
+            return self._robots[name].report(now_s, alive=alive)
+        except Exception:  # any error that a stranger's figures can cause
+            _log.exception("the results of %s could not be reported", name or "the robot")
             fresh = self._robots[name] = Results(self._robots[name].losses.get(UNREADABLE, 0) + 1)
-            return json.dumps({**fresh.as_plain(now_s), "alive": alive}, allow_nan=False)
+            return fresh.report(now_s, alive=alive)
 
 
 def results_topic(topic: str) -> tuple[str, str] | None:
-    """The robot and which result a topic is of; None of any other."""
+    """The robot and the result that a topic belongs to; None for any other topic."""
     head, _, last = topic.rpartition("/")
     if last not in TOPICS or not head.endswith("/stemmap"):
         return None
     return head.removesuffix("/stemmap").strip("/"), last
 
 
-def main(uri: str) -> None:
-    """Hear and say until the standard input ends."""
+def main(uri: str, ending: threading.Event, parent: ParentConnection) -> None:
+    """Send reports until the parent closes the connection.
+
+    Args:
+        uri: Address of the router.
+        ending: Set when the parent closes the connection.
+        parent: The server.
+    """
     address = parse_address(uri)
     if not isinstance(address, ZenohAddress):
-        raise SystemExit("results are heard over Zenoh alone")
-    inbox, ending = Inbox(), threading.Event()
+        raise SystemExit("results are received over Zenoh only")
+    inbox = Inbox()
     link = ZenohLink(address, inbox)
     hearing = Hearing(link, inbox)
-
-    def wait_for_the_end() -> None:
-        sys.stdin.buffer.read()
-        ending.set()
-
-    threading.Thread(target=wait_for_the_end, daemon=True).start()
-    said_s = 0.0
+    reported_s = 0.0
     while not ending.wait(_POLL_S):
         now_s = time.monotonic()
-        hearing.look_around()
+        hearing.subscribe_to_new()
         hearing.take(now_s)
-        if now_s >= said_s + SAY_S:
-            said_s = now_s
-            print(hearing.said(now_s), flush=True)  # noqa: T201
+        if now_s >= reported_s + REPORT_S:
+            reported_s = now_s
+            parent.send(hearing.report(now_s))
     link.close()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    _ending = threading.Event()
+    run_child(partial(main, sys.argv[1], _ending), on_close=_ending.set)

@@ -1,53 +1,35 @@
-"""Robots that map by themselves, on the page of a fleet: their results are heard, their scans are not."""
+"""Robots that map by themselves, on the page of a fleet: their results are received, their scans are not."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
-import sys
 import time
 from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 
-from app.fleet.fleet import Fleet
-from app.fleet.names import NAMELESS
-from app.fleet.tasks import end
+from app.common.child_process import ChildProcess, python_module
+from app.fleet.fleet import Fleet, end
+from app.fleet.hearing import Report, RobotReport
+from app.fleet.robots import NAMELESS
+from pipeline.errors import StemmapError
 
 _log = logging.getLogger(__name__)
 
-HEARING = (sys.executable, "-P", "-m", "app.fleet.hearing")
+HEARING = python_module("app.fleet.hearing")
 _LONGEST_LINE = 32 << 20
 _RETRY_S = 2.0
-#: Nothing for so long is worth a word.
+#: A longer silence is shown [s].
 SILENT_S = 3.0
 
 
-class _Robot(msgspec.Struct, frozen=True):
-    """What `app.fleet.hearing` says of a robot."""
-
-    silence_s: float | None
-    rate_hz: float
-    distance_m: float
-    clearance: dict[str, Any] | None
-    unreadable: int
-    map: dict[str, Any]
-    alive: bool
-
-
-class _Said(msgspec.Struct, frozen=True):
-    problem: str
-    place: str
-    robots: dict[str, _Robot]
-
-
 class RemoteRobots:
-    """Keeps the process that hears them, and tells the fleet.
+    """Keeps the process that receives the maps running, and passes its reports to the fleet.
 
     Args:
-        fleet: That shows them.
+        fleet: Shows the robots.
         uri: Address of the router.
         command: The process.
     """
@@ -55,10 +37,10 @@ class RemoteRobots:
     def __init__(self, fleet: Fleet, uri: str, command: Sequence[str] = HEARING) -> None:
         self._fleet, self._uri, self._command = fleet, uri, command
         self._task: asyncio.Task[None] | None = None
-        self._known: dict[str, tuple[_Robot, float]] = {}  # and when it was said [s]
+        self._known: dict[str, tuple[RobotReport, float]] = {}  # with the time of the report [s]
 
     def start(self) -> None:
-        """Begin."""
+        """Start the process."""
         self._task = asyncio.create_task(self._keep(), name="hear robots")
 
     async def close(self) -> None:
@@ -68,71 +50,58 @@ class RemoteRobots:
     async def _keep(self) -> None:
         while True:
             try:
-                await self._hear()
-                self._fleet.notice = "Waiting: what hears the robots ended and is started again"
-            except OSError as error:
-                _log.exception("no process hears the robots")
-                reason = error.strerror or type(error).__name__
-                self._fleet.notice = f"Waiting: what hears the robots cannot be started ({reason})"
-            self._show(hearing=False)
+                await self._receive()
+                self._fleet.notice = "Waiting: the process that receives the maps ended and is started again"
+            except StemmapError as error:
+                _log.exception("the process that receives the maps failed")
+                self._fleet.notice = f"Waiting: {error}"
+            self._show(receiving=False)
             await asyncio.sleep(_RETRY_S)
 
-    async def _hear(self) -> None:
-        process = await asyncio.create_subprocess_exec(
-            *self._command,
-            self._uri,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            limit=_LONGEST_LINE,
-            start_new_session=True,  # Ctrl-C in the terminal is for the server
-        )
-        assert process.stdout is not None  # noqa: S101 - it was asked for
+    async def _receive(self) -> None:
+        child = await ChildProcess.start((*self._command, self._uri), line_limit=_LONGEST_LINE)
         try:
-            while line := await process.stdout.readline():
-                self._take(msgspec.json.decode(line, type=_Said))
-        except (msgspec.MsgspecError, ValueError):  # a line that is no word of ours, or far too long
-            return
+            while (report := await child.receive(Report)) is not None:
+                self._take(report)
         finally:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
+            await child.end()
 
-    def _take(self, said: _Said) -> None:
-        self._fleet.notice = f"Waiting: {said.problem}" if said.problem else ""
-        if not said.robots and not said.problem:
-            self._fleet.notice = f"Waiting: {said.place}; no robot publishes a map of its own"
+    def _take(self, report: Report) -> None:
+        self._fleet.notice = f"Waiting: {report.problem}" if report.problem else ""
+        if not report.robots and not report.problem:
+            self._fleet.notice = f"Waiting: {report.place}; no robot publishes a map of its own"
         now_s = time.monotonic()
         for name, robot in self._known.items():
-            if name not in said.robots:  # a process that began anew has not heard of it
+            if name not in report.robots:  # a process that was started again does not know it
                 self._known[name] = (msgspec.structs.replace(_aged(*robot, now_s), alive=False), now_s)
-        for name, new in said.robots.items():
-            if new.silence_s is None and name in self._known:  # nor of its map: the last picture stays
+        for name, new in report.robots.items():
+            if new.silence_s is None and name in self._known:  # nor its map: the last one stays
                 new = msgspec.structs.replace(_aged(*self._known[name], now_s), alive=new.alive)
             self._known[name] = (new, now_s)
-        self._show(hearing=True)
+        self._show(receiving=True)
 
-    def _show(self, *, hearing: bool) -> None:
-        """Hand the cards and maps to the fleet; while nobody hears, none of them is live."""
+    def _show(self, *, receiving: bool) -> None:
+        """Pass cards and maps to the fleet; without the process, none of them is live."""
         now_s = time.monotonic()
         self._fleet.remote = {}
         for robot, known in self._known.items():
             name, aged = robot or NAMELESS, _aged(*known, now_s)
-            self._fleet.remote[name] = (card_of(name, self._uri, aged, hearing=hearing), aged.map)
+            self._fleet.remote[name] = (card_of(name, self._uri, aged, receiving=receiving), aged.map)
 
 
-def _aged(robot: _Robot, said_s: float, now_s: float) -> _Robot:
-    """What was said of a robot then, as it is now when nothing came since."""
-    silence_s = None if robot.silence_s is None else robot.silence_s + now_s - said_s
+def _aged(robot: RobotReport, reported_s: float, now_s: float) -> RobotReport:
+    """A report of an earlier time, with its silence up to now."""
+    silence_s = None if robot.silence_s is None else robot.silence_s + now_s - reported_s
     return msgspec.structs.replace(robot, silence_s=silence_s)
 
 
-def card_of(name: str, uri: str, robot: _Robot, *, hearing: bool) -> dict[str, Any]:
-    """The card of a robot, as `app.fleet.payload.card` makes it of a dashboard."""
-    silent = not hearing or robot.silence_s is None or robot.silence_s > SILENT_S
+def card_of(name: str, uri: str, robot: RobotReport, *, receiving: bool) -> dict[str, Any]:
+    """The card of a robot, as `app.fleet.fleet.card` makes it of a dashboard."""
+    silent = not receiving or robot.silence_s is None or robot.silence_s > SILENT_S
     since = "" if robot.silence_s is None else f"Nothing heard for {robot.silence_s:.0f} s: "
     reason = "it is announced and silent" if robot.alive else "its mapping is gone"
-    if not hearing:
-        reason = "what hears the robots ended"
+    if not receiving:
+        reason = "the process that receives the maps ended"
     return {
         "name": name,
         "source": f"{uri}, mapped on the robot",

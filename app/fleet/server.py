@@ -1,38 +1,67 @@
-"""The web application of a fleet: one page of all robots, and the way to the dashboard of each."""
+"""Web server of a fleet: the page of all robots on one port, their dashboards on the ports after it."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+import asyncio
+import contextlib
+import sys
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from typing import Protocol
+from dataclasses import replace
 
 from fastapi import APIRouter, FastAPI, Request
 from starlette.responses import Response
 from starlette.websockets import WebSocket
 
+from app.common.compile_ahead import PATIENCE_S
 from app.common.settings import Settings
+from app.dashboard.parameters import ParameterState
 from app.fleet.fleet import Fleet
+from app.fleet.remote import RemoteRobots
+from app.fleet.robots import Watching
+from app.robot.address import ZenohAddress
 from app.web.app import guarded
-from app.web.auth import role_of
+from app.web.auth import new_token, role_of, viewer_token
 from app.web.responses import error_reply
 from app.web.routes.page import access, lead_on, page_answer, page_file
+from app.web.serving import LinkedServer, bind, link_of, uvicorn_config
 from app.web.static_files import page_folder
 from app.web.websocket_feed import telling
+from app.worker.protocol import Open
+
+WARMING = (sys.executable, "-P", "-c", "from app.worker.numba_warmup import warm_up; warm_up()")
+
+
+async def warmed(command: Sequence[str] = WARMING) -> None:
+    """Wait until a process of its own has compiled what every worker needs; it may fail, they then do it."""
+    process = await asyncio.create_subprocess_exec(
+        *command,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C in the terminal is for the server
+    )
+    try:
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(process.wait(), PATIENCE_S)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+
 
 _TRY_AGAIN_LATER, _REFUSED = 1013, 1003
 
 router = APIRouter()
 
 
-class Watching(Protocol):
-    """Adds robots to a fleet as they come."""
-
-    def start(self) -> None: ...
-    async def close(self) -> None: ...
-
-
 def build_fleet(
-    settings: Settings, *, port: int, token: str, fleet: Fleet, watching: Watching | None = None
+    settings: Settings,
+    *,
+    port: int,
+    token: str,
+    fleet: Fleet,
+    watching: Watching | RemoteRobots | None = None,
 ) -> FastAPI:
     """The application.
 
@@ -96,3 +125,51 @@ async def fleet_live(browser: WebSocket) -> None:
         async with telling(browser, fleet.live):
             if (await browser.receive())["type"] != "websocket.disconnect":
                 await browser.close(_REFUSED, "nothing is taken here")
+
+
+def serve_fleet(
+    settings: Settings,
+    *,
+    sources: Mapping[str, Open],
+    make_parameters: Callable[[], ParameterState],
+    watched: tuple[ZenohAddress, Open] | None,
+    open_browser: bool,
+    viewer: bool = False,
+) -> int:
+    """Serve until SIGINT or SIGTERM.
+
+    Args:
+        settings: Of the deployment.
+        sources: What is open from the start, by name.
+        make_parameters: The parameters that each dashboard begins with.
+        watched: A router whose robots are added as they come, and how they are opened.
+        open_browser: Whether to show the page.
+        viewer: Whether to print the link for looking only too.
+
+    Raises:
+        StemmapError: The port is in use, or the address is not one of this machine.
+    """
+    listening = bind(settings)
+    port = listening.getsockname()[1]
+    token = settings.token or new_token()
+    if viewer:
+        print(f"for looking only: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
+
+    async def served() -> bool:
+        fleet = Fleet(replace(settings, port=port), port, token, make_parameters, warm=warmed)
+        for name, source in sources.items():
+            fleet.add(name, source)
+        watching: Watching | RemoteRobots | None = None
+        if watched is not None:
+            address, source = watched
+            there = address.mapped_there
+            watching = RemoteRobots(fleet, address.uri) if there else Watching(fleet, address, source)
+        app = build_fleet(settings, port=port, token=token, fleet=fleet, watching=watching)
+        server = LinkedServer(
+            uvicorn_config(app, settings), settings, link_of(settings, port, token), open_browser=open_browser
+        )
+        await server.serve(sockets=[listening])
+        return server.started
+
+    with contextlib.closing(listening):
+        return 0 if asyncio.run(served()) else 1

@@ -181,8 +181,8 @@ class ZenohLink:
         return self._session
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these topics; publishers of fixed transforms repeat their last ones."""
-        self._channels = tuple(channels)
+        """Receive the messages of further topics; publishers of fixed transforms repeat their last ones."""
+        self._channels = (*self._channels, *channels)
         if self._session is not None:
             self._subscriptions += [self._subscribe_to(channel) for channel in channels]
 

@@ -20,9 +20,8 @@ from app.dashboard.run_recorder import _Page
 from app.fleet import fleet as fleet_module
 from app.fleet.fleet import Fleet
 from app.fleet.frames import Frames
-from app.fleet.names import named
-from app.fleet.server import build_fleet
-from app.fleet.warming import warmed
+from app.fleet.robots import named
+from app.fleet.server import build_fleet, warmed
 from app.sources.request import SourceRequest
 from app.store.book import Beginning
 from app.web.auth import viewer_token
@@ -143,7 +142,7 @@ async def test_what_has_no_room_is_said(monkeypatch: pytest.MonkeyPatch):
         assert fleet.add("red", Open("fake:red")), "the same is no other"
         assert not fleet.add("blue", Open("fake:blue"))
         assert "more than 1 robots; blue" in fleet.notice
-        fleet.tell_cards()
+        fleet.send_cards()
         (_, told), *_ = [m for m in fleet.live.messages_after(0) if b'"fleet"' in m[1]]
         assert json.loads(told)["notice"] == fleet.notice
 
@@ -182,7 +181,7 @@ async def test_robots_begin_when_what_they_need_is_compiled():
     assert fleet.add("red", Open("fake:red"))
     fleet.start()
     await asyncio.sleep(0.05)
-    fleet.tell_cards()
+    fleet.send_cards()
     (_, told), *_ = [m for m in fleet.live.messages_after(0) if b'"fleet"' in m[1]]
     (card,) = json.loads(told)["members"]
     assert (card["state"], card["source"]) == ("starting", "fake:red")
@@ -239,8 +238,8 @@ async def test_a_task_that_had_failed_hinders_no_end(caplog: pytest.LogCaptureFi
         raise OSError("no process")
 
     fleet = make(40000)
-    fleet._laying = asyncio.create_task(broken(), name="frames")
-    await asyncio.wait([fleet._laying])
+    fleet._aligning = asyncio.create_task(broken(), name="frames")
+    await asyncio.wait([fleet._aligning])
     await fleet.close()
     assert "frames had ended with a fault" in caplog.text
 

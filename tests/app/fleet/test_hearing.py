@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 
-from app.fleet.hearing import Hearing
-from app.fleet.results import UNREADABLE, Results
+from app.fleet.hearing import UNREADABLE, Hearing, Results
 from app.robot.inbox import Inbox
 from app.robot.topics import Publisher
 from app.robot.zenoh import ZenohLink
@@ -48,29 +46,21 @@ def test_a_range_that_is_none_is_counted_and_the_last_one_stays(within: float):
     for messages in (published(3.0), published(within)):
         for topic in (outputs.ZONE, outputs.CLEARANCE):
             results.take(topic, messages[topic], 1.0)
-    told = json.loads(json.dumps(results.as_plain(1.0), allow_nan=False))
-    assert told["clearance"]["within_m"] == 3.0
-    assert told["unreadable"] == 1
+    told = results.report(1.0, alive=True)
+    assert told.clearance is not None
+    assert told.clearance["within_m"] == 3.0
+    assert told.unreadable == 1
 
 
-def test_a_robot_of_which_nothing_can_be_said_is_begun_anew_and_the_others_are_heard_on(
-    monkeypatch: pytest.MonkeyPatch,
-):
+def test_results_that_cannot_be_reported_are_dropped_and_other_robots_are_not_affected():
     link, inbox = FakeLink(["/red/stemmap/odometry", "/blue/stemmap/odometry"]), Inbox()
     hearing = Hearing(cast(ZenohLink, link), inbox)
-    hearing.look_around()
+    hearing.subscribe_to_new()
     for number in link.numbers.values():
         inbox.put(Message(number, 0, published(3.0)[outputs.ODOMETRY]), is_scan=False)
     hearing.take(1.0)
-    honest = Results.as_plain
-
-    def as_plain(results: Results, now_s: float) -> dict[str, Any]:
-        told = honest(results, now_s)
-        return {**told, "distance_m": math.inf} if results is red else told
-
-    red = hearing._robots["red"]
-    monkeypatch.setattr(Results, "as_plain", as_plain)
-    told = json.loads(hearing.said(1.5))["robots"]
-    assert (told["red"]["silence_s"], told["red"]["unreadable"]) == (None, 1)
-    assert (told["blue"]["silence_s"], told["blue"]["unreadable"]) == (0.5, 0)
+    hearing._robots["red"]._path = [[math.inf, 0.0]]  # a fault in reading
+    robots = hearing.report(1.5).robots
+    assert (robots["red"].silence_s, robots["red"].unreadable) == (None, 1)
+    assert (robots["blue"].silence_s, robots["blue"].unreadable) == (0.5, 0)
     assert hearing._robots["red"].losses == {UNREADABLE: 1}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from app.fleet.names import NAMELESS, address_of, recorded_apart
-from app.fleet.watching import Watching
+from app.fleet.robots import NAMELESS, Watching, address_of, recorded_apart
 from app.robot.address import ROOT, ZenohAddress, parse_address
 from app.robot.topics import Publisher, choose
 from app.worker.protocol import Open

@@ -63,7 +63,7 @@ sys.stdin.read()
         card, _ = fleet.remote["red"]
         assert card["state"] == "waiting"
         assert card["detail"].startswith("Nothing heard for ")
-        assert "what hears the robots ended" in card["detail"]
+        assert "the process that receives the maps ended" in card["detail"]
         go_on.touch()
         await until(lambda: fleet.notice == "")
         assert list(fleet.remote) == ["red", "blue"]
@@ -77,5 +77,5 @@ async def test_a_process_that_cannot_be_started_is_said_and_the_fleet_still_ends
     fleet = make(40000)
     far = RemoteRobots(fleet, "zenoh:tcp/127.0.0.1:9", [str(tmp_path / "nowhere")])
     far.start()
-    await until(lambda: "cannot be started (No such file" in fleet.notice)
+    await until(lambda: "no process can be started: No such file" in fleet.notice)
     await far.close()

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.robot.source import LiveSource, open_live
 from pipeline.geometry.poses import Pose3
 from pipeline.io.recording import write_recording
 from pipeline.types.records import Odometry, Record, Scan, Sensor
@@ -69,6 +70,13 @@ class Robot(Child):
     def sent(self) -> int:
         """Wait until all is sent; how many scans."""
         return int(json.loads(self.hear())["scans"])
+
+
+def listening(uri: str) -> LiveSource:
+    """A live source that listens, without a recorder."""
+    source = open_live(uri)
+    source.start()
+    return source
 
 
 def until(condition: Callable[[], Any], state: Callable[[], str] = str, limit_s: float = 60.0) -> None:

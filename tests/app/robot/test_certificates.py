@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from app.fleet.names import address_of
+from app.fleet.robots import address_of
 from app.robot.address import ZenohAddress, parse_address
 from app.robot.source import LiveSource, open_live
 from app.robot.zenoh import configuration, data_key
@@ -20,7 +20,7 @@ from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.recording import outputs
 from tests.app.fakes import START_NS, frame, path
 from tests.app.robot.certificates import Authority
-from tests.app.robot.conftest import ROOT, free_port, until
+from tests.app.robot.conftest import ROOT, free_port, listening, until
 from tests.benchmarks.live_robot import Topic
 
 zenoh: Any = pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed")
@@ -107,7 +107,7 @@ def test_with_its_certificate_stemmap_hears_the_robot_and_says_its_own_results(
 
 @pytest.mark.parametrize("name", ["", "forged"])
 def test_without_a_certificate_of_the_authority_nobody_comes_in(folder: Path, port: int, name: str):
-    with closing(open_live(address(folder, port, name))) as source:
+    with closing(listening(address(folder, port, name))) as source:
         until(lambda: "no connection" in source.waiting_for() or _is_dropped(source), source.waiting_for)
         assert source.robots == []
 
@@ -115,8 +115,8 @@ def test_without_a_certificate_of_the_authority_nobody_comes_in(folder: Path, po
 def test_a_certificate_that_is_not_on_the_list_hears_nothing(folder: Path, port: int, drive: Path):
     with (
         robot(folder, port, drive),
-        closing(open_live(address(folder, port, "stranger"))) as stranger,
-        closing(open_live(address(folder, port, "stemmap"))) as own,
+        closing(listening(address(folder, port, "stranger"))) as stranger,
+        closing(listening(address(folder, port, "stemmap"))) as own,
     ):
         until(lambda: own.robots == ["robot1"], own.waiting_for)
         until(lambda: "no scans of a robot are announced" in stranger.waiting_for(), stranger.waiting_for)

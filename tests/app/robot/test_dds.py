@@ -13,12 +13,12 @@ import pytest
 
 from app.robot.address import DdsAddress, parse_address
 from app.robot.dds import DdsGraph, Offer
-from app.robot.source import LiveSource, open_live
+from app.robot.source import LiveSource
 from app.robot.topics import Publisher
 from pipeline.errors import SourceError
 from pipeline.io.readers.ros_messages import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
 from pipeline.types.records import Odometry, Record, Scan
-from tests.app.robot.conftest import POINTS, SCANS, until
+from tests.app.robot.conftest import POINTS, SCANS, listening, until
 from tests.app.robot.fast_dds import Peer, messages_of
 
 #: A domain of this test process: others on the machine must not be heard.
@@ -119,7 +119,7 @@ def test_a_robot_of_fast_dds_is_found_heard_lost_and_found_again(fast_dds: Path,
     pytest.importorskip("cyclonedds", reason="cyclonedds, an extra, is not installed")
     with (
         closing(Peer(fast_dds, DOMAIN, drive)) as robot,
-        closing(open_live(f"dds:?domain={DOMAIN}")) as source,
+        closing(listening(f"dds:?domain={DOMAIN}")) as source,
     ):
         until(lambda: not source.listen() and "no scans are announced" in source.waiting_for())
         robot.announce(reliable=reliable)
@@ -157,7 +157,7 @@ def test_a_writer_in_cdr_is_heard(drive: Path):
 
     from app.robot.dds import idl_type
 
-    with closing(open_live(f"dds:?domain={DOMAIN}")) as source:
+    with closing(listening(f"dds:?domain={DOMAIN}")) as source:
         until(lambda: not source.listen() and "no scans are announced" in source.waiting_for())
         participant = DomainParticipant(DOMAIN)
         writers: dict[str, Any] = {}
@@ -187,5 +187,5 @@ def test_a_writer_in_cdr_is_heard(drive: Path):
 
 def test_the_web_of_an_absent_network_is_said(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("cyclonedds", reason="cyclonedds, an extra, is not installed")
-    with closing(open_live(f"dds:?domain={DOMAIN}&interface=203.0.113.9")) as source:
+    with closing(listening(f"dds:?domain={DOMAIN}&interface=203.0.113.9")) as source:
         until(lambda: "cannot take part in DDS domain" in source.waiting_for(), source.waiting_for)

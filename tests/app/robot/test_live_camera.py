@@ -22,7 +22,7 @@ from app.robot.inbox import (
 )
 from app.robot.picture_store import FULL, REFUSED, SPARED, PictureStore
 from app.robot.recorder import Recorder
-from app.robot.source import LiveSource, open_live
+from app.robot.source import LiveSource
 from app.robot.topics import PICTURE_TYPES, Publisher, choose
 from app.worker.camera import camera_picture, has_camera
 from pipeline.errors import StemmapError
@@ -40,7 +40,7 @@ from pipeline.remapping.scan_cache import SPARE_BYTES
 from pipeline.types.records import Path as Way
 from pipeline.types.records import Record, Scan, Truth
 from tests.app.batch.test_tree_pictures import trees_at
-from tests.app.robot.conftest import Robot, until
+from tests.app.robot.conftest import Robot, listening, until
 from tests.app.robot.fast_dds import Peer, messages_of
 from tests.app.robot.test_dds import DOMAIN
 from tests.app.robot.test_live_session import FakeLink
@@ -256,7 +256,7 @@ def test_the_pictures_of_an_independent_robot_are_seen(router: int, run: Path):
     pytest.importorskip("zenoh_ros2_sdk", reason="zenoh-ros2-sdk, the independent robot, is not installed")
     robot = Robot(router, run, "red")
     try:
-        with closing(open_live(f"zenoh:tcp/127.0.0.1:{router}")) as source:
+        with closing(listening(f"zenoh:tcp/127.0.0.1:{router}")) as source:
             until(lambda: source.listen() or "announced and silent" in source.waiting_for())
             robot.send()
             scans: list[Scan] = []
@@ -285,7 +285,7 @@ def test_pictures_arrived_over_plain_dds(run: Path):
 
     from app.robot.dds import idl_type
 
-    with closing(open_live(f"dds:?domain={DOMAIN}")) as source:
+    with closing(listening(f"dds:?domain={DOMAIN}")) as source:
         participant, writers = DomainParticipant(DOMAIN), dict[str, Any]()
         for topic, msgtype, _ in messages_of(run, one_each=True):
             held = [Policy.Durability.TransientLocal] if topic.endswith("tf_static") else []
@@ -313,7 +313,7 @@ def test_pictures_arrived_over_plain_dds(run: Path):
 @pytest.mark.slow
 def test_the_pictures_of_a_robot_of_fast_dds_are_seen(fast_dds: Path, run: Path):
     pytest.importorskip("cyclonedds", reason="cyclonedds, an extra, is not installed")
-    with closing(Peer(fast_dds, DOMAIN, run)) as robot, closing(open_live(f"dds:?domain={DOMAIN}")) as source:
+    with closing(Peer(fast_dds, DOMAIN, run)) as robot, closing(listening(f"dds:?domain={DOMAIN}")) as source:
         robot.announce(reliable=True)
         until(lambda: source.listen() or "announced and silent" in source.waiting_for(), source.waiting_for)
         for topic in dict.fromkeys(message[0] for message in robot.messages):

@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.robot.inbox import SKIPPED
-from app.robot.source import open_live
 from app.robot.velodyne import NO_DATA, OTHERS, Sweeps
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.container import Channel, Message
@@ -25,7 +24,7 @@ from pipeline.io.readers.pcap_packets import find_packets
 from pipeline.io.readers.ros_messages import VELODYNE_SCAN, standard_types
 from pipeline.io.readers.velodyne import PACKET_BYTES, is_data_packet
 from pipeline.types.records import Record, Scan
-from tests.app.robot.conftest import free_port, until
+from tests.app.robot.conftest import free_port, listening, until
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 1_327_000
@@ -144,7 +143,7 @@ def real_or_made(shared: Callable[[], Path]) -> list[bytes]:
 def test_a_sensor_is_heard_over_the_network_and_lost(request):
     packets = real_or_made(lambda: request.getfixturevalue("shared_data") / "velodyne" / "vlp16.pcap")
     port = free_port()
-    with closing(open_live(f"velodyne:127.0.0.1:{port}")) as source:
+    with closing(listening(f"velodyne:127.0.0.1:{port}")) as source:
         until(lambda: not source.listen() and "no data packet" in source.waiting_for())
         scans: list[Record] = []
         with sensor(port, [*packets, b"x" * PACKET_BYTES, b"short"]):
@@ -166,7 +165,7 @@ def test_a_sensor_is_heard_over_the_network_and_lost(request):
 
 def test_packets_of_another_sender_are_refused_and_counted():
     port = free_port()
-    with closing(open_live(f"velodyne:127.0.0.1:{port}?from=127.0.0.9")) as source:
+    with closing(listening(f"velodyne:127.0.0.1:{port}?from=127.0.0.9")) as source:
         until(lambda: "no data packet" in source.waiting_for())
         with sensor(port, turn()):
             until(lambda: not source.listen() and source.losses.get(OTHERS, 0) > 20)
@@ -178,5 +177,5 @@ def test_a_port_in_use_is_said():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        with closing(open_live(f"velodyne:127.0.0.1:{port}")) as source:
+        with closing(listening(f"velodyne:127.0.0.1:{port}")) as source:
             until(lambda: f"cannot listen on 127.0.0.1:{port}" in source.waiting_for())

@@ -20,9 +20,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from app.cli import serve
-from app.fleet.hearing import results_topic
+from app.fleet.hearing import TOPICS, UNREADABLE, Results, results_topic
 from app.fleet.remote import RemoteRobots
-from app.fleet.results import TOPICS, UNREADABLE, Results
 from app.robot.source import open_live
 from app.worker.numba_warmup import warm_up
 from app.worker.protocol import Open
@@ -32,7 +31,7 @@ from pipeline.io.recording import outputs
 from pipeline.types.clearance import Clearance, Zone
 from tests.app.fakes import START_NS, frame, path, trees
 from tests.app.fleet.test_fleet import make
-from tests.app.robot.conftest import ROOT, Child, Robot, free_port
+from tests.app.robot.conftest import ROOT, Child, Robot, free_port, listening
 from tests.app.robot.conftest import until as patiently
 
 _START = "from app.cli import command; command()"
@@ -123,7 +122,7 @@ async def test_a_robot_that_maps_is_watched_from_afar_until_it_ends(
         await until(lambda card: card["state"] == "playing" or "Nothing heard for" in card["detail"])
         assert fleet.notice == ""
         assert len(fleet.remote["red"][1]["path"]) >= 1
-        fleet.tell_cards()
+        fleet.send_cards()
         (_, told), *_ = [m for m in fleet.live.messages_after(0) if b'"fleet"' in m[1]]
         (card,) = json.loads(told)["members"]
         assert (card["name"], card["remote"]) == ("red", True)
@@ -142,7 +141,7 @@ def test_routers_that_are_connected_pass_a_robot_on(router: int, robots: Callabl
     far = free_port()
     other = Child("-m", "tests.app.robot.router", str(far), str(router))
     assert other.hear() == "ready"
-    with closing(open_live(f"zenoh:tcp/127.0.0.1:{far}?robot=red")) as source:
+    with closing(listening(f"zenoh:tcp/127.0.0.1:{far}?robot=red")) as source:
         robot = robots("red")
         patiently(
             lambda: source.listen() or "announced and silent" in source.waiting_for(), source.waiting_for

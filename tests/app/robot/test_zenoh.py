@@ -16,7 +16,7 @@ from pipeline.io.recording import outputs
 from pipeline.types.clearance import Clearance, Zone
 from pipeline.types.records import Odometry, Record, Scan
 from tests.app.fakes import START_NS, frame, path, trees
-from tests.app.robot.conftest import POINTS, SCANS, Child, Robot, until
+from tests.app.robot.conftest import POINTS, SCANS, Child, Robot, listening, until
 
 
 def taken(source: LiveSource, records: list[Record], scans: int) -> None:
@@ -35,7 +35,7 @@ def subscribed(source: LiveSource) -> bool:
 
 
 def test_a_robot_is_found_heard_lost_and_found_again(router: int, robots: Callable[[str], Robot]):
-    with closing(open_live(f"zenoh:tcp/127.0.0.1:{router}")) as source:
+    with closing(listening(f"zenoh:tcp/127.0.0.1:{router}")) as source:
         until(lambda: not source.listen() and "no scans of a robot are announced" in source.waiting_for())
         robot = robots("robot1")
         until(lambda: subscribed(source))
@@ -65,7 +65,7 @@ def test_a_robot_is_found_heard_lost_and_found_again(router: int, robots: Callab
 
 
 def test_only_the_router_is_connected_and_nothing_listens(router: int):
-    with closing(open_live(f"zenoh:tcp/127.0.0.1:{router}")) as source:
+    with closing(listening(f"zenoh:tcp/127.0.0.1:{router}")) as source:
         until(lambda: "no scans" in source.waiting_for())
         link = source._link
         (connection,) = link.session.info.links()
@@ -74,7 +74,7 @@ def test_only_the_router_is_connected_and_nothing_listens(router: int):
 
 
 def test_a_router_that_is_not_there_is_named_and_tried_again():
-    with closing(open_live("zenoh:tcp/127.0.0.1:9")) as source:
+    with closing(listening("zenoh:tcp/127.0.0.1:9")) as source:
         until(lambda: "no connection to tcp/127.0.0.1:9" in source.waiting_for())
         assert not source.listen()
 
