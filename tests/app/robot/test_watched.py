@@ -49,16 +49,17 @@ def test_what_was_published_is_what_is_shown():
     for topic, payload in messages().items():
         if topic in TOPICS:
             results.take(topic, payload, 10.0)
-    told = results.as_plain(10.5)
+    told = results.report(10.5, alive=True)
     known = trees(4)
-    shown = told["map"]["trees"]
+    shown = told.map["trees"]
     assert [[tree["x"], tree["y"]] for tree in shown] == known.position[known.confirmed].tolist()
     assert [tree["dbh_cm"] for tree in shown] == [30.0, None, 30.0]
-    np.testing.assert_allclose(told["map"]["pose"], [4.0, -2.0, 3.0], atol=1e-3)
-    assert [x for x, _ in told["map"]["path"]] == [0.0, 1.0, 3.0]
-    assert told["distance_m"] == pytest.approx(3.0 + math.hypot(1.0, 2.0), abs=0.1)
-    assert (told["clearance"]["zone"], told["clearance"]["ahead_m"]) == ("stop", 0.75)
-    assert (told["silence_s"], results.losses) == (0.5, {})
+    np.testing.assert_allclose(told.map["pose"], [4.0, -2.0, 3.0], atol=1e-3)
+    assert [x for x, _ in told.map["path"]] == [0.0, 1.0, 3.0]
+    assert told.distance_m == pytest.approx(3.0 + math.hypot(1.0, 2.0), abs=0.1)
+    assert told.clearance is not None
+    assert (told.clearance["zone"], told.clearance["ahead_m"]) == ("stop", 0.75)
+    assert (told.silence_s, results.losses) == (0.5, {})
 
 
 @settings(deadline=None, max_examples=50)
@@ -67,11 +68,11 @@ def test_damaged_messages_are_counted_and_harm_nothing(topic: str, extra: bytes,
     results, whole = Results(), messages()
     for name in TOPICS:
         results.take(name, whole[name], 1.0)
-    before = json.dumps(results.as_plain(2.0)["map"]["trees"])
+    before = json.dumps(results.report(2.0, alive=True).map["trees"])
     results.take(topic, whole[topic][:cut] + extra, 1.5)
-    json.dumps(results.as_plain(2.0), allow_nan=False)
+    results.report(2.0, alive=True)
     if results.losses.get(UNREADABLE) or topic != outputs.DETECTIONS:
-        assert json.dumps(results.as_plain(2.0)["map"]["trees"]) == before
+        assert json.dumps(results.report(2.0, alive=True).map["trees"]) == before
 
 
 def test_results_are_known_by_their_names():
