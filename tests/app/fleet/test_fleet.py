@@ -218,7 +218,7 @@ async def test_a_fleet_that_ends_while_it_compiles_leaves_nothing():
     await waiting.close()
 
 
-async def test_a_map_that_cannot_be_laid_is_written_down_and_the_fleet_still_ends(
+async def test_a_map_that_cannot_be_aligned_is_logged_and_the_fleet_still_ends(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
     async def broken(_frames: Frames, _maps: object) -> bool:
@@ -228,7 +228,7 @@ async def test_a_map_that_cannot_be_laid_is_written_down_and_the_fleet_still_end
     fleet = make(40000)
     fleet.start()
     async with asyncio.timeout(60):
-        while "could not be laid" not in caplog.text:
+        while "could not be aligned" not in caplog.text:
             await asyncio.sleep(0.01)
     await fleet.close()
 
