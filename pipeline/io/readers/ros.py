@@ -288,6 +288,12 @@ class RosSource:
                 f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "
                 "the LiDAR is taken to stand at the base"
             )
+        unnamed = {channel.topic for channel in self._channels.values() if not channel.encoding}
+        read = [topic.name for topic in self._topics.recorded() if topic.read_as and topic.name in unnamed]
+        if read:
+            warnings.append(
+                f"the recording does not name the serialization format of {', '.join(read)}: CDR is assumed"
+            )
         if not self._clock.by_stamp:
             warnings.append("the time stamps in the messages do not fit together: times of writing are used")
         if self._container.damage:

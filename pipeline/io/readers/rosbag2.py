@@ -114,7 +114,13 @@ class Db3File:
             count = int(np.count_nonzero(self._topic == int(number)))
             channels.append(
                 Channel(
-                    int(number), str(topic), ros2_type_name(str(msgtype)), str(encoding), text, kind, count
+                    int(number),
+                    str(topic),
+                    ros2_type_name(str(msgtype)),
+                    str(encoding or ""),
+                    text,
+                    kind,
+                    count,
                 )
             )
         return channels

@@ -32,7 +32,8 @@ TYPES_BY_ROLE = {
     "camera": (COMPRESSED_IMAGE, IMAGE),
 }
 ROLES = "scan, odometry, imu, gnss, pose or camera"
-_READABLE = ("cdr", "ros1")
+#: A recording that does not name the serialization is read as CDR, the default of ROS 2.
+_READABLE = ("cdr", "ros1", "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +167,7 @@ def _group(channels: Iterable[Channel]) -> list[Topic]:
         if channel.encoding in _READABLE:
             groups.setdefault((channel.topic, channel.msgtype), []).append(channel)
         else:
-            named = f"{channel.msgtype or 'unknown type'} as {channel.encoding[:20] or 'unknown encoding'}"
+            named = f"{channel.msgtype or 'unknown type'} as {channel.encoding[:20]}"
             groups.setdefault((channel.topic, named), []).append(channel)
     return [
         Topic(name, msgtype, frozenset(c.number for c in members), sum(c.count for c in members))

@@ -1,4 +1,4 @@
-"""Velodyne data packets (1206 bytes): from packets to a Scan, shared by pcap files and ROS bags."""
+"""Velodyne data packets (1206 bytes): decoding of packets into a Scan, for captures, ROS messages and UDP."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import velodyne_decoder
 from numpy.typing import NDArray
 
 from pipeline.io.readers.scan_columns import clean_scan
-from pipeline.types.records import Scan, Sensor
+from pipeline.types.records import Bool, Int, Scan, Sensor
 
 PACKET_BYTES = 1206
 BLOCK_BYTES, BLOCKS = 100, 12
 PRODUCT = 1205
-#: VLP-32A and VLP-32B share a number; the later one is taken.
+#: VLP-32A and VLP-32B share a product number; the later one is assumed.
 VLP_32 = 0x23
 
 
@@ -22,7 +22,7 @@ def _sensor(name: str, rings: int, ring_step: float, range_max: float) -> Sensor
     return Sensor(name, rings, float(np.radians(ring_step)), float(np.radians(0.2)), 0.03, range_max)
 
 
-#: Sensors by the product number in the last byte of a packet. HDL-64 sends other things there.
+#: Sensors by product number, the last byte of a packet. An HDL-64 does not send it.
 SENSORS = {
     0x21: _sensor("HDL-32E", 32, 1.33, 100.0),
     0x22: _sensor("VLP-16", 16, 2.0, 100.0),
@@ -34,25 +34,34 @@ SENSORS = {
 
 
 class PacketError(Exception):
-    """Packets that no decoder should see, or that it refused."""
+    """There are no packets, or the decoder refuses them."""
 
 
 def is_data_packet(packet: bytes) -> bool:
-    """Whether the bytes look like a data packet of a known sensor.
+    """Return whether the bytes are a data packet of a known sensor."""
+    return len(packet) == PACKET_BYTES and bool(
+        are_data_packets(np.frombuffer(packet, np.uint8), np.zeros(1, np.int64))[0]
+    )
 
-    The decoder takes 1206 bytes of anything in silence, so the marks of the twelve blocks, their
-    azimuths and the product number are looked at first.
+
+def are_data_packets(buffer: NDArray[np.uint8], at: Int) -> Bool:
+    """Return which places of a buffer hold a data packet of a known sensor, shape (N,).
+
+    The decoder accepts any 1206 bytes, so the flags and azimuths of the twelve blocks and the product number
+    are checked before.
+
+    Args:
+        buffer: Bytes.
+        at: First byte of each packet, shape (N,); 1206 bytes from there are in the buffer.
     """
-    if len(packet) != PACKET_BYTES or packet[PRODUCT] not in SENSORS:
-        return False
-    heads = np.frombuffer(packet, "u1", BLOCKS * BLOCK_BYTES).reshape(BLOCKS, BLOCK_BYTES)[:, :4]
-    azimuth = heads[:, 2].astype(np.int64) + 256 * heads[:, 3].astype(np.int64)
-    marks = (heads[:, 0] == 0xFF) & (heads[:, 1] >= 0xBB)
-    return bool(marks.all() and (azimuth < 36000).all())
+    heads = buffer[at[:, None, None] + BLOCK_BYTES * np.arange(BLOCKS)[:, None] + np.arange(4)]
+    azimuth = heads[..., 2].astype(np.int64) + 256 * heads[..., 3].astype(np.int64)
+    sound = (heads[..., 0] == 0xFF) & (heads[..., 1] >= 0xBB) & (azimuth < 36000)
+    return np.asarray(sound.all(axis=1) & np.isin(buffer[at + PRODUCT], list(SENSORS)))
 
 
 class PacketDecoder:
-    """Decodes one sensor's packets, a whole sweep at a time."""
+    """Decodes the packets of one sensor, one sweep at a time."""
 
     def __init__(self) -> None:
         self._decoders: dict[int, velodyne_decoder.ScanDecoder] = {}
@@ -61,12 +70,12 @@ class PacketDecoder:
         """Decode the packets of one sweep; each must pass `is_data_packet`.
 
         Args:
-            stamp_ns: What the scan is stamped with.
-            stamps_ns: When each packet came; offsets are relative to the last.
+            stamp_ns: Stamp of the scan.
+            stamps_ns: Time of arrival of each packet; point times are relative to the last one.
             packets: In the order of time.
 
         Raises:
-            PacketError: There are none, or the decoder refused them.
+            PacketError: There are no packets, or the decoder refuses them.
         """
         if not packets:
             raise PacketError("no packets")
@@ -80,7 +89,7 @@ class PacketDecoder:
         return self._scan(stamp_ns, stamps_ns[-1] - stamp_ns, table)
 
     def _decoder_of(self, product: int) -> velodyne_decoder.ScanDecoder:
-        """The decoder finds the model by its product number, but for the two that share one."""
+        """Return the decoder of a product number; it finds the model itself, except for VLP-32."""
         if product not in self._decoders:
             model = velodyne_decoder.Model.VLP32B if product == VLP_32 else None
             self._decoders[product] = velodyne_decoder.ScanDecoder(velodyne_decoder.Config(model=model))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import bz2
+import sqlite3
 import zlib
+from contextlib import closing
 from pathlib import Path
 
 import lz4.frame
@@ -143,6 +145,22 @@ def test_times_of_writing_serve_where_stamps_do_not(tmp_path: Path, opened: Open
     source = opened(write_recording("db3", tmp_path, unstamped))
     assert [record.stamp_ns for record in source.records()] == [START_NS + k * STEP_NS for k in range(3)]
     assert "times of writing" in " ".join(source.description.warnings)
+
+
+def test_a_database_that_does_not_name_the_serialization_is_read_as_cdr(tmp_path: Path, opened: Opened):
+    folder = write_recording("db3", tmp_path, drive)
+    whole = [record.stamp_ns for record in opened(folder).records()]
+    (path,) = folder.glob("*.db3")
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(
+            "UPDATE topics SET serialization_format = '' WHERE name IN ('/velodyne_points', '/odom')"
+        )
+        database.commit()
+    source = opened(folder)
+    assert [record.stamp_ns for record in source.records()] == whole
+    assert source.description.warnings == (
+        "the recording does not name the serialization format of /odom, /velodyne_points: CDR is assumed",
+    )
 
 
 def test_a_single_impossible_stamp_is_counted(tmp_path: Path, opened: Opened):
