@@ -1,14 +1,20 @@
-"""Recordings of stamped messages: the interface, compressed blocks, and chunks read in the order of time."""
+"""Recordings of stamped messages: the interface, compressed blocks, and chunked files in the order of time.
+
+The readers of MCAP files and ROS 1 bags are our own. rosbags refuses bags without an index and trusts the
+sizes in a file; mcap decompresses without a limit and gives up at the first damaged record.
+"""
 
 from __future__ import annotations
 
 import bz2
 import heapq
 import io
+import struct
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Protocol
 
 import lz4.frame
@@ -17,17 +23,23 @@ import zstandard
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
 
+#: Largest block that is unpacked. Recorders write blocks of 1 to 4 MB; a file of 16 kB can claim 512 MB.
+BLOCK_LIMIT = 256 << 20
+#: Most messages of one chunk, and the memory that a message takes besides its payload [bytes].
+MOST_IN_CHUNK, _MESSAGE_BYTES = 1 << 20, 200
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One publisher's messages of one topic.
+    """The messages of one publisher on one topic.
 
     Attributes:
-        number: The file's own number of it.
+        number: Number of the channel in the file.
         topic: e.g. "/velodyne_points".
         msgtype: In the ROS 2 spelling, e.g. "sensor_msgs/msg/PointCloud2".
-        encoding: "cdr" (ROS 2) or "ros1".
-        definition: The text of the message's definition, "" when the file has none.
+        encoding: "cdr" (ROS 2), "ros1", or "" when the file does not name it.
+        definition: Text of the message definition, "" when the file has none.
         definition_format: "ros2msg", "ros1msg", "ros2idl" or "".
         count: Number of messages.
     """
@@ -43,7 +55,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message as it was recorded: its channel's number, when it was written, its bytes."""
+    """A recorded message: number of its channel, time of recording, and bytes."""
 
     channel: int
     log_ns: int
@@ -51,33 +63,33 @@ class Message:
 
 
 class Container(Protocol):
-    """A recording that can be read from any time. Nothing is decoded here."""
+    """A recording that can be read from any time. It does not decode messages."""
 
     @property
     def kind(self) -> str:
-        """The format in words, e.g. "ROS 2 MCAP"."""
+        """Name of the format, e.g. "ROS 2 MCAP"."""
 
     @property
     def channels(self) -> list[Channel]:
         """All channels."""
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """A time from which on reading meets the last message of these channels, soon after."""
+        """Return a time shortly before the last message of some channels."""
 
     @property
     def damage(self) -> dict[str, int]:
-        """What could not be read when the file was opened, by reason."""
+        """Parts that could not be read when the file was opened, by reason."""
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """Yield the messages of these channels in the order of writing, from `start_ns` on.
+        """Yield the messages of some channels in the order of recording, from `start_ns` on.
 
-        Parts that cannot be read are counted in `losses` and left out.
+        Parts that cannot be read are left out and counted in `losses`.
         """
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """The bytes of a file attached to the recording, None when there is none of this name.
+        """Return the bytes of a file attached to the recording, None when there is none of this name.
 
         Raises:
             SourceError: It is longer than `limit` bytes or damaged.
@@ -94,44 +106,38 @@ def ros2_type_name(name: str) -> str:
 
 
 def damaged(what: str, path: object) -> SourceError:
-    """The error for a file that cannot be read at all."""
+    """Return the error for a file of which nothing can be read."""
     return SourceError(what, where=str(path), remedy="Copy the file again, or record it again.")
 
 
-#: Largest block that is unpacked. Recorders write blocks of 1 to 4 MB; a file of 16 kB can claim 512 MB.
-BLOCK_LIMIT = 256 << 20
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+# --- compressed blocks -----------------------------------------------------------------------------
 
 
 class UnpackError(Exception):
-    """A block that is damaged, too large, or packed in a way that is not known."""
+    """A block is damaged, too large, or has an unknown compression."""
 
 
 def unpack(block: bytes, compression: str, size: int) -> bytes:
-    """Unpack a block that must have exactly `size` bytes afterwards.
+    """Unpack a block to exactly `size` bytes.
 
     Args:
         block: The packed bytes.
         compression: "", "none", "lz4", "zstd" or "bz2".
-        size: The size that the file promises.
+        size: Size by the header.
 
     Raises:
-        UnpackError: The promise is broken, larger than BLOCK_LIMIT, or the method is unknown.
+        UnpackError: The size is larger than BLOCK_LIMIT or wrong, or the compression is unknown.
     """
     if size > BLOCK_LIMIT:
         raise UnpackError("a block is too large")
-    raw = unpack_up_to(block, compression, size)
+    raw = _unpack_up_to(block, compression, size)
     if len(raw) != size:
-        raise UnpackError("a block has another size than it says")
+        raise UnpackError("a block has another size than its header says")
     return raw
 
 
-def unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
-    """Unpack a block, but no more than one byte over `limit`.
-
-    Raises:
-        UnpackError: The block is damaged or the method is unknown.
-    """
+def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
+    """Unpack at most `limit` + 1 bytes of a block."""
     try:
         match compression:
             case "" | "none":
@@ -150,26 +156,29 @@ def unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
 
 
 def plain_message(payload: bytes) -> bytes:
-    """A message as it was sent: recorders can compress each by itself. Empty when it is damaged."""
-    if payload[:4] != ZSTD_MAGIC:
+    """Decompress a message that a recorder compressed by itself; empty when it is damaged."""
+    if payload[:4] != _ZSTD_MAGIC:
         return payload
     try:
-        return unpack_up_to(payload, "zstd", BLOCK_LIMIT)[:BLOCK_LIMIT]
+        return _unpack_up_to(payload, "zstd", BLOCK_LIMIT)[:BLOCK_LIMIT]
     except UnpackError:
         return b""
 
 
+# --- files of chunks -------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Where a run of messages lies in the file.
+    """Position of a run of messages in a file.
 
     Attributes:
         offset, length: Of the packed bytes.
-        start_ns, end_ns: When the first and the last message was written.
+        start_ns, end_ns: Time of recording of the first and the last message.
         compression: As the file names it, "" for none.
-        size: Number of bytes once unpacked.
+        size: Bytes after unpacking.
         crc: CRC-32 of the unpacked bytes, 0 when the file has none.
-        counts: Number of messages by channel, None when the file does not say.
+        counts: Number of messages by channel, None when it is not known yet.
     """
 
     offset: int
@@ -182,80 +191,156 @@ class Chunk:
     counts: dict[int, int] | None
 
 
-class LastChunk:
-    """Keeps the chunk that was unpacked last: opening a recording looks at its first one several times."""
+class BrokenChunkError(Exception):
+    """Nothing more of a chunk can be read."""
 
-    def __init__(self) -> None:
-        self._offset = -1
-        self._raw = b""
 
-    def unpacked(self, chunk: Chunk, read: Callable[[int, int], bytes]) -> bytes:
-        """The unpacked bytes of a chunk.
+class ChunkedFile:
+    """A file with messages in compressed chunks, indexed by reading the headers of its records.
 
-        Args:
-            chunk: To be unpacked.
-            read: Gives (offset, length) of the file.
+    The index of the file itself is not needed, so a file that was cut during a recording gives all its whole
+    chunks, and a wrong index does no harm.
+
+    Attributes:
+        damage: Parts that could not be read on opening, by reason.
+
+    Raises:
+        SourceError: The file cannot be opened, or holds no messages that can be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.damage: dict[str, int] = {}
+        self._path = path
+        self._chunks: list[Chunk] = []
+        self._unpacked: tuple[int, bytes] = (-1, b"")  # offset and bytes of the last chunk
+        try:
+            self._file = path.open("rb", buffering=0)
+        except OSError as error:
+            raise SourceError(f"cannot open the file: {error.strerror}", where=str(path)) from error
+        try:
+            self._read_index()
+            self._survey_chunks()
+        except BaseException:
+            self.close()
+            raise
+
+    def tail_ns(self, numbers: Collection[int]) -> int:
+        """See Container."""
+        last = max(self._needed(frozenset(numbers), None), key=attrgetter("end_ns"), default=None)
+        return 0 if last is None else last.start_ns
+
+    def messages(
+        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
+    ) -> Iterator[Message]:
+        """See Container. Chunks may overlap in time; each is unpacked when its first message is due."""
+        wanted = frozenset(numbers)
+        heap: list[tuple[int, int, Message]] = []
+        serial = held = 0
+        for chunk in sorted(self._needed(wanted, start_ns), key=attrgetter("start_ns", "offset")):
+            while heap and (heap[0][0] <= chunk.start_ns or held > BLOCK_LIMIT):
+                held -= len(heap[0][2].payload) + _MESSAGE_BYTES
+                yield heapq.heappop(heap)[2]
+            try:
+                for message in self._contents(chunk, define=False):
+                    if message.channel in wanted and (start_ns is None or message.log_ns >= start_ns):
+                        heapq.heappush(heap, (message.log_ns, serial, message))
+                        serial += 1
+                        held += len(message.payload) + _MESSAGE_BYTES
+            except (UnpackError, BrokenChunkError):
+                count_loss(losses, "damaged chunks of the recording")
+        while heap:
+            yield heapq.heappop(heap)[2]
+
+    def close(self) -> None:
+        """Close the file; safe to call twice."""
+        self._file.close()
+
+    # --- for the formats ---
+
+    def _read_index(self) -> None:
+        """Read the headers of the records: chunks, channels, attachments.
+
+        Raises:
+            SourceError: The file has another format.
+        """
+        raise NotImplementedError
+
+    def _known_channels(self) -> Collection[int]:
+        """Return the numbers of the channels that are known so far."""
+        raise NotImplementedError
+
+    def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
+        """Yield the messages of an unpacked chunk; with `define`, keep the channels that it defines.
+
+        Raises:
+            BrokenChunkError: The rest cannot be read.
+            struct.error, ValueError, KeyError: The same.
+        """
+        raise NotImplementedError
+
+    # --- shared ---
+
+    def _read(self, offset: int, size: int) -> bytes:
+        try:
+            self._file.seek(offset)
+            return self._file.read(size)
+        except OSError as error:
+            raise damaged(f"cannot read on: {error.strerror}", self._path) from error
+
+    def _counts(self) -> dict[int, int]:
+        """Return the number of messages by channel."""
+        total: dict[int, int] = {}
+        for chunk in self._chunks:
+            for number, count in (chunk.counts or {}).items():
+                total[number] = total.get(number, 0) + count
+        return total
+
+    def _needed(self, wanted: frozenset[int], start_ns: int | None) -> Iterable[Chunk]:
+        for chunk in self._chunks:
+            if start_ns is not None and chunk.end_ns < start_ns:
+                continue
+            if chunk.counts is None or not wanted.isdisjoint(chunk.counts):
+                yield chunk
+
+    def _contents(self, chunk: Chunk, *, define: bool) -> Iterator[Message]:
+        """Yield the messages of a chunk.
 
         Raises:
             UnpackError, BrokenChunkError: It is damaged.
         """
-        if chunk.offset != self._offset:
+        if chunk.offset != self._unpacked[0]:
             if chunk.length > BLOCK_LIMIT:
                 raise BrokenChunkError
-            raw = unpack(read(chunk.offset, chunk.length), chunk.compression, chunk.size)
+            raw = unpack(self._read(chunk.offset, chunk.length), chunk.compression, chunk.size)
             if chunk.crc and zlib.crc32(raw) != chunk.crc:
                 raise BrokenChunkError
-            self._offset, self._raw = chunk.offset, raw
-        return self._raw
-
-
-class BrokenChunkError(Exception):
-    """A chunk of which nothing, or nothing more, can be read."""
-
-
-def in_order(
-    chunks: Iterable[Chunk],
-    wanted: frozenset[int],
-    start_ns: int | None,
-    expand: Callable[[Chunk], Iterable[Message]],
-    losses: dict[str, int],
-) -> Iterator[Message]:
-    """Merge the messages of chunks that may overlap, unpacking each only when its time has come.
-
-    Args:
-        chunks: In any order.
-        wanted: Numbers of the channels.
-        start_ns: Leave out what was written before.
-        expand: Gives the messages of one chunk; raises UnpackError or BrokenChunkError.
-        losses: Counts chunks that cannot be read.
-    """
-    heap: list[tuple[int, int, Message]] = []
-    serial = held = 0
-    for chunk in sorted(_needed(chunks, wanted, start_ns), key=attrgetter("start_ns", "offset")):
-        while heap and (heap[0][0] <= chunk.start_ns or held > BLOCK_LIMIT):
-            held -= len(heap[0][2].payload)
-            yield heapq.heappop(heap)[2]
+            self._unpacked = (chunk.offset, raw)
         try:
-            for message in expand(chunk):
-                if message.channel in wanted and (start_ns is None or message.log_ns >= start_ns):
-                    heapq.heappush(heap, (message.log_ns, serial, message))
-                    serial += 1
-                    held += len(message.payload)
+            for number, message in enumerate(self._parse(self._unpacked[1], define=define)):
+                if number >= MOST_IN_CHUNK:
+                    raise BrokenChunkError
+                yield message
+        except (struct.error, ValueError, KeyError) as error:
+            raise BrokenChunkError from error
+
+    def _survey(self, chunk: Chunk) -> Chunk:
+        """Return a chunk with the number and times of its messages, and keep the channels that it defines."""
+        counts: dict[int, int] = {}
+        first_ns, last_ns = 2**64, -1
+        try:
+            for message in self._contents(chunk, define=True):
+                counts[message.channel] = counts.get(message.channel, 0) + 1
+                first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
         except (UnpackError, BrokenChunkError):
-            count_loss(losses, "damaged chunks of the recording")
-    while heap:
-        yield heapq.heappop(heap)[2]
+            count_loss(self.damage, "chunks of the recording damaged in part")
+        if counts:
+            chunk = replace(chunk, start_ns=first_ns, end_ns=last_ns)
+        return replace(chunk, counts=counts)
 
-
-def tail_ns(chunks: Iterable[Chunk], wanted: frozenset[int]) -> int:
-    """When the last chunk begins that holds messages of these channels, 0 when there is none."""
-    last = max(_needed(chunks, wanted, None), key=attrgetter("end_ns"), default=None)
-    return 0 if last is None else last.start_ns
-
-
-def _needed(chunks: Iterable[Chunk], wanted: frozenset[int], start_ns: int | None) -> Iterator[Chunk]:
-    for chunk in chunks:
-        if start_ns is not None and chunk.end_ns < start_ns:
-            continue
-        if chunk.counts is None or not wanted.isdisjoint(chunk.counts):
-            yield chunk
+    def _survey_chunks(self) -> None:
+        """Survey the chunks without an index, and those with channels that are not defined elsewhere."""
+        for index, chunk in enumerate(self._chunks):
+            if chunk.counts is None or not set(chunk.counts) <= set(self._known_channels()):
+                self._chunks[index] = self._survey(chunk)
+        if not self._known_channels():
+            raise damaged("the recording holds no messages that can be read", self._path)

@@ -13,25 +13,25 @@ Opener = Callable[[str, Path, SourceOptions], Source]
 
 def _mcap(uri: str, path: Path, options: SourceOptions) -> Source:
     from pipeline.io.readers.live import open_live_recording
-    from pipeline.io.readers.mcap_file import open_mcap
+    from pipeline.io.readers.mcap_file import McapFile
     from pipeline.io.readers.ros import open_ros
 
     live = open_live_recording(uri, path, options)
-    return live or open_ros(uri, lambda: open_mcap(path), [path], options)
+    return live or open_ros(uri, lambda: McapFile(path), [path], options)
 
 
 def _db3(uri: str, path: Path, options: SourceOptions) -> Source:
     from pipeline.io.readers.ros import open_ros
-    from pipeline.io.readers.rosbag2 import open_db3
+    from pipeline.io.readers.rosbag2 import Db3File
 
-    return open_ros(uri, lambda: open_db3(path), [path], options)
+    return open_ros(uri, lambda: Db3File(path), [path], options)
 
 
 def _bag(uri: str, path: Path, options: SourceOptions) -> Source:
     from pipeline.io.readers.ros import open_ros
-    from pipeline.io.readers.rosbag1 import open_bag
+    from pipeline.io.readers.rosbag1 import BagFile
 
-    return open_ros(uri, lambda: open_bag(path), [path], options)
+    return open_ros(uri, lambda: BagFile(path), [path], options)
 
 
 def _bag_folder(uri: str, folder: Path, options: SourceOptions) -> Source:

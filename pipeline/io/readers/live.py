@@ -29,7 +29,7 @@ from pipeline.io.readers.camera import (
     time_beside,
 )
 from pipeline.io.readers.container import Channel, Container, Message
-from pipeline.io.readers.mcap_file import McapFile, open_mcap
+from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.message_time import SECOND_NS, SteppingClock, header_stamp
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.ros_messages import CAMERA_INFO, MessageDecoder, standard_types
@@ -529,7 +529,7 @@ def open_live_recording(uri: str, path: Path, options: SourceOptions) -> LiveRec
     Raises:
         SourceError: It is one and cannot be read.
     """
-    container = open_mcap(path)
+    container = McapFile(path)
     try:
         told = told_of(container, uri)
         if told is not None:

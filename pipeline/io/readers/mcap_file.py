@@ -1,98 +1,58 @@
-"""MCAP files (https://mcap.dev/spec): the index is made by walking over the record headers.
-
-The file's own summary is not needed, so a file that was cut in the middle of a recording gives all
-its whole chunks, and a summary that contradicts the data does no harm.
-"""
+"""MCAP files (https://mcap.dev/spec)."""
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
-from pathlib import Path
 
-from pipeline.errors import SourceError
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
+
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import (
+    BLOCK_LIMIT,
     BrokenChunkError,
     Channel,
     Chunk,
-    LastChunk,
+    ChunkedFile,
     Message,
-    UnpackError,
     damaged,
-    in_order,
     ros2_type_name,
-    tail_ns,
-)
+)  # fmt: skip
 
 MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT = 0x03, 0x04, 0x05, 0x06, 0x07, 0x09
-DATA_END, FOOTER = 0x0F, 0x02
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, DATA_END = 2, 3, 4, 5, 6, 7, 9, 0x0F
 RECORD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 CHUNK_HEAD = struct.Struct("<QQQI")
+#: Messages outside of chunks are read in runs of this many bytes.
 LOOSE_RUN = 4 << 20
-#: A file with more records of no known kind is something else, and would take long to walk over.
+#: A file with more records of unknown kinds has another format, and would take long to read.
 STRANGE_LIMIT = 1000
 DEFINITION_LIMIT = 1 << 20
 
 
-class McapFile:
-    """One MCAP file as a container of messages.
+class McapFile(ChunkedFile):
+    """An MCAP file as a container of messages.
 
     Raises:
-        SourceError: It is no MCAP file or holds no channel at all.
+        SourceError: It cannot be opened, is not an MCAP file, or has no channels.
     """
 
     kind = "ROS 2 MCAP"
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._file = path.open("rb", buffering=0)
-        self.damage: dict[str, int] = {}
-        self._schemas: dict[int, tuple[str, str, str]] = {}
-        self._channels: dict[int, tuple[int, str, str]] = {}
-        self._chunks: list[Chunk] = []
-        self._attachments: list[tuple[int, int]] = []
-        self._last = LastChunk()
-        try:
-            self._walk()
-            self._learn_channels()
-        except BaseException:
-            self.close()
-            raise
-
     @property
     def channels(self) -> list[Channel]:
-        """All channels whose schema is known."""
-        counts: dict[int, int] = {}
-        for chunk in self._chunks:
-            for number, count in (chunk.counts or {}).items():
-                counts[number] = counts.get(number, 0) + count
-        return [
-            Channel(
-                number,
-                topic,
-                ros2_type_name(self._schemas[schema][0]) if schema in self._schemas else "",
-                encoding,
-                self._schemas[schema][2] if schema in self._schemas else "",
-                self._schemas[schema][1] if schema in self._schemas else "",
-                counts.get(number, 0),
-            )
-            for number, (schema, topic, encoding) in sorted(self._channels.items())
-        ]
-
-    def tail_ns(self, numbers: Collection[int]) -> int:
-        """See Container."""
-        return tail_ns(self._chunks, frozenset(numbers))
-
-    def messages(
-        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
-    ) -> Iterator[Message]:
-        """See Container."""
-        return in_order(self._chunks, frozenset(numbers), start_ns, self._expand, losses)
+        """All channels."""
+        counts, unknown = self._counts(), ("", "", "")
+        channels = []
+        for number, (schema, topic, encoding) in sorted(self._channels.items()):
+            name, form, definition = self._schemas.get(schema, unknown)
+            count = counts.get(number, 0)
+            channels.append(Channel(number, topic, ros2_type_name(name), encoding, definition, form, count))
+        return channels
 
     def attachment(self, name: str, limit: int) -> bytes | None:
         """See Container."""
@@ -116,36 +76,29 @@ class McapFile:
             return content
         return None
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+    # --- index -------------------------------------------------------------------------------------
 
-    # --- the walk over the records ---------------------------------------------------------------
+    def _known_channels(self) -> Collection[int]:
+        return self._channels
 
-    def _read(self, offset: int, size: int) -> bytes:
-        try:
-            self._file.seek(offset)
-            return self._file.read(size)
-        except OSError as error:
-            raise damaged(f"cannot read on: {error.strerror}", self._path) from error
-
-    def _walk(self) -> None:
+    def _read_index(self) -> None:
+        self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, definition
+        self._channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
+        self._attachments: list[tuple[int, int]] = []
         end = self._file.seek(0, 2)
         if self._read(0, 8) != MAGIC:
             raise damaged("not an MCAP file", self._path)
-        at = 8
-        loose: list[int] = []
-        whole = False
-        strange = 0
+        at, run, strange, whole = 8, -1, 0, False
         while at + RECORD.size <= end:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
             body, after = at + RECORD.size, at + RECORD.size + length
             if after > end or opcode == 0 or strange > STRANGE_LIMIT:
                 break
-            if loose and (opcode != MESSAGE or at - loose[0] > LOOSE_RUN):
-                self._close_run(loose.pop(), at)
+            if run >= 0 and (opcode != MESSAGE or at - run > LOOSE_RUN):
+                self._add_run(run, at)
+                run = -1
             if opcode == MESSAGE:
-                loose = loose or [at]
+                run = at if run < 0 else run
             elif opcode in (FOOTER, DATA_END):
                 whole = True
                 if opcode == FOOTER:
@@ -153,13 +106,35 @@ class McapFile:
             else:
                 strange += not self._take(opcode, body, length)
             at = after
-        if loose:
-            self._close_run(loose.pop(), at)
+        if run >= 0:
+            self._add_run(run, at)
         if not whole:
-            count_loss(self.damage, "bytes at the end of a recording that was cut", max(end - at, 1))
+            read = self._read_summary(at)
+            what = "bytes between damaged records" if read else "bytes at the end of a recording that was cut"
+            count_loss(self.damage, what, max((read or end) - at, 1))
+
+    def _read_summary(self, after: int) -> int:
+        """Add the chunks behind a damaged record by the summary; return where they begin, 0 for none."""
+        try:
+            summary = SeekingReader(self._file, record_size_limit=BLOCK_LIMIT).get_summary()
+        except (McapError, struct.error, ValueError, OSError, StopIteration, MemoryError):
+            return 0
+        if summary is None:
+            return 0
+        for schema in summary.schemas.values():
+            text = schema.data[:DEFINITION_LIMIT].decode(errors="replace")
+            self._schemas.setdefault(schema.id, (schema.name, schema.encoding, text))
+        for channel in summary.channels.values():
+            known = (channel.schema_id, channel.topic, channel.message_encoding)
+            self._channels.setdefault(channel.id, known)
+        chunks = sorted((c for c in summary.chunk_indexes if c.chunk_start_offset > after),
+                        key=lambda chunk: chunk.chunk_start_offset)  # fmt: skip
+        for chunk in chunks:
+            self._take(CHUNK, chunk.chunk_start_offset + RECORD.size, chunk.chunk_length - RECORD.size)
+        return chunks[0].chunk_start_offset if chunks else 0
 
     def _take(self, opcode: int, body: int, length: int) -> bool:
-        """Keep what a record says; False when it is damaged or of no known kind."""
+        """Keep the contents of a record; return False when it is damaged or of an unknown kind."""
         try:
             if opcode in (SCHEMA, CHANNEL):
                 self._define(opcode, self._read(body, min(length, DEFINITION_LIMIT)))
@@ -191,91 +166,41 @@ class McapFile:
         compression, at = _text(head, CHUNK_HEAD.size)
         (packed,) = struct.unpack_from("<Q", head, at)
         if at + 8 + packed > length:
-            raise ValueError("the chunk is shorter than it says")
+            raise ValueError("the chunk is shorter than its header says")
         self._chunks.append(Chunk(body + at + 8, packed, start_ns, end_ns, compression, size, crc, None))
 
+    def _add_run(self, start: int, end: int) -> None:
+        """Add messages outside of chunks as an uncompressed chunk."""
+        self._chunks.append(self._survey(Chunk(start, end - start, 0, 0, "", end - start, 0, None)))
+
     def _count(self, body: int, length: int) -> None:
+        """Take the number of messages of a channel from an index record behind its chunk."""
         number, size = struct.unpack_from("<HI", self._read(body, 6))
-        if not self._chunks or size + 6 > length:
-            return
-        chunk = self._chunks[-1]
-        if chunk.counts is None:
-            chunk = replace(chunk, counts={})
-            self._chunks[-1] = chunk
-        if chunk.counts is not None and size:
-            chunk.counts[number] = size // 16
+        if self._chunks and size + 6 <= length:
+            chunk = self._chunks[-1]
+            counts = {**(chunk.counts or {}), **({number: size // 16} if size else {})}
+            self._chunks[-1] = replace(chunk, counts=counts)
 
-    def _close_run(self, start: int, end: int) -> None:
-        """Keep messages that stand outside of chunks as if they were a chunk that is not packed."""
-        run = Chunk(start, end - start, 0, 0, "", end - start, 0, None)
-        counts, first, last = self._survey(run)
-        self._chunks.append(replace(run, start_ns=first, end_ns=last, counts=counts))
+    # --- chunks ------------------------------------------------------------------------------------
 
-    # --- what lies in the chunks -----------------------------------------------------------------
-
-    def _records(self, chunk: Chunk) -> Iterator[tuple[int, memoryview]]:
-        """The records inside of a chunk as (opcode, content)."""
-        raw = self._last.unpacked(chunk, self._read)
+    def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
         view, at = memoryview(raw), 0
         while at < len(raw):
-            if at + RECORD.size > len(raw):
-                raise BrokenChunkError
             opcode, length = RECORD.unpack_from(raw, at)
             at += RECORD.size
             if at + length > len(raw) or opcode == 0:
                 raise BrokenChunkError
-            yield opcode, view[at : at + length]
+            if opcode == MESSAGE and length >= MESSAGE_HEAD.size:
+                number, _sequence, log_ns, _publish_ns = MESSAGE_HEAD.unpack_from(raw, at)
+                yield Message(number, log_ns, bytes(view[at + MESSAGE_HEAD.size : at + length]))
+            elif define and opcode in (SCHEMA, CHANNEL):
+                self._define(opcode, bytes(view[at : at + min(length, DEFINITION_LIMIT)]))
             at += length
-
-    def _expand(self, chunk: Chunk) -> Iterable[Message]:
-        for opcode, record in self._records(chunk):
-            if opcode == MESSAGE and len(record) >= MESSAGE_HEAD.size:
-                number, _sequence, log_ns, _publish_ns = MESSAGE_HEAD.unpack_from(record)
-                yield Message(number, log_ns, bytes(record[MESSAGE_HEAD.size :]))
-
-    def _survey(self, chunk: Chunk) -> tuple[dict[int, int], int, int]:
-        """Count a chunk's messages and take its definitions: (counts, first_ns, last_ns)."""
-        counts: dict[int, int] = {}
-        times: list[int] = []
-        try:
-            for opcode, record in self._records(chunk):
-                if opcode in (SCHEMA, CHANNEL):
-                    self._define(opcode, bytes(record[:DEFINITION_LIMIT]))
-                elif opcode == MESSAGE and len(record) >= MESSAGE_HEAD.size:
-                    number, _sequence, log_ns, _publish_ns = MESSAGE_HEAD.unpack_from(record)
-                    counts[number] = counts.get(number, 0) + 1
-                    times.append(log_ns)
-        except (UnpackError, BrokenChunkError, struct.error, ValueError):
-            count_loss(self.damage, "chunks of the recording damaged in part")
-        return counts, min(times, default=chunk.start_ns), max(times, default=chunk.end_ns)
-
-    def _learn_channels(self) -> None:
-        """Look into the chunks when no summary names the channels or no index counts the messages."""
-        missing = {n for chunk in self._chunks for n in chunk.counts or ()} - self._channels.keys()
-        for index, chunk in enumerate(self._chunks):
-            if chunk.counts is None or not missing.isdisjoint(chunk.counts):
-                counts, _first, _last = self._survey(chunk)
-                self._chunks[index] = replace(chunk, counts=counts)
-                missing -= self._channels.keys()
-        if not self._channels:
-            raise damaged("the MCAP file holds no messages that can be read", self._path)
 
 
 def _text(record: bytes, at: int) -> tuple[str, int]:
-    """A string with its length before it, and where the next field begins."""
+    """Return a string with its length before it, and the position of the next field."""
     (size,) = struct.unpack_from("<I", record, at)
     if at + 4 + size > len(record):
         raise ValueError("the text is longer than its record")
     return record[at + 4 : at + 4 + size].decode(), at + 4 + size
-
-
-def open_mcap(path: Path) -> McapFile:
-    """Open an MCAP file.
-
-    Raises:
-        SourceError: It cannot be opened or read.
-    """
-    try:
-        return McapFile(path)
-    except OSError as error:
-        raise SourceError(f"cannot open the file: {error.strerror}", where=str(path)) from error

@@ -68,6 +68,7 @@ class RosSource:
         self._mounting.read(self._topics.fixed, self._topics.moving)
         self._records = RecordDecoder(channels, decoder, self._mounting.tree)
         self._losses: dict[str, int] = {}
+        self._warnings: list[str] = []
         self._camera: tuple[Camera | None, str] | None = None
         named = [t for t in (self._topics.scan, self._topics.odometry, self._topics.imu) if t is not None]
         self._clock = make_clock([self._clock_offset(topic) for topic in named])
@@ -260,8 +261,12 @@ class RosSource:
         return max((arrival.stamp_ns for arrival in self._scan_arrivals(tail_ns)), default=None)
 
     def _read_truth(self) -> tuple[Truth | None, Sensor | None]:
-        content = self._container.attachment(ATTACHMENT, SIZE_LIMIT)
-        return (None, None) if content is None else read_truth(content, self._uri)
+        try:
+            content = self._container.attachment(ATTACHMENT, SIZE_LIMIT)
+            return (None, None) if content is None else read_truth(content, self._uri)
+        except SourceError as error:
+            self._warnings.append(f"the attached ground truth is not used: {error.what}")
+            return None, None
 
     def _said_base(self) -> str:
         """The base frame as the odometry topic names it, "" when it does not."""
@@ -282,7 +287,10 @@ class RosSource:
         self._records.base = base = self._mounting.base_frame(self._said_base())
         has_odometry = self._topics.odometry is not None or bool(self._moving)
         linked = options.T_base_lidar or self._mounting.tree.find(base, frame)
-        warnings = [f"the file's definition of {topic} is not used: it is not sound" for topic in refused]
+        warnings = [
+            f"the definition of {topic} in the file is not used: it is not valid" for topic in refused
+        ]
+        warnings += self._warnings
         if linked is None and has_odometry and base != frame:
             warnings.append(
                 f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "

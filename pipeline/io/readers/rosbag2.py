@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Container, Message, damaged, ros2_type_name
-from pipeline.io.readers.mcap_file import open_mcap
+from pipeline.io.readers.mcap_file import McapFile
 from pipeline.types.records import Int
 
 MAGIC = b"SQLite format 3\x00"
@@ -23,10 +23,10 @@ MESSAGE_LIMIT = 256 << 20
 
 
 class Db3File:
-    """One SQLite bag as a container of messages. The file is opened for reading only.
+    """A SQLite bag as a container of messages. The file is opened for reading only.
 
     Raises:
-        SourceError: It is no bag, or its tables cannot be read.
+        SourceError: It is not a bag, or its tables cannot be read.
     """
 
     kind = "ROS 2 bag (db3)"
@@ -34,8 +34,11 @@ class Db3File:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.damage: dict[str, int] = {}
-        # `immutable` keeps SQLite from writing a journal beside a recording on a read-only disk.
-        self._database = sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)
+        # `immutable` keeps SQLite from writing a journal, which fails on a read-only disk.
+        try:
+            self._database = sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)
+        except sqlite3.Error as error:
+            raise SourceError(f"cannot open the file: {error}", where=str(path)) from error
         try:
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MESSAGE_LIMIT)
             self._database.execute("PRAGMA trusted_schema = OFF")
@@ -68,7 +71,7 @@ class Db3File:
                 yield Message(int(self._topic[index]), int(self._stamp[index]), payload)
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """A db3 bag has no attachments."""
+        """Return None: a db3 bag has no attachments."""
         del name, limit
         return None
 
@@ -84,7 +87,7 @@ class Db3File:
         return found[0] if found is not None and isinstance(found[0], bytes) else None
 
     def _refuse_views(self) -> None:
-        """A view or a virtual table could compute for ever; a recorder writes plain tables."""
+        """Refuse views and virtual tables, which can compute without end; recorders write plain tables."""
         plain = self._database.execute(
             "SELECT name FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
             " AND sql NOT LIKE '%VIRTUAL%' AND sql NOT LIKE '%GENERATED%'"
@@ -93,7 +96,7 @@ class Db3File:
             raise damaged("the database holds no tables of messages and topics", self._path)
 
     def _read_index(self) -> tuple[Int, Int, Int]:
-        """Row, topic and time of all messages in the order of time; what is damaged is left out."""
+        """Return row, topic and time of all messages in the order of time, without damaged ones."""
         rows: list[tuple[int, int, int]] = []
         cursor = self._database.execute("SELECT rowid, topic_id, timestamp FROM messages")
         try:
@@ -126,7 +129,7 @@ class Db3File:
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
-        """Message definitions by type, as recorders since ROS 2 Iron store them."""
+        """Return the format and text of message definitions by type, stored since ROS 2 Iron."""
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         try:
             return {str(name): (str(kind), str(text)) for name, kind, text in self._database.execute(query)}
@@ -134,28 +137,16 @@ class Db3File:
             return {}
 
 
-def open_db3(path: Path) -> Db3File:
-    """Open a SQLite bag.
-
-    Raises:
-        SourceError: It cannot be opened or read.
-    """
-    try:
-        return Db3File(path)
-    except (OSError, sqlite3.Error) as error:
-        raise SourceError(f"cannot open the file: {error}", where=str(path)) from error
-
-
-_OPENERS: dict[str, Callable[[Path], Container]] = {".mcap": open_mcap, ".db3": open_db3}
-#: Channels of the n-th file get numbers from n times this on.
+_OPENERS: dict[str, Callable[[Path], Container]] = {".mcap": McapFile, ".db3": Db3File}
+#: The channels of the n-th file are numbered from n times this value.
 _STRIDE = 1 << 40
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """The .mcap and .db3 files of a folder, by name.
+    """Return the .mcap and .db3 files of a folder in the order of their names.
 
     Raises:
-        SourceError: They are compressed as a whole, or are several without metadata.yaml.
+        SourceError: The files themselves are compressed, or there are several without metadata.yaml.
     """
     files = sorted((path for path in folder.iterdir() if path.suffix in _OPENERS), key=_natural)
     packed = sorted(path for path in folder.iterdir() if path.suffixes[-1:] == [".zstd"])
@@ -175,19 +166,19 @@ def bag_files(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> tuple[int, str]:
-    """Recorders number the parts ..._0, ..._1, ..., ..._10."""
+    """Sort key by the number of the part: recorders write ..._0, ..._1, ..., ..._10."""
     tail = path.stem.rpartition("_")[2]
     return (int(tail), path.name) if tail.isdecimal() and len(tail) < 10 else (0, path.name)
 
 
 class BagFolder:
-    """Several files as one container of messages.
+    """The files of a recording as one container of messages.
 
     Args:
-        files: In the order of recording.
+        files: The files in the order of recording.
 
     Raises:
-        SourceError: None of them can be read.
+        SourceError: None of the files can be read.
     """
 
     def __init__(self, files: list[Path]) -> None:
@@ -208,12 +199,12 @@ class BagFolder:
 
     @property
     def kind(self) -> str:
-        """The format in words."""
+        """Name of the format."""
         return self._parts[0].kind
 
     @property
     def channels(self) -> list[Channel]:
-        """The channels of all files, with numbers of their own."""
+        """The channels of all files, with unique numbers."""
         return [
             replace(channel, number=channel.number + _STRIDE * index)
             for index, part in enumerate(self._parts)

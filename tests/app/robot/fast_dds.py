@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.io.readers.container import Message
-from pipeline.io.readers.mcap_file import open_mcap
+from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.ros_messages import POINT_CLOUD
 
 PEER = Path(__file__).parent / "fastdds" / "peer.cpp"
@@ -30,7 +30,7 @@ def compiled(folder: Path) -> Path:
 
 def messages_of(run: Path, *, one_each: bool = False) -> Iterator[tuple[str, str, bytes]]:
     """Topic, type and CDR of the messages of a recording."""
-    with closing(open_mcap(run)) as container:
+    with closing(McapFile(run)) as container:
         channels = {c.number: c for c in container.channels}
         left = set(channels)
         message: Message

@@ -117,6 +117,20 @@ def test_a_truth_of_another_form_is_refused(changes: dict[str, object], reason: 
         read_truth(msgspec.json.encode({"version": 1, **changes}), "here")
 
 
+def test_a_damaged_truth_does_not_refuse_the_recording(tmp_path: Path, opened: Opened):
+    path = tmp_path / "run.mcap"
+    write(path, open_source(URI))
+    content = path.read_bytes()
+    assert content.count(b'"azimuth_step"') == 1
+    path.write_bytes(content.replace(b'"azimuth_step"', b'"azimuth_stop"'))
+    source = opened(path)
+    assert source.truth() is None
+    assert source.description.warnings == (
+        f"the attached ground truth is not used: the attachment {ATTACHMENT} has a wrong checksum",
+    )
+    assert sum(isinstance(record, Scan) for record in source.records()) == source.description.scans
+
+
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"version": 1e999}'])
 def test_a_truth_that_is_no_json_is_refused(content: bytes):
     with pytest.raises(SourceError, match="ground truth cannot be read"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import sqlite3
+import struct
 import zlib
 from contextlib import closing
 from pathlib import Path
@@ -14,11 +15,13 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.container import Channel, UnpackError, unpack
+from pipeline.io.readers.container import MOST_IN_CHUNK, Channel, UnpackError, unpack
+from pipeline.io.readers.mcap_file import CHUNK, CHUNK_HEAD, MESSAGE, MESSAGE_HEAD, RECORD, McapFile
 from pipeline.io.readers.message_time import WINDOW_NS, Stamped, by_stamp
 from pipeline.io.readers.ros_messages import POINT_CLOUD, MessageDecoder
 from pipeline.io.readers.transforms import TransformTree
@@ -125,6 +128,48 @@ def test_every_packing_with_and_without_an_index_is_read(
     source = opened(path)
     assert source.description.scans == len(list(source.records())) == 5
     assert len(list(source.records(START_NS + 2 * STEP_NS))) == 3
+
+
+def test_chunks_behind_a_damaged_length_are_found_by_the_summary(tmp_path: Path, opened: Opened):
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1, compression=CompressionType.LZ4)
+        writer.start("ros2", "")
+        channel = writer.register_channel(
+            "/points", "cdr", writer.register_schema(POINT_CLOUD, "ros2msg", b"")
+        )
+        for k, payload in enumerate(cloud_payloads(6)):
+            writer.add_message(channel, START_NS + k * STEP_NS, payload, START_NS)
+        writer.finish()
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    second = sorted(chunk.chunk_start_offset for chunk in summary.chunk_indexes)[1]
+    content = bytearray(path.read_bytes())
+    content[second + 1 : second + 9] = b"\xff" * 8
+    path.write_bytes(content)
+    source = opened(path)
+    stamps = [(record.stamp_ns - START_NS) // STEP_NS for record in source.records()]
+    assert stamps == [0, 2, 3, 4, 5]
+    assert list(source.losses) == ["bytes between damaged records"]
+    assert any("cut or damaged" in warning for warning in source.description.warnings)
+
+
+def test_a_chunk_of_millions_of_empty_messages_is_given_up(tmp_path: Path):
+    message = RECORD.pack(MESSAGE, 22) + MESSAGE_HEAD.pack(1, 0, START_NS, START_NS)
+    raw = message * (MOST_IN_CHUNK + 10)
+    packed = zstandard.ZstdCompressor().compress(raw)
+    head = CHUNK_HEAD.pack(START_NS, START_NS, len(raw), 0) + struct.pack("<I4sQ", 4, b"zstd", len(packed))
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start("ros2", "")
+        writer.register_channel("/points", "cdr", writer.register_schema(POINT_CLOUD, "ros2msg", b""))
+        file.write(RECORD.pack(CHUNK, len(head) + len(packed)) + head + packed)
+    losses: dict[str, int] = {}
+    with closing(McapFile(path)) as container:
+        assert sum(1 for _ in container.messages({1}, None, losses)) <= MOST_IN_CHUNK
+        assert losses == {"damaged chunks of the recording": 1}
 
 
 def test_messages_packed_one_by_one_are_read(tmp_path: Path, opened: Opened):
