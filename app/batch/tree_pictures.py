@@ -10,8 +10,8 @@ import numpy as np
 from app.common.draw_picture import drawn
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.readers.base import Source
-from pipeline.io.readers.camera import Camera, WithPictures, nearest
-from pipeline.odometry.odometry_override import WithMotion
+from pipeline.io.readers.camera import Camera, PictureSource, nearest
+from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.types.records import Bool, Int, Path, Trees
 
 FOLDER = "pictures"
@@ -87,8 +87,8 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
         OSError: The folder cannot be written.
     """
     _clear(folder / FOLDER)
-    origin: object = source.source if isinstance(source, WithMotion) else source
-    if not isinstance(origin, WithPictures):
+    origin: object = source.source if isinstance(source, OdometryOverride) else source
+    if not isinstance(origin, PictureSource):
         return 0, ""
     camera, why = origin.camera()
     if camera is None:

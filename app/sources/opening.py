@@ -11,7 +11,7 @@ from app.robot.source import LiveSource, open_live
 from pipeline.errors import SourceError
 from pipeline.io.readers import Source, SourceOptions, open_source
 from pipeline.io.readers.base import SourceDescription
-from pipeline.odometry.odometry_override import Motion, WithMotion
+from pipeline.odometry.odometry_override import OdometryEstimator, OdometryOverride
 from pipeline.odometry.synchroniser import OdometryChoice
 
 FILE = "file:"
@@ -84,7 +84,7 @@ def _no_matching(known: SourceDescription) -> str:
     return "there is one scan alone" if known.scans == 1 else ""
 
 
-def motion_of(known: SourceDescription, choice: str, chosen: Chosen) -> Motion | None:
+def motion_of(known: SourceDescription, choice: str, chosen: Chosen) -> OdometryEstimator | None:
     """What makes the motion; None where the source tells it, or nobody does.
 
     Raises:
@@ -95,9 +95,9 @@ def motion_of(known: SourceDescription, choice: str, chosen: Chosen) -> Motion |
 
         return LidarOdometry(known.T_base_lidar)
     if chosen.method == "file":
-        from pipeline.odometry.odometry_override import PoseTable
+        from pipeline.odometry.odometry_override import FileOdometry
 
-        return PoseTable(Path(choice.removeprefix(FILE)).expanduser(), known.T_base_lidar)
+        return FileOdometry(Path(choice.removeprefix(FILE)).expanduser(), known.T_base_lidar)
     return None
 
 
@@ -115,7 +115,7 @@ def with_odometry(source: Source, choice: str) -> tuple[Source, Chosen]:
     if motion is None:
         return source, chosen
     digest = digest_of([Path(choice.removeprefix(FILE)).expanduser()]) if chosen.method == "file" else ""
-    return WithMotion(source, motion, digest), chosen
+    return OdometryOverride(source, motion, digest), chosen
 
 
 def open_any(uri: str, options: SourceOptions) -> Source | LiveSource:

@@ -7,9 +7,9 @@ import msgspec
 from app.robot.source import LiveSource
 from pipeline.errors import StemmapError
 from pipeline.io.readers.base import Source, SourceDescription
-from pipeline.io.readers.camera import SHOWN_NS, Camera, Picture, WithPictures
+from pipeline.io.readers.camera import SHOWN_NS, Camera, Picture, PictureSource
 from pipeline.io.readers.ros_messages import COMPRESSED_IMAGE, IMAGE
-from pipeline.odometry.odometry_override import WithMotion
+from pipeline.odometry.odometry_override import OdometryOverride
 
 
 class CameraPicture(msgspec.Struct, frozen=True):
@@ -39,8 +39,8 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     Raises:
         StemmapError: There is none, and why.
     """
-    origin: object = source.source if isinstance(source, WithMotion) else source
-    if source is None or not has_camera(source.description) or not isinstance(origin, WithPictures):
+    origin: object = source.source if isinstance(source, OdometryOverride) else source
+    if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
         raise StemmapError("this run has no camera", remedy="Record a camera's topic beside the LiDAR")
     picture = origin.picture_near(stamp_ns, SHOWN_NS)
     if picture is None:

@@ -19,8 +19,8 @@ from app.robot.source import LiveSource
 from app.sources.opening import Chosen
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
-from pipeline.odometry.odometry_override import WithMotion
-from pipeline.odometry.synchroniser import Joiner
+from pipeline.odometry.odometry_override import OdometryOverride
+from pipeline.odometry.synchroniser import Synchroniser
 from pipeline.types.records import Learnt, Record, Step
 
 
@@ -183,8 +183,8 @@ class LiveCursor:
     def __init__(self, source: LiveSource, chosen: Chosen, moving: Source) -> None:
         self._source = source
         self.losses = Counter[str]()
-        self._moving = moving if isinstance(moving, WithMotion) else None
-        self._joiner = Joiner(use_odometry=chosen.steps != "static", index=0, losses=self.losses)
+        self._moving = moving if isinstance(moving, OdometryOverride) else None
+        self._synchroniser = Synchroniser(use_odometry=chosen.steps != "static", index=0, losses=self.losses)
         self._ready: deque[Step] = deque()
         self._stamps = array("q")
 
@@ -213,8 +213,8 @@ class LiveCursor:
                 return None
             for record in records:
                 for told in (record,) if self._moving is None else self._moving.pass_on(record):
-                    self._joiner.add(told)
-                self._ready.extend(self._joiner.ready())
+                    self._synchroniser.add(told)
+                self._ready.extend(self._synchroniser.ready())
         return self._ready[0]
 
     def take(self) -> Step | None:

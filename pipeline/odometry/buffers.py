@@ -45,7 +45,7 @@ class Moving(NamedTuple):
     tilt: Tilt | None
 
 
-class OdometryInTime:
+class OdometryBuffer:
     """The newest readings, as if every jump so far had been no motion at all.
 
     Attributes:
@@ -142,7 +142,7 @@ NO_HEADING = 1.0  # rad^2; who says no more of the heading than this says nothin
 MOST = 64
 
 
-class MeasuredInTime:
+class PoseBuffer:
     """The newest measured poses, and apart from them the newest places: poses without a heading, as GNSS
     fixes are, which no odometry can carry on."""
 

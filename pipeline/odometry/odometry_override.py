@@ -14,7 +14,7 @@ from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses
 from pipeline.types.records import Odometry, Record, Scan, Truth
 
 
-class Motion(Protocol):
+class OdometryEstimator(Protocol):
     """Tells the motion of a source whose records it is given one by one.
 
     Attributes:
@@ -30,7 +30,7 @@ class Motion(Protocol):
         """Every record from the first to the last was given."""
 
 
-class WithMotion:
+class OdometryOverride:
     """A source (see `Source`) through which the records of another go on their way.
 
     Args:
@@ -42,7 +42,7 @@ class WithMotion:
         source: As given.
     """
 
-    def __init__(self, source: Source, motion: Motion, digest: str = "") -> None:
+    def __init__(self, source: Source, motion: OdometryEstimator, digest: str = "") -> None:
         self.source, self._motion = source, motion
         self._digest = digest
 
@@ -86,7 +86,7 @@ TOO_MANY = "rows of poses without a scan; if scans are missing between others, l
 TOO_FEW = "scans after the last row of the poses"
 
 
-class PoseTable:
+class FileOdometry:
     """Gives each scan the pose that a file tells for it, as Odometry before it.
 
     Rows with times (TUM) are poses of the LiDAR at those times, in the clock of the source; between two

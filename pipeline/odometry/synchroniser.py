@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.geometry.poses import Pose2, Pose3, wrap_angle
-from pipeline.odometry.buffers import KEEP_NS, STILL, Jump, MeasuredInTime, OdometryInTime, Tilt
+from pipeline.odometry.buffers import KEEP_NS, STILL, Jump, OdometryBuffer, PoseBuffer, Tilt
 from pipeline.odometry.gyro import Gyro
 from pipeline.types.records import Imu, Learnt, Notice, Odometry, PoseMeasurement, Record, Scan, Step, Turn
 
@@ -53,14 +53,14 @@ def steps(
             that step.
     """
     counted = Counter[str]() if losses is None else losses
-    joiner = Joiner(use_odometry=odometry != "static", index=first_index, losses=counted, after=after)
+    joiner = Synchroniser(use_odometry=odometry != "static", index=first_index, losses=counted, after=after)
     for record in records:
         joiner.add(record)
         yield from joiner.ready()
     yield from joiner.ready(end=True)
 
 
-class Joiner:
+class Synchroniser:
     """Takes records one by one, in the order in which they came, and gives the steps that are ready.
 
     Args:
@@ -77,7 +77,7 @@ class Joiner:
         self._use_odometry = use_odometry
         self._index = index
         self._scans: deque[Scan] = deque()
-        self._odometry = OdometryInTime()
+        self._odometry = OdometryBuffer()
         self._imu: deque[Imu] = deque()
         self._gyro = Gyro()
         self._after = after
@@ -86,7 +86,7 @@ class Joiner:
         self._stepped: Pose2 | None = None  # the odometry of the step before
         self._turned_ns: int | None = None
         self._gyro_tilt = (0, 0.0, 0.0)  # when [ns], roll and pitch [rad]
-        self._measured = MeasuredInTime()
+        self._measured = PoseBuffer()
         self._slack = (0.0, 0.0)
         self._doubt = ""
         self._stepped_ns: int | None = None

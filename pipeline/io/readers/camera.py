@@ -1,4 +1,4 @@
-"""Pictures of a recording's camera, and where things of the map stand in them; nothing is decoded here."""
+"""Camera of a recording: its pictures, not decoded, and the projection of points into them."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, Mess
 from pipeline.io.readers.transforms import TransformTree, frame_name
 from pipeline.types.records import Bool, Int
 
-#: Larger pictures are not looked at: bytes as recorded, and pixels.
+#: Larger pictures are refused: bytes as recorded, and pixels.
 BYTES_LIMIT, PIXEL_LIMIT = 64 << 20, 40_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """A pinhole camera on the robot; its lens's distortion is not taken into account.
+    """A pinhole camera on the robot, without lens distortion.
 
     Attributes:
-        topic: Of its pictures.
-        width, height: Of a picture [pixels].
-        K: Focal lengths and centre, shape (3, 3) [pixels].
-        T_base_camera: Where it stands; its axes are x right, y down, z ahead.
+        topic: Topic of its pictures.
+        width, height: Size of a picture [pixels].
+        K: Camera matrix, shape (3, 3) [pixels].
+        T_base_camera: Extrinsics; the axes of the camera are x right, y down, z ahead.
     """
 
     topic: str
@@ -39,7 +39,7 @@ class Camera:
     T_base_camera: Pose3
 
     def project(self, points: Float) -> tuple[Float, Float]:
-        """Pixels, shape (N, 2), and depths [m], shape (N,), of points in the base frame, shape (N, 3)."""
+        """Project points in the base frame, (N, 3) [m]; return pixels, (N, 2), and depths [m], (N,)."""
         seen = self.T_base_camera.inverse().apply(points)
         depth = seen[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -52,10 +52,10 @@ class Picture:
     """One picture as it was recorded.
 
     Attributes:
-        stamp_ns: When it was taken.
-        encoding: "" for a file (JPEG, PNG), else that of its raw pixels, e.g. "rgb8".
-        width, height, step: Of raw pixels; 0 for a file.
-        data: Its bytes.
+        stamp_ns: Time of the picture.
+        encoding: "" for a file (JPEG, PNG), else the encoding of raw pixels, e.g. "rgb8".
+        width, height, step: Size of raw pixels and bytes per row; 0 for a file.
+        data: Bytes.
     """
 
     stamp_ns: int
@@ -73,13 +73,13 @@ def find_camera(
     base: str,
     pictures: frozenset[int],
 ) -> tuple[Camera | None, str]:
-    """The camera of some channels of pictures by its CameraInfo and the transforms; None and why.
+    """Return the camera of some channels by its CameraInfo and the transforms, or None and the reason.
 
     Args:
-        container, decoder: The recording and what reads its messages.
-        tree: Its fixed transforms.
+        container, decoder: The recording and the decoder of its messages.
+        tree: Fixed transforms.
         base: Name of the base frame.
-        pictures: Numbers of the channels.
+        pictures: Numbers of the channels with its pictures.
     """
     channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
     topic = next(channels[number].topic for number in sorted(pictures))
@@ -88,7 +88,7 @@ def find_camera(
         key=lambda channel: (-shared_parts(channel.topic, topic), channel.topic),
     )
     if not near:
-        return None, f"no CameraInfo tells of {topic} where things stand in it"
+        return None, f"there is no CameraInfo for {topic}"
     for message in islice(container.messages({near[0].number}, None, {}), 20):
         try:
             plain = plain_message(message.payload)
@@ -103,13 +103,13 @@ def find_camera(
             continue
         linked = tree.find(base, frame_name(info.header.frame_id))
         if linked is None:
-            return None, f"no fixed transform tells where {frame_name(info.header.frame_id) or 'it'} stands"
+            return None, f"there is no fixed transform to {frame_name(info.header.frame_id) or 'the camera'}"
         return Camera(topic, width, height, K, linked), ""
-    return None, f"nothing sound is told in {near[0].topic}"
+    return None, f"no message of {near[0].topic} is valid"
 
 
 def shared_parts(first: str, second: str) -> int:
-    """How many parts two topics share from the front."""
+    """Return the number of leading parts that two topic names share."""
     parts = zip(first.split("/"), second.split("/"), strict=False)
     return next((k for k, (a, b) in enumerate(parts) if a != b), 99)
 
@@ -117,7 +117,7 @@ def shared_parts(first: str, second: str) -> int:
 def picture_of(
     message: Message, channels: Mapping[int, Channel], decoder: MessageDecoder, stamp_ns: int
 ) -> Picture | None:
-    """A message as a picture, None where its sizes contradict one another or are beyond all bounds."""
+    """Decode a picture, None when its sizes contradict each other or are too large."""
     if len(message.payload) > BYTES_LIMIT:
         return None
     channel = channels[message.channel]
@@ -130,55 +130,55 @@ def picture_of(
         if not (0 < width * height <= PIXEL_LIMIT and width <= step and step * height <= len(image.data)):
             return None
         return Picture(stamp_ns, str(image.encoding)[:20], width, height, step, image.data.tobytes())
-    except Exception:  # whatever the generated decoders of rosbags raise
+    except Exception:  # the generated decoders of rosbags raise many kinds
         return None
 
 
-#: A picture that is farther from a scan in time is not taken for one of its place [ns].
+#: Largest time between a scan and a picture of the same place [ns].
 SAME_TIME_NS = 150_000_000
-#: One that is shown beside a scan may be so far from it [ns]: cameras of one picture a second, too, have a
-#: picture for each scan. How far it is is said, and things are marked as seen from where the robot was then.
+#: Largest time between a scan and the picture shown with it [ns], so that a camera with one picture per
+#: second has one for each scan. Marks in the picture use the pose of the robot at the time of the picture.
 SHOWN_NS = 1_000_000_000
 
 
 def nearest(stamps: Int, wanted_ns: Int) -> tuple[Int, Bool]:
-    """Of times (ascending, N >= 1) the nearest to each wanted one, and whether it is near enough."""
+    """Return the nearest of `stamps` (ascending, N >= 1) to each time, and whether it is near enough."""
     after = np.clip(np.searchsorted(stamps, wanted_ns), 0, len(stamps) - 1)
     before = np.maximum(after - 1, 0)
     near = np.where(np.abs(stamps[before] - wanted_ns) <= np.abs(stamps[after] - wanted_ns), before, after)
     return stamps[near], np.abs(stamps[near] - wanted_ns) <= SAME_TIME_NS
 
 
-#: A picture may be written so long before a scan of its time is stamped, and so long after.
+#: A picture may be recorded this long before or after a scan of its time [ns].
 _EARLY_NS, _LATE_NS = 300_000_000, 1_000_000_000
-#: A stamp that is farther from its arrival than that of the scans was made by a clock that was set meanwhile.
+#: A stamp minus arrival that differs more from that of the scans comes from a clock that was set [ns].
 _OTHER_CLOCK_NS = 2_000_000_000
 
 
 @runtime_checkable
-class WithPictures(Protocol):
-    """A source that may have pictures."""
+class PictureSource(Protocol):
+    """A source with pictures of a camera."""
 
     def camera(self) -> tuple[Camera | None, str]:
-        """How the camera stands; None and why where nobody tells, or there is none ("")."""
+        """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """The picture that was taken nearest to a time, None where none is within `within_ns` of it."""
+        """Return the picture nearest to a time, None when none is within `within_ns` of it."""
 
     def picture_stamps(self) -> list[int]:
-        """When pictures were taken that can still be had, ascending [ns]."""
+        """Return the times of the pictures that are available, ascending [ns]."""
 
     def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """The pictures that were taken at some of `picture_stamps`, each once."""
+        """Yield the pictures of some of `picture_stamps`, each once."""
 
 
 def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
-    """The time of a picture of a live run [ns].
+    """Return the time of a picture of a live run [ns]: its stamp, or its arrival when the clock was set.
 
     Args:
-        stamp_ns: In its message, if any.
-        log_ns: When it came.
-        offset_ns: Stamp minus arrival of the run's first scan.
+        stamp_ns: Stamp in its message, None without one.
+        log_ns: Time of arrival.
+        offset_ns: Stamp minus arrival of the first scan of the run.
     """
     if stamp_ns and abs(stamp_ns - log_ns - offset_ns) < _OTHER_CLOCK_NS:
         return stamp_ns
@@ -186,14 +186,14 @@ def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
 
 
 class RecordedPictures:
-    """The pictures of some channels.
+    """The pictures of some channels of a recording.
 
     Args:
-        container, decoder: The recording and what reads its messages.
-        channels: Of the recording, by number.
-        numbers: Of the channels of pictures.
-        time_of: A message's time [ns] from its stamp, None where that is impossible.
-        offset_ns: Times minus times of writing, roughly.
+        container, decoder: The recording and the decoder of its messages.
+        channels: Channels of the recording by number.
+        numbers: Numbers of the channels of pictures.
+        time_of: Returns the time of a message [ns] by its stamp, None when it is impossible.
+        offset_ns: Time minus time of recording, roughly.
     """
 
     def __init__(
@@ -209,11 +209,11 @@ class RecordedPictures:
         self._numbers, self._time_of, self._offset_ns = numbers, time_of, offset_ns
 
     def stamps(self) -> list[int]:
-        """When they were taken, ascending [ns]."""
+        """Return the times of the pictures, ascending [ns]."""
         return sorted(stamp_ns for stamp_ns, _ in self._stamped(None))
 
     def at(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Those that were taken at some of `stamps`, each once."""
+        """Yield the pictures of some of `stamps`, each once."""
         left = set(wanted_ns)
         for stamp_ns, message in self._stamped(None) if left else ():
             if stamp_ns in left:
@@ -223,13 +223,13 @@ class RecordedPictures:
                     yield picture
 
     def near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """The one that was taken nearest to a time, None where that is farther from it than `within_ns`."""
-        # Of a fast camera only the pictures around the time are read: they can be a megabyte each.
+        """Return the picture nearest to a time, None when it is farther than `within_ns`."""
+        # First only a short interval is read: pictures of a fast camera can be a megabyte each.
         best = self._nearest(stamp_ns, min(within_ns, SAME_TIME_NS)) or self._nearest(stamp_ns, within_ns)
         return None if best is None else picture_of(best[1], self._channels, self._decoder, best[0])
 
     def _nearest(self, stamp_ns: int, within_ns: int) -> tuple[int, Message] | None:
-        """Time [ns] and message of the nearest picture within a time."""
+        """Return the time [ns] and message of the nearest picture within an interval."""
         log_ns, best = stamp_ns - self._offset_ns, None
         wider_ns = within_ns - SAME_TIME_NS
         for taken_ns, message in self._stamped(log_ns - _EARLY_NS - wider_ns):
@@ -241,7 +241,7 @@ class RecordedPictures:
         return best
 
     def _stamped(self, from_log_ns: int | None) -> Iterator[tuple[int, Message]]:
-        """Messages with their times, in the order of writing."""
+        """Yield the messages with their times in the order of recording."""
         for message in self._container.messages(self._numbers, from_log_ns, {}) if self._numbers else ():
             plain = replace(message, payload=plain_message(message.payload))
             stamp_ns = self._time_of(header_stamp(self._channels[message.channel], plain.payload), plain)

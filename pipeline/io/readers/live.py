@@ -30,23 +30,24 @@ from pipeline.io.readers.camera import (
 )
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.message_time import SECOND_NS, SteppingClock, header_stamp
+from pipeline.io.readers.message_time import SECOND_NS, ClockStepFilter, header_stamp
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.ros_messages import CAMERA_INFO, MessageDecoder, standard_types
 from pipeline.io.readers.topics import TYPES_BY_ROLE, Topic
-from pipeline.io.readers.transforms import Mounting
+from pipeline.io.readers.transforms import Extrinsics
 from pipeline.types.records import Notice, Record, Truth
 
-#: So long after the first scan, or after so many, it is clear which topics speak and where the LiDAR stands.
+#: The source is described this long after the first scan, or after this many scans: then its topics and
+#: extrinsics are known.
 OPENING_NS = SECOND_NS
 OPENING_SCANS = 10
-#: So many messages are kept while no scan comes.
+#: Most messages that are kept before the first scan.
 OPENING_LIMIT = 4000
 _TRIES = 5
 
 
-class Heard:
-    """Some messages that came as a container."""
+class MessageList:
+    """Messages in memory as a container."""
 
     damage: dict[str, int]
 
@@ -72,7 +73,7 @@ class Heard:
                 yield message
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """There is none."""
+        """Return None: there are no attachments."""
         del name, limit
         return None
 
@@ -81,17 +82,20 @@ class Heard:
 
 
 class ArrivalReader:
-    """Turns messages into records, one by one.
+    """Turns messages into records, one by one, in the order of arrival.
+
+    The records depend only on the messages and their times of arrival, so a recording gives those of the live
+    run.
 
     Args:
-        uri, kind: Of the source, for people.
-        channels: That may come.
-        options: What the user knows better.
+        uri, kind: Address and format of the source, for the user.
+        channels: Channels of the messages.
+        options: Topics and extrinsics chosen by the user.
 
     Attributes:
-        description: None until a second after the first scan, or ten scans.
-        losses: What was left out so far, by reason.
-        from_ns: What lies before this time is not decoded; None decodes all.
+        description: None until a second after the first scan, or until ten scans.
+        losses: Records left out so far, by reason.
+        from_ns: Messages before this time are not decoded; None decodes all.
     """
 
     def __init__(self, uri: str, kind: str, channels: Sequence[Channel], options: SourceOptions) -> None:
@@ -104,7 +108,7 @@ class ArrivalReader:
         self._heard = 0
         self._failures = 0
         self._source: RosSource | None = None
-        self._clock: SteppingClock | None = None
+        self._clock: ClockStepFilter | None = None
         self.description: SourceDescription | None = None
         self.losses: dict[str, int] = {}
         self.from_ns: int | None = None
@@ -117,14 +121,14 @@ class ArrivalReader:
 
     @property
     def base(self) -> str:
-        """The name of the base frame, "" where nobody says it."""
+        """Name of the base frame, "" when it is unknown."""
         return "" if self._source is None else self._source.base
 
     def add(self, message: Message) -> list[Record]:
-        """Take the next message; the records that are known by it.
+        """Take the next message; return the records that it completes.
 
         Raises:
-            SourceError: There are scans and none can be read.
+            SourceError: There are scans, and none can be read.
         """
         if self._source is not None:
             return self._records_of(message)
@@ -142,10 +146,10 @@ class ArrivalReader:
         return self._open(message.log_ns)
 
     def finish(self) -> list[Record]:
-        """No more messages will come: what the opening held, where it was not over.
+        """Return the records of the messages that still wait for the description, at the end of the input.
 
         Raises:
-            SourceError: As `add`.
+            SourceError: There are scans, and none can be read.
         """
         if self._source is not None or self._first_ns is None:
             return []
@@ -153,30 +157,30 @@ class ArrivalReader:
         return self._open(self._first_ns)
 
     def _forget_oldest(self) -> None:
-        """Of the oldest half only the fixed transforms stay, which are said once, and the scans."""
+        """Drop the older half of the waiting messages, except scans and fixed transforms."""
         half, kept = len(self._opening) // 2, self._fixed | self._scans
         old = [message for message in self._opening[:half] if message.channel in kept]
         self._opening[:half] = old[-half // 2 :]
 
     def _open(self, now_ns: int) -> list[Record]:
-        clocks: list[SteppingClock] = []
+        clocks: list[ClockStepFilter] = []
 
-        def make_clock(offsets_ns: list[int | None]) -> SteppingClock:
-            clocks.append(SteppingClock(offsets_ns))
+        def make_clock(offsets_ns: list[int | None]) -> ClockStepFilter:
+            clocks.append(ClockStepFilter(offsets_ns))
             return clocks[-1]
 
-        heard = Heard(self._kind, self._channels, self._opening)
+        heard = MessageList(self._kind, self._channels, self._opening)
         try:
             source = RosSource(self._uri, heard, [], self._options, make_clock, live=True)
         except SourceError:
             self._failures += 1
             if self._failures >= _TRIES:
                 raise
-            self._first_ns, self._heard = now_ns, 0  # a second more
+            self._first_ns, self._heard = now_ns, 0  # wait another second
             return []
         self._source = source
-        # What the opening looked at must not count for the run, which begins anew with its first message.
-        self._clock = SteppingClock(clocks[-1].offsets_ns)
+        # The run starts again with its first message, so the clock must not remember the messages seen here.
+        self._clock = ClockStepFilter(clocks[-1].offsets_ns)
         source.use_clock(self._clock)
         known = source.description
         self.description = replace(known, scans=None, end_ns=None, digest="", in_order_of_arrival=True)
@@ -184,29 +188,31 @@ class ArrivalReader:
         return [record for message in opening for record in self._records_of(message)]
 
     def _records_of(self, message: Message) -> list[Record]:
-        assert self._source is not None  # noqa: S101 - the two callers have looked
+        assert self._source is not None  # noqa: S101 - checked by the two callers
         assert self._clock is not None  # noqa: S101 - set with it
         records = list(self._source.records_of(message, self.losses, self.from_ns))
-        told = [*self._clock.notices, *self._source.notices]
-        if told:
+        notices = [*self._clock.notices, *self._source.notices]
+        if notices:
             stamp_ns = records[0].stamp_ns if records else 0
-            records = [*(Notice(stamp_ns, text) for text in told), *records]
+            records = [*(Notice(stamp_ns, text) for text in notices), *records]
             self._clock.notices.clear()
             self._source.notices.clear()
         return records
 
 
-#: So many pictures are held, and no more bytes of them: a paused run can still show its scan.
+#: Most pictures in memory, and their bytes; a paused run can still show those of its scan.
 MOST_PICTURES, MOST_BYTES = 60, 64 << 20
 _MOST_FIXED, _LARGEST_TOLD = 200, 64 << 10
 
 
 class LiveCamera:
-    """Takes the messages of a camera one by one, see `app.robot.source`.
+    """Camera of a live run: the pictures of the last seconds, in bounded memory, and the pose of the camera.
+
+    Pictures do not influence the map.
 
     Args:
-        channels: Of the pictures first, then of their CameraInfo, if there is one.
-        fixed: Of fixed transforms.
+        channels: Channel of the pictures, then that of their CameraInfo, if there is one.
+        fixed: Channels of fixed transforms.
     """
 
     def __init__(self, channels: Sequence[Channel], fixed: Sequence[Channel]) -> None:
@@ -221,7 +227,7 @@ class LiveCamera:
         self._found: tuple[str, Camera | None, str] | None = None
 
     def add(self, message: Message) -> bool:
-        """Take a message, whatever it is of; whether it is of the camera alone."""
+        """Take a message of any channel; return whether only the camera uses it."""
         number = message.channel
         if number not in self._numbers:
             if number in self._channels and len(self._fixed) < _MOST_FIXED:
@@ -237,24 +243,24 @@ class LiveCamera:
         return True
 
     def camera(self, base: str) -> tuple[Camera | None, str]:
-        """How it stands on the robot; None and why where nobody tells.
+        """Return the camera with its pose on the robot, or None and the reason why it is unknown.
 
         Args:
-            base: The name of the base frame.
+            base: Name of the base frame.
         """
         if self._found is None or self._found[0] != base:
-            told = [*self._fixed, *([] if self._info is None else [self._info])]
-            heard = Heard("", list(self._channels.values()), told)
-            self._found = (base, *placed(heard, self._decoder, self._pictures_of.number, base))
+            known = [*self._fixed, *([] if self._info is None else [self._info])]
+            messages = MessageList("", list(self._channels.values()), known)
+            self._found = (base, *find_live_camera(messages, self._decoder, self._pictures_of.number, base))
         return self._found[1:]
 
     def near(self, stamp_ns: int, offset_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """The held picture that was taken nearest to a time, None where that is farther from it.
+        """Return the picture in memory that is nearest to a time, None when it is farther than `within_ns`.
 
         Args:
             stamp_ns: The time.
-            offset_ns: Stamp minus arrival of the run's first scan.
-            within_ns: So far from it at most.
+            offset_ns: Stamp minus arrival of the first scan of the run.
+            within_ns: Largest time difference.
         """
         times = [(time_beside(stamp, m.log_ns, offset_ns), k) for k, (stamp, m) in enumerate(self._held)]
         taken_ns, k = min(times, key=lambda each: abs(each[0] - stamp_ns), default=(0, -1))
@@ -263,8 +269,8 @@ class LiveCamera:
         return picture_of(self._held[k][1], self._channels, self._decoder, taken_ns)
 
     def _is_other(self, info: Message) -> bool:
-        """Whether it tells another thing than the one that is known, but for its time."""
-        head = 12  # of CDR: what the bytes mean, and the stamp
+        """Return whether a CameraInfo differs from the known one in more than its time."""
+        head = 12  # of CDR: the byte order and the stamp
         return self._info is None or info.payload[head:] != self._info.payload[head:]
 
     def _keep_fixed(self, message: Message) -> None:
@@ -274,15 +280,17 @@ class LiveCamera:
             self._found = None
 
 
-def placed(
+def find_live_camera(
     container: Container, decoder: MessageDecoder, pictures: int, base: str
 ) -> tuple[Camera | None, str]:
-    """How the camera of a channel stands, from the fixed transforms and CameraInfo beside it; None and why.
+    """Return the camera of a channel by the fixed transforms and the CameraInfo, or None and the reason.
 
     Args:
-        pictures: The channel's number.
+        container, decoder: The messages and their decoder.
+        pictures: Number of the channel of its pictures.
+        base: Name of the base frame.
     """
-    mounting = Mounting(container, decoder)
+    mounting = Extrinsics(container, decoder)
     fixed = [c for c in container.channels if c.topic.endswith("tf_static")]
     mounting.read([Topic(c.topic, c.msgtype, frozenset((c.number,)), c.count) for c in fixed], ())
     return find_camera(container, decoder, mounting.tree, base, frozenset((pictures,)))
@@ -298,15 +306,15 @@ _MOST_NOTES = 1_000_000
 _MOST_SKIPPED = 10_000_000
 
 
-class Told(msgspec.Struct, frozen=True):
-    """What the recorder said of the run.
+class RunRecord(msgspec.Struct, frozen=True):
+    """Settings of a live run, attached to its recording.
 
     Attributes:
-        version: Of this form.
-        uri: The robot's address.
-        topics: That were read, in the order of their numbers; the first one is of the scans.
-        seed, odometry, preset: As the run had them.
-        camera: Topics of pictures and of what tells of them, of which no map is made.
+        version: Version of this record.
+        uri: Address of the robot.
+        topics: Topics that were read, in the order of their channel numbers; the first one has the scans.
+        seed, odometry, preset: Settings of the run.
+        camera: Topics of pictures and their CameraInfo, which are not mapped.
     """
 
     version: int
@@ -318,47 +326,49 @@ class Told(msgspec.Struct, frozen=True):
     camera: list[str] = []
 
 
-def told_of(container: McapFile, where: str) -> Told | None:
-    """What the recorder said; None where the file is another recording.
+def read_run_record(container: McapFile, where: str) -> RunRecord | None:
+    """Read the settings of a live run; None when the file is not the recording of a live run.
 
     Raises:
-        SourceError: It is damaged or of a newer form.
+        SourceError: They are damaged or of a newer version.
     """
     content = container.attachment(NAME, _LIMIT)
     if content is None:
         return None
     try:
-        told = msgspec.json.decode(content, type=Told)
+        run = msgspec.json.decode(content, type=RunRecord)
     except (msgspec.DecodeError, RecursionError) as error:
-        raise SourceError(f"what the recorder said cannot be read: {error}", where=where) from error
-    if told.version != VERSION or not 0 < len(told.topics) + len(told.camera) <= _MOST_TOPICS:
+        raise SourceError(f"the settings of the live run cannot be read: {error}", where=where) from error
+    if run.version != VERSION or not 0 < len(run.topics) + len(run.camera) <= _MOST_TOPICS:
         raise SourceError("the recording is of a newer version of stemmap", where=where)
-    return told
+    return run
 
 
 class LiveRecording:
-    """A live run, read again.
+    """Source that reads the recording of a live run: the same records in the same order.
 
     Args:
         uri: As the user wrote it.
         container: The file; the source closes it.
-        told: What the recorder said.
+        run: Settings of the live run.
         path: Of the file, for the digest.
-        options: Mounting, where the user knows better.
+        options: Extrinsics, where the user knows better.
 
     Raises:
-        SourceError: There is no scan in it that can be read.
+        SourceError: It has no scan that can be read.
     """
 
-    def __init__(self, uri: str, container: McapFile, told: Told, path: Path, options: SourceOptions) -> None:
-        self._uri, self._container, self._told = uri, container, told
-        self._options = replace(options, topics={"scan": told.topics[0], **options.topics})
-        self._channels = _channels(container, told, uri)
+    def __init__(
+        self, uri: str, container: McapFile, run: RunRecord, path: Path, options: SourceOptions
+    ) -> None:
+        self._uri, self._container, self._run = uri, container, run
+        self._options = replace(options, topics={"scan": run.topics[0], **options.topics})
+        self._channels = _channels(container, run, uri)
         self._losses: dict[str, int] = {}
         self._skipped = self._read_skipped()
         self._base, self._offset_ns = "", 0
-        self._placed: tuple[Camera | None, str] | None = None
-        camera = [c for c in container.channels if c.topic in told.camera]
+        self._found_camera: tuple[Camera | None, str] | None = None
+        camera = [c for c in container.channels if c.topic in run.camera]
         self._camera = tuple(replace(c, definition="", definition_format="") for c in camera)
         self.description = self._describe(path)
         self._recorded = RecordedPictures(
@@ -372,11 +382,11 @@ class LiveRecording:
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out when opening and in the latest reading, by reason."""
+        """Records left out on opening and in the latest reading, by reason."""
         return {**self._container.damage, **self._losses}
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order in which they came; what lies before `start_ns` is not decoded."""
+        """Yield records in the order of arrival; messages before `start_ns` are not decoded."""
         reader = self._reader()
         self._losses = reader.losses
         reader.from_ns = start_ns
@@ -386,28 +396,30 @@ class LiveRecording:
         yield from reader.finish()
 
     def truth(self) -> Truth | None:
-        """Nobody knows."""
+        """Return None: the ground truth of a live run is unknown."""
         return None
 
     def camera(self) -> tuple[Camera | None, str]:
-        """How the camera stands; None and why where nobody tells, or there is none ("")."""
-        if self._placed is None:  # it is asked for with each picture
+        """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
+        if self._found_camera is None:  # needed for each picture
             pictures = [c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
-            self._placed = None, ""
+            self._found_camera = None, ""
             if pictures:
-                self._placed = placed(self._container, MessageDecoder(()), pictures[0], self._base)
-        return self._placed
+                self._found_camera = find_live_camera(
+                    self._container, MessageDecoder(()), pictures[0], self._base
+                )
+        return self._found_camera
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """The picture that was taken nearest to a time, None where none is within `within_ns` of it."""
+        """Return the picture nearest to a time, None when none is within `within_ns` of it."""
         return self._recorded.near(stamp_ns, within_ns)
 
     def picture_stamps(self) -> list[int]:
-        """When the pictures were taken, ascending [ns]."""
+        """Return the times of the pictures, ascending [ns]."""
         return self._recorded.stamps()
 
     def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """The pictures that were taken at some of `picture_stamps`, each once."""
+        """Yield the pictures of some of `picture_stamps`, each once."""
         return self._recorded.at(wanted_ns)
 
     def close(self) -> None:
@@ -430,7 +442,7 @@ class LiveRecording:
         self._base, self._offset_ns = reader.base, reader.offset_ns
         if known is None:
             raise SourceError("there is no scan in it", where=self._uri, remedy="Record the LiDAR's topic.")
-        scans = {c.number: c.count for c in self._container.channels if c.topic == self._told.topics[0]}
+        scans = {c.number: c.count for c in self._container.channels if c.topic == self._run.topics[0]}
         recorded, skipped = sum(scans.values()), sum(len(self._skipped.get(c, ())) for c in scans)
         first_ns = next((m.log_ns for m in self._messages(list(scans), {})), 0)
         tail_ns = self._container.tail_ns(scans)
@@ -452,7 +464,7 @@ class LiveRecording:
             scans=recorded - (skipped if self._options.as_live else 0),
             end_ns=(known.start_ns or 0) + last_ns - first_ns,
             digest=digest_of([path]),
-            preset=self._told.preset,
+            preset=self._run.preset,
             warnings=(*known.warnings, *cut, *partly),
             revisions=revisions,
             topics=(*known.topics, *camera_topics(self._camera)),
@@ -501,39 +513,39 @@ class LiveRecording:
                 break
             try:
                 yield types.deserialize_cdr(message.payload, "std_msgs/msg/String").data
-            except Exception:  # whatever the generated decoders of rosbags raise
+            except Exception:  # the generated decoders of rosbags raise many kinds
                 count_loss(self._losses, "notes of the recorder that cannot be read")
 
 
 def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
-    """The topics of a live run's camera, for people."""
+    """Describe the topics of the camera of a live run."""
     return tuple(RecordedTopic(c.topic, c.msgtype, c.count, "camera", "") for c in channels)
 
 
-def _channels(container: McapFile, told: Told, where: str) -> list[Channel]:
-    """The robot's channels as the live run had them: numbered in the order of their choice."""
+def _channels(container: McapFile, run: RunRecord, where: str) -> list[Channel]:
+    """Return the channels of the robot in the order of the live run."""
     by_topic = {channel.topic: channel for channel in container.channels}
-    missing = [topic for topic in told.topics if topic not in by_topic]
+    missing = [topic for topic in run.topics if topic not in by_topic]
     if missing:
         raise SourceError(f"the recording lacks the topic {missing[0][:100]}", where=where)
-    channels = [by_topic[topic] for topic in told.topics]
+    channels = [by_topic[topic] for topic in run.topics]
     if channels[0].msgtype not in TYPES_BY_ROLE["scan"]:
         raise SourceError("the recording's first topic is of no scans", where=where)
-    # The live run had no definitions but the standard ones.
+    # The live run used the standard definitions.
     return [replace(channel, definition="", definition_format="", count=0) for channel in channels]
 
 
 def open_live_recording(uri: str, path: Path, options: SourceOptions) -> LiveRecording | None:
-    """Open an MCAP as the recording of a live run; None where it is another one.
+    """Open an MCAP as the recording of a live run; None when it is another recording.
 
     Raises:
-        SourceError: It is one and cannot be read.
+        SourceError: It is the recording of a live run and cannot be read.
     """
     container = McapFile(path)
     try:
-        told = told_of(container, uri)
-        if told is not None:
-            return LiveRecording(uri, container, told, path, options)
+        run = read_run_record(container, uri)
+        if run is not None:
+            return LiveRecording(uri, container, run, path, options)
     except BaseException:
         container.close()
         raise

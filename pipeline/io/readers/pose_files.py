@@ -1,4 +1,4 @@
-"""Poses and times that stand in text files beside a folder of scans."""
+"""Text files with poses and times."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.types.records import Float, Int
 
 TEXT_LIMIT = 64 << 20
-#: The usual turn between a camera's axes (x right, y down, z forward) and a LiDAR's.
+#: Rotation from the axes of a camera (x right, y down, z forward) to those of a LiDAR.
 R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _STILL = 0.05
 TUM_COLUMNS = 8
 
 
 class TextError(Exception):
-    """A text file that does not hold what its name promises; the text says why."""
+    """A text file does not have the expected contents; the message gives the reason."""
 
 
 def read_poses(path: Path) -> list[Pose3]:
-    """Poses of the LiDAR, x forward, in the frame of the first LiDAR pose's axes.
+    """Read poses of the LiDAR (x forward), one per scan.
 
-    A row has the 12 numbers of a 3 x 4 matrix. KITTI writes the poses of its left camera (x right,
-    y down, z forward); others write those of the LiDAR itself. Where `calib.txt` with a row `Tr:`
-    stands beside it, it is KITTI's. Otherwise the motion tells: a robot goes forward, along z of a
-    camera or along x of a LiDAR. Poses that do not move are the same in both. (The poses of the
-    shared recordings in park_trunks are of that kind: all rows are equal, the sensor stood still.)
+    A row has the 12 numbers of a 3 x 4 matrix. KITTI writes the poses of its left camera (x right, y down,
+    z forward); others write those of the LiDAR. With a file `calib.txt` with a row `Tr:` in the same folder,
+    they are KITTI poses. Otherwise the motion decides: a robot moves along z of a camera or along x of a
+    LiDAR.
 
     Raises:
-        TextError: It has another form.
+        TextError: It has another format, or positions beyond 1e8 m.
         OSError: It cannot be read.
     """
     rows = read_table(path, 12).reshape(-1, 3, 4)
+    _check_positions(rows[:, :, 3])
     R, t = rows[:, :, :3], rows[:, :, 3]
     if not np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-2):
         raise TextError("its matrices are no rotations")
@@ -49,15 +50,16 @@ def read_poses(path: Path) -> list[Pose3]:
 
 
 def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
-    """Poses of the LiDAR with their times [ns] (TUM: t x y z qx qy qz qw), or one a scan (KITTI, times None).
+    """Read poses of the LiDAR: TUM rows t x y z qx qy qz qw with times [ns], or KITTI rows (times None).
 
     Raises:
-        TextError: It has neither form.
+        TextError: It has neither format, or positions beyond 1e8 m.
         OSError: It cannot be read.
     """
     if _columns(path) != TUM_COLUMNS:
         return None, read_poses(path)
     rows = read_table(path, TUM_COLUMNS)
+    _check_positions(rows[:, 1:4])
     times = exact_ns(path)
     if np.any(np.diff(times) <= 0):
         raise TextError("its times do not ascend")
@@ -68,7 +70,7 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
 
 
 def exact_ns(path: Path) -> Int:
-    """The first column, seconds in decimals, in whole nanoseconds: a float has not the digits for it."""
+    """Parse the first column, decimal seconds, as integer nanoseconds; a float has too few digits."""
     words = [line.split()[0] for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
     try:
         return np.array([seconds_ns(word) for word in words], dtype=np.int64)
@@ -77,10 +79,10 @@ def exact_ns(path: Path) -> Int:
 
 
 def seconds_ns(text: str) -> int:
-    """Seconds in decimals as nanoseconds, to the last digit.
+    """Parse decimal seconds as integer nanoseconds, exactly.
 
     Raises:
-        ValueError: It is no number, or beyond what nanoseconds can tell.
+        ValueError: It is not a number, or too large.
     """
     whole, dot, fraction = text.partition(".")
     plain = whole.isascii() and whole.isdigit() and (not dot or (fraction.isascii() and fraction.isdigit()))
@@ -100,10 +102,10 @@ def _columns(path: Path) -> int:
 
 
 def read_times(path: Path) -> Int:
-    """Times [ns] of a file with seconds, or with dates and times of day, one a row.
+    """Read times [ns], one per row, in seconds or as dates with times of day.
 
     Raises:
-        TextError: It has another form, or its times go back.
+        TextError: It has another format, or its times go back.
         OSError: It cannot be read.
     """
     try:
@@ -113,6 +115,11 @@ def read_times(path: Path) -> Int:
     if not len(times) or np.any(np.diff(times) < 0):
         raise TextError("its times go back")
     return times
+
+
+def _check_positions(positions: Float) -> None:
+    if not (np.abs(positions) < COORDINATE_LIMIT).all():
+        raise TextError(f"it has positions beyond {COORDINATE_LIMIT:.0e} m")
 
 
 def _text(path: Path) -> str:
@@ -125,10 +132,10 @@ def _text(path: Path) -> str:
 
 
 def read_table(path: Path, columns: int) -> Float:
-    """Rows of finite numbers below 10^10, shape (rows, columns); lines that begin with # are left aside.
+    """Read rows of finite numbers below 1e10, shape (rows, columns); lines that begin with # are skipped.
 
     Raises:
-        TextError: It has another form.
+        TextError: It has another format.
         OSError: It cannot be read.
     """
     lines = [line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
@@ -144,7 +151,7 @@ def read_table(path: Path, columns: int) -> Float:
 
 
 def _date(line: str) -> int:
-    """A time like 2011-09-26 13:02:25.964389445 in nanoseconds since 1970 (UTC)."""
+    """Parse a time like 2011-09-26 13:02:25.964389445 as nanoseconds since 1970 (UTC)."""
     whole, _, fraction = line.strip().partition(".")
     try:
         moment = datetime.fromisoformat(whole + "+00:00")
@@ -154,7 +161,7 @@ def _date(line: str) -> int:
 
 
 def _calibration(path: Path) -> Pose3 | None:
-    """`T_camera_lidar` of KITTI's calib.txt, None when there is none."""
+    """Return `T_camera_lidar` of the calib.txt of KITTI, None when there is none."""
     try:
         rows = [line.split() for line in _text(path).split("\n") if line.startswith("Tr:")]
         matrix = np.array([float(word) for word in rows[0][1:]]).reshape(3, 4)
@@ -165,7 +172,7 @@ def _calibration(path: Path) -> Pose3 | None:
 
 
 def _moves_along_z(R: Float, t: Float) -> bool:
-    """Whether the steps, seen from the poses themselves, go along z more than along x."""
+    """Return whether the steps, in the frame of each pose, are along z more than along x."""
     steps = np.einsum("nji,nj->ni", R[:-1], np.diff(t, axis=0))
     x, _, z = np.abs(steps).sum(axis=0)
     return bool(z > x and z > _STILL)
@@ -177,15 +184,17 @@ def _nearest_rotation(matrix: Float) -> Float:
     return R
 
 
-#: No pose is told for a time that lies farther from the rows [ns].
+#: A time farther from all rows has no pose [ns].
 _FAR_NS = 1_000_000_000
 
 
 def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
-    """The pose at a time between two rows, that of the nearest row at the ends; None far from any.
+    """Interpolate the pose at a time; the nearest row applies outside of their range, None far from it.
 
     Args:
-        times: Ascending [ns], shape (N,), N >= 1.
+        times: Times of the poses, ascending [ns], shape (N,), N >= 1.
+        poses: Poses, N of them.
+        stamp_ns: The time.
     """
     after = int(np.searchsorted(times, stamp_ns))
     before = max(after - 1, 0)
@@ -200,7 +209,7 @@ def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
 
 
 def between(first: Pose3, second: Pose3, fraction: float) -> Pose3:
-    """From one pose to another: the position on a line, the attitude on the great arc (slerp)."""
+    """Interpolate between two poses: the position on a line, the attitude by slerp."""
     q, p = first.quaternion(), second.quaternion()
     dot = float(q @ p)
     if dot < 0.0:

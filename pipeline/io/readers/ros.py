@@ -22,7 +22,7 @@ from pipeline.io.readers.ros_messages import LASER_SCAN, MessageDecoder
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.scan_columns import rings_descend, sensor_of
 from pipeline.io.readers.topics import Topic, choose_topics
-from pipeline.io.readers.transforms import Mounting, frame_name
+from pipeline.io.readers.transforms import Extrinsics, frame_name
 from pipeline.io.readers.truth_file import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.velodyne import SENSORS
 from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
@@ -64,9 +64,9 @@ class RosSource:
         decoder = MessageDecoder(channels.values())
         self._channels, self._decoder = channels, decoder
         self._topics = choose_topics(channels.values(), options.topics, uri)
-        self._mounting = Mounting(container, decoder)
-        self._mounting.read(self._topics.fixed, self._topics.moving)
-        self._records = RecordDecoder(channels, decoder, self._mounting.tree)
+        self._extrinsics = Extrinsics(container, decoder)
+        self._extrinsics.read(self._topics.fixed, self._topics.moving)
+        self._records = RecordDecoder(channels, decoder, self._extrinsics.tree)
         self._losses: dict[str, int] = {}
         self._warnings: list[str] = []
         self._camera: tuple[Camera | None, str] | None = None
@@ -132,7 +132,7 @@ class RosSource:
             return None, ""
         if self._camera is None:  # it is asked for with each picture
             self._camera = find_camera(
-                self._container, self._decoder, self._mounting.tree, self._records.base, topic.numbers
+                self._container, self._decoder, self._extrinsics.tree, self._records.base, topic.numbers
             )
         return self._camera
 
@@ -203,8 +203,8 @@ class RosSource:
 
     def _transforms(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         """Odometry that is only there as a moving transform."""
-        for stamp_ns, parent, child, pose in self._mounting.decode(message):
-            if (parent, child) == self._mounting.odometry_link:
+        for stamp_ns, parent, child, pose in self._extrinsics.decode(message):
+            if (parent, child) == self._extrinsics.odometry_link:
                 time_ns = self._clock.time_of(stamp_ns, message)
                 if time_ns is None:
                     count_loss(losses, "messages with an impossible time stamp")
@@ -220,7 +220,7 @@ class RosSource:
     # --- opening ---------------------------------------------------------------------------------
 
     def _moving_numbers(self) -> frozenset[int]:
-        if self._topics.odometry is not None or self._mounting.odometry_link is None:
+        if self._topics.odometry is not None or self._extrinsics.odometry_link is None:
             return frozenset()
         return frozenset[int]().union(*(topic.numbers for topic in self._topics.moving))
 
@@ -284,9 +284,9 @@ class RosSource:
     def _describe(
         self, first: Scan, frame: str, sensor: Sensor, refused: list[str], options: SourceOptions
     ) -> SourceDescription:
-        self._records.base = base = self._mounting.base_frame(self._said_base())
+        self._records.base = base = self._extrinsics.base_frame(self._said_base())
         has_odometry = self._topics.odometry is not None or bool(self._moving)
-        linked = options.T_base_lidar or self._mounting.tree.find(base, frame)
+        linked = options.T_base_lidar or self._extrinsics.tree.find(base, frame)
         warnings = [
             f"the definition of {topic} in the file is not used: it is not valid" for topic in refused
         ]

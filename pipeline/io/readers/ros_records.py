@@ -46,15 +46,15 @@ TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 class LayoutError(Exception):
-    """The header of a cloud contradicts itself or its data."""
+    """The header of a cloud or laser scan contradicts itself or its data."""
 
 
 def decode_cloud(cloud: PointCloud2, stamp_ns: int) -> Scan:
-    """Decode a PointCloud2 message.
+    """Decode a PointCloud2 message of any layout.
 
-    The time of a point is taken from a field named t, time, timestamp, time_offset or offset_time:
-    integers are nanoseconds; floating numbers are seconds after the stamp, or since 1970 in the
-    unit that their size tells. Times that do not lie within 2 s of the stamp are not used.
+    The time of a point is read from a field named t, time, timestamp, time_offset or offset_time: integers
+    are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit inferred from
+    their size. Times farther than 2 s from the stamp are not used.
 
     Raises:
         LayoutError: Width, height, steps, fields and length of the data do not fit together.
@@ -72,7 +72,7 @@ def decode_cloud(cloud: PointCloud2, stamp_ns: int) -> Scan:
 
 
 def _table(cloud: PointCloud2) -> NDArray[np.void]:
-    """The points as a structured array of shape (N,); its size is checked before it is made."""
+    """Return the points as a structured array of shape (N,), after a check of its size."""
     width, height = int(cloud.width), int(cloud.height)
     step, row_step, length = int(cloud.point_step), int(cloud.row_step), len(cloud.data)
     count = width * height
@@ -113,12 +113,12 @@ def _dtype(cloud: PointCloud2, step: int) -> np.dtype[np.void]:
 
 
 def decode_laser_scan(laser: LaserScan, stamp_ns: int) -> Scan:
-    """Decode a LaserScan; the stamp is the time of its first beam.
+    """Decode a LaserScan into a planar scan (z = 0, ring 0); the stamp is the time of its first beam.
 
-    Beams outside of its own range_min and range_max are no returns. All points are of ring 0.
+    Beams outside of range_min and range_max of the message are no returns.
 
     Raises:
-        LayoutError: Its angles or ranges cannot be true.
+        LayoutError: Its angles or ranges are impossible.
     """
     ranges = np.asarray(laser.ranges, dtype=np.float64)
     first, step = float(laser.angle_min), float(laser.angle_increment)
@@ -147,12 +147,12 @@ _NAMES = {ODOMETRY: "odometry messages", IMU: "IMU messages", NAV_SAT_FIX: "GNSS
 
 
 class RecordDecoder:
-    """Turns the messages of one recording into records.
+    """Decodes the messages of one recording into records.
 
     Args:
-        channels: Of the recording, by number.
-        decoder: Of its messages.
-        tree: Its fixed transforms.
+        channels: Channels of the recording by number.
+        decoder: Decoder of the messages.
+        tree: Fixed transforms.
 
     Attributes:
         base: Name of the base frame, "" when there is none.
@@ -169,10 +169,10 @@ class RecordDecoder:
         self.poses = frozenset[int]()
 
     def record(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
-        """Decode a message; None when it cannot be used, which is counted in `losses`."""
+        """Decode a message into a record; None when it cannot be used, which is counted in `losses`."""
         channel = self._channels[message.channel]
         try:
-            # Damaged numbers may be of any size; what comes of them is looked at afterwards.
+            # Damaged numbers may be of any size; the records are checked afterwards.
             with np.errstate(all="ignore"):
                 if message.channel in self.poses:
                     return self._other_measurement(message, stamp_ns, losses)
@@ -195,7 +195,7 @@ class RecordDecoder:
         return None
 
     def scan(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> tuple[Scan, str, int]:
-        """A scan, the name of its frame, and the product number of the sensor (0 when not known).
+        """Decode a scan; return it, the name of its frame, and the product number of the sensor (0: unknown).
 
         Raises:
             Exception: Of many kinds, when the message is damaged.
@@ -217,7 +217,7 @@ class RecordDecoder:
         return scan, frame_name(decoded.header.frame_id), good[0][1][-1]
 
     def message(self, message: Message) -> object:
-        """The decoded message.
+        """Decode a message as the type of its channel.
 
         Raises:
             Exception: Of many kinds, when it is damaged.
@@ -225,7 +225,7 @@ class RecordDecoder:
         return self._decoder.decode(self._channels[message.channel], message.payload)
 
     def fix(self, message: Message, stamp_ns: int) -> tuple[Fix | None, str]:
-        """A GNSS fix, None where the receiver had none; and the frame of its antenna.
+        """Decode a GNSS fix; return it, None when the receiver had no fix, and the frame of its antenna.
 
         Raises:
             Exception: Of many kinds, when the message is damaged.
@@ -254,7 +254,7 @@ class RecordDecoder:
         return OtherPose.of(stamp_ns, at, [float(number) for number in covariance], linked), frame
 
     def place_of(self, frame: str) -> Pose3 | None:
-        """Where a frame stands on the robot, None when no fixed transform says it."""
+        """Return the pose of a frame on the robot, None when no fixed transform leads to it."""
         return self._tree.find(self.base, frame)
 
     def _gnss_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
@@ -281,7 +281,7 @@ class RecordDecoder:
         return Odometry(stamp_ns, pose_of(pose.position, pose.orientation))
 
     def _imu(self, message: Message, stamp_ns: int) -> Imu:
-        """A reading, turned into the base frame when the recording says how the IMU stands in it."""
+        """Decode an IMU reading, rotated into the base frame when the pose of the IMU is known."""
         decoded = cast(ros_messages.Imu, self.message(message))
         linked = self._tree.find(self.base, frame_name(decoded.header.frame_id))
         R_base_imu = np.eye(3) if linked is None else linked.R
@@ -289,7 +289,7 @@ class RecordDecoder:
         rates = np.array([[turn.x, turn.y, turn.z], [pull.x, pull.y, pull.z]]) @ R_base_imu.T
         if not (np.abs(rates) < 1e6).all():
             raise ValueError("the reading is not finite")
-        # REP 145: a first covariance of -1 says that there is no orientation; some drivers send zeros.
+        # REP 145: a first covariance of -1 means no orientation; some drivers send a zero quaternion instead.
         orientation = None
         if decoded.orientation_covariance[0] >= 0 and abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) > 0.1:
             R_level_imu = Pose3.from_quaternion(np.zeros(3), [q.w, q.x, q.y, q.z]).R

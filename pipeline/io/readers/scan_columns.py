@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from pipeline.types.records import Float, Float32, Int, Int32, Scan, Sensor
 
-#: Most points that one scan may have; a 128-ring sensor at 5 Hz gives 480,000.
+#: Most points of one scan; a 128-ring sensor at 5 Hz gives 480,000.
 POINT_LIMIT = 16_000_000
-#: No LiDAR sees farther; such a number is a damaged one, and it would overflow in the stages.
+#: Larger ranges [m] are damaged numbers.
 RANGE_LIMIT = 10_000.0
-#: Drivers write (0, 0, 0) for a beam without a return; nothing real is seen at 1 mm.
+#: Drivers write (0, 0, 0) for a beam without a return; closer points are no returns [m].
 NEAR_LIMIT = 1e-3
 
 
@@ -28,8 +28,8 @@ def clean_scan(
 ) -> Scan:
     """Make a Scan of points of shape (N, 3) [m] and their columns of shape (N,).
 
-    Rows that are not finite, beyond 10 km, or at the origin are no returns: they are left out and
-    added to `dropped`.
+    Rows that are not finite, beyond 10 km, or at the origin are no returns: they are left out and added to
+    `dropped`.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         xyz = np.ascontiguousarray(points, dtype=np.float32)
@@ -76,22 +76,22 @@ OFFSET_LIMIT_NS = 2_000_000_000
 def first_of(
     columns: Mapping[str, NDArray[np.generic]], names: tuple[str, ...]
 ) -> NDArray[np.generic] | None:
-    """The column with the first of these names that is there, None when none is."""
+    """Return the column with the first of some names that exists, None when none exists."""
     return next((columns[name] for name in names if name in columns), None)
 
 
 def is_ring(ring: NDArray[np.generic]) -> bool:
-    """Whether a column numbers lasers: whole numbers from 0 to less than RING_LIMIT."""
+    """Return whether a column has ring numbers: integers from 0 to below RING_LIMIT."""
     if ring.dtype.kind not in "iu" or not len(ring):
         return False
     return int(ring.min()) >= 0 and int(ring.max()) < RING_LIMIT
 
 
 def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | None:
-    """Times of points relative to the stamp [ns], shape (N,), or None when they make no sense.
+    """Return the times of points relative to the stamp [ns], shape (N,), or None when they are impossible.
 
-    Integers are nanoseconds; floating numbers are seconds after the stamp, or since 1970 in the unit
-    that their size tells. Times that do not lie within 2 s of the stamp make no sense.
+    Integers are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit
+    inferred from their size. Times farther than 2 s from the stamp are impossible.
     """
     if not len(time):
         return None
@@ -116,20 +116,20 @@ def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64]
 
 
 def _unit(largest: float) -> float | None:
-    """Seconds in one unit of times since 1970, None when they are relative."""
+    """Return the unit [s] of times since 1970 by the largest one, None when times are relative."""
     for limit, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
         if largest > limit:
             return unit
     return None
 
 
-#: Fewer points than this in a ring say nothing about its elevation.
+#: Fewest points of a ring for its elevation.
 _RING_POINTS = 8
 VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.03, 100.0)
 
 
 def sensor_of(scan: Scan) -> Sensor:
-    """Rings, their step and the step of the azimuth as the scan shows them.
+    """Infer the sensor from a scan: number of rings, their step in elevation, and the step in azimuth.
 
     Without a ring column only a VLP-16 is recognised, by its elevations; else `rings` is 0.
     """
@@ -155,10 +155,10 @@ def sensor_of(scan: Scan) -> Sensor:
 
 
 def _in_steps_of_vlp_16(scan: Scan) -> bool:
-    """Whether nearly all returns lie at odd degrees of elevation from -15 to 15, in four rings or more."""
+    """Return whether nearly all returns have odd degrees of elevation, -15 to 15, in four rings or more."""
     points = scan.points.astype(np.float64)
     reach = np.hypot(points[:, 0], points[:, 1])
-    # The lasers stand up to 11 mm above and below the centre, which blurs the angles near by.
+    # The lasers are up to 11 mm above and below the centre, which blurs the angles of near returns.
     degrees = np.degrees(np.arctan2(points[:, 2], reach))[reach > 3.0]
     if len(degrees) < 100:
         return False
@@ -168,14 +168,14 @@ def _in_steps_of_vlp_16(scan: Scan) -> bool:
 
 
 def rings_descend(scan: Scan) -> bool:
-    """Whether ring 0 looks highest, as some drivers number them."""
+    """Return whether ring 0 has the highest elevation, as some drivers number rings."""
     elevation = _elevations(scan) if scan.ring is not None and len(scan.points) else np.zeros(0)
     elevation = elevation[np.isfinite(elevation)]
     return len(elevation) >= 2 and float(np.median(np.diff(elevation))) < 0.0
 
 
 def _elevations(scan: Scan) -> Float:
-    """Median elevation [rad] by ring, NaN for rings with few points, shape (rings,)."""
+    """Return the median elevation [rad] of each ring, NaN for rings with few points, shape (rings,)."""
     ring = np.asarray(scan.ring, dtype=np.int64)
     points = scan.points.astype(np.float64)
     angle = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
@@ -188,13 +188,13 @@ def _elevations(scan: Scan) -> Float:
 
 
 def _azimuth_step(scan: Scan) -> float:
-    """Median angle between neighbouring returns of a ring [rad], 0 when it cannot be told."""
+    """Return the median angle between neighbouring returns of a ring [rad], 0 when it is unknown."""
     steps = []
     ring = np.asarray(scan.ring)
     azimuth = np.arctan2(scan.points[:, 1].astype(np.float64), scan.points[:, 0].astype(np.float64))
     for number in np.unique(ring):
         gaps = np.diff(np.sort(azimuth[ring == number]))
-        # Two returns of one shot share their azimuth; gaps of 2 degrees are holes.
+        # Two returns of one shot have the same azimuth; gaps of 2 degrees are holes.
         steps.append(gaps[(gaps > 2e-4) & (gaps < 0.035)])
     gaps = np.concatenate(steps) if steps else np.zeros(0)
     return float(np.median(gaps)) if len(gaps) >= _RING_POINTS else 0.0

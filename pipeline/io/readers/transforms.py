@@ -13,7 +13,7 @@ from pipeline.io.readers.container import Channel, Container, Message, plain_mes
 from pipeline.io.readers.ros_messages import MessageDecoder, Quaternion, Transforms, TransformStamped, Vector
 from pipeline.io.readers.topics import Topic
 
-#: Positions on Earth in any of its frames are smaller [m].
+#: Positions in any frame of the Earth are smaller [m].
 FARTHEST = 1e9
 
 
@@ -29,11 +29,11 @@ class TransformTree:
         self._links.setdefault(child, {})[parent] = T_parent_child.inverse()
 
     def knows(self, frame: str) -> bool:
-        """Whether any transform names this frame."""
+        """Return whether any transform names a frame."""
         return frame in self._links
 
     def find(self, target: str, source: str) -> Pose3 | None:
-        """`T_target_source` along the fewest links, None when the frames are not linked."""
+        """Return `T_target_source` along the fewest links, None when the frames are not linked."""
         reached = {target: Pose3.identity()}
         border = [target]
         while border and source not in reached:
@@ -48,12 +48,12 @@ class TransformTree:
 
 
 def frame_name(name: object) -> str:
-    """A frame's name without the leading slash that ROS 1 sometimes writes."""
+    """Return the name of a frame without the leading slash of some ROS 1 messages."""
     return str(name).lstrip("/")
 
 
 def pose_of(position: Vector, orientation: Quaternion) -> Pose3:
-    """A Pose3 of the message parts with x, y, z and x, y, z, w.
+    """Make a Pose3 of the position and the quaternion of a message.
 
     Raises:
         ValueError: A number is not finite or the quaternion is zero.
@@ -65,11 +65,11 @@ def pose_of(position: Vector, orientation: Quaternion) -> Pose3:
 
 
 def is_odometry_link(parent: str, child: str) -> bool:
-    """Whether a moving transform says where the robot is: from a frame named odom to its base."""
+    """Return whether a transform is odometry: from a frame named odom to a frame named base."""
     return parent.split("/")[-1].startswith("odom") and child.split("/")[-1].startswith("base")
 
 
-#: So many messages of fixed and of moving transforms are looked at when a recording is opened.
+#: Messages of fixed and of moving transforms that are read when a recording is opened.
 FIXED_MESSAGES = 1000
 MOVING_MESSAGES = 300
 _WORLD = ("map", "world", "earth", "odom", "utm")
@@ -78,12 +78,12 @@ _WORLD = ("map", "world", "earth", "odom", "utm")
 Link = tuple[int, str, str, Pose3]
 
 
-class Mounting:
-    """The fixed transforms of a recording, and the link of its odometry when a transform carries it.
+class Extrinsics:
+    """Extrinsics of a recording: its fixed transforms, and the transform that carries the odometry.
 
     Attributes:
         tree: Fixed transforms.
-        odometry_link: (parent, child) of the moving transform that says where the robot is, or None.
+        odometry_link: (parent, child) of the moving transform with the pose of the robot, or None.
     """
 
     def __init__(self, container: Container, decoder: MessageDecoder) -> None:
@@ -94,23 +94,23 @@ class Mounting:
         self.odometry_link: tuple[str, str] | None = None
 
     def read(self, fixed: Iterable[Topic], moving: Iterable[Topic]) -> None:
-        """Look at the transforms; what cannot be decoded is passed over here and counted when read."""
+        """Read the transforms; messages that cannot be decoded are skipped here."""
         for (parent, child), pose in self._links(moving, MOVING_MESSAGES, steady=True).items():
             self.tree.add(parent, child, pose)
         for (parent, child), pose in self._links(fixed, FIXED_MESSAGES, steady=False).items():
             self.tree.add(parent, child, pose)
 
-    def base_frame(self, said: str) -> str:
-        """The frame of the base: what the odometry said, else a frame with a usual name, else ""."""
-        if said:
-            return said
+    def base_frame(self, by_odometry: str) -> str:
+        """Return the base frame: that of the odometry, else a frame with a usual name, else ""."""
+        if by_odometry:
+            return by_odometry
         if self.odometry_link is not None:
             return self.odometry_link[1]
         usual = ("base_link", "base_footprint", "base")
         return next((name for name in usual if self.tree.knows(name)), "")
 
     def _links(self, topics: Iterable[Topic], limit: int, *, steady: bool) -> dict[tuple[str, str], Pose3]:
-        """Transforms of the first messages; with `steady` only those that do not move."""
+        """Return the transforms of the first messages; with `steady` only those that do not change."""
         numbers = frozenset[int]().union(*(topic.numbers for topic in topics))
         seen: dict[tuple[str, str], Pose3] = {}
         moved: set[tuple[str, str]] = set()
@@ -130,11 +130,11 @@ class Mounting:
         }
 
     def decode(self, message: Message) -> list[Link]:
-        """The transforms of one message, without those that are not finite; [] when it is damaged."""
+        """Decode the finite transforms of a message; [] when it is damaged."""
         try:
             payload = plain_message(message.payload)
             decoded = cast(Transforms, self._decoder.decode(self._channels[message.channel], payload))
-        except Exception:  # whatever the generated decoders of rosbags raise
+        except Exception:  # the generated decoders of rosbags raise many kinds
             return []
         with np.errstate(all="ignore"):
             return [link for link in map(_link, decoded.transforms) if link is not None]

@@ -17,7 +17,7 @@ from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import OPENING_LIMIT, ArrivalReader
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.message_time import SteppingClock
+from pipeline.io.readers.message_time import ClockStepFilter
 from pipeline.io.readers.ros_messages import ODOMETRY, POINT_CLOUD
 from pipeline.types.records import Notice, Odometry, PoseMeasurement, Record, Scan
 from tests.app.robot.conftest import SCANS
@@ -61,7 +61,7 @@ def test_a_planar_laser_and_fixes_count_live_too(tmp_path: Path):
         late = [record for message in messages for record in again.add(message)]
     assert reader.description is not None
     assert reader.description.preset == "laser2d"
-    assert "drove far enough" in reader.description.gnss
+    assert "driven far enough" in reader.description.gnss
     assert sum(isinstance(record, Scan) for record in records) == 60
     assert [n.text for n in records if isinstance(n, Notice) and "north is known" in n.text]
     measured = [record for record in records if isinstance(record, PoseMeasurement)]
@@ -106,8 +106,8 @@ def test_scans_that_nobody_can_read_are_an_error_in_the_end():
         send()
 
 
-def clock() -> SteppingClock:
-    return SteppingClock([0, 0])
+def clock() -> ClockStepFilter:
+    return ClockStepFilter([0, 0])
 
 
 @given(st.integers(-2_000_000_000, 4 * 10**9), st.integers(1, 400), st.integers(-SECOND // 4, SECOND // 4))
