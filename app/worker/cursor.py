@@ -24,7 +24,7 @@ from pipeline.odometry.synchroniser import Synchroniser
 from pipeline.types.records import Learnt, Record, Step
 
 
-class Synchroniser(Protocol):
+class StepsFunction(Protocol):
     """Joins records to steps; see `pipeline.odometry.synchroniser.steps`."""
 
     def __call__(self, records: Iterator[Record], *, after: Learnt | None = None) -> Iterator[Step]: ...
@@ -41,7 +41,7 @@ class Cursor:
         synchronise: Joins records to steps; it is called anew for every place that is read from.
     """
 
-    def __init__(self, source: Source, synchronise: Synchroniser) -> None:
+    def __init__(self, source: Source, synchronise: StepsFunction) -> None:
         self._source = source
         self._synchronise = synchronise
         self._stamps = array("q")

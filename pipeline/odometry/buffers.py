@@ -22,7 +22,7 @@ Tilt = tuple[float, float]  # roll, pitch [rad]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Odometry as it is used: in the plane, without jumps; tilt None where it knows the plane alone."""
+    """Planar odometry without jumps; tilt is None for odometry in the plane."""
 
     stamp_ns: int
     pose: Pose2
@@ -30,15 +30,15 @@ class Reading:
 
 
 class Jump(NamedTuple):
-    """A step that no robot makes: distance [m], turn [rad] (absolute)."""
+    """A step of the odometry that is impossible for a robot: distance [m] and absolute turn [rad]."""
 
     distance: float
     turn: float
 
 
 class Moving(NamedTuple):
-    """The base at a time: T_odom_base, its velocity x, y [m/s], yaw [rad/s] in its own frame, and its tilt
-    where the odometry is of the whole pose."""
+    """Motion of the base at a time: T_odom_base, velocity x, y [m/s], yaw [rad/s] in the base frame, and tilt
+    (None for odometry in the plane)."""
 
     pose: Pose2
     twist: tuple[float, float, float]
@@ -46,10 +46,10 @@ class Moving(NamedTuple):
 
 
 class OdometryBuffer:
-    """The newest readings, as if every jump so far had been no motion at all.
+    """The odometry of the last seconds, from which jumps are removed.
 
     Attributes:
-        stands: Since when [ns] the robot has been standing, and where; of the last reading.
+        stands: Time [ns] and pose since which the robot has not moved, None before the first reading.
     """
 
     def __init__(self) -> None:
@@ -59,11 +59,11 @@ class OdometryBuffer:
 
     @property
     def newest(self) -> Reading | None:
-        """The last reading, None before the first."""
+        """The last reading, None before the first one."""
         return self._readings[-1] if self._readings else None
 
     def add(self, odometry: Odometry) -> Jump | None:
-        """Keep a reading with finite numbers that is later than the one before; what of it was a jump."""
+        """Add a finite reading that is later than the last one; return its jump, None when there is none."""
         raw, jump = odometry.T_odom_base.planar(), None
         pose = self._T_odom_jumped @ raw
         if self._readings:
@@ -88,19 +88,19 @@ class OdometryBuffer:
         self.stands = (reading.stamp_ns, reading.pose)
 
     def forget(self, needed_ns: int) -> None:
-        """Drop what no scan from that time on will ask for."""
+        """Drop readings that no scan from a time on needs."""
         while len(self._readings) > 2 and self._readings[1].stamp_ns < needed_ns - KEEP_NS:
             self._readings.popleft()
 
     def pose_at(self, stamp_ns: int) -> Pose2:
-        """T_odom_base at a time, that of the nearest reading where it lies outside; there is a reading."""
+        """Return T_odom_base at a time, interpolated or that of the nearest reading; needs a reading."""
         before, after = self._around(stamp_ns)
         span = after.stamp_ns - before.stamp_ns
         fraction = (stamp_ns - before.stamp_ns) / span if span > 0 else 1.0
         return interpolate(before.pose, after.pose, min(max(fraction, 0.0), 1.0))
 
     def motion_at(self, stamp_ns: int) -> Moving:
-        """The base at a time; there is a reading."""
+        """Return the motion of the base at a time; needs a reading."""
         before, after = self._around(stamp_ns)
         span = (after.stamp_ns - before.stamp_ns) * 1e-9
         if span <= 0.0:
@@ -113,7 +113,7 @@ class OdometryBuffer:
         )
 
     def _around(self, stamp_ns: int) -> tuple[Reading, Reading]:
-        """The readings before and after a time; the two nearest ones where it lies outside."""
+        """Return the readings before and after a time, or the two nearest ones outside of their range."""
         readings = self._readings
         after = next((k for k, r in enumerate(readings) if r.stamp_ns >= stamp_ns), len(readings) - 1)
         after = max(after, min(1, len(readings) - 1))
@@ -121,7 +121,7 @@ class OdometryBuffer:
 
 
 def _tilt_between(before: Reading, after: Reading, fraction: float) -> Tilt | None:
-    """Roll and pitch between two readings; a reading in the plane beside one in space is level by chance."""
+    """Interpolate roll and pitch between two readings; a reading without a tilt is level."""
     if before.tilt is None and after.tilt is None:
         return None
     (roll, pitch), (roll_after, pitch_after) = before.tilt or (0.0, 0.0), after.tilt or (0.0, 0.0)
@@ -130,28 +130,28 @@ def _tilt_between(before: Reading, after: Reading, fraction: float) -> Tilt | No
 
 
 def _tilt(T_odom_base: Pose3) -> Tilt | None:
-    """Roll and pitch of a pose in space; None for wheel odometry, which knows the plane alone."""
+    """Return roll and pitch of a pose; None for odometry in the plane."""
     roll, pitch, _ = T_odom_base.euler()
     return None if roll == 0.0 and pitch == 0.0 else (roll, pitch)
 
 
 SAME_TIME_NS = 50_000_000
-CARRIED_NS = 500_000_000  # a whole pose this old is carried on by the odometry, which errs by
-CARRIED = 0.05  # of the way and of the turn
-NO_HEADING = 1.0  # rad^2; who says no more of the heading than this says nothing
+CARRIED_NS = 500_000_000  # a pose up to this age is predicted by the odometry, with an error of
+CARRIED = 0.05  # of the distance and of the turn
+NO_HEADING = 1.0  # rad^2; with a larger variance the heading is unknown
 MOST = 64
 
 
 class PoseBuffer:
-    """The newest measured poses, and apart from them the newest places: poses without a heading, as GNSS
-    fixes are, which no odometry can carry on."""
+    """The pose measurements of the last seconds. Positions without a heading, such as GNSS fixes, are kept
+    separately, because the odometry cannot predict them."""
 
     def __init__(self) -> None:
         self._places: deque[PoseMeasurement] = deque(maxlen=MOST)
         self._poses: deque[PoseMeasurement] = deque(maxlen=MOST)
 
     def add(self, pose: PoseMeasurement) -> bool:
-        """Keep a sound pose; whether it is later than the one before of its kind, else it is not kept."""
+        """Add a valid pose; return False, and drop it, when it is not later than the last one of its kind."""
         kept = self._places if pose.covariance[2, 2] >= NO_HEADING else self._poses
         if kept and pose.stamp_ns <= kept[-1].stamp_ns:
             return False
@@ -161,13 +161,15 @@ class PoseBuffer:
     def at(
         self, stamp_ns: int, T_odom_base: Pose2 | None, odometry_at: Callable[[int], Pose2] | None
     ) -> PoseMeasurement | None:
-        """The measured pose of a scan. A place that lies farther away in time is of another place; a whole
-        pose is carried on by the odometry, and used once.
+        """Return the pose measurement for a scan, None when there is none.
+
+        A position must be from the same time as the scan. A pose is predicted to the time of the scan by the
+        odometry, and is used once.
 
         Args:
-            stamp_ns: Of the scan.
-            T_odom_base: The odometry then, None where it is not known.
-            odometry_at: Gives T_odom_base at an earlier time, None where there is no odometry.
+            stamp_ns: Stamp of the scan.
+            T_odom_base: Odometry at the stamp, None when unknown.
+            odometry_at: Returns T_odom_base at an earlier time, None without odometry.
         """
         near = min(self._places, key=lambda pose: abs(pose.stamp_ns - stamp_ns), default=None)
         if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS:
@@ -183,7 +185,7 @@ class PoseBuffer:
 
 
 def _carried(pose: PoseMeasurement, step: Pose2, stamp_ns: int) -> PoseMeasurement:
-    """A measured pose, moved by a step of the odometry to a later time: P' = F P F^T + Q."""
+    """Predict a pose measurement to a later time by a step of the odometry: P' = F P F^T + Q."""
     error = CARRIED * float(np.hypot(step.x, step.y))
     at = pose.T_map_base @ step
     dx, dy = at.x - pose.T_map_base.x, at.y - pose.T_map_base.y

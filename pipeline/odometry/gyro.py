@@ -1,8 +1,8 @@
-"""The gyroscope: how far the robot turned between two scans, and what that says of its wheels.
+"""Gyroscope: turn of the robot between two scans, and detection of wheel slip.
 
-Wheels that slip tell a wrong turn, a gyroscope does not; it has a bias instead, which is seen while the robot
-stands. Turn rates are about the vertical: (w_y sin roll + w_z cos roll) / cos pitch. It may hang upside down
-where nobody said how it is mounted, or tell degrees, so it is not asked before it turned as the wheels did.
+Slipping wheels measure a wrong turn; a gyroscope has a bias instead, which is estimated while the robot
+stands still. Turn rates are about the vertical: (w_y sin roll + w_z cos roll) / cos pitch. A gyroscope can be
+mounted upside down or measure degrees, so it is used only after its turns agree with those of the wheels.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from pipeline.types.records import Imu, Learnt, Turn
 
 KEEP_NS = 3_000_000_000
 GAP_NS = 60_000_000  # a longer time without a reading is a hole
-AROUND_NS = 50_000_000  # to both sides of a scan's stamp, for the rate at its time
-BLOCK = 50  # readings in a row that are looked at for a bias
-BLOCKS_MOST = 20  # that are averaged: the bias wanders
-STILL_SIGMA, STILL_MOST = 0.03, 0.1  # rad/s; scatter and mean of a block in which the robot stands
-DEAD = 20  # the same reading so many times is no gyroscope
-NOISE = 1e-3  # rad/sqrt(s), of a small MEMS gyroscope on a robot that shakes
+AROUND_NS = 50_000_000  # half width of the interval for the rate at a stamp
+BLOCK = 50  # consecutive readings for one estimate of the bias
+BLOCKS_MOST = 20  # blocks that are averaged, because the bias drifts
+STILL_SIGMA, STILL_MOST = 0.03, 0.1  # rad/s; largest standard deviation and mean of a block at rest
+DEAD = 20  # equal consecutive readings after which the gyroscope is defective
+NOISE = 1e-3  # rad/sqrt(s), MEMS gyroscope on a vibrating robot
 SCALE = 0.01  # of the turn: one sigma of the scale error
-# rad; over a turn of this size the scale error is the same, so that the sigmas of its steps add up, not their
-# variances (as WANDERS does for the bias).
+# rad; the scale error is constant over a turn of this size, so the sigmas of its steps add up, not their variances
+# (as for WANDERS and the bias).
 SCALE_TURN = math.pi / 2.0
 BIAS_UNKNOWN, BIAS_KNOWN = 0.01, 5e-4  # rad/s
-WANDERS = 10.0  # s, over which what is left of a bias errs alike: short scans must not take it for noise
+WANDERS = 10.0  # s; the error of the bias is constant over this time, so short steps do not average it
 CONTRADICTION, CONTRADICTION_LEAST = 4.0, 0.01  # sigma, rad
-PROOF, ALIKE = 0.1, 3.0  # rad by the wheels; and what a gyroscope that is right may differ by, as a factor
-HALF_TRACK = 0.5  # m; wheels that told a turn wrongly by an angle slipped by so much of it
-SLIPPED = "the wheels and the gyroscope tell different turns: the wheels slip"
+PROOF, ALIKE = 0.1, 3.0  # turn by the wheels [rad] and largest ratio for the gyroscope to agree with them
+HALF_TRACK = 0.5  # m; slip of the wheels per angle of a wrong turn
+SLIPPED = "the turns of the wheels and the gyroscope differ: the wheels slip"
 
 
 class Gyro:
-    """Readings of the last seconds, and the bias."""
+    """Gyroscope readings of the last seconds, and the estimate of the bias."""
 
     def __init__(self) -> None:
         self._readings: deque[tuple[int, float]] = deque()
@@ -47,11 +47,12 @@ class Gyro:
         self._proven = False
 
     def add(self, imu: Imu, tilt: tuple[float, float], *, standing: bool, needed_ns: int) -> None:
-        """One reading more, later than those before it.
+        """Add a reading that is later than the last one.
 
         Args:
+            imu: The reading.
             tilt: Roll and pitch [rad].
-            standing: Whether the wheels stand still.
+            standing: Whether the robot stands still by its wheels.
             needed_ns: Readings from shortly before this time on are kept.
         """
         _, wy, wz = (float(w) for w in imu.angular_velocity)
@@ -65,7 +66,7 @@ class Gyro:
         self._learn_bias(rate, standing=standing)
 
     def forget_since(self, stamp_ns: int) -> None:
-        """Drop the readings of this time and later: they were of no such time."""
+        """Drop the readings from a time on, whose stamps were wrong."""
         while self._readings and self._readings[-1][0] >= stamp_ns:
             self._readings.pop()
 
@@ -84,24 +85,24 @@ class Gyro:
             self._scatter += (sigma - self._scatter) / self._blocks
 
     def learnt(self, stamp_ns: int) -> Learnt:
-        """What the readings so far have taught, as of a time."""
+        """Return the state of the estimates at a time."""
         block = tuple(self._block)
         of_bias = stamp_ns, self._bias, self._scatter, self._blocks, block
         return Learnt(*of_bias, self._same, self._turned, self._proven)
 
     def go_on_from(self, learnt: Learnt) -> None:
-        """Know what was learnt before; readings are kept as they are."""
+        """Restore the state of the estimates; readings are kept."""
         self._bias, self._scatter = learnt.bias, learnt.scatter
         self._blocks, self._block = learnt.blocks, list(learnt.block)
         self._same, self._turned, self._proven = learnt.same, learnt.turned, learnt.proven
 
     @property
     def proven(self) -> bool:
-        """Whether it was seen to turn as the wheels do."""
+        """Whether the turns of the gyroscope agree with those of the wheels."""
         return self._proven
 
     def compare(self, by_wheels: float, turn: Turn) -> None:
-        """Take both turns of one step [rad]; the slope of a line through all of them proves the gyroscope."""
+        """Compare the turns of a step by wheels and gyroscope [rad]: fit the slope over all steps."""
         way, square, product = self._turned
         way, square = way + abs(by_wheels), square + by_wheels**2
         self._turned = (way, square, product + by_wheels * turn.angle)
@@ -110,11 +111,11 @@ class Gyro:
 
     @property
     def bias(self) -> float:
-        """Of the turn rate [rad/s], 0 before the robot stood."""
+        """Bias of the turn rate [rad/s], 0 until the robot has stood still."""
         return self._bias
 
     def turn(self, from_ns: int, to_ns: int) -> Turn | None:
-        """The turn between two times; None where readings are missing."""
+        """Return the turn between two times, None when readings are missing."""
         angle = self._integral(from_ns, to_ns)
         if angle is None:
             return None
@@ -128,13 +129,13 @@ class Gyro:
         return Turn(angle, math.sqrt(variance))
 
     def rate(self, stamp_ns: int) -> float | None:
-        """The turn rate around a time [rad/s]; None where readings are missing."""
+        """Return the turn rate at a time [rad/s], None when readings are missing."""
         near = [rate for _, rate in self._between(stamp_ns - AROUND_NS, stamp_ns + AROUND_NS)]
         return None if not near or self._is_dead else float(np.mean(near)) - self._bias
 
     @property
     def _is_dead(self) -> bool:
-        """Whether it says the same again and again, or has said nothing else yet."""
+        """Whether the readings are constant."""
         return self._same >= min(DEAD, max(len(self._readings) - 1, 1))
 
     def _between(self, from_ns: int, to_ns: int) -> list[tuple[int, float]]:
@@ -147,7 +148,7 @@ class Gyro:
         return found[::-1]
 
     def _integral(self, from_ns: int, to_ns: int) -> float | None:
-        """Of the rate by trapezoids [rad]; the rate stays as it is before the first and after the last."""
+        """Integrate the rate by trapezoids [rad]; it is constant outside of the readings."""
         inside = self._between(from_ns - GAP_NS, to_ns + GAP_NS)
         if self._is_dead or not inside or to_ns <= from_ns:
             return None
@@ -163,17 +164,20 @@ class Gyro:
 def fused(
     step: Pose2, sigma: float, slack: tuple[float, float], turn: Turn
 ) -> tuple[Pose2, float, tuple[float, float], str]:
-    """A step of the wheels with the turn that the gyroscope tells.
+    """Fuse a step of the wheels with the turn by the gyroscope.
 
-    Both turns are weighed by their variances; where they contradict one another the gyroscope is believed.
-    The way goes along the middle of the turn, so it is turned by half of what the turn is corrected by.
+    The turns are weighted by their inverse variances; when they contradict each other the turn of the
+    gyroscope is used. The translation is rotated by half of the correction of the turn.
 
     Args:
-        step: By the wheels; sigma: of its turn [rad]; slack: see `records.Step`.
+        step: Step by the wheels.
+        sigma: Standard deviation of its turn [rad].
+        slack: Additional standard deviations, see `records.Step`.
+        turn: Turn by the gyroscope.
 
     Returns:
-        The step, the sigma of its turn [rad], the slack that is left, and why the wheels are doubted, empty
-        where they are not.
+        The step, the standard deviation of its turn [rad], the remaining slack, and the reason why the wheels
+        are not trusted, "" when they are.
     """
     of_wheels, of_gyro = sigma**2 + slack[1] ** 2, turn.sigma**2
     gap = float(wrap_angle(turn.angle - step.yaw))

@@ -1,7 +1,7 @@
-"""LiDAR odometry (KISS-ICP, Vizzo et al., RA-L 2023) for sources that tell no motion, or whose wheels slip.
+"""LiDAR odometry (KISS-ICP, Vizzo et al., RA-L 2023) for sources without odometry, or with slipping wheels.
 
-Each scan is laid over a map of the scans before it, point to point with an adaptive gate. Where a source
-has wheels too, their step is where the search begins, in place of a constant velocity.
+Each scan is registered to a map of the scans before it, point to point with an adaptive threshold. The
+initial guess is the step of the wheels where the source has them, else constant velocity.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.readers.base import count_loss
 from pipeline.types.records import Odometry, Record, Scan
 
-#: What is farther is thin, and one scan in ten would be spent on it [m].
+#: Farther points are sparse and would cost a tenth of the time [m].
 RANGE_MAX, RANGE_MIN = 40.0, 0.5
-#: As KISS-ICP takes it for a LiDAR of 100 m: the side of the map's voxels [m].
+#: Side of the voxels of the map [m], the default of KISS-ICP for a LiDAR of 100 m.
 VOXEL = 1.0
-#: More iterations follow the rings on the ground, which move with the sensor, and find nothing new.
+#: More iterations follow the rings on the ground, which move with the sensor.
 ITERATIONS = 20
-#: Rings on the ground hold a scan back; what is lower than this above the robot's feet is left aside [m].
+#: Points lower than this above the ground are not used, because rings on the ground move with the sensor [m].
 GROUND = 0.3
-#: Fewer points than this tell no motion.
+#: Fewest points for a registration.
 FEWEST = 100
-#: Wheels that were silent for longer say nothing of where to begin [ns].
+#: Older odometry of the wheels gives no initial guess [ns].
 STALE_NS = 300_000_000
-#: A pause after which the velocity before it says nothing [ns].
+#: After a longer pause the previous velocity is not used [ns].
 PAUSE_NS = 1_000_000_000
 
 
 class Matcher(Protocol):
-    """What is used of `kiss_icp.kiss_icp.KissICP`."""
+    """The used part of `kiss_icp.kiss_icp.KissICP`."""
 
     last_pose: Float
     last_delta: Float
@@ -41,15 +41,15 @@ class Matcher(Protocol):
 
 
 class LidarOdometry:
-    """Gives each scan the pose of the base, so that it comes as Odometry before it.
+    """Estimator of odometry: each scan gets the pose of the base as an Odometry record before it.
 
-    A scan that was matched once keeps its pose: who reads again from an earlier time gets the same.
+    A scan keeps its first pose, so reading again from an earlier time gives the same poses.
 
     Args:
-        T_base_lidar: Where the LiDAR stands.
+        T_base_lidar: Extrinsics of the LiDAR.
 
     Attributes:
-        losses: Scans that gave no pose, by reason.
+        losses: Scans without a pose, by reason.
     """
 
     def __init__(self, T_base_lidar: Pose3) -> None:
@@ -63,10 +63,10 @@ class LidarOdometry:
         self.losses: dict[str, int] = {}
 
     def end(self) -> None:
-        """Nothing waits for the end."""
+        """Do nothing."""
 
     def add(self, record: Record) -> Iterator[Record]:
-        """The records that stand for one: wheels are used up, a scan has its pose before it."""
+        """Yield the records that replace one: odometry of the wheels is consumed, a scan follows its pose."""
         if isinstance(record, Odometry):
             self._wheels = record
             return
@@ -106,7 +106,7 @@ class LidarOdometry:
         return self._T_base_lidar @ T_odom_lidar @ self._T_base_lidar.inverse()
 
     def _useful(self, scan: Scan) -> tuple[Float, Float | None]:
-        """The points to be matched, sensor frame, and their times after the stamp [s]."""
+        """Return the points to register, in the sensor frame, and their times after the stamp [s]."""
         points = scan.points.astype(np.float64)
         reach = np.sqrt(np.einsum("ij,ij->i", points, points))
         up = points @ self._T_base_lidar.R[2]
@@ -115,7 +115,7 @@ class LidarOdometry:
         return points[keep], offset
 
     def _expected(self, velocity: Float, span_ns: int) -> Float:
-        """The step since the scan before, in the sensor's frame: by the wheels, else as the step before."""
+        """Predict the step since the last scan in the sensor frame: by the wheels, else the last step."""
         now, before = self._wheels, self._wheels_before
         if (
             now is not None
@@ -132,13 +132,15 @@ class LidarOdometry:
 
 
 def undistorted(points: Float, offset_s: Float | None, delta: Float, span_ns: int) -> Float:
-    """Points of shape (N, 3) as if all were seen at the scan's stamp: p' = p + (w x p + v) dt, exact to a
-    centimetre for the turns of a robot within one sweep.
+    """Transform points to the stamp of the scan with constant velocity: p' = p + (w x p + v) dt.
+
+    The linearisation is exact to a centimetre for the turns of a robot within one sweep.
 
     Args:
-        points: Sensor frame [m].
-        offset_s: Time of each after the stamp [s], shape (N,); None leaves them as they are.
-        delta: The step that the sensor makes in `span_ns`, shape (4, 4).
+        points: Points in the sensor frame [m], shape (N, 3).
+        offset_s: Time of each point after the stamp [s], shape (N,); None returns the points unchanged.
+        delta: Motion of the sensor in `span_ns`, shape (4, 4).
+        span_ns: Duration of the motion [ns].
     """
     if offset_s is None:
         return points
@@ -148,12 +150,12 @@ def undistorted(points: Float, offset_s: Float | None, delta: Float, span_ns: in
 
 
 def _matcher() -> Matcher:
-    """KISS-ICP on one thread: with more, sums come in another order and the bytes of a map with them."""
+    """Return KISS-ICP with one thread, because more threads change the order of sums and so the result."""
     from kiss_icp.config import KISSConfig
     from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
     from kiss_icp.kiss_icp import KissICP
 
-    # Every value is named: KISS-ICP would take others from the environment.
+    # Every value is set, because KISS-ICP reads missing ones from the environment.
     matcher: Matcher = KissICP(
         KISSConfig(
             out_dir="",

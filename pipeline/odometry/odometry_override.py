@@ -1,4 +1,4 @@
-"""Odometry that replaces that of a source: poses from a text file, or another estimator."""
+"""Replacement of the odometry of a source by that of a file or of another estimator."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from pipeline.types.records import Odometry, Record, Scan, Truth
 
 
 class OdometryEstimator(Protocol):
-    """Tells the motion of a source whose records it is given one by one.
+    """An estimator of odometry from the records of a source.
 
     Attributes:
-        losses: What got no pose, by reason.
+        losses: Number of scans without a pose, by reason.
     """
 
     losses: dict[str, int]
 
     def add(self, record: Record) -> Iterator[Record]:
-        """The records that stand for one."""
+        """Yield the records that replace one record."""
 
     def end(self) -> None:
-        """Every record from the first to the last was given."""
+        """Finish after the last record of a complete reading."""
 
 
 class OdometryOverride:
-    """A source (see `Source`) through which the records of another go on their way.
+    """A source whose odometry is replaced (see `pipeline.io.readers.base.Source`).
 
     Args:
-        source: Closed with this one.
-        motion: Tells the odometry.
-        digest: Of what else is read; "" for nothing.
+        source: The source; it is closed with this one.
+        motion: Estimator of the odometry.
+        digest: Digest of the file that the estimator reads, "" for none.
 
     Attributes:
-        source: As given.
+        source: The source without replacement.
     """
 
     def __init__(self, source: Source, motion: OdometryEstimator, digest: str = "") -> None:
@@ -48,14 +48,14 @@ class OdometryOverride:
 
     @property
     def description(self) -> SourceDescription:
-        """As the source's own, with odometry."""
+        """Description of the source, with odometry."""
         known = self.source.description
         digest = f"{known.digest}+{self._digest}" if self._digest else known.digest
         return replace(known, has_odometry=True, digest=digest)
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out, by reason."""
+        """Records left out, by reason."""
         total = dict(self.source.losses)
         for reason, count in self._motion.losses.items():
             count_loss(total, reason, count)
@@ -69,11 +69,11 @@ class OdometryOverride:
             self._motion.end()
 
     def pass_on(self, record: Record) -> Iterator[Record]:
-        """The records that stand for one of the source, where somebody else reads it (live)."""
+        """Yield the records that replace one record of the source, when the caller reads it (live)."""
         return self._motion.add(record)
 
     def truth(self) -> Truth | None:
-        """That of the source."""
+        """Return the ground truth of the source."""
         return self.source.truth()
 
     def close(self) -> None:
@@ -81,25 +81,24 @@ class OdometryOverride:
         self.source.close()
 
 
-#: Rows without times, counted against the scans that could be read.
+#: Losses when the rows without times are not as many as the scans.
 TOO_MANY = "rows of poses without a scan; if scans are missing between others, later ones have wrong poses"
 TOO_FEW = "scans after the last row of the poses"
 
 
 class FileOdometry:
-    """Gives each scan the pose that a file tells for it, as Odometry before it.
+    """Odometry from the poses in a text file: each scan gets its pose as an Odometry record before it.
 
-    Rows with times (TUM) are poses of the LiDAR at those times, in the clock of the source; between two
-    of them the pose is interpolated. Rows without times (KITTI) belong to the scans in their order; a scan
-    that cannot be read takes no row, so that rows which are left at the end may mean that later scans have
-    rows of others: that is told.
+    Rows with times (TUM) are poses of the LiDAR in the clock of the source and are interpolated. Rows without
+    times (KITTI) belong to the scans in their order. A scan that cannot be read uses no row, so surplus rows
+    can mean that later scans have wrong poses; this is counted as a loss.
 
     Args:
         path: The file.
-        T_base_lidar: Where the LiDAR stands.
+        T_base_lidar: Extrinsics of the LiDAR.
 
     Attributes:
-        losses: Rows or scans that are left over at the end, by reason.
+        losses: Rows without a scan, or scans without a row, by reason.
 
     Raises:
         SourceError: It cannot be read.
@@ -120,7 +119,7 @@ class FileOdometry:
         self.losses: dict[str, int] = {}
 
     def add(self, record: Record) -> Iterator[Record]:
-        """The records that stand for one: other odometry is left aside, a scan has its pose before it."""
+        """Yield the records that replace one: other odometry is dropped, a scan follows its pose."""
         if isinstance(record, Odometry):
             return
         if isinstance(record, Scan):
@@ -130,7 +129,7 @@ class FileOdometry:
         yield record
 
     def end(self) -> None:
-        """Count what is left over of rows without times."""
+        """Count rows without a scan, or scans without a row."""
         left = 0 if self._times is not None else len(self._poses) - len(self._row_of)
         self.losses = {reason: n for reason, n in ((TOO_MANY, left), (TOO_FEW, -left)) if n > 0}
 

@@ -1,4 +1,4 @@
-"""Steps: each scan joined with the motion and the tilt at its time."""
+"""Synchroniser: joins each scan with the odometry, tilt and pose measurement at its time into a step."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from pipeline.odometry.gyro import Gyro
 from pipeline.types.records import Imu, Learnt, Notice, Odometry, PoseMeasurement, Record, Scan, Step, Turn
 
 OdometryChoice = Literal["auto", "wheels", "static"]
-WAIT = 5  # scans that wait for the odometry that follows them before they go without
-STALE_NS = 250_000_000  # a reading farther away in time than this says nothing of a scan
-JUMP_SLACK = (0.2, 0.05)  # m, rad; what the robot may have moved while its odometry jumped
-PAUSE_NS = 10_000_000_000  # without a scan; trees that were in view may be out of it
-WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion that no odometry told
-WALK_MOST = (3.0, 0.5)  # m, rad; beyond it the trees around are others
+WAIT = 5  # most scans that wait for later odometry
+STALE_NS = 250_000_000  # readings farther in time from a scan are not used
+JUMP_SLACK = (0.2, 0.05)  # m, rad; one sigma of the motion during a jump of the odometry
+PAUSE_NS = 10_000_000_000  # a longer time without a scan is reported
+WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion without odometry
+WALK_MOST = (3.0, 0.5)  # m, rad; upper bound of that sigma
 SETTLES_NS = 300_000_000
 AHEAD_NS = 1_000_000_000
 TILTS_NS = 90_000_000
 NO_ODOMETRY = (
-    "there is no odometry for some scans: the robot stands still in them, unless trees tell its motion"
+    "there is no odometry for some scans: the robot is assumed to stand still, unless trees show its motion"
 )
-FASTEST = 20.0  # rad/s; a robot that maps trees, whatever it shakes like, does not turn this fast
+FASTEST = 20.0  # rad/s; faster readings of the gyroscope are damaged
 
 
 def steps(
@@ -38,19 +38,18 @@ def steps(
     losses: Counter[str] | None = None,
     after: Learnt | None = None,
 ) -> Iterator[Step]:
-    """Join scans with the pose by odometry, interpolated to their time, and the tilt.
+    """Yield a step for each scan: the scan with the odometry interpolated to its time, the tilt, and more.
 
-    A scan is held back until the first odometry at or after its stamp has come, or until five
-    scans wait; then the last pose stands for it. A scan that is not later than the one before it
-    is left out, counted in `losses` and said in the warnings of the next step.
+    A scan waits for the first odometry at or after its stamp, until more than five scans wait; then the last
+    pose is used. A scan that is not later than the last one is left out, counted in `losses`, and reported in
+    the warnings of the next step.
 
     Args:
-        records: In the order in which they came.
-        odometry: "static" leaves poses aside: the robot stands still.
+        records: In the order of arrival.
+        odometry: "static" ignores odometry: the robot does not move.
         first_index: Number of the first step.
         losses: Counts what was left out, by reason.
-        after: What had been learnt until a step of an earlier reading, where the records begin shortly before
-            that step.
+        after: State of the estimates at a step of an earlier reading; the records begin shortly before it.
     """
     counted = Counter[str]() if losses is None else losses
     joiner = Synchroniser(use_odometry=odometry != "static", index=first_index, losses=counted, after=after)
@@ -61,10 +60,10 @@ def steps(
 
 
 class Synchroniser:
-    """Takes records one by one, in the order in which they came, and gives the steps that are ready.
+    """Takes records one by one in the order of arrival, and yields the steps that are ready.
 
     Args:
-        use_odometry: Else poses are left aside and no scan waits for one.
+        use_odometry: Whether odometry is used; without it no scan waits.
         index: Number of the first step.
         losses: Counts what was left out, by reason.
         after: See `steps`.
@@ -83,7 +82,7 @@ class Synchroniser:
         self._after = after
         if after is not None:
             self._gyro.go_on_from(after)
-        self._stepped: Pose2 | None = None  # the odometry of the step before
+        self._stepped: Pose2 | None = None  # odometry of the last step
         self._turned_ns: int | None = None
         self._gyro_tilt = (0, 0.0, 0.0)  # when [ns], roll and pitch [rad]
         self._measured = PoseBuffer()
@@ -94,7 +93,7 @@ class Synchroniser:
         self._warnings: list[str] = []
 
     def add(self, record: Record) -> None:
-        """Take a record of any kind."""
+        """Add a record of any kind."""
         match record:
             case Scan():
                 self._add_scan(record)
@@ -123,13 +122,13 @@ class Synchroniser:
         elif self._use_odometry:
             jump = self._odometry.add(odometry)
             if jump is not None:
-                self._tell_jump(jump)
+                self._report_jump(jump)
             self._odometry.forget(self._needed_ns(odometry.stamp_ns))
 
-    def _tell_jump(self, jump: Jump) -> None:
+    def _report_jump(self, jump: Jump) -> None:
         self._warn(
             f"the odometry jumped by {jump.distance:.1f} m and {np.degrees(jump.turn):.0f} degrees; "
-            "that is not taken as motion"
+            "the jump is not used as motion"
         )
         self._suspect("the odometry jumped", JUMP_SLACK)
 
@@ -162,8 +161,11 @@ class Synchroniser:
             self._imu.popleft()
 
     def _was_ahead(self, stamp_ns: int) -> bool:
-        """Whether the IMU's reading before was of no such time, so that this one counts in its place: then it
-        lies farther from all else than this one does, by more than the order of messages can be mixed up."""
+        """Drop the last IMU readings when their stamps were ahead of the time; return whether they were.
+
+        They were ahead when the new reading is earlier by more than the order of messages can explain, and is
+        nearer to the other records.
+        """
         last = self._turned_ns
         newest = self._odometry.newest
         others = [s.stamp_ns for s in self._scans] + ([] if newest is None else [newest.stamp_ns])
@@ -188,17 +190,17 @@ class Synchroniser:
         fresh = newest is not None and imu.stamp_ns - newest.stamp_ns < STALE_NS
         still = settled and fresh and self._after is None
         oldest = self._needed_ns(imu.stamp_ns)
-        # A tilt changes the rate by its square alone; counted so that it does not hang on the first reading.
+        # The rate depends on the tilt by its square only, so the tilt is updated in fixed intervals of time.
         if imu.stamp_ns // TILTS_NS != self._gyro_tilt[0] // TILTS_NS:
             self._gyro_tilt = (imu.stamp_ns, *(_tilt_of(imu) or (0.0, 0.0)))
         self._gyro.add(imu, self._gyro_tilt[1:], standing=still, needed_ns=oldest)
 
     def _needed_ns(self, now_ns: int) -> int:
-        """From when on readings may still be asked for: that of the oldest scan that waits."""
+        """Return the time from which readings are still needed: the stamp of the oldest waiting scan."""
         return self._scans[0].stamp_ns if self._scans else now_ns
 
     def ready(self, *, end: bool = False) -> Iterator[Step]:
-        """Steps whose odometry has come, in order."""
+        """Yield the steps whose odometry has arrived; with `end`, all remaining steps."""
         while self._scans and (end or self._is_ready(self._scans[0])):
             yield self._join(self._scans.popleft())
 
@@ -211,7 +213,7 @@ class Synchroniser:
     def _join(self, scan: Scan) -> Step:
         if self._stepped_ns is None and self._after is not None and self._after.stamp_ns < scan.stamp_ns:
             self._stepped_ns = self._after.stamp_ns
-        self._tell_pause(scan.stamp_ns)
+        self._report_pause(scan.stamp_ns)
         pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
         turn = self._turn_to(scan.stamp_ns, pose)
@@ -246,7 +248,7 @@ class Synchroniser:
         return step
 
     def _turn_to(self, stamp_ns: int, pose: Pose2 | None) -> Turn | None:
-        """By the gyroscope since the step before, compared with the odometry where that has no doubt."""
+        """Return the turn since the last step by the gyroscope; compare it with trusted odometry."""
         turn = None if self._stepped_ns is None else self._gyro.turn(self._stepped_ns, stamp_ns)
         if turn is None or pose is None or self._stepped is None or self._doubt or self._after is not None:
             return turn
@@ -254,7 +256,7 @@ class Synchroniser:
         return turn
 
     def _motion_at(self, stamp_ns: int) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None]:
-        """Pose, velocity in the base frame, and tilt where the odometry is of the whole pose."""
+        """Return pose, velocity in the base frame, and tilt by the odometry."""
         newest = self._odometry.newest
         if newest is None:
             if self._use_odometry:
@@ -265,15 +267,15 @@ class Synchroniser:
             return newest.pose, STILL, None
         return self._odometry.motion_at(stamp_ns)
 
-    def _tell_pause(self, stamp_ns: int) -> None:
-        """Of a long time without a scan the odometry alone tells; the trees after it may contradict that."""
+    def _report_pause(self, stamp_ns: int) -> None:
+        """Warn of a long time without a scan, and mark the odometry as doubtful."""
         seconds = 0.0 if self._stepped_ns is None else (stamp_ns - self._stepped_ns) * 1e-9
         if seconds * 1e9 > PAUSE_NS:
-            self._warn(f"no scan came for {seconds:.0f} s: where the robot is then, the odometry alone tells")
-            self._suspect(f"no scan came for {seconds:.0f} s", (0.0, 0.0))
+            self._warn(f"no scan for {seconds:.0f} s: the pose is known only by the odometry")
+            self._suspect(f"no scan for {seconds:.0f} s", (0.0, 0.0))
 
     def _bridge(self, stamp_ns: int) -> None:
-        """Nothing told the motion since the scan before: it may have been any walk of a robot."""
+        """Add the uncertainty of an unknown motion since the last scan."""
         self._warn(NO_ODOMETRY)
         since = self._stepped_ns if self._stepped_ns is not None else stamp_ns
         seconds = (stamp_ns - since) * 1e-9
@@ -301,7 +303,7 @@ class Synchroniser:
 
 
 def _tilt_of(imu: Imu) -> tuple[float, float] | None:
-    """Roll and pitch by a reading's orientation, None where it tells none."""
+    """Return roll and pitch by the orientation of a reading, None without one."""
     if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
         return None
     try:

@@ -236,7 +236,7 @@ TROUBLES = {
     "jump of 5 m": Trouble(_from(lambda p: Pose2(p.x + 5.0, p.y, p.yaw)), said="the odometry jumped by"),
     "jump of 50 m": Trouble(_from(lambda p: Pose2(p.x + 50.0, p.y, p.yaw)), said="the odometry jumped by"),
     "flip of the yaw": Trouble(
-        _from(lambda p: Pose2(-p.x, -p.y, p.yaw + np.pi)), said="degrees; that is not taken as motion"
+        _from(lambda p: Pose2(-p.x, -p.y, p.yaw + np.pi)), said="degrees; the jump is not used as motion"
     ),
     "NaN": Trouble(_from(lambda p: Pose2(float("nan"), p.y, p.yaw)), said="without finite numbers", soon=6),
     "negative time step": Trouble(
@@ -248,10 +248,10 @@ TROUBLES = {
     "scans twice": Trouble(arrival=_again, said=LEFT_OUT_SCANS, state="good", soon=6),
     "a late scan": Trouble(arrival=_late, said=LEFT_OUT_SCANS, state="good", soon=8),
     "scans out of order": Trouble(arrival=_swapped, said=LEFT_OUT_SCANS, state="good", soon=3),
-    "gap, driven on": Trouble(pause_ms=GAP_MS, said="no scan came for 60 s"),
-    "gap, pushed": Trouble(push=Pose2(2.0, 0.3, 0.1), pause_ms=GAP_MS, said="no scan came for 60 s"),
+    "gap, driven on": Trouble(pause_ms=GAP_MS, said="no scan for 60 s"),
+    "gap, pushed": Trouble(push=Pose2(2.0, 0.3, 0.1), pause_ms=GAP_MS, said="no scan for 60 s"),
     "gap, odometry begins anew": Trouble(
-        _restarted, pause_ms=GAP_MS, said="no scan came for 60 s", may_be_lost=True
+        _restarted, pause_ms=GAP_MS, said="no scan for 60 s", may_be_lost=True
     ),
     "kidnapped": Trouble(
         push=Pose2(3.0, 3.0, 2.0),

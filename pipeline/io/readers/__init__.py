@@ -1,4 +1,4 @@
-"""Where records come from: `open_source` takes a file, a folder or a URI and gives a Source."""
+"""Sources of records: `open_source` opens a file, a folder or a URI."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
     """Open a run to be read.
 
     Args:
-        uri: A simulated scenario ("sim:stand"), a file or a folder. What it is, is decided by its
-            contents before its name.
-        options: What the user says about it.
+        uri: A simulated scenario ("sim:stand"), a file or a folder. The format is detected by the contents
+            first, then by the name.
+        options: Choices of the user.
 
     Raises:
-        SourceError: It is not there, of a kind that cannot be read, or damaged.
+        SourceError: It does not exist, has an unknown format, or is damaged.
     """
     chosen = options or SourceOptions()
     scheme = _SCHEME.match(uri)
@@ -41,7 +41,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
             return _open_scheme(scheme.group(1).lower(), uri, chosen)
         path = Path(uri).expanduser()
         return _opener(path, uri)(uri, path, chosen)
-    except RuntimeError as error:  # a home folder of nobody
+    except RuntimeError as error:  # the home folder of an unknown user
         raise SourceError("there is no such user", where=uri, remedy="Look at the path.") from error
     except (OSError, MemoryError) as error:
         reason = getattr(error, "strerror", None) or "too large for the memory of this machine"

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 _REMEDY = "Copy the file again, or export it again"
 LAS, E57 = b"LASF", b"ASTM-E57"
-#: Whole clouds unless somebody says otherwise; one .pcd file is a scan unless somebody says otherwise.
+#: Files that are clouds by default; a .pcd file is a scan by default.
 SUFFIXES = (".las", ".laz", ".ply", ".npy", ".npz", ".e57")
 READABLE = "LAS, LAZ, PLY, E57, .npy, .npz and PCD"
 
 
 def is_cloud(uri: str) -> bool:
-    """Whether it names a file that is taken for a whole cloud, by its first bytes or its name."""
+    """Return whether a file is a whole cloud by its first bytes or its name."""
     path = Path(uri).expanduser()
     try:
         with path.open("rb") as file:
@@ -50,7 +50,7 @@ def open_cloud(uri: str) -> Cloud:
     """Open a whole cloud.
 
     Raises:
-        SourceError: It is not there, of a kind that cannot be read, or damaged.
+        SourceError: It does not exist, has an unknown format, or is damaged.
     """
     try:
         path = Path(uri).expanduser()
@@ -70,23 +70,24 @@ def open_cloud(uri: str) -> Cloud:
 
 
 def is_place(xyz: Float) -> NDArray[np.bool_]:
-    """Which rows of shape (N, 3) [m] are coordinates, shape (N,)."""
+    """Return which rows of shape (N, 3) [m] are finite and within the limit of coordinates, shape (N,)."""
     with np.errstate(invalid="ignore"):
         return np.asarray((np.isfinite(xyz) & (np.abs(xyz) < COORDINATE_LIMIT)).all(axis=1))
 
 
 def offset_for(middle: Float) -> Float:
-    """The offset of a cloud by a place within it, shape (3,) [m]: whole hundreds near the points, so that
-    nothing is lost and who reads the files can add it.
+    """Return the offset of a cloud by a position in it, shape (3,) [m].
+
+    The offset has whole hundreds of metres, so 32 bits hold the rest of the coordinates without loss.
     """
     return np.where(np.abs(middle) < 1000.0, 0.0, np.round(middle / 100.0) * 100.0)
 
 
 class TableCloud:
-    """A file with a column for each coordinate (see `pipeline.inventory.cloud.Cloud`).
+    """A PLY, NumPy or PCD file as a cloud (see `pipeline.inventory.cloud.Cloud`).
 
     Raises:
-        SourceError: It is no such file, or damaged.
+        SourceError: It has another format, or is damaged.
         OSError: It cannot be read.
     """
 
@@ -98,7 +99,7 @@ class TableCloud:
         except ScanFileError as error:
             raise SourceError(str(error), where=uri, remedy=_REMEDY) from None
         if not np.isfinite(middle).all():
-            raise SourceError("the coordinates of the cloud are no coordinates", where=uri, remedy=_REMEDY)
+            raise SourceError("the coordinates of the cloud are not valid", where=uri, remedy=_REMEDY)
         self.description = CloudDescription(
             uri=uri,
             kind=self._table.kind,
@@ -110,12 +111,12 @@ class TableCloud:
         )
 
     def parts(self) -> Iterator[Float32]:
-        """All points, part by part."""
+        """Yield all points part by part, shape (N, 3)."""
         self.losses = {}
         read = 0
         try:
             for columns in self._table.parts():
-                with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers may be of any size
+                with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers may have any size
                     xyz = _places(columns) - self.description.offset
                 good = is_place(xyz)
                 read += len(xyz)
@@ -128,7 +129,7 @@ class TableCloud:
             count_loss(self.losses, MISSING, self._table.points - read)
 
     def _first_places(self) -> Float:
-        """The first places that are some, shape (N, 3) [m]; empty where there is none."""
+        """Return the first valid positions, shape (N, 3) [m]; one row of NaN when there is none."""
         for columns in self._table.parts():
             xyz = _places({axis: columns[axis][:10_000] for axis in "xyz"})
             xyz = xyz[is_place(xyz)][:1000]
@@ -146,9 +147,9 @@ def _places(columns: Columns) -> Float:
 
 _LAS_PART = 1 << 19  # points
 RECORD_LIMIT = 1024  # bytes of a point
-#: A variable length record: what it is (after who says it), how long it is (before what it is in words).
+#: A variable length record: its number (after the user id), its length (before the description).
 _RECORD = struct.Struct("<18xHH32x")
-#: The one of LASzip lists the items of a point from that byte on: kind, length and version of each.
+#: The record of LASzip lists the items of a point from this byte on: kind, length and version of each.
 _LASZIP_USER = b"laszip encoded"
 _LASZIP, _ITEMS, _ITEM = 22204, 34, struct.Struct("<HHH")
 
@@ -157,7 +158,7 @@ class LasCloud:
     """A .las or .laz file (see `pipeline.inventory.cloud.Cloud`).
 
     Raises:
-        SourceError: It is no such file, or damaged.
+        SourceError: It has another format, or is damaged.
         OSError: It cannot be read.
     """
 
@@ -173,7 +174,7 @@ class LasCloud:
                 crs = _crs_of(header)
                 low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
                 attributes = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
-                with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+                with np.errstate(over="ignore", invalid="ignore"):  # checked below
                     first = self._xyz(reader.read_points(min(1000, self._there)))
         except SourceError:
             raise
@@ -184,7 +185,7 @@ class LasCloud:
         with np.errstate(over="ignore", invalid="ignore"):
             middle = first.mean(axis=0)
         if not is_place(middle[None]).all():
-            raise SourceError("the coordinates of the cloud are no coordinates", where=uri, remedy=_REMEDY)
+            raise SourceError("the coordinates of the cloud are not valid", where=uri, remedy=_REMEDY)
         self.description = CloudDescription(
             uri=uri,
             kind=f"LAS {version}" + (" compressed" if compressed else ""),
@@ -198,7 +199,7 @@ class LasCloud:
         )
 
     def parts(self) -> Iterator[Float32]:
-        """All points, part by part."""
+        """Yield all points part by part, shape (N, 3)."""
         self.losses = {}
         read = 0
         try:
@@ -219,7 +220,7 @@ class LasCloud:
                 raise SourceError(
                     f"the LAS file is damaged: {error}", where=self.description.uri, remedy=_REMEDY
                 ) from None
-            # What came before the damage is whole and stays.
+            # Points before the damage are valid.
         self._lose("points after the damage in the file", self.description.points - read)
 
     def _xyz(self, chunk: laspy.ScaleAwarePointRecord) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
@@ -235,7 +236,7 @@ class LasCloud:
 
 @contextmanager
 def _without_panic() -> Iterator[None]:
-    """What makes the decoder panic is damage as any other; its own exception is none that is caught."""
+    """Turn a panic of the LAZ decoder, which is no Exception, into a ValueError."""
     try:
         yield
     except BaseException as error:
@@ -247,7 +248,7 @@ def _without_panic() -> Iterator[None]:
 def _open_las(path: Path) -> laspy.LasReader:
     import laspy
 
-    # One decoder, in this thread: results do not depend on the machine's cores.
+    # One decoder in this thread: results do not depend on the number of cores.
     return laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False)
 
 
@@ -272,11 +273,14 @@ def _all_that_damage_raises() -> tuple[type[BaseException], ...]:
 
 
 def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
-    """Number of points that are promised and that can be there, whether they are compressed, version; all
-    sizes held against the file's.
+    """Check the sizes in the header of a LAS file against the size of the file, before laspy reads it.
+
+    Returns:
+        Number of points by the header, number of points that the file can hold, whether they are compressed,
+        and the version.
 
     Raises:
-        SourceError: They contradict it.
+        SourceError: They contradict each other.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -293,7 +297,7 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
         if not fits or not 20 <= length <= RECORD_LIMIT:
             raise SourceError("the header of the LAS file contradicts itself", where=uri, remedy=_REMEDY)
         room = size - first
-        # One that was cut off in the middle is read as far as it goes.
+        # A file that is cut is read up to its end.
         there = points if compressed else min(points, room // length)
         if points and there == 0:
             raise SourceError("the LAS file ends before its first point", where=uri, remedy=_REMEDY)
@@ -308,9 +312,9 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
 
 
 def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, uri: str) -> None:
-    """The items that a point is packed in are together as long as a point (LASzip, `laszip.check`).
+    """Check that the compressed items of a point are together as long as a point (LASzip, `laszip.check`).
 
-    The decoder takes memory for what they say: 65,535 bytes a point, whatever the header promises.
+    The decoder allocates memory by their sizes: up to 65,535 bytes per point.
     """
     for _ in range(records):
         file.seek(at)
@@ -321,16 +325,16 @@ def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, 
         at += _RECORD.size + content
         if number != _LASZIP or head[2:18].rstrip(b"\0") != _LASZIP_USER:
             continue
-        told = file.read(content)
-        items = int.from_bytes(told[_ITEMS - 2 : _ITEMS], "little")
-        table = told[_ITEMS : _ITEMS + _ITEM.size * items]
+        record = file.read(content)
+        items = int.from_bytes(record[_ITEMS - 2 : _ITEMS], "little")
+        table = record[_ITEMS : _ITEMS + _ITEM.size * items]
         table = table[: len(table) // _ITEM.size * _ITEM.size]
         if sum(size for _, size, _ in _ITEM.iter_unpack(table)) != length:
             raise SourceError("the header of the LAS file contradicts itself", where=uri, remedy=_REMEDY)
 
 
 def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:
-    """The table of the compressed parts names no more of them than the file has bytes."""
+    """Check that the chunk table has no more entries than the file has bytes."""
     file.seek(first)
     raw = file.read(8)
     at = struct.unpack("<q", raw)[0] if len(raw) == 8 else 0
@@ -346,7 +350,7 @@ def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:
 
 
 def _crs_of(header: laspy.LasHeader) -> str:
-    """The coordinate reference system as the header tells it, empty when it does not."""
+    """Return the coordinate reference system of the header, "" when there is none."""
     for record in header.vlrs:
         if record.record_id == 2112:
             wkt = str(getattr(record, "string", "")).strip("\0 \n")
@@ -355,7 +359,7 @@ def _crs_of(header: laspy.LasHeader) -> str:
     for record in header.vlrs:
         if record.record_id == 34735:
             keys = {int(key.id): key for key in getattr(record, "geo_keys", ())}
-            for name in (3072, 2048):  # projected before geographic
+            for name in (3072, 2048):  # a projected system before a geographic one
                 key = keys.get(name)
                 if (
                     key is not None
@@ -375,10 +379,10 @@ _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 
 class E57Cloud:
-    """An .e57 file (see `pipeline.inventory.cloud.Cloud`): all stations in its common frame.
+    """An E57 file (ASTM E2807) as a cloud (see `pipeline.inventory.cloud.Cloud`): all stations in one frame.
 
     Raises:
-        SourceError: It is no such file, or damaged, or pye57 is not installed.
+        SourceError: It has another format, is damaged, or pye57 is not installed.
     """
 
     def __init__(self, uri: str, path: Path) -> None:
@@ -407,7 +411,7 @@ class E57Cloud:
         )
 
     def parts(self) -> Iterator[Float32]:
-        """All points, part by part."""
+        """Yield all points part by part, shape (N, 3)."""
         self.losses = {}
         read = 0
         file = self._open()
@@ -426,7 +430,7 @@ class E57Cloud:
             count_loss(self.losses, "points after the damage in the file", self.description.points - read)
 
     def _places(self, file: Any) -> Iterator[tuple[Float, Any]]:  # noqa: ANN401 - pye57 has no types
-        """Points of all stations in the file's frame, shape (N, 3) [m], and which of them are some."""
+        """Yield points of all stations in the frame of the file, (N, 3) [m], and which are valid, (N,)."""
         for station in range(self._guarded(lambda: int(file.scan_count))):
             yield from self._station(file, station)
 
@@ -462,7 +466,7 @@ class E57Cloud:
         return self._guarded(lambda: E57(str(self._path)))
 
     def _guarded(self, work: Any) -> Any:  # noqa: ANN401
-        """Whatever libE57 throws is damage."""
+        """Call a function of pye57; any exception means damage."""
         try:
             return work()
         except Exception as error:
@@ -474,7 +478,7 @@ class E57Cloud:
 
 
 def _pose(header: Any) -> tuple[Float, Float]:  # noqa: ANN401
-    """Where a station stands in the file's frame; in the origin where it does not say."""
+    """Return rotation and translation of a station in the frame of the file; identity by default."""
     if not header.has_pose():
         return np.eye(3), np.zeros(3)
     return np.asarray(header.rotation_matrix, np.float64), np.asarray(header.translation, np.float64)

@@ -1,4 +1,4 @@
-"""The formats that can be read, and how each is recognised: by contents first, by name last."""
+"""Formats of files and folders, detected by their contents first, then by their names."""
 
 from __future__ import annotations
 
@@ -89,10 +89,10 @@ class Format:
     """A kind of file.
 
     Attributes:
-        words: For people.
-        magic: What the file may begin with; () when only the name tells.
-        suffixes: Names it usually has, in lower case.
-        open: Makes the source.
+        words: Name for the user.
+        magic: First bytes of the file; () when only its name identifies it.
+        suffixes: Usual suffixes in lower case.
+        open: Opens the source.
     """
 
     words: str
@@ -139,7 +139,7 @@ READABLE = ", ".join(
 
 
 def file_format(path: Path, head: bytes) -> Format | None:
-    """The format of a file by its first bytes, or by its name where the contents have no mark."""
+    """Return the format of a file by its first bytes, or by its name for formats without magic bytes."""
     if path.suffix.lower() == ".npz":  # a .zip by its contents
         return expected_format(path)
     for kind in FILES:
@@ -150,23 +150,23 @@ def file_format(path: Path, head: bytes) -> Format | None:
 
 
 def expected_format(path: Path) -> Format | None:
-    """The format that a file's name promises."""
+    """Return the format by the suffix of a file."""
     return next((kind for kind in FILES if path.suffix.lower() in kind.suffixes), None)
 
 
 def recordings_in(folder: Path) -> list[str]:
-    """Names of the files in a folder that are runs or clouds by their names, each by itself."""
+    """Return the names of the files in a folder that are runs or clouds by their suffixes."""
     return sorted(path.name for path in folder.iterdir() if path.is_file() and expected_format(path))
 
 
 def named(names: list[str]) -> str:
-    """Some of them, for people."""
+    """List the first few names for a message."""
     more = len(names) - _MOST_NAMED
     return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def folder_opener(folder: Path) -> Opener | None:
-    """How to open a folder, None when nothing in it can be read."""
+    """Return the opener of a folder, None when nothing in it can be read."""
     names = {path.name for path in folder.iterdir() if path.is_file()}
     if any(name.startswith("TreeManagerState_") for name in names):
         return _tree_manager

@@ -448,7 +448,9 @@ class LiveRecording:
         tail_ns = self._container.tail_ns(scans)
         last_ns = max((m.log_ns for m in self._container.messages(scans, tail_ns, {})), default=first_ns)
         cut = (
-            ("the recording is cut or damaged: only what is whole is read",) if self._container.damage else ()
+            ("the recording is cut or damaged: only whole messages are read",)
+            if self._container.damage
+            else ()
         )
         revisions = tuple(self._revisions())
         partly: tuple[str, ...] = ()

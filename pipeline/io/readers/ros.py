@@ -27,26 +27,26 @@ from pipeline.io.readers.truth_file import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.velodyne import SENSORS
 from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
 
-#: How many scans may be unreadable at the start before the recording is refused.
+#: Number of unreadable scans at the start after which the recording is refused.
 _TRIES = 20
 
 
 class RosSource:
-    """A recording of ROS messages.
+    """Source of records from ROS messages, in a recording or live.
 
     Args:
         uri: As the user wrote it.
         container: The recording; the source closes it.
-        paths: Its files, for the digest.
-        options: Topics and mounting, where the user knows better.
-        make_clock: From stamp minus time of writing of each topic's first message.
-        live: Whether `records_of` will be given more than the container holds.
+        paths: Files of the recording, for the digest.
+        options: Topics and extrinsics chosen by the user.
+        make_clock: Makes the clock from stamp minus time of recording of the first message of each topic.
+        live: Whether `records_of` gets more messages than the container holds.
 
     Attributes:
-        notices: What a person should know of the messages of `records_of`; who tells of it empties the list.
+        notices: New messages for the user from `records_of`; whoever shows them clears the list.
 
     Raises:
-        SourceError: It holds no scans, or none of the first ones can be read.
+        SourceError: It has no scans, or none of the first ones can be read.
     """
 
     def __init__(
@@ -88,19 +88,19 @@ class RosSource:
 
     @property
     def description(self) -> SourceDescription:
-        """What is known before reading."""
+        """Description that is known before reading."""
         return self._description
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out when opening and in the latest reading, by reason."""
+        """Records left out on opening and in the latest reading, by reason."""
         total = dict(self._container.damage)
         for reason, count in self._losses.items():
             count_loss(total, reason, count)
         return total
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of time; what lies before `start_ns` is not decoded."""
+        """Yield records in the order of time; messages before `start_ns` are not decoded."""
         losses: dict[str, int] = {}
         self._losses = losses
         for stamped in by_stamp(self._arrivals(start_ns, losses), losses):
@@ -109,8 +109,7 @@ class RosSource:
     def records_of(
         self, message: Message, losses: dict[str, int], from_ns: int | None = None
     ) -> Iterator[Record]:
-        """The records that one message gives, whenever it came, unless they lie before a time; what cannot be
-        used is counted."""
+        """Yield the records of one message from `from_ns` on; what cannot be used is counted in `losses`."""
         if message.channel in self._wanted or message.channel in self._alignments.numbers:
             for stamped in self._times_of(message, losses):
                 self._alignments.add(stamped)
@@ -118,39 +117,39 @@ class RosSource:
                     yield from self._decoded(stamped, losses)
 
     def use_clock(self, clock: Clock) -> None:
-        """Tell times by another clock from now on."""
+        """Use another clock from now on."""
         self._clock = clock
 
     def truth(self) -> Truth | None:
-        """The truth that a simulated recording carries."""
+        """Return the ground truth attached to a simulated recording, None when there is none."""
         return self._truth
 
     def camera(self) -> tuple[Camera | None, str]:
-        """The camera beside the LiDAR; None and why where there is none that tells where things stand."""
+        """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
         topic = self._topics.camera
         if topic is None:
             return None, ""
-        if self._camera is None:  # it is asked for with each picture
+        if self._camera is None:  # needed for each picture
             self._camera = find_camera(
                 self._container, self._decoder, self._extrinsics.tree, self._records.base, topic.numbers
             )
         return self._camera
 
     def picture_stamps(self) -> list[int]:
-        """When the camera took a picture, ascending [ns]."""
+        """Return the times of the pictures, ascending [ns]."""
         return self._pictures().stamps()
 
     def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """The pictures that were taken at some of `picture_stamps`, each once."""
+        """Yield the pictures of some of `picture_stamps`, each once."""
         return self._pictures().at(wanted_ns)
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """The picture that was taken nearest to a time, None where none is within `within_ns` of it."""
+        """Return the picture nearest to a time, None when none is within `within_ns` of it."""
         return self._pictures().near(stamp_ns, within_ns)
 
     @property
     def base(self) -> str:
-        """The name of the base frame, "" where nobody says it."""
+        """Name of the base frame, "" when it is unknown."""
         return self._records.base
 
     def close(self) -> None:
@@ -169,7 +168,7 @@ class RosSource:
     def _arrivals(
         self, start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Stamped[Message | Odometry]]:
-        """The messages that are read, with their time, in the order of writing."""
+        """Yield the messages that are read with their times, in the order of recording."""
         log_start = None if start_ns is None else start_ns - self._clock.offset_ns - WINDOW_NS
         wanted = self._wanted | self._alignments.numbers
         for message in self._container.messages(wanted, log_start, losses):
@@ -178,7 +177,7 @@ class RosSource:
                     yield arrival
 
     def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
-        """What a message holds, with its time."""
+        """Yield the contents of a message with their times."""
         plain = replace(message, payload=plain_message(message.payload))
         if message.channel in self._moving:
             return self._transforms(plain, losses)
@@ -202,7 +201,7 @@ class RosSource:
             yield Stamped(time_ns, int(message.channel in self._topics.scan.numbers), message)
 
     def _transforms(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
-        """Odometry that is only there as a moving transform."""
+        """Yield odometry that is recorded as a moving transform."""
         for stamp_ns, parent, child, pose in self._extrinsics.decode(message):
             if (parent, child) == self._extrinsics.odometry_link:
                 time_ns = self._clock.time_of(stamp_ns, message)
@@ -212,7 +211,7 @@ class RosSource:
                     yield Stamped(time_ns, 0, Odometry(time_ns, pose))
 
     def _upright(self, scan: Scan) -> Scan:
-        """Number the rings from below, as records say."""
+        """Number the rings from below, as defined for Scan."""
         if self._top_ring is None or scan.ring is None:
             return scan
         return replace(scan, ring=np.maximum(self._top_ring - scan.ring, 0).astype(np.int32))
@@ -225,14 +224,14 @@ class RosSource:
         return frozenset[int]().union(*(topic.numbers for topic in self._topics.moving))
 
     def _clock_offset(self, topic: Topic) -> int | None:
-        """Stamp minus time of writing of a topic's first message [ns], None without a stamp."""
+        """Return stamp minus time of recording of the first message of a topic [ns], None without a stamp."""
         for message in islice(self._container.messages(topic.numbers, None, {}), 1):
             stamp_ns = header_stamp(self._channels[message.channel], plain_message(message.payload))
             return stamp_ns - message.log_ns if stamp_ns else None
         return None
 
     def _first_scan(self) -> tuple[Scan, str, int]:
-        """The first scan that can be read, its frame and the product number of the sensor."""
+        """Return the first scan that can be read, its frame and the product number of the sensor."""
         reason = "the topic has no messages that can be read"
         for arrival in islice(self._scan_arrivals(None), _TRIES):
             try:
@@ -268,8 +267,8 @@ class RosSource:
             self._warnings.append(f"the attached ground truth is not used: {error.what}")
             return None, None
 
-    def _said_base(self) -> str:
-        """The base frame as the odometry topic names it, "" when it does not."""
+    def _odometry_base(self) -> str:
+        """Return the base frame named by the odometry topic, "" when there is none."""
         topic = self._topics.odometry
         numbers = frozenset[int]() if topic is None else topic.numbers
         for message in islice(self._container.messages(numbers, None, {}), 1 if numbers else 0):
@@ -284,7 +283,7 @@ class RosSource:
     def _describe(
         self, first: Scan, frame: str, sensor: Sensor, refused: list[str], options: SourceOptions
     ) -> SourceDescription:
-        self._records.base = base = self._extrinsics.base_frame(self._said_base())
+        self._records.base = base = self._extrinsics.base_frame(self._odometry_base())
         has_odometry = self._topics.odometry is not None or bool(self._moving)
         linked = options.T_base_lidar or self._extrinsics.tree.find(base, frame)
         warnings = [
@@ -294,7 +293,7 @@ class RosSource:
         if linked is None and has_odometry and base != frame:
             warnings.append(
                 f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "
-                "the LiDAR is taken to stand at the base"
+                "the LiDAR is assumed to be at the base"
             )
         unnamed = {channel.topic for channel in self._channels.values() if not channel.encoding}
         read = [topic.name for topic in self._topics.recorded() if topic.read_as and topic.name in unnamed]
@@ -303,9 +302,9 @@ class RosSource:
                 f"the recording does not name the serialization format of {', '.join(read)}: CDR is assumed"
             )
         if not self._clock.by_stamp:
-            warnings.append("the time stamps in the messages do not fit together: times of writing are used")
+            warnings.append("the time stamps in the messages are inconsistent: times of recording are used")
         if self._container.damage:
-            warnings.append("the recording is cut or damaged: only what is whole is read")
+            warnings.append("the recording is cut or damaged: only whole messages are read")
         return SourceDescription(
             uri=self._uri,
             kind=self._container.kind,
@@ -326,7 +325,7 @@ class RosSource:
 def open_ros(
     uri: str, open_container: Callable[[], Container], paths: list[Path], options: SourceOptions
 ) -> RosSource:
-    """Open a recording; its files are closed again when it cannot be read.
+    """Open a recording; its files are closed when it cannot be read.
 
     Raises:
         SourceError: See RosSource.

@@ -240,8 +240,14 @@ Fields = tuple[list[Any], list[tuple[str, Any]]]
 class MessageDecoder:
     """Decodes the messages of one recording.
 
+    A definition in the file is untrusted: it is used only where it differs from the standard one, and after a
+    check of its names, sizes and nesting.
+
     Args:
-        channels: Of the recording; their definitions are used where they differ from the standard.
+        channels: Channels of the recording with their definitions.
+
+    Attributes:
+        refused: Topics with definitions that are not valid.
     """
 
     def __init__(self, channels: Iterable[Channel]) -> None:
@@ -255,7 +261,7 @@ class MessageDecoder:
         """Decode one message.
 
         Raises:
-            Exception: Of many kinds, when the bytes do not fit the type. Callers count a loss.
+            Exception: Of many kinds, when the bytes do not match the type. Callers count a loss.
         """
         store = self._store(channel)
         if channel.encoding == "ros1":
@@ -271,7 +277,7 @@ class MessageDecoder:
         return self._stores[channel.encoding]
 
     def _adopt(self, channel: Channel) -> None:
-        """Use the recording's own definition of a type where it says another thing than ours."""
+        """Use the definition of a type in the recording when it differs from the standard one."""
         standard = self._store(channel)
         try:
             found = _parse(channel)
@@ -289,7 +295,7 @@ class MessageDecoder:
 
 @cache
 def standard_types(encoding: str) -> Typestore:
-    """The definitions that come with ROS ("cdr": ROS 2, "ros1"), with those of Velodyne and tf."""
+    """Return the definitions of ROS ("cdr": ROS 2, "ros1"), with those of Velodyne and tf."""
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_JAZZY)
     for name, text in _EXTRA.items():
         if name not in store.fielddefs:
@@ -307,10 +313,10 @@ def _parse(channel: Channel) -> dict[str, Fields]:
 
 
 def _closed(found: dict[str, Fields], root: str, standard: Typestore) -> dict[str, Fields]:
-    """The type and all that it is made of; what the file leaves out is taken from the standard.
+    """Return a type with all types of its fields; those missing in the file are the standard ones.
 
     Raises:
-        ValueError: A type is not defined, or could take memory or time without end.
+        ValueError: A type is not defined, or is too large.
     """
     closed: dict[str, Fields] = {}
     open_names = [root]
@@ -320,14 +326,14 @@ def _closed(found: dict[str, Fields], root: str, standard: Typestore) -> dict[st
             continue
         fields = found[name][1] if name in found else standard.fielddefs.get(name, ([], []))[1]
         _check(name, fields)
-        # Constants are not needed, and their text need not be trusted.
+        # Constants are not needed and are not trusted.
         closed[name] = ([], fields)
         open_names += [part for _, kind in fields for part in _parts(kind)]
     return closed
 
 
 def _parts(kind: tuple[Any, Any]) -> list[str]:
-    """The names of types in the description of a field."""
+    """Return the names of the types in the description of a field."""
     nodetype, detail = kind
     if nodetype == Nodetype.NAME:
         return [str(detail)]
@@ -335,10 +341,10 @@ def _parts(kind: tuple[Any, Any]) -> list[str]:
 
 
 def _check(name: str, fields: list[tuple[str, Any]]) -> None:
-    """Refuse what is no plain type.
+    """Check that a type is plain.
 
     Raises:
-        ValueError: The type has no fields, a name is no identifier, or an array is too long.
+        ValueError: It has no fields, a name is not an identifier, or an array is too long.
     """
     if not _TYPE.fullmatch(name) or not fields:
         raise ValueError(f"bad type {name!r}")

@@ -21,7 +21,7 @@ _TICK_NS = 1_000_000_000 // IMU_HZ
 
 
 class SimulatedSource:
-    """A simulated run, read like any recording (see `pipeline.io.readers.base.Source`)."""
+    """A simulated run as a source (see `pipeline.io.readers.base.Source`)."""
 
     def __init__(
         self,
@@ -51,11 +51,14 @@ class SimulatedSource:
         self.losses: dict[str, int] = {}
 
     def records(self, start_ns: int | None = None, *, every: int = 1) -> Iterator[Record]:
-        """All records in the order of time; at the same time IMU, odometry, scan. Of so many scans one is
-        made: what is not asked for costs nothing.
+        """Yield all records in the order of time; with equal times IMU, odometry, scan.
 
-        A scan bears the time at which its sweep starts, so readings taken while the sensor turns follow
-        it. They go on to the end of the last sweep, so that every sweep can be undistorted.
+        The stamp of a scan is the start of its sweep, so readings during the sweep follow it. Readings
+        continue to the end of the last sweep, so that every sweep can be undistorted.
+
+        Args:
+            start_ns: Time of the first record, None for all.
+            every: Only every n-th scan is simulated.
         """
         period = self.run.lidar.period_ns
         per_odometry, per_scan = IMU_HZ // ODOMETRY_HZ, period // _TICK_NS
@@ -68,7 +71,7 @@ class SimulatedSource:
                 yield self.run.sweep(tick // per_scan).scan
 
     def truth(self) -> Truth:
-        """All trees and what else stands there, and the true path."""
+        """Return the trees and other objects, and the true path."""
         trees = self.run.scene.truth if self._knows_trees else None
         return Truth(trees=trees, path=self.run.true_path())
 
@@ -79,10 +82,8 @@ class SimulatedSource:
 def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedSource:
     """Open `sim:NAME?seed=&sigma=&odometry=&duration=&trees=`.
 
-    `options.seed` is taken where the URI names no seed; `options.T_base_lidar` mounts the simulated
-    LiDAR elsewhere on the robot.
-
-    `sim:cloud?file=&truth=` drives through the real cloud of a plot instead.
+    `options.seed` applies when the URI has no seed; `options.T_base_lidar` are the extrinsics of the
+    simulated LiDAR. `sim:cloud?file=&truth=` is a drive through the real cloud of a plot.
 
     Raises:
         SourceError: No such scenario or option, a value out of bounds, or a file that cannot be read.
@@ -95,7 +96,7 @@ def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedS
 
 
 def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> SimulatedSource:
-    """A run through the real cloud of a plot."""
+    """Open a drive through the real cloud of a plot."""
     from pipeline.io.ground_truth import read_truth_trees
     from pipeline.io.readers.clouds import open_cloud
     from pipeline.simulation.cloud_run import open_cloud_run
@@ -106,10 +107,10 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
 
 
 def drive_through(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
-    """A whole cloud as a run: a simulated robot drives through it (`sim:cloud?file=`).
+    """Open a whole cloud as a run: a simulated robot drives through it (`sim:cloud?file=`).
 
     Raises:
-        SourceError: It cannot be read, or leaves no way for a robot.
+        SourceError: It cannot be read, or has no path for a robot.
     """
     from pipeline.io.readers.clouds import open_cloud
     from pipeline.simulation.cloud_run import open_cloud_run

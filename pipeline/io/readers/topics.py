@@ -1,4 +1,4 @@
-"""Which topics of a recording are read: found by their type, the one with the most messages wins."""
+"""Choice of the topics of a recording: by type, and of several the one with the most messages."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ _READABLE = ("cdr", "ros1", "")
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of one type with the channels that carry it.
+    """A topic of one type.
 
     Attributes:
-        name, msgtype: Of the topic.
-        numbers: The channels.
-        count: Number of messages of all of them.
+        name, msgtype: Name and message type.
+        numbers: Numbers of its channels.
+        count: Number of messages of all channels.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """The topics that are read; `fixed` and `moving` carry transforms, `every` is all there is."""
+    """The topics that are read by role; `fixed` and `moving` have transforms, `every` lists all topics."""
 
     scan: Topic
     odometry: Topic | None
@@ -67,7 +67,7 @@ class Topics:
     every: tuple[Topic, ...]
 
     def recorded(self) -> tuple[RecordedTopic, ...]:
-        """All topics for people, each with what it is read as."""
+        """Describe all topics for the user, each with its role."""
         reading: dict[Topic, str] = dict.fromkeys((*self.fixed, *self.moving), "transforms")
         infos = [topic for topic in self.every if topic.msgtype == CAMERA_INFO]
         reading.update(dict.fromkeys(infos if self.camera else [], "camera"))
@@ -97,13 +97,14 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
     """Choose the topics by role.
 
     Args:
-        channels: Of the recording.
-        wanted: Topic by role ("scan", "odometry", "imu", "pose") as the user said; others are found by type.
-        where: The recording, for errors.
+        channels: Channels of the recording.
+        wanted: Topic by role ("scan", "odometry", "imu", "pose") chosen by the user; others are found by
+            type.
+        where: Name of the recording in errors.
 
     Raises:
-        SourceError: There is no scan, or a topic that the user named is not there or not of a type
-            for its role. The text names the topics that are there.
+        SourceError: There is no topic with scans, or a topic chosen by the user does not exist or has no type
+            for its role. The message lists the topics.
     """
     topics = _group(channels)
     unknown = sorted(wanted.keys() - TYPES_BY_ROLE.keys())
@@ -141,15 +142,15 @@ def _role_of(topic: Topic) -> str:
 
 
 def _free(topics: list[Topic], role: str, wanted: Mapping[str, str]) -> list[Topic]:
-    """The topics that may be given a role: what was named as the pose of another SLAM is no odometry."""
+    """Return the topics for a role: the topic chosen as pose of another SLAM is not used as odometry."""
     taken = wanted.get("pose") if role == "odometry" else None
     return [topic for topic in topics if topic.name != taken]
 
 
 def _why_not(topic: Topic, chosen: Topic | None) -> str:
-    """Why a topic is not read, for people."""
+    """Return the reason why a topic is not read, for the user."""
     if chosen is None and topic.count and topic.msgtype == POSE_WITH_COVARIANCE:
-        return "it counts when it is named as pose"
+        return "it is read when it is named as pose"
     if chosen is None:
         return "no message in it" if _role_of(topic) else "nothing is made of this type"
     if topic.count == 0:
@@ -184,11 +185,11 @@ def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Top
         raise SourceError(
             f"{reason}; {_listing(topics)}", where=where, remedy=f"Name one with --topic {role}=NAME."
         )
-    if role == "pose" and name is None:  # whether another program is better than we are, a person knows
+    if role == "pose" and name is None:  # only used when the user chooses it
         return None
     filled = [topic for topic in fitting if topic.count > 0] or (fitting if name is not None else [])
-    # Of equally many messages the decoded cloud is preferred to the raw packets it was made of.
-    # A laser that sees in one plane is the robot's bumper where there is a LiDAR too.
+    # With equal counts a decoded cloud is preferred to the raw packets. A planar laser of a robot with a 3D
+    # LiDAR is its bumper.
     return max(
         filled,
         key=lambda topic: (topic.msgtype != LASER_SCAN, topic.count, -types.index(topic.msgtype)),

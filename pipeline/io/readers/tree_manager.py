@@ -34,10 +34,10 @@ class TreeManagerSource:
     Args:
         uri: As the user wrote it.
         path: The folder.
-        options: The mounting; the trajectory is the sensor's own.
+        options: Extrinsics; the trajectory is that of the sensor.
 
     Raises:
-        SourceError: The trajectory is missing, damaged or of another length, or no file holds stems.
+        SourceError: The trajectory is missing, damaged or too short, or no file has stems.
         OSError: The folder cannot be read.
     """
 
@@ -73,12 +73,12 @@ class TreeManagerSource:
 
     @property
     def description(self) -> SourceDescription:
-        """What is known before reading."""
+        """Description that is known before reading."""
         return self._description
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out in the latest reading, by reason."""
+        """Records left out in the latest reading, by reason."""
         return dict(self._losses)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
@@ -95,14 +95,14 @@ class TreeManagerSource:
                     yield scan
 
     def truth(self) -> Truth | None:
-        """The trajectory is odometry; what is true nobody says."""
+        """Return None: the trajectory is odometry, and the ground truth is unknown."""
         return None
 
     def close(self) -> None:
         """Nothing is held open."""
 
     def _scan(self, file: Path, stamp_ns: int, losses: dict[str, int]) -> Scan | None:
-        """One frame; a frame without stems is a scan too. None when the file cannot be read."""
+        """Return the scan of a frame, which may have no stems; None when the file cannot be read."""
         try:
             frame = _read_frame(file, self._uri)
         except (SourceError, OSError):
@@ -116,7 +116,7 @@ class TreeManagerSource:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _FrameTable:
-    """One file: places (N, 3), axes (N, 3), DBH (N,), and how many rows were left out."""
+    """Stems of one file: places (N, 3), axes (N, 3), DBH (N,), and the number of damaged rows."""
 
     place: Float
     axis: Float
@@ -125,10 +125,10 @@ class _FrameTable:
 
 
 def _read_frame(file: Path, uri: str) -> _FrameTable:
-    """The stems of a file.
+    """Read the stems of a file.
 
     Raises:
-        SourceError: It is too large, or its header is another one.
+        SourceError: It is too large, or its header lacks a column.
         OSError: It cannot be read.
     """
     with file.open("rb") as opened:
@@ -147,7 +147,7 @@ def _read_frame(file: Path, uri: str) -> _FrameTable:
 
 
 def _axes(table: Float, at: dict[str, int]) -> Float:
-    """Unit vectors along the stems, upwards; NaN where the file has none that is sound."""
+    """Return unit vectors along the stems, upwards, shape (N, 3); NaN for invalid ones."""
     if not all(name in at for name in STEM_AXIS):
         return np.full((len(table), 3), np.nan)
     axis = table[:, [at[name] for name in STEM_AXIS]]
@@ -158,7 +158,7 @@ def _axes(table: Float, at: dict[str, int]) -> Float:
 
 
 def _dbh(table: Float, at: dict[str, int]) -> Float:
-    """Diameters [m]; NaN where none was fitted or where it is no diameter."""
+    """Return diameters [m], shape (N,); NaN for missing or impossible ones."""
     if DBH not in at:
         return np.full(len(table), np.nan)
     dbh = table[:, at[DBH]]
@@ -184,7 +184,11 @@ def _header(file: Path) -> list[str]:
 
 
 def _columns(names: list[str], file: Path, uri: str) -> dict[str, int]:
-    """Column of each name."""
+    """Return the index of each column.
+
+    Raises:
+        SourceError: The place is missing.
+    """
     at = {name: k for k, name in enumerate(names)}
     missing = [name for name in PLACE if name not in at]
     if missing:
@@ -202,12 +206,12 @@ def _check_sizes(files: list[Path], uri: str) -> None:
             raise SourceError(
                 f"{file.name} is larger than {CSV_LIMIT >> 20} MB",
                 where=uri,
-                remedy="It is no frame of stems.",
+                remedy="It is not a frame of stems.",
             )
 
 
 def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
-    """Stamps [ns], ascending, and poses."""
+    """Read stamps [ns], ascending, and poses."""
     remedy = "It needs a row `time x y z qx qy qz qw` for each TreeManagerState file."
     try:
         table = read_table(file, 8)

@@ -146,7 +146,7 @@ def test_poses_that_nobody_named_do_not_count(tmp_path: Path, opened: Opened):
     source = opened(path)
     assert source.description.other_slam == ""
     assert {t.why_not for t in source.description.topics if t.name == "/other/pose"} == {
-        "it counts when it is named as pose"
+        "it is read when it is named as pose"
     }
     assert not any(isinstance(record, PoseMeasurement) for record in source.records())
     measured = [record for record in opened(path, NAMED).records() if isinstance(record, PoseMeasurement)]

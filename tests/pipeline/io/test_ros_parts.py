@@ -189,7 +189,7 @@ def test_times_of_writing_serve_where_stamps_do_not(tmp_path: Path, opened: Open
 
     source = opened(write_recording("db3", tmp_path, unstamped))
     assert [record.stamp_ns for record in source.records()] == [START_NS + k * STEP_NS for k in range(3)]
-    assert "times of writing" in " ".join(source.description.warnings)
+    assert "times of recording" in " ".join(source.description.warnings)
 
 
 def test_a_database_that_does_not_name_the_serialization_is_read_as_cdr(tmp_path: Path, opened: Opened):
@@ -230,7 +230,7 @@ def test_without_a_transform_the_mounting_is_taken_as_none_and_said(tmp_path: Pa
     known = opened(write_recording("mcap", tmp_path, bare)).description
     np.testing.assert_array_equal(known.T_base_lidar.R, np.eye(3))
     assert known.warnings == (
-        "no fixed transform from velodyne to base_link: the LiDAR is taken to stand at the base",
+        "no fixed transform from velodyne to base_link: the LiDAR is assumed to be at the base",
     )
 
 
