@@ -116,7 +116,8 @@ class McapFile(ChunkedFile):
     def _read_summary(self, after: int) -> int:
         """Add the chunks behind a damaged record by the summary; return where they begin, 0 for none."""
         try:
-            summary = SeekingReader(self._file, record_size_limit=BLOCK_LIMIT).get_summary()
+            with self._path.open("rb") as file:
+                summary = SeekingReader(file, record_size_limit=BLOCK_LIMIT).get_summary()
         except (McapError, struct.error, ValueError, OSError, StopIteration, MemoryError):
             return 0
         if summary is None:

@@ -21,7 +21,16 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import MOST_IN_CHUNK, Channel, UnpackError, unpack
-from pipeline.io.readers.mcap_file import CHUNK, CHUNK_HEAD, MESSAGE, MESSAGE_HEAD, RECORD, McapFile
+from pipeline.io.readers.mcap_file import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD,
+    McapFile,
+)
 from pipeline.io.readers.message_time import WINDOW_NS, Stamped, by_stamp
 from pipeline.io.readers.ros_messages import POINT_CLOUD, MessageDecoder
 from pipeline.io.readers.transforms import TransformTree
@@ -161,11 +170,10 @@ def test_a_chunk_of_millions_of_empty_messages_is_given_up(tmp_path: Path):
     packed = zstandard.ZstdCompressor().compress(raw)
     head = CHUNK_HEAD.pack(START_NS, START_NS, len(raw), 0) + struct.pack("<I4sQ", 4, b"zstd", len(packed))
     path = tmp_path / "run.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, use_chunking=False)
-        writer.start("ros2", "")
-        writer.register_channel("/points", "cdr", writer.register_schema(POINT_CLOUD, "ros2msg", b""))
-        file.write(RECORD.pack(CHUNK, len(head) + len(packed)) + head + packed)
+    channel = struct.pack("<HHI7sI3sI", 1, 0, 7, b"/points", 3, b"cdr", 0)
+    records = [(CHANNEL, channel), (CHUNK, head + packed)]
+    content = b"".join(RECORD.pack(opcode, len(record)) + record for opcode, record in records)
+    path.write_bytes(MAGIC + content)
     losses: dict[str, int] = {}
     with closing(McapFile(path)) as container:
         assert sum(1 for _ in container.messages({1}, None, losses)) <= MOST_IN_CHUNK
