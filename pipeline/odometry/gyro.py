@@ -24,8 +24,8 @@ STILL_SIGMA, STILL_MOST = 0.03, 0.1  # rad/s; largest standard deviation and mea
 DEAD = 20  # equal consecutive readings after which the gyroscope is defective
 NOISE = 1e-3  # rad/sqrt(s), MEMS gyroscope on a vibrating robot
 SCALE = 0.01  # of the turn: one sigma of the scale error
-# rad; the scale error is constant over a turn of this size, so the sigmas of its steps add up, not their variances
-# (as for WANDERS and the bias).
+# rad; the scale error is constant over a turn of this size, so the sigmas of its steps add up, not their
+# variances (as for WANDERS and the bias).
 SCALE_TURN = math.pi / 2.0
 BIAS_UNKNOWN, BIAS_KNOWN = 0.01, 5e-4  # rad/s
 WANDERS = 10.0  # s; the error of the bias is constant over this time, so short steps do not average it
