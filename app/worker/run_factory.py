@@ -9,7 +9,7 @@ from pathlib import Path
 from app.common.timers import Stopwatch
 from app.robot.source import LiveSource
 from app.sources.opening import with_odometry
-from app.worker.cursor import Cursor, LiveCursor, Synchroniser
+from app.worker.cursor import Cursor, LiveCursor, StepsFunction
 from app.worker.run import MakeMapper, Run
 from pipeline.config import Parameters
 from pipeline.config.model import validated
@@ -17,7 +17,7 @@ from pipeline.errors import ParameterError, SourceError
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.remapping import ScanCaches
 
-MakeSynchroniser = Callable[[str], Synchroniser]
+MakeSynchroniser = Callable[[str], StepsFunction]
 OpenCaches = Callable[[Source | LiveSource, str, int], ScanCaches]
 
 _LARGE = Path("/var/tmp")  # noqa: S108 - the default may be in memory; the file has no name
