@@ -78,7 +78,7 @@ def _compiling_is_not_said(monkeypatch: pytest.MonkeyPatch) -> None:
     def unheard(_tell: Callable[[], None]) -> AbstractContextManager[None]:
         return nullcontext()
 
-    # `app.cli.progress` takes it from there each time; workers have their own name for it.
+    # `app.cli.flags` takes it from there each time; workers have their own name for it.
     monkeypatch.setattr("pipeline.jit.on_compiling", unheard)
 
 

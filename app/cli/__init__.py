@@ -1,7 +1,7 @@
 """The command line: `stemmap [serve] [SOURCE]`, `stemmap map SOURCE --out DIR`, and more.
 
-Each command is a module of this package with `HELP`, `configure(parser)` and `run(arguments)`.
-Whatever is heavy is imported inside `run`, so that `--help` answers at once.
+Each command is a module of this package with `HELP`, `configure(parser)` and `run(arguments)`. Heavy modules
+are imported inside `run`, so that `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ COMMANDS = (
 DONE, FAILED, WRONG_USAGE, DONE_WITH_LOSSES = 0, 1, 2, 3
 
 CODES = (
-    "Exit codes: 0 done, 1 failed (one line says why), 2 wrong usage (as a mistyped flag, parameter or\n"
-    "scenario), 3 done, but something was left out (said on stderr)."
+    "Exit codes: 0 done; 1 failed, with a message; 2 wrong usage, such as a mistyped flag, parameter or\n"
+    "scenario; 3 done, but something was left out (see stderr)."
 )
 
 
@@ -48,7 +48,7 @@ STOPPED = "stopped; no result was written"
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what was wrong in one line, and where the help is."""
+    """Reports wrong usage in one line, with the command for help."""
 
     def error(self, message: str) -> None:  # type: ignore[override]
         self.exit(WRONG_USAGE, f"{self.prog}: {message}. Help: {self.prog} --help\n")
@@ -58,12 +58,12 @@ _PYTHON_FORMAT = warnings.formatwarning
 
 
 def command() -> NoReturn:
-    """The program `stemmap`: `main` with the words of this process, whose code the process ends with."""
+    """The program `stemmap`: runs `main` and ends the process with its exit code."""
     warnings.formatwarning = _format_warning
     code = main()
     if "zenoh" in sys.modules:
-        # All is written and closed. Its threads outlive a session and now and then abort a process that is
-        # taking the interpreter down, which would report a map that stands whole as a crash.
+        # Threads of zenoh may abort the process while the interpreter shuts down, after all files are written
+        # and closed. The abort would look like a failure.
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
             sys.stderr.flush()
@@ -87,21 +87,21 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: Words after the program's name; None takes those of this process.
 
     Returns:
-        0 done, 1 failed with one clear line, 2 wrong usage, 3 done with losses (said on stderr).
+        0 done, 1 failed with a message, 2 wrong usage, 3 done with losses (see stderr).
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or (words[0] not in COMMANDS and words[0] not in ("-h", "--help", "--version")):
-        words.insert(0, "serve")  # `stemmap run.mcap` is what people type first
+        words.insert(0, "serve")  # `stemmap run.mcap` is short for `stemmap serve run.mcap`
     parser, known = _build_parser(words[0])
     try:
-        _look_for_slip(words)
+        _check_command(words)
         parsed, unknown = parser.parse_known_args(words)
         if unknown:
             _refuse(unknown, parsed.command, known[parsed.command])
         command = importlib.import_module(f"app.cli.{parsed.command}")
-        with _ended_kindly():
+        with _sigterm_as_ctrl_c():
             return int(command.run(parsed))
-    except SystemExit as stop:  # argparse has printed its line
+    except SystemExit as stop:  # argparse has printed its message
         return int(stop.code or 0)
     except (ParameterError, UsageError) as error:
         return _complain(error, WRONG_USAGE)
@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain("this needs more memory than this machine has", FAILED)
     except KeyboardInterrupt:
         return _complain(STOPPED, FAILED)
-    except SystemError as error:  # a request to stop that came inside of compiled code's loading
+    except SystemError as error:  # Ctrl-C while compiled code was loaded
         if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
             raise
         return _complain(STOPPED, FAILED)
@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -> None:
-    """Say which words a command does not know, and what may have been meant.
+    """Report unknown words of a command, with the nearest flag.
 
     Raises:
         UsageError: Always.
@@ -134,11 +134,11 @@ def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -
     )
 
 
-def _look_for_slip(words: list[str]) -> None:
-    """Say of `stemmap mpa run.mcap` that there is no such command, and not that a file is missing.
+def _check_command(words: list[str]) -> None:
+    """Report a mistyped command, such as `stemmap mpa run.mcap`, as such and not as a missing file.
 
     Raises:
-        UsageError: The word is no source, and nearly a command.
+        UsageError: The first word is not a source but similar to a command.
     """
     if len(words) < 2 or words[0] != "serve" or words[1].startswith("-"):
         return
@@ -148,8 +148,8 @@ def _look_for_slip(words: list[str]) -> None:
 
 
 @contextlib.contextmanager
-def _ended_kindly() -> Iterator[None]:
-    """A request to end (SIGTERM) is as Ctrl-C: what was begun is removed, nothing is left half-written."""
+def _sigterm_as_ctrl_c() -> Iterator[None]:
+    """Inside, SIGTERM acts as Ctrl-C: partial outputs are removed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -161,10 +161,10 @@ def _ended_kindly() -> Iterator[None]:
 
 
 def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The parser, and that of each command."""
+    """The parser of the program, and the parser of each command."""
     parser = _Parser(
         prog="stemmap",
-        description="Maps trees from a robot's LiDAR as it drives, and shows in the browser why.",
+        description="Maps trees from a robot's LiDAR as it drives, and shows the reasons in the browser.",
         epilog="`stemmap [SOURCE]` opens the dashboard; without a SOURCE a simulated stand plays.\n"
         f"{CODES} Each command has its own --help.",
         formatter_class=argparse.RawDescriptionHelpFormatter,

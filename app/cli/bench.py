@@ -1,4 +1,5 @@
-"""`stemmap bench`: measures the pipeline beside its peer, from the source tree."""
+"""`stemmap bench`: measures speed and memory of the pipeline and of a comparable one, from the source
+tree."""
 
 from __future__ import annotations
 
@@ -17,8 +18,8 @@ _ROOT = Path(__file__).resolve().parents[2]
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("names", metavar="NAME", nargs="*", help="benchmarks to run (default: all)")
-    parser.add_argument("--list", action="store_true", help="list the benchmarks and run none")
-    parser.add_argument("--json", metavar="FILE", type=Path, help="write the figures as JSON too")
+    parser.add_argument("--list", action="store_true", help="only list the benchmarks")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures as JSON")
     parser.add_argument(
         "--out", metavar="FILE", type=Path, help="Markdown file (default: docs/benchmarks.md of the tree)"
     )
@@ -26,15 +27,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--pictures",
         metavar="DIR",
         type=Path,
-        help="draw path, truth and map of the named benchmarks into a folder, and measure nothing",
+        help="only draw path, ground truth and map of the named benchmarks into a folder",
     )
     parser.add_argument(
         "--date",
         metavar="YYYY-MM-DD",
         type=_date,
-        help="date written beside the figures (default: today)",
+        help="date of the figures (default: today)",
     )
-    parser.epilog = "Sections of the Markdown file whose benchmarks are not run stay as they are."
+    parser.epilog = "Sections of benchmarks that are not run stay unchanged."
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,24 +1,45 @@
-"""`stemmap evaluate`: finished maps against the ground truth; with `--param-grid` runs under many sets."""
+"""`stemmap evaluate`: scores finished maps; with `--param-grid` compares parameter sets on runs."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import os
 import sys
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.choices import plain, source
-from app.cli.grid import add_grid_flags, distances, refuse_without_grid, run_grid
+from app.cli.flags import (
+    add_parameter_flags,
+    add_run_flags,
+    add_source_flags,
+    cannot_write,
+    chosen_parameters,
+    plain,
+    says_parameters,
+    source,
+    whole_number,
+)
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from app.batch.run_folder import FinishedRun
+    from app.tuning.sweep.comparison import Comparison
+    from app.tuning.sweep.jobs import PreparedRun, SweepPlan
+    from app.tuning.sweep.sweep import Outcome
+    from app.tuning.sweep.workers import Workers
+    from pipeline.config import Parameters
+    from pipeline.config.model import Value
     from pipeline.evaluation import Evaluation
     from pipeline.types.records import TruthTrees
 
-HELP = "judge mapped runs by ground truth trees, or compare many sets of parameters on runs"
+HELP = "score mapped runs against ground truth trees, or compare parameter sets on runs"
+
+MOST_JOBS = 20_000
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -36,21 +57,22 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=Path,
         action="append",
         default=[],
-        help="trees (CSV) in the frame of the map, for all runs or one FILE each; default: the source's own",
+        help="true trees (CSV) in the frame of the map, one FILE for all runs or one each "
+        "(default: those of the source)",
     )
     parser.add_argument(
-        "--dbh-unit", choices=("m", "cm", "mm"), help="of a truth column that does not say it"
+        "--dbh-unit", choices=("m", "cm", "mm"), help="unit of a diameter column without unit"
     )
-    parser.add_argument("--match-distance", metavar="M", help="a tree farther from its truth is no match [m]")
     parser.add_argument(
-        "--reach", metavar="M", help="truth farther than this from the path is not asked for [m]"
+        "--match-distance", metavar="M", help="largest distance between a tree and its ground truth [m]"
     )
+    parser.add_argument("--reach", metavar="M", help="largest distance of ground truth from the path [m]")
     parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
     add_grid_flags(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Judge them and print the scores."""
+    """Score the runs and print the scores."""
     if len(arguments.truth) not in (0, 1, len(arguments.runs)):
         raise ParameterError(
             f"{len(arguments.truth)} tables of true trees for {len(arguments.runs)} runs",
@@ -60,12 +82,12 @@ def run(arguments: argparse.Namespace) -> int:
         return run_grid(arguments)
     refuse_without_grid(arguments)
     if len(arguments.runs) == 1:
-        return _print(arguments, *_judged(arguments, 0))
+        return _print(arguments, *_score(arguments, 0))
     failed, plains = 0, {}
     for number, name in enumerate(arguments.runs):
         try:
-            evaluation, whole = _judged(arguments, number)
-        except StemmapError as error:  # one that cannot be judged does not end the others
+            evaluation, whole = _score(arguments, number)
+        except StemmapError as error:  # the other runs are scored all the same
             print(f"stemmap: {plain(name)}: {error}", file=sys.stderr)
             failed += 1
             continue
@@ -90,8 +112,8 @@ def _print(arguments: argparse.Namespace, evaluation: Evaluation, whole: bool) -
     return 0
 
 
-def _judged(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, bool]:
-    """The scores of a run, and whether all of the truth was asked for."""
+def _score(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, bool]:
+    """The scores of a run, and whether it is a whole cloud."""
     import numpy as np
 
     from app.batch.run_folder import read_run
@@ -104,7 +126,7 @@ def _judged(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, boo
     finished = read_run(folder)
     parameters = assign(finished.parameters, distances(arguments))
     truth = _truth(arguments, finished, number)
-    # A whole cloud was mapped without a path: all of the truth is asked for.
+    # A whole cloud has no path: all true trees count.
     path = None if finished.of_cloud else np.stack([finished.path.x, finished.path.y], axis=1)
     evaluation = evaluate(finished.trees, truth, parameters.evaluation, path)
     if evaluation.TA.of + evaluation.TR.of == 0:
@@ -114,24 +136,33 @@ def _judged(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, boo
             f"none of {count(evaluation.TA.of, 'true tree')} has a mapped tree within "
             f"{parameters.evaluation.match_distance:g} m",
             where=str(folder),
-            remedy="Check that the ground truth stands in the frame of the map: the first pose is its origin",
+            remedy="Check that the ground truth is in the frame of the map: the first pose is its origin",
         )
     return evaluation, path is None
+
+
+def _given_truth(arguments: argparse.Namespace, number: int) -> TruthTrees | None:
+    """The true trees that --truth gives for a run."""
+    from pipeline.io.ground_truth import read_truth_trees
+
+    if not arguments.truth:
+        return None
+    file = arguments.truth[number if len(arguments.truth) > 1 else 0]
+    return read_truth_trees(file, dbh_unit=arguments.dbh_unit)
 
 
 def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) -> TruthTrees:
     from contextlib import closing
 
-    from pipeline.io.ground_truth import read_truth_trees
     from pipeline.io.readers import SourceOptions, open_source
 
-    if arguments.truth:
-        file = arguments.truth[number if len(arguments.truth) > 1 else 0]
-        return read_truth_trees(file, dbh_unit=arguments.dbh_unit)
+    given = _given_truth(arguments, number)
+    if given is not None:
+        return given
     uri = finished.uri
     if finished.of_cloud:
         raise StemmapError(
-            "a whole cloud brings no true trees",
+            "a whole cloud has no true trees",
             where=uri,
             remedy="Give them with --truth trees.csv, in the coordinates of the cloud",
         )
@@ -139,6 +170,198 @@ def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) ->
         truth = source.truth()
     if truth is None or truth.trees is None:
         raise StemmapError(
-            "the source knows no true trees", where=uri, remedy="Give them with --truth trees.csv"
+            "the source has no true trees", where=uri, remedy="Give them with --truth trees.csv"
         )
     return truth.trees
+
+
+# --- comparison of parameter sets ------------------------------------------------
+
+
+def add_grid_flags(parser: argparse.ArgumentParser) -> None:
+    """--param-grid and its flags."""
+    group = parser.add_argument_group("comparison of parameter sets")
+    group.add_argument(
+        "--param-grid",
+        metavar="GRID",
+        action="append",
+        default=[],
+        help="STAGE.NAME=0.1,0.15,0.2 or STAGE.NAME=30..60/4 (4 values, ends included; 0.01..1/5log: "
+        "equal ratios), in the units of --set; preset=forest,paper; or a TOML file with lists. "
+        "Repeated flags are combined",
+    )
+    group.add_argument(
+        "--jobs",
+        metavar="N",
+        type=whole_number(1, 1024),
+        help="processes on this machine (default: one per core)",
+    )
+    group.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="use the Dask cluster at tcp://host:port; runs and stemmap must have the same paths there",
+    )
+    group.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help="folder for report.html, results.csv, means.csv, results.json and times.csv",
+    )
+    group.add_argument(
+        "--keep",
+        metavar="DIR",
+        type=Path,
+        help="folder that stores results, so that they are computed once (default: in STEMMAP_FOLDER)",
+    )
+    add_parameter_flags(parser)
+    add_run_flags(parser)
+    add_source_flags(parser)
+
+
+def refuse_without_grid(arguments: argparse.Namespace) -> None:
+    """Refuse flags that need --param-grid.
+
+    Raises:
+        ParameterError: Such a flag was given.
+    """
+    given = {
+        "--jobs": arguments.jobs,
+        "--dask": arguments.dask,
+        "--out": arguments.out,
+        "--keep": arguments.keep,
+        "--preset, --config and --set": says_parameters(arguments),
+        "--topic and --mount": arguments.topics or arguments.mount,
+    }
+    for flag, value in given.items():
+        if value:
+            raise ParameterError(f"{flag}: only with --param-grid", remedy="Add --param-grid GRID")
+
+
+def distances(arguments: argparse.Namespace) -> list[str]:
+    """--match-distance and --reach as assignments."""
+    asked = (("match_distance", arguments.match_distance), ("reach", arguments.reach))
+    return [f"evaluation.{name}={value}" for name, value in asked if value is not None]
+
+
+def run_grid(arguments: argparse.Namespace) -> int:
+    """Compare all sets on all runs."""
+    from app.tuning.sweep.grid import combinations, read_axes
+
+    sets = combinations(read_axes(arguments.param_grid))
+    arguments.assignments = [*arguments.assignments, *distances(arguments)]
+    chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
+    if len(sets) * len(arguments.runs) > MOST_JOBS:
+        raise ParameterError(
+            f"{len(sets):,} sets on {len(arguments.runs)} runs are more than {MOST_JOBS:,} results",
+            remedy="Ask for fewer values",
+        )
+    runs, refused = _ready(arguments)
+    if not runs:
+        return 1
+
+    from app.tuning.sweep.comparison import compare_answers
+    from app.tuning.sweep.jobs import plan_jobs
+
+    plan = plan_jobs(runs, sets, lambda run, changes: _base(arguments, run, changes))
+    numbers = list(plan.jobs)
+    outcome = _swept(arguments, plan)
+    comparison = compare_answers(plan, dict(zip(numbers, outcome.answers, strict=True)))
+    return _print_comparison(arguments, comparison, outcome, refused=refused)
+
+
+def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
+    """The runs that can be scored, and the number of the others, which are reported."""
+    from app.sources.request import SourceRequest, mount_of_degrees
+    from app.tuning.sweep.jobs import prepare_run
+
+    runs, refused = [], 0
+    for number, name in enumerate(arguments.runs):
+        try:
+            truth = _given_truth(arguments, number)
+            source = SourceRequest(
+                name,
+                arguments.odometry,
+                arguments.seed,
+                dict(arguments.topics),
+                mount_of_degrees(arguments.mount),
+            )
+            runs.append(prepare_run(source, truth))
+        except StemmapError as error:
+            print(f"stemmap: left out: {plain(str(error))}", file=sys.stderr)
+            refused += 1
+    return runs, refused
+
+
+def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Value]) -> Parameters:
+    """The parameters that a set changes: the preset of the set or of the run, and the flags."""
+    from app.tuning.sweep.grid import PRESET
+    from pipeline.config import preset
+
+    suits = str(changes.get(PRESET, run.preset))
+    present = preset(suits) if PRESET in changes else None
+    return chosen_parameters(arguments, suits, present)[1]
+
+
+def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> Outcome:
+    from tqdm import tqdm
+
+    from app.common.settings import from_environment
+    from app.tuning.sweep.sweep import KeptAnswers, sweep
+
+    folder = from_environment().folder
+    kept = KeptAnswers(arguments.keep or (folder and folder / "results"))
+    with (
+        _workers(arguments, len(plan.jobs)) as workers,
+        tqdm(
+            total=len(plan.jobs), unit="set", file=sys.stderr, disable=not sys.stderr.isatty(), leave=False
+        ) as bar,
+    ):
+        return sweep(list(plan.jobs.values()), workers, kept, bar.update)
+
+
+@contextlib.contextmanager
+def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
+    from app.tuning.sweep.workers import DaskWorkers, Processes
+
+    workers: Workers
+    if arguments.dask is not None:
+        workers = DaskWorkers(arguments.dask)
+    else:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = Processes(min(arguments.jobs or cores, jobs))
+    try:
+        yield workers
+    finally:
+        workers.close()
+
+
+def _print_comparison(
+    arguments: argparse.Namespace, comparison: Comparison, outcome: Outcome, *, refused: int
+) -> int:
+    """Print the comparison; returns the exit code."""
+    from app.common.text import count
+    from app.tuning.sweep.report import files, json_text, lines
+
+    if arguments.json:
+        print(json_text(comparison), end="")
+    else:
+        for line in lines(comparison):
+            print(plain(line))
+    if arguments.out is not None:
+        try:
+            names = files(comparison, arguments.out)
+        except OSError as error:
+            raise cannot_write(error, arguments.out) from None
+        print(f"{', '.join(names)} in {arguments.out}", file=sys.stderr)
+    if outcome.known:
+        print(f"{count(outcome.known, 'stored result')} used", file=sys.stderr)
+    for warning in outcome.warnings:
+        print(f"warning: {plain(warning)}", file=sys.stderr)
+    for reason, times in sorted(outcome.lost.items()):
+        print(f"warning: {count(times, 'worker')} lost during a job: {plain(reason)}", file=sys.stderr)
+    failed = comparison.failed
+    for why, times in Counter(row.error for row in failed).items():
+        print(f"left out: {count(times, 'result')}: {plain(why)}", file=sys.stderr)
+    if len(failed) == len(comparison.rows):
+        return 1
+    return 3 if failed or refused else 0

@@ -1,4 +1,4 @@
-"""`stemmap export`: a finished run in the files of other tools."""
+"""`stemmap export`: writes a finished run in the format of other tools."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import argparse
 import sys
 from pathlib import Path
 
+from app.cli.flags import positive_number
 from pipeline.errors import StemmapError
 
-HELP = "write a finished run in the files of other tools"
+HELP = "write a finished run in the format of other tools"
 REACH = 30.0
 
 
@@ -20,19 +21,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reach",
         metavar="M",
-        type=_metres,
+        type=positive_number(1e4, "distance in metres"),
         default=REACH,
-        help=f"trees farther from a pose are not in its frame (default: {REACH:g} m)",
+        help=f"largest distance of a tree from the pose of its frame (default: {REACH:g} m)",
     )
     parser.epilog = (
-        "tree-manager: TreeManagerState_<i>.csv with the trees around each pose, and trajectory.txt, as\n"
-        "tools that find a place again by its stems exchange them. `stemmap map FOLDER` reads them back.\n"
-        "Exit code 3 says that trees stand too far from the path to be in any frame."
+        "tree-manager: TreeManagerState_<i>.csv with the trees around each pose, and trajectory.txt, the\n"
+        "exchange format of place recognition by stems. `stemmap map FOLDER` reads it.\n"
+        "Exit code 3: some trees are too far from the path to be in any frame."
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write it."""
+    """Write the files."""
     from app.batch.run_folder import read_run
     from app.common.text import count
     from pipeline.io.tree_manager_writer import write_tree_manager
@@ -40,9 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
     finished = read_run(arguments.run)
     if finished.of_cloud:
         raise StemmapError(
-            "this is the map of a whole cloud: nobody drove, so there are no frames to write",
+            "this is the map of a whole cloud, which has no poses",
             where=str(arguments.run),
-            remedy="Use its trees.csv, trees.geojson and slices.csv as they are",
+            remedy="Use its trees.csv, trees.geojson and slices.csv",
         )
     left_out = write_tree_manager(arguments.out, finished.path, finished.trees, arguments.reach)
     frames, trees = count(len(finished.path.x), "frame"), count(len(finished.trees.number), "tree")
@@ -51,13 +52,3 @@ def run(arguments: argparse.Namespace) -> int:
         told = f"trees farther than {arguments.reach:g} m from the path ({left_out:,})"
         print(f"left out: {told}", file=sys.stderr)
     return 3 if left_out else 0
-
-
-def _metres(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < 1e4:
-        raise argparse.ArgumentTypeError(f"{text!r} is no distance in metres")
-    return value

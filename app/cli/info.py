@@ -1,39 +1,47 @@
-"""`stemmap info`: what is in a source, and what can be done with it."""
+"""`stemmap info`: describes a source and shows the commands for it."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import shlex
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
-from app.cli.choices import SOURCE_HELP, add_source_flags, plain, program, seed, source, source_options
+from app.cli.flags import SOURCE_HELP, add_source_flags, plain, program, seed, source, source_options
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from pipeline.inventory.cloud import CloudDescription
     from pipeline.io.readers import Source, SourceDescription
     from pipeline.io.readers.base import RecordedTopic
     from pipeline.types.records import Sensor, Truth
 
-HELP = "say what is in a recording and what can be done with it"
+HELP = "describe a source and show the commands for it"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("source", metavar="SOURCE", type=source, help=SOURCE_HELP)
     add_source_flags(parser)
-    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="of a simulated run (default: 0)")
+    parser.add_argument(
+        "--seed", type=seed, default=0, metavar="N", help="random seed of a simulated run (default: 0)"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Open it, look, print."""
+    """Print the description."""
     from pipeline.io.readers import open_source
     from pipeline.io.readers.clouds import is_cloud, open_cloud
 
     if is_cloud(arguments.source):
-        from app.cli.info_cloud import say
-
-        say(open_cloud(arguments.source).description, as_json=arguments.json)
+        cloud = open_cloud(arguments.source).description
+        if arguments.json:
+            print(json.dumps(_cloud_record(cloud), indent=1, allow_nan=False))
+        else:
+            print("\n".join(_cloud_lines(cloud)))
         return 0
     with closing(open_source(arguments.source, source_options(arguments))) as opened:
         if arguments.json:
@@ -74,23 +82,19 @@ def _lines(opened: Source) -> list[str]:
     d, truth = opened.description, opened.truth()
     x, y, z = d.T_base_lidar.t
     trees, others = _truth_counts(truth)
-    known = (
-        [f"{count(trees, 'tree')}, {others} that {'is' if others == 1 else 'are'} none"]
-        if trees + others
-        else []
-    )
+    known = [f"{count(trees, 'tree')}, {count(others, 'other object')}"] if trees + others else []
     known += ["the path"] if truth is not None and truth.path is not None else []
     rows = [
         ("kind", d.kind),
         ("scans", _scans(d)),
         ("LiDAR", _sensor(d.sensor)),
         ("mounted", f"x {x:.2f} m, y {y:.2f} m, z {z:.2f} m on the robot"),
-        ("odometry", "yes" if d.has_odometry else f"no; taken: {choose_odometry(d, 'auto').words}"),
+        ("odometry", "yes" if d.has_odometry else f"no; used: {choose_odometry(d, 'auto').words}"),
         ("IMU", "yes" if d.has_imu else "no"),
         *([("GNSS", d.gnss)] if d.gnss else []),
         *([("SLAM pose", d.other_slam)] if d.other_slam else []),
-        ("truth", ", ".join(known) or "none; give trees with --truth trees.csv"),
-        ("preset", f"{d.preset} suits it"),
+        ("truth", ", ".join(known) or "none; give true trees with --truth trees.csv"),
+        ("preset", d.preset),
         ("SHA-256", d.digest),
     ]
     lines = [f"{name:10}{text}" for name, text in rows]
@@ -102,11 +106,11 @@ def _lines(opened: Source) -> list[str]:
 def _topic_lines(d: SourceDescription) -> list[str]:
     if not d.topics:
         return []
-    lines = ["", "topics (* is read; --topic ROLE=NAME chooses another)"]
+    lines = ["", "topics (* is used; --topic ROLE=NAME selects another)"]
     width = max(len(plain(topic.name)) for topic in d.topics)
     seconds = 0.0 if d.start_ns is None or d.end_ns is None else (d.end_ns - d.start_ns) * 1e-9
     for topic in d.topics:
-        mark, use = ("*", f"read as {topic.read_as}") if topic.read_as else (" ", _not_read(topic))
+        mark, use = ("*", f"used as {topic.read_as}") if topic.read_as else (" ", _not_read(topic))
         name, kind = plain(topic.name), plain(topic.type)
         rate = (
             f"{(topic.messages - 1) / seconds:7.1f} Hz" if seconds > 0.0 and topic.messages > 1 else " " * 10
@@ -117,19 +121,17 @@ def _topic_lines(d: SourceDescription) -> list[str]:
 
 def _not_read(topic: RecordedTopic) -> str:
     could = f", could be {topic.fits}" if topic.fits and topic.messages else ""
-    return f"not read: {plain(topic.why_not)}{could}"
+    return f"not used: {plain(topic.why_not)}{could}"
 
 
 def _commands(d: SourceDescription) -> list[str]:
-    import shlex
-
     uri, command = shlex.quote(d.uri), program()
     return ["", f"watch it:  {command} {uri}", f"map it:    {command} map {uri} --out out"]
 
 
 def _scans(d: SourceDescription) -> str:
     if d.scans is None:
-        return "not counted"
+        return "unknown number"
     if d.start_ns is None or d.end_ns is None or d.end_ns <= d.start_ns:
         return f"{d.scans:,}"
     seconds = (d.end_ns - d.start_ns) * 1e-9
@@ -145,7 +147,92 @@ def _sensor(sensor: Sensor) -> str:
 
 
 def _truth_counts(truth: Truth | None) -> tuple[int, int]:
-    """True trees, and what else is known to stand there."""
+    """Numbers of true trees and of other known objects."""
     kinds = () if truth is None or truth.trees is None else truth.trees.kind
     trees = sum(kind == "tree" for kind in kinds)
     return trees, len(kinds) - trees
+
+
+# --- a whole cloud ----------------------------------------------------------------
+
+SQUARE_M = 1.0  # smallest area for the point density [m^2]
+
+
+def _cloud_record(d: CloudDescription) -> dict[str, Any]:
+    extent = _extent(d)
+    return {
+        "uri": d.uri,
+        "kind": d.kind,
+        "digest": d.digest,
+        "points": d.points,
+        "low_m": None if extent is None else extent[0].tolist(),
+        "high_m": None if extent is None else extent[1].tolist(),
+        "offset_m": d.offset.tolist(),
+        "crs": d.crs or None,
+        "attributes": list(d.attributes),
+        "warnings": list(d.warnings),
+    }
+
+
+def _cloud_lines(d: CloudDescription) -> list[str]:
+    rows = [
+        ("kind", f"whole cloud, {d.kind}"),
+        ("points", f"{d.points:,}"),
+        *_extent_rows(d),
+        ("CRS", _crs_words(d.crs)),
+        ("attributes", ", ".join(map(plain, d.attributes)) or "only its position"),
+        ("truth", "give true trees with --truth trees.csv, in the coordinates of the cloud"),
+        ("SHA-256", d.digest),
+    ]
+    uri, command = shlex.quote(d.uri), program()
+    return [
+        *(f"{name:11}{text}" for name, text in rows),
+        *(f"warning: {text}" for text in d.warnings),
+        "",
+        f"map it:        {command} map {uri} --out out",
+        f"drive through: {command} {uri}   (a simulated robot; `sim:cloud?file=` takes options)",
+    ]
+
+
+def _extent(d: CloudDescription) -> tuple[np.ndarray, np.ndarray] | None:
+    """The corners; None where the file has no valid extent."""
+    import numpy as np
+
+    if d.low is None or d.high is None:
+        return None
+    with np.errstate(invalid="ignore", over="ignore"):
+        is_extent = np.isfinite(d.low).all() and np.isfinite(d.high).all() and bool((d.high >= d.low).all())
+    return (d.low, d.high) if is_extent else None
+
+
+def _extent_rows(d: CloudDescription) -> list[tuple[str, str]]:
+    extent = _extent(d)
+    if extent is None:
+        return [("extent", "unknown")]
+    (x, y, z), (to_x, to_y, to_z) = (corner.tolist() for corner in extent)
+    from app.common.text import count
+
+    wide, long = to_x - x, to_y - y
+    dense = d.points / max(wide * long, SQUARE_M)
+    return [
+        (
+            "extent",
+            f"{wide:.1f} x {long:.1f} m, {to_z - z:.1f} m high; {count(round(dense), 'point')} per m²",
+        ),
+        ("from", f"x {x:.2f}, y {y:.2f}, z {z:.2f} m"),
+        ("to", f"x {to_x:.2f}, y {to_y:.2f}, z {to_z:.2f} m"),
+    ]
+
+
+def _crs_words(crs: str) -> str:
+    """The name of the reference system."""
+    if not crs:
+        return "none: positions have no longitude and latitude"
+    import pyproj
+
+    try:
+        known = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.ProjError:
+        return "unknown: positions have no longitude and latitude"
+    code = known.to_authority()
+    return plain(known.name) + (f" ({':'.join(code)})" if code else "")

@@ -32,7 +32,7 @@ def recording_of(arguments: argparse.Namespace) -> Recorder | None:
         ParameterError: The source is no live one.
         SourceError: The file cannot be made.
     """
-    from app.cli.choices import recording_place
+    from app.cli.flags import recording_place
     from app.robot.recorder import Recorder
 
     place = recording_place(arguments, arguments.source)

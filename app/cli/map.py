@@ -9,25 +9,27 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.cli.choices import (
+from app.cli.flags import (
     SOURCE_HELP,
     add_force_flag,
     add_live_flags,
     add_parameter_flags,
     add_run_flags,
     add_source_flags,
+    cannot_write,
     chosen_parameters,
+    compilation_notice,
     says_parameters,
     source,
     source_options,
+    whole_number,
 )
-from app.cli.progress import compiling_is_said
-from pipeline.errors import ParameterError, StemmapError
+from pipeline.errors import ParameterError
 
 if TYPE_CHECKING:
     from app.batch.continue_map import Start
 
-NOT_TIMED = "not timed: the first scan loads the compiled code, and there is no other"
+NOT_TIMED = "not timed: the only scan loads the compiled code"
 HELP = "map a run without a browser and write its files"
 
 
@@ -40,25 +42,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_run_flags(parser)
     add_source_flags(parser)
     add_live_flags(parser)
+    parser.add_argument("--truth", metavar="FILE", type=Path, help="ground truth trees (CSV) for the scores")
     parser.add_argument(
-        "--truth", metavar="FILE", type=Path, help="ground truth trees (CSV), to be judged by"
-    )
-    parser.add_argument(
-        "--dbh-unit", choices=("m", "cm", "mm"), help="of a truth column that does not say it"
+        "--dbh-unit", choices=("m", "cm", "mm"), help="unit of a diameter column without unit"
     )
     parser.add_argument(
         "--continue",
         dest="continued",
         metavar="DIR",
         type=Path,
-        help="go on with the map that an earlier run saved there; trees keep their numbers",
+        help="continue the map of an earlier run in this folder; trees keep their numbers",
     )
     parser.add_argument(
         "--start",
         metavar="WHERE",
         type=_start,
-        help="of a continued map: auto (found by the stems around, the default); X,Y,YAW in m and degrees; "
-        "last (where the earlier run ended); resume (the same drive goes on)",
+        help="start in a continued map: auto (found by the stems, default); X,Y,YAW in m and degrees; "
+        "last (end of the earlier run); resume (the same drive continues)",
     )
     parser.add_argument(
         "--as-live",
@@ -66,30 +66,33 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="of a recorded live run: map only the scans that were mapped live, for the same map again",
     )
     parser.add_argument(
-        "--stop-after", metavar="N", type=_scans, help="map so many scans; --start resume maps the rest"
+        "--stop-after",
+        metavar="N",
+        type=whole_number(1, (1 << 31) - 1),
+        help="map N scans; --start resume maps the rest",
     )
     parser.add_argument(
         "--as",
         dest="kind",
         choices=("auto", "scans", "plot"),
         default="auto",
-        help="plot: the file is one whole cloud of a plot (auto: .las, .laz, .ply, .npy and .npz are, "
-        "one .pcd is a scan)",
+        help="plot: the file is one whole cloud of a plot (auto: .las, .laz, .ply, .npy and .npz are "
+        "plots, a .pcd is a scan)",
     )
     parser.set_defaults(seed=None)
     parser.epilog = (
-        "DIR gets trees.csv, path.csv, trees.geojson, detections.csv, terrain.csv, run.json and state.zip,\n"
-        "from which --continue goes on (all the same bytes for the same source, parameters and seed). A map\n"
-        "of the same source that stands there is replaced. Exit code 3 says that something was left out."
+        "Writes trees.csv, path.csv, trees.geojson, detections.csv, terrain.csv, run.json and state.zip\n"
+        "(for --continue) to DIR, with the same bytes for the same source, parameters and seed. A map of\n"
+        "the same source in DIR is replaced. Exit code 3: some messages or points were left out."
     )
 
 
-@compiling_is_said()
+@compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
     """Map the run."""
     if arguments.start is not None and arguments.continued is None:
-        raise ParameterError("--start is of a continued map", remedy="Name it with --continue DIR")
-    chosen_parameters(arguments, "forest")  # a mistyped flag is said before anything heavy is loaded
+        raise ParameterError("--start needs a continued map", remedy="Add --continue DIR")
+    chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
 
     from app.batch.data_folders import partial_output_warnings
     from pipeline.io.readers.clouds import is_cloud
@@ -102,11 +105,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_plot(arguments: argparse.Namespace) -> int:
-    """A whole cloud of a plot."""
+    """Map a whole cloud of a plot."""
     if arguments.continued is not None or arguments.stop_after is not None:
-        raise ParameterError(
-            "a whole cloud has no scans to go on with", remedy="Leave --continue and --stop-after away"
-        )
+        raise ParameterError("a whole cloud has no scans", remedy="Remove --continue and --stop-after")
     from app.batch.map_cloud import map_plot_run
     from app.batch.run_folder import check_folder
     from pipeline.io.ground_truth import read_truth_trees
@@ -119,7 +120,7 @@ def _run_plot(arguments: argparse.Namespace) -> int:
     try:
         outcome = map_plot_run(cloud, name, parameters, truth, arguments.out)
     except OSError as error:
-        raise _cannot_write(error, arguments.out) from None
+        raise cannot_write(error, arguments.out) from None
     return _tell(outcome.summary, arguments.out, outcome.warnings, outcome.losses, replaces=replaces)
 
 
@@ -168,13 +169,9 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             bar = _Bar(opened.description.scans)
             outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
         except OSError as error:
-            raise _cannot_write(error, arguments.out) from None
+            raise cannot_write(error, arguments.out) from None
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
-    times = (
-        f"median {outcome.scan_ms:.2f} ms a scan; stages, where they ran: {stages}"
-        if outcome.scan_ms
-        else NOT_TIMED
-    )
+    times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
     return _tell(
         [*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses, replaces=replaces
     )
@@ -188,17 +185,13 @@ def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
     return {**(kept or {}), "as_live": True} if arguments.as_live else kept
 
 
-def _cannot_write(error: OSError, out: Path) -> StemmapError:
-    return StemmapError(f"cannot write: {error.strerror}", where=str(error.filename or out))
-
-
 def _tell(
     summary: list[str], out: Path, warnings: list[str], losses: dict[str, int], *, replaces: bool
 ) -> int:
-    """Print what came of it; the exit code."""
+    """Print the result; returns the exit code."""
     for line in summary:
         print(line)
-    print(f"files in {out}" + (", in place of those that stood there" if replaces else ""))
+    print(f"files in {out}" + (" (replaced)" if replaces else ""))
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
     for reason, number in losses.items():
@@ -226,14 +219,8 @@ def _start(text: str) -> str | tuple[float, float, float]:
     raise argparse.ArgumentTypeError(f"{text!r} is not auto, last, resume or three numbers x,y,yaw")
 
 
-def _scans(text: str) -> int:
-    if text.isascii() and text.isdigit() and 0 < int(text) < 1 << 31:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
-
-
 class _Bar:
-    """A progress bar on a terminal, nothing elsewhere."""
+    """A progress bar on a terminal; silent elsewhere."""
 
     def __init__(self, scans: int | None) -> None:
         from tqdm import tqdm
@@ -249,12 +236,12 @@ class _Bar:
         self._begun = False
 
     def update(self, n: int = 1, /) -> object:
-        """So many scans more."""
+        """Add completed scans."""
         if not self._begun:
             self._bar.set_description("mapping", refresh=False)
             self._begun = True
         return self._bar.update(n)
 
     def close(self) -> None:
-        """No more will come."""
+        """End the bar."""
         self._bar.close()

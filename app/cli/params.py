@@ -1,11 +1,11 @@
-"""`stemmap params`: every parameter as a table, or a preset as TOML."""
+"""`stemmap params`: prints all parameters as a table, as TOML or as Markdown."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from app.cli.choices import add_parameter_flags, chosen_parameters
+from app.cli.flags import add_parameter_flags, chosen_parameters
 
 if TYPE_CHECKING:
     from pipeline.config import Parameters

@@ -1,4 +1,4 @@
-"""`stemmap recover FILE --out MENDED`: all that is whole of a recording that was cut or damaged."""
+"""`stemmap recover FILE --out REPAIRED`: writes the readable part of a damaged recording."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ import argparse
 import sys
 from pathlib import Path
 
-HELP = "mend a recording that was cut or damaged"
+HELP = "repair a recording that was cut or damaged"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("file", metavar="FILE", type=Path, help="an .mcap; it is not changed")
-    parser.add_argument("--out", metavar="MENDED", type=Path, required=True, help="the new .mcap")
-    parser.add_argument("--force", action="store_true", help="overwrite a file that is there already")
-    parser.epilog = "Exit code 0: it was whole; 3: something is lost (said on stderr); 1: nothing is whole."
+    parser.add_argument("file", metavar="FILE", type=Path, help="an .mcap file; it is not changed")
+    parser.add_argument("--out", metavar="REPAIRED", type=Path, required=True, help="the new .mcap file")
+    parser.add_argument("--force", action="store_true", help="overwrite an existing file")
+    parser.epilog = "Exit code 0: nothing is lost; 3: something is lost (see stderr); 1: nothing is readable."
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Mend it."""
+    """Repair the recording."""
     from pipeline.errors import StemmapError
     from pipeline.io.recording.recovery import mend
 
     if arguments.out.exists() and arguments.file.exists() and arguments.out.samefile(arguments.file):
         raise StemmapError(
-            "this is the damaged file itself", where=str(arguments.out), remedy="Name another with --out"
+            "this is the damaged file", where=str(arguments.out), remedy="Name another with --out"
         )
     if arguments.out.exists() and not arguments.force:
         raise StemmapError(
-            "the file is there already", where=str(arguments.out), remedy="Name another, or add --force"
+            "the file exists already", where=str(arguments.out), remedy="Name another, or add --force"
         )
     mended = mend(arguments.file, arguments.out)
     print(f"{arguments.out}: {mended.messages} messages")

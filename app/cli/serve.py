@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.choices import (
+from app.cli.flags import (
     SOURCE_HELP,
     add_live_flags,
     add_parameter_flags,
@@ -15,6 +15,7 @@ from app.cli.choices import (
     chosen_parameters,
     recording_place,
     source,
+    whole_number,
 )
 from app.common.settings import DEFAULT_PORT, VARIABLES, Settings, from_environment
 from pipeline.errors import SourceError
@@ -35,27 +36,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="SOURCE",
         type=source,
         nargs="*",
-        help=f"{SOURCE_HELP} (default: {_DEFAULT_SOURCE}); several, or a router with several robots, "
-        "get a dashboard each and one page of all",
+        help=f"{SOURCE_HELP} (default: {_DEFAULT_SOURCE}); several sources, or a router with several robots, "
+        "get one dashboard each and a common page",
     )
     parser.add_argument(
         "--port",
-        type=_port,
+        type=whole_number(0, 65535),
         metavar="N",
         help=f"port to listen on, 0 for any free one (default: {DEFAULT_PORT}, or one of the next)",
     )
     parser.add_argument(
         "--host",
         metavar="ADDRESS",
-        help="address to listen on (default: this machine only; any other is open to the network)",
+        help="address to listen on (default: this machine only; other addresses are open to the network)",
     )
     add_parameter_flags(parser)
     add_run_flags(parser)
     add_live_flags(parser)
-    parser.add_argument(
-        "--viewer", action="store_true", help="print a second link too, for who may look and not touch"
-    )
-    parser.add_argument("--no-browser", action="store_true", help="print the link, open no browser")
+    parser.add_argument("--viewer", action="store_true", help="also print a view-only link")
+    parser.add_argument("--no-browser", action="store_true", help="print the link without opening a browser")
     width = max(map(len, VARIABLES))
     table = "\n".join(f"  {name:{width}}  {meaning}" for name, meaning in VARIABLES.items())
     parser.epilog = f"Settings in the environment (flags win):\n{table}"
@@ -70,10 +69,10 @@ def run(arguments: argparse.Namespace) -> int:
         settings = replace(settings, port=arguments.port)
     uris = arguments.source or [_DEFAULT_SOURCE]
     for uri in uris:
-        _look_for(uri)
-    _tell_of_unfinished(settings)
+        _check_source(uri)
+    _report_partial_outputs(settings)
     record = recording_place(arguments, *uris)
-    chosen_parameters(arguments, "forest")  # a mistyped flag is said now, not on the page
+    chosen_parameters(arguments, "forest")  # reports a mistyped flag here and not on the page
 
     from app.dashboard.parameters import ParameterState
     from app.web.serving import serve
@@ -110,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
-    """The router whose robots are all shown: one that was asked for with robot=*, or that has several."""
+    """The router whose robots are all shown: one with robot=* in its address, or with several robots."""
     from app.robot.address import ALL_ROBOTS, ZenohAddress, is_live, parse_address
 
     if len(sources) != 1 or not is_live(sources[0].uri):
@@ -122,24 +121,24 @@ def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
         return address, sources[0]
     if address.robot == ALL_ROBOTS:
         return replace(address, robot=""), sources[0]
-    if address.topics:  # a topic is of one robot
+    if address.topics:  # a topic belongs to one robot
         return None
     from app.fleet.robots import robots_at
 
     return (address, sources[0]) if len(robots_at(address)) > 1 else None
 
 
-def _tell_of_unfinished(settings: Settings) -> None:
+def _report_partial_outputs(settings: Settings) -> None:
     from app.batch.data_folders import partial_outputs
     from app.common.text import count
 
     if left := partial_outputs(settings):
         they = count(len(left), "run was", "runs were")
-        print(f"{they} ended before the map was whole; the page Runs can delete what is left of them")
+        print(f"{they} killed before the map was complete; the page Runs can delete the partial outputs")
 
 
-def _look_for(uri: str) -> None:
-    """Say at once that a file or a scenario is missing; what is in a file, the worker finds out."""
+def _check_source(uri: str) -> None:
+    """Report a missing file or scenario at once. The worker checks the contents of a file."""
     if _exists(uri):
         return
     scheme, colon, _ = uri.partition(":")
@@ -154,17 +153,11 @@ def _look_for(uri: str) -> None:
     if scheme == "sim":
         from pipeline.simulation.uri import parse_uri
 
-        parse_uri(uri)  # an unknown scenario is said here; the scene itself is built in the worker
+        parse_uri(uri)  # reports an unknown scenario; the worker builds the scene
 
 
 def _exists(path: str) -> bool:
     try:
         return Path(path).expanduser().exists()
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: a home of nobody
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: unknown home directory
         return False
-
-
-def _port(text: str) -> int:
-    if not text.isdecimal() or int(text) > 65535:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a port (0 to 65535)")
-    return int(text)

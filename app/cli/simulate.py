@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.choices import seed
-from app.cli.progress import compiling_is_said
+from app.cli.flags import compilation_notice, seed
 
 if TYPE_CHECKING:
     from pipeline.io.readers.camera import Picture
@@ -19,7 +18,7 @@ HELP = "write a simulated run as an MCAP of ROS 2 messages, with its ground trut
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Declare the words of the command."""
+    """Add the arguments."""
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",
@@ -27,18 +26,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "(seed, sigma, odometry = good, normal, poor or exact, duration, trees, drive)",
     )
     parser.add_argument("--out", required=True, type=_mcap, metavar="RUN.mcap", help="the file to write")
-    parser.add_argument(
-        "--seed", type=seed, metavar="N", help="of everything random in the run; 0 if not given"
-    )
+    parser.add_argument("--seed", type=seed, metavar="N", help="random seed (default: 0)")
     parser.add_argument("--duration", type=float, metavar="S", help="length of the run in seconds")
     parser.add_argument(
-        "--camera", action="store_true", help="add simple pictures of a camera that looks ahead, two a second"
+        "--camera", action="store_true", help="add simple pictures of a front camera, two per second"
     )
-    parser.add_argument("--force", action="store_true", help="overwrite files that are there already")
-    parser.epilog = "The ground truth is attached to the recording, and written beside it as RUN.trees.csv."
+    parser.add_argument("--force", action="store_true", help="overwrite existing files")
+    parser.epilog = "The ground truth is attached to the recording and written to RUN.trees.csv."
 
 
-@compiling_is_said()
+@compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
     """Write the recording and the table of trees beside it."""
     from app.common.text import count
@@ -76,7 +73,7 @@ def _mcap(text: str) -> Path:
 
 
 def _uri(arguments: argparse.Namespace) -> str:
-    """The scenario with the flags as options, so that one place checks them all."""
+    """The URI of the scenario with the flags as options, which its parser checks."""
     uri: str = arguments.scenario if arguments.scenario.startswith("sim:") else f"sim:{arguments.scenario}"
     for key in ("seed", "duration"):
         value = getattr(arguments, key)
@@ -91,7 +88,7 @@ def _refuse_to_overwrite(paths: list[Path], force: bool) -> None:
     for path in paths:
         if path.exists() and not force:
             raise StemmapError(
-                "the file is there already", where=str(path), remedy="Name another, or add --force"
+                "the file exists already", where=str(path), remedy="Name another, or add --force"
             )
 
 

@@ -1,18 +1,24 @@
-"""`stemmap train`: the decision trees behind the verdicts, made anew."""
+"""`stemmap train`: trains the random forest that classifies the columns, from scenes or from annotations."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.choices import seed as whole_seed
+from app.cli.flags import plain
+from app.cli.flags import seed as whole_seed
+from app.common.text import count
 from pipeline.errors import StemmapError, UsageError
 
 if TYPE_CHECKING:
+    from app.store.store import Store
+    from app.training.annotated_runs import AnnotatedRun
     from app.training.fit_forest import Examples
 
-HELP = "make the decision trees anew that say what is a tree"
+HELP = "train the random forest that classifies trees"
 SCENES = "stand,slope,dense"
 SEEDS = "11,12,13,14,15,16,17,18"
 STREETS, FIRST_STREET = 80, 200  # and the seed of the first
@@ -25,52 +31,46 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "places",
         metavar="SOURCE",
         nargs="*",
-        help="scans of one place (velodyne/*.bin, labels/*.label), or one .bin with its .label beside it; "
-        "with --annotations runs that were annotated (default: all that were)",
+        help="labelled scans of one place (velodyne/*.bin, labels/*.label), or one .bin with its .label; "
+        "with --annotations annotated runs (default: all)",
     )
     parser.add_argument(
         "--annotations",
         action="store_true",
-        help="let the decision trees of the package learn from what was annotated in the dashboard, and show "
-        "what old and new ones are worth on things that they did not see",
+        help="extend the forest of the package with the annotations of the dashboard, and print the "
+        "scores of the present and the new forest on objects that were not used for training",
     )
     parser.add_argument(
         "--out",
         metavar="FILE",
         type=Path,
-        help="JSON file to write (with --annotations: into the data folder, to be used by its name)",
+        help="JSON file to write (default with --annotations: the data folder)",
     )
-    parser.add_argument(
-        "--seed", type=whole_seed, default=0, metavar="N", help="of every random number (default: 0)"
-    )
+    parser.add_argument("--seed", type=whole_seed, default=0, metavar="N", help="random seed (default: 0)")
     parser.add_argument("--scenes", default=SCENES, help=f"simulated scenes (default: {SCENES})")
     parser.add_argument(
         "--seeds",
         default=SEEDS,
-        help=f"of the simulated scenes, every second one with more furniture (default: {SEEDS})",
+        help=f"seeds of the simulated scenes; every second one has more objects (default: {SEEDS})",
     )
     parser.add_argument(
-        "--streets", type=int, default=STREETS, help=f"simulated streets (default: {STREETS})"
+        "--streets", type=int, default=STREETS, help=f"number of simulated streets (default: {STREETS})"
     )
-    parser.add_argument(
-        "--every", type=int, default=4, help="make every so many-th simulated scan (default: 4)"
-    )
+    parser.add_argument("--every", type=int, default=4, help="use every N-th simulated scan (default: 4)")
     parser.add_argument(
         "--examples",
         metavar="DIR",
         type=Path,
-        help="keep the examples of each scene here, and take them from here",
+        help="folder that stores the examples of each scene, so that they are computed once",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Gather examples, grow the trees, print what they are worth on scenes left out, write them."""
+    """Collect examples, print the scores on scenes that are left out, and write the forest."""
     if arguments.annotations:
-        from app.cli.learning import learn_from_annotations
-
         return learn_from_annotations(arguments.places, arguments.out, arguments.seed)
     if arguments.out is None:
-        raise UsageError("there is no file to write to", remedy="Name it with --out FILE")
+        raise UsageError("--out is missing", remedy="Add --out FILE")
     arguments.labelled = [Path(place) for place in arguments.places]
     from app.training.fit_forest import as_json, grow_all
     from app.training.learned_forests import write_forest
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     _look_for(arguments)
     examples = _examples(arguments)
     if not examples:
-        raise StemmapError("there is nothing to learn from", remedy="Name scenes, or folders with labels")
+        raise StemmapError("there are no examples", remedy="Name scenes, or folders with labelled scans")
     pasted = _pasted(arguments)
     for line in leave_one_out(examples, pasted, preset("forest").classification.tree_share):
         print(line)
@@ -91,20 +91,20 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _look_for(arguments: argparse.Namespace) -> None:
-    """Say what is missing before scenes are simulated for an hour."""
+    """Check the paths before scenes are simulated for an hour."""
     if not arguments.out.absolute().parent.is_dir():
-        raise StemmapError("there is no such folder to write to", where=str(arguments.out.parent))
+        raise StemmapError("the folder for --out does not exist", where=str(arguments.out.parent))
     for place in arguments.labelled:
         files = [place.with_suffix(".label")] if place.is_file() else [place / "velodyne", place / "labels"]
         missing = [file for file in files if not file.exists()]
         if missing:
             raise StemmapError(
-                "there are no labelled scans", where=str(place), remedy=f"{missing[0]} is looked for"
+                "there are no labelled scans", where=str(place), remedy=f"{missing[0]} is missing"
             )
 
 
 def _scenes(arguments: argparse.Namespace) -> list[str]:
-    """What was learned from, in a few lines of the JSON."""
+    """Description of the training data for the JSON file."""
     from app.training.augmentation import COPIES
 
     stands = [name for name in arguments.scenes.split(",") if name]
@@ -117,7 +117,7 @@ def _scenes(arguments: argparse.Namespace) -> list[str]:
 def _examples(arguments: argparse.Namespace) -> list[Examples]:
     from functools import partial
 
-    from app.training.keeping import kept_or_made
+    from app.training.keeping import stored_or_computed
     from app.training.scenes import labelled_examples, stand_examples, stand_name, street_examples
     from pipeline.config import preset
 
@@ -129,21 +129,21 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
         for n, seed in enumerate(arguments.seeds.split(",")):
             uri, furnished = f"sim:{name}?seed={seed}&odometry=exact&sigma={sigma[n % 3]}", n % 2 == 1
             make = partial(stand_examples, uri, forest, arguments.every, furnished=furnished)
-            found += kept_or_made(arguments.examples, stand_name(uri, furnished), make)
+            found += stored_or_computed(arguments.examples, stand_name(uri, furnished), make)
     for seed in range(FIRST_STREET, FIRST_STREET + arguments.streets):
-        # Parks seen one way teach the all-around sensors too.
+        # Parks seen by a forward-looking sensor also serve the sensors that see all around.
         for one_way in (False, True):
             make = partial(street_examples, seed, one_way, forest, REACH)
-            found += kept_or_made(arguments.examples, f"{'park' if one_way else 'street'} {seed}", make)
+            found += stored_or_computed(arguments.examples, f"{'park' if one_way else 'street'} {seed}", make)
     for folder in arguments.labelled:
-        found += kept_or_made(
+        found += stored_or_computed(
             arguments.examples, str(folder), partial(labelled_examples, folder, forest, REACH)
         )
     return found
 
 
 def _pasted(arguments: argparse.Namespace) -> list[Examples]:
-    """The labelled scans of sensors that look one way once more, with poles and trees pasted into them."""
+    """Copies of the labelled forward-looking scans with additional poles and trees."""
     from app.training.augmentation import FOLDER, copies
     from pipeline.config import preset
 
@@ -153,7 +153,78 @@ def _pasted(arguments: argparse.Namespace) -> list[Examples]:
 
 
 def _one_way(arguments: argparse.Namespace) -> list[Path]:
-    """The labelled scans of sensors that look one way."""
+    """The labelled scans of forward-looking sensors."""
     from app.training.scenes import looks_all_around
 
     return [folder for folder in arguments.labelled if not looks_all_around(folder)]
+
+
+# --- from annotations ------------------------------------------------------------
+
+
+def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int:
+    """Train a random forest with annotations, print its scores beside those of the present one, and write it.
+
+    Args:
+        names: Annotated runs by URI or by their name in the dashboard; empty for all.
+        out: File to write; None for the data folder.
+        seed: Random seed.
+    """
+    from contextlib import closing
+
+    from app.common.settings import from_environment
+    from app.store.store import Store
+    from app.training.learned_forests import Forests, name_of, write_forest
+    from app.training.learning import LearningOptions, learn, table_lines
+    from pipeline.config import preset
+
+    settings = from_environment()
+    if settings.folder is None and not settings.database:
+        raise StemmapError("there is no data folder with annotations", remedy="Set STEMMAP_FOLDER")
+    if out is not None and not out.absolute().parent.is_dir():
+        raise StemmapError("the folder for --out does not exist", where=str(out.parent))
+    with closing(Store(settings.folder, database=settings.database)) as store:
+        runs = _chosen(store, names)
+    forests = Forests(settings.folder)
+    options = LearningOptions(
+        in_force=preset("forest").classification,
+        forests=forests,
+        seen=(),
+        seed=seed,
+        date=time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
+        kept=settings.folder and settings.folder / "examples",
+        progress=lambda words: print(plain(words), file=sys.stderr) if sys.stderr.isatty() else None,
+    )
+    learned = learn(runs, options)
+    for line in table_lines(learned):
+        print(plain(line))
+    for warning in learned.warnings:
+        print(f"warning: {plain(warning)}", file=sys.stderr)
+    if out is None:
+        name = forests.keep(learned.data)
+        print(f"stored as {name}; use it with --set classification.forest={name}")
+    else:
+        write_forest(learned.data, out)
+        print(f"{name_of(learned.data)}, written to {out}")
+    return 0
+
+
+def _chosen(store: Store, names: list[str]) -> list[AnnotatedRun]:
+    from app.training.annotated_runs import annotated_run
+
+    sources = store.annotated_sources()
+    known = {word: source for source in sources for word in (source.source, source.request.uri, source.name)}
+    unknown = [name for name in names if name not in known and str(Path(name).absolute()) not in known]
+    if unknown:
+        told = ", ".join(source.name for source in sources[:10]) or "none"
+        raise UsageError(
+            f"there is no annotated run {unknown[0]!r}",
+            remedy=f"{count(len(sources), 'annotated run')}: {told}",
+        )
+    if not sources:
+        raise StemmapError(
+            "there are no annotations",
+            remedy="Open a run with `stemmap RUN` and annotate trees in the tab Annotate",
+        )
+    wanted = [known.get(name) or known[str(Path(name).absolute())] for name in names] or sources
+    return [annotated_run(source) for source in {source.source: source for source in wanted}.values()]

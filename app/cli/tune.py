@@ -1,4 +1,4 @@
-"""`stemmap tune`: searches for the parameters that map runs with known trees best."""
+"""`stemmap tune`: searches the parameters that give the best map of runs with true trees."""
 
 from __future__ import annotations
 
@@ -7,15 +7,23 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.choices import add_parameter_flags, add_run_flags, chosen_parameters, source
-from app.cli.progress import compiling_is_said
+from app.cli.flags import (
+    add_parameter_flags,
+    add_run_flags,
+    cannot_write,
+    chosen_parameters,
+    compilation_notice,
+    positive_number,
+    source,
+    whole_number,
+)
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from app.tuning.plan import Plan, PlannedRun, Trial
     from app.tuning.search import Search
 
-HELP = "search for the parameters that map runs with known trees best"
+HELP = "search the parameters that give the best map of runs with true trees"
 STOPPED = 3
 
 
@@ -30,11 +38,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         dest="truths",
         action="append",
         default=[],
-        help="true trees (CSV) of a run, in the frame of its map; given again for each run, in their order "
-        "or with RUN= before; default: the run's own",
+        help="true trees (CSV) of a run, in the frame of its map; repeated for each run, in their order "
+        "or with RUN= in front (default: those of the source)",
     )
     parser.add_argument(
-        "--dbh-unit", choices=("m", "cm", "mm"), help="of a truth column that does not say it"
+        "--dbh-unit", choices=("m", "cm", "mm"), help="unit of a diameter column without unit"
     )
     parser.add_argument(
         "--held-out",
@@ -42,52 +50,58 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=source,
         action="append",
         default=[],
-        help="a run that is scored beside and not searched over; may be given again",
+        help="a run that is only scored and does not guide the search; may be repeated",
     )
     parser.add_argument(
         "--over",
         metavar="NAME[=LOW..HIGH|=A,B]",
         action="append",
         default=[],
-        help="a parameter to search over, within its declared bounds or narrower ones; may be given again "
-        "(default: eight that decide what is a tree)",
+        help="a parameter of the search, within its declared bounds or narrower ones; may be repeated "
+        "(default: eight parameters with a large effect)",
     )
     parser.add_argument(
         "--goal", choices=("f1", "ta", "position", "pairs"), default="f1",
-        help="F1 (the default); TA with false trees bounded; position RMSE or pair error with F1 not below "
-        "that of the start",
+        help="f1: F1 (default); ta: TA with a limit of false trees; position, pairs: position RMSE or "
+        "pair error with F1 not below that of the start",
     )  # fmt: skip
     parser.add_argument(
         "--false-max", metavar="SHARE", type=float, default=0.1,
-        help="with --goal ta: this share of the map's trees may be none (default: 0.1)",
+        help="with --goal ta: largest share of false trees in the map (default: 0.1)",
     )  # fmt: skip
     parser.add_argument(
-        "--trials", metavar="N", type=_number, default=200, help="so many in all (default: 200)"
+        "--trials",
+        metavar="N",
+        type=whole_number(1, 1 << 20),
+        default=200,
+        help="number of trials in all (default: 200)",
     )
-    parser.add_argument("--minutes", metavar="M", type=_minutes, default=0.0, help="stop after this time")
     parser.add_argument(
-        "--workers", metavar="N", type=_number, default=1,
-        help="processes at once; with one the same input gives the same result (default: 1)",
+        "--minutes", metavar="M", type=positive_number(1e6, "time in minutes"), default=0.0, help="time limit"
+    )
+    parser.add_argument(
+        "--workers", metavar="N", type=whole_number(1, 1 << 20), default=1,
+        help="number of processes; with one, the same input gives the same result (default: 1)",
     )  # fmt: skip
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="TOML file for the best set")
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
         "--journal", metavar="FILE", type=Path,
-        help="where each trial is kept; the same command goes on with it (default: beside --out)",
+        help="file with the trials; the same command continues with it (default: beside --out)",
     )  # fmt: skip
     place.add_argument(
         "--storage", metavar="ADDRESS", nargs="?", const="",
-        help="keep the trials in PostgreSQL, where several machines share them: "
+        help="store the trials in PostgreSQL, where several machines share them: "
         "postgresql://name@host/database (without an address: that of STEMMAP_DATABASE)",
     )  # fmt: skip
     add_parameter_flags(parser)
     add_run_flags(parser)
-    parser.epilog = "Ctrl-C ends the search and writes the best set so far; the same command goes on with it."
+    parser.epilog = "Ctrl-C stops the search and writes the best set so far; the same command continues it."
 
 
-@compiling_is_said()
+@compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Search, and write the best set."""
+    """Search and write the best set."""
     from app.common.compile_ahead import compile_ahead
     from app.tuning.search import Search
 
@@ -112,14 +126,14 @@ def _plan(arguments: argparse.Namespace) -> Plan:
     for uri in (*arguments.runs, *arguments.held_out):
         if is_live(uri):
             raise ParameterError(
-                "a live run cannot be mapped again and again",
+                "a live run cannot be mapped again",
                 where=uri,
                 remedy="Record it, and name the recording",
             )
     goal = goal_of(arguments.goal, arguments.false_max)
     preset_name, parameters = chosen_parameters(arguments, _suggested(arguments.runs[0]))
     if not arguments.out.absolute().parent.is_dir():
-        raise StemmapError("there is no such folder to write to", where=str(arguments.out.absolute().parent))
+        raise StemmapError("the folder for --out does not exist", where=str(arguments.out.absolute().parent))
     return Plan(
         runs=_planned(arguments),
         axes=axes_of(arguments.over or SENSIBLE),
@@ -168,24 +182,24 @@ def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
 
 
 def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
-    """The file with the true trees of each run that one was named for.
+    """Return the file with the true trees by run.
 
     Args:
-        uris: The runs in their order, those that are held out last.
-        truths: `FILE` or `RUN=FILE`, as they were given.
+        uris: The runs in their order, held-out runs last.
+        truths: `FILE` or `RUN=FILE`.
 
     Raises:
-        ParameterError: It is not clear which run a file is of.
+        ParameterError: A file cannot be assigned to a run.
     """
     named: dict[str, str] = {}
     bare = []
     for text in truths:
-        # A run's own name may have = in it; the longest that fits is meant.
+        # The name of a run may contain =; the longest match is used.
         run = max((uri for uri in uris if text.startswith(f"{uri}=")), key=len, default=None)
         if run is None:
             bare.append(text)
         elif run in named:
-            raise ParameterError("two truths are named for one run", where=run, remedy="Name one")
+            raise ParameterError("a run has two files of true trees", where=run, remedy="Give one")
         else:
             named[run] = text.removeprefix(f"{run}=")
     others = [uri for uri in uris if uri not in named]
@@ -193,7 +207,7 @@ def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
         raise ParameterError(
             f"{len(bare)} files of true trees for {len(others)} runs",
             where=bare[0],
-            remedy="Say which run each is of: --truth RUN=FILE",
+            remedy="Name the run of each file: --truth RUN=FILE",
         )
     return {**named, **dict(zip(others, bare, strict=False))}
 
@@ -207,7 +221,7 @@ def _storage(arguments: argparse.Namespace) -> str:
     address = arguments.storage or from_environment().database
     if not is_server(address):
         raise ParameterError(
-            "this is not the address of a PostgreSQL database" if address else "no database is named",
+            "this is not the address of a PostgreSQL database" if address else "no database is given",
             where=address,
             remedy="Give postgresql://name@host/database, or set STEMMAP_DATABASE",
         )
@@ -215,7 +229,8 @@ def _storage(arguments: argparse.Namespace) -> str:
 
 
 def _search(search: Search, number: int) -> tuple[bool, int]:
-    """Make the trials. Whether it was stopped before the last, and how many processes were lost."""
+    """Make the trials. Returns whether the search stopped before the last one, and the number of lost
+    processes."""
     import time
 
     from app.tuning.search_processes import SearchWorkers
@@ -225,7 +240,7 @@ def _search(search: Search, number: int) -> tuple[bool, int]:
     bar = _Bar(plan)
     since, before = time.monotonic(), 0
     try:
-        bar.say(search.begin(), search)
+        bar.begin(search.begin(), search)
         workers = SearchWorkers(plan, number - 1)
         since, before = time.monotonic(), len(search.trials())
         while not plan.seconds or time.monotonic() - since < plan.seconds:
@@ -260,26 +275,26 @@ def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool, los
         with write_beside(arguments.out) as file:
             file.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise StemmapError(f"cannot write: {error.strerror}", where=str(arguments.out)) from None
+        raise cannot_write(error, arguments.out) from None
     for line in lines_of(plan, result):
         print(line)
     print(f"written to {arguments.out}; use it with --config {arguments.out}")
     if lost:
         print(
-            f"warning: {count(lost, 'process', 'processes')} ended in the middle and began again",
+            f"warning: {count(lost, 'process', 'processes')} ended early and were restarted",
             file=sys.stderr,
         )
     if warning := warning_of(result):
         print(f"warning: {warning}", file=sys.stderr)
     if stopped:
         left = plan.trials - result.made
-        print(f"left out: {count(left, 'trial')}; the same command goes on with them", file=sys.stderr)
+        print(f"left out: {count(left, 'trial')}; the same command continues the search", file=sys.stderr)
         return STOPPED
     return 0
 
 
 class _Bar:
-    """A progress bar on a terminal; each set that is better than all before is said in a line."""
+    """A progress bar, and a line for each set that is better than all before."""
 
     def __init__(self, plan: Plan) -> None:
         from tqdm import tqdm
@@ -288,21 +303,21 @@ class _Bar:
         self._goal = plan.aim
         self._best: float | None = None
         self._bar = tqdm(
-            total=plan.trials, unit="trial", desc="looking at the scans", file=sys.stderr,
+            total=plan.trials, unit="trial", desc="first mapping", file=sys.stderr,
             disable=not sys.stderr.isatty(), leave=False,
         )  # fmt: skip
 
-    def say(self, start: Trial, search: Search) -> None:
-        """The score to begin with, and how many trials stand there already."""
+    def begin(self, start: Trial, search: Search) -> None:
+        """Print the score of the start and the number of earlier trials."""
         made = len(search.trials())
         self._line(f"start: {self._goal.shown(start.loss or 0.0)}")
         if made:
-            self._line(f"going on after {made} trials")
+            self._line(f"continuing after {made} trials")
         self._bar.set_description("searching", refresh=False)
         self._bar.update(made)
 
     def show(self, search: Search) -> None:
-        """How far it is."""
+        """Update the bar."""
         made, best = len(search.trials()), search.best()
         self._bar.update(made - self._bar.n if not self._bar.disable else 0)
         if best is None or best.loss is None or (self._best is not None and best.loss >= self._best):
@@ -317,7 +332,7 @@ class _Bar:
         self._line(told)
 
     def close(self, made: int, seconds: float) -> None:
-        """No more will come; how many were made, and how fast."""
+        """End the bar and print the speed of the search."""
         self._bar.close()
         if made > 1:
             self._line(f"{made:,} trials in {seconds:,.0f} s: {3600.0 * made / seconds:,.0f} an hour")
@@ -325,19 +340,3 @@ class _Bar:
     def _line(self, text: str) -> None:
         self._tqdm.write(text, file=sys.stderr)
         sys.stderr.flush()
-
-
-def _number(text: str) -> int:
-    if text.isascii() and text.isdigit() and 0 < int(text) < 1 << 20:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 on")
-
-
-def _minutes(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 < value < 1e6:
-        raise argparse.ArgumentTypeError(f"{text!r} is no time in minutes")
-    return value

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
-import os
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
+from app.common.child_process import ChildProcess, python_module
 from app.store.async_store import Keeper
 from app.store.store import AnnotatedSource
 from app.training.learned_forests import Forests
@@ -22,8 +18,7 @@ from pipeline.classification.forest import PACKAGE
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 
-# -P: a folder that holds a file `app.py` must not decide what runs.
-LEARN = (sys.executable, "-P", "-m", "app.training.learn_process")
+LEARN = python_module("app.training.learn_process")
 LONGEST_LINE = 1 << 20
 # As in app.training.learning, which the web process does not load.
 LEAST_TREES, LEAST_OTHERS = 10, 5
@@ -58,7 +53,7 @@ class Learning:
         """What there is to learn from: annotations by class, runs, and what is needed; and where the decision
         trees in force come from, None for those of the package.
         """
-        in_use = await asyncio.to_thread(self._forests.told_of, in_force)
+        in_use = await asyncio.to_thread(self._forests.provenance, in_force)
         sources = await self._keeper.ask(lambda store: store.annotated_sources())
         by_class = Counter(each.kind for source in sources for each in source.annotations)
         needed = {"trees": LEAST_TREES, "others": LEAST_OTHERS}
@@ -110,14 +105,13 @@ class Learning:
     async def _learn(self, sources: list[AnnotatedSource], parameters: Parameters, folder: Path) -> None:
         question = {
             "sources": sources,
-            "gathering": parameters.classification.model_dump(),
+            "classification": parameters.classification.model_dump(),
             "folder": str(folder),
-            "parent": os.getpid(),
             "date": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
         }
         try:
-            told = await self._ask(msgspec.json.encode(question))
-        except (OSError, ValueError):  # no process, or no line of ours
+            told = await self._ask(question)
+        except StemmapError:
             told = {}
         self._task = None
         if learned := told.get("learned"):
@@ -126,29 +120,16 @@ class Learning:
             broke = "the process ended without an answer; nothing was changed"
             self._become("failed", str(told.get("error") or broke))
 
-    async def _ask(self, question: bytes) -> dict[str, Any]:
-        """The last line that the process says; those before are told as progress."""
-        process = await asyncio.create_subprocess_exec(
-            *self._command,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            limit=LONGEST_LINE,
-            start_new_session=True,  # Ctrl-C in the terminal is for the server
-        )
-        assert process.stdin is not None  # noqa: S101 - it was asked for
-        assert process.stdout is not None  # noqa: S101
-        told: dict[str, Any] = {}
+    async def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
+        """Return the last message of the process; those before are progress."""
+        process = await ChildProcess.start(self._command, line_limit=LONGEST_LINE)
+        last: dict[str, Any] = {}
         try:
-            with contextlib.suppress(ConnectionError):
-                process.stdin.write(question)
-                await process.stdin.drain()
-            process.stdin.close()
-            while line := await process.stdout.readline():
-                told = json.loads(line)
-                if "progress" in told:
-                    self._become("working", str(told["progress"])[:300])
+            await process.send(question)
+            while (message := await process.receive(dict)) is not None:
+                last = message
+                if "progress" in message:
+                    self._become("working", str(message["progress"])[:300])
         finally:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
-        return told
+            await process.end()
+        return last

@@ -1,15 +1,17 @@
-"""Runs that people annotated: mapped once more, as they were mapped then, to gather examples of what was
-judged."""
+"""Training examples from annotated runs: a run is mapped again as it was mapped before, and the features of
+the columns at its annotations are collected."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from app.common.version import version
 from app.robot.source import LiveSource
@@ -17,30 +19,113 @@ from app.sources.opening import open_any, with_odometry
 from app.sources.request import SourceRequest
 from app.store.records import Content
 from app.store.store import AnnotatedSource
-from app.training.annotated import REACH, SEEN, Judged
 from app.training.fit_forest import Examples
-from app.training.keeping import kept_or_made
-from pipeline.classification.features import NAMES
-from pipeline.classification.forest import PACKAGE
+from app.training.keeping import stored_or_computed
+from pipeline.classification.features import COUNT, NAMES
+from pipeline.classification.forest import CLASSES, PACKAGE
 from pipeline.config import PRESETS, Parameters, preset
 from pipeline.errors import ParameterError, SourceError
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
+from pipeline.types.records import Columns, Float, Int, Verdict
+
+# Numbers of observations at which an object gives an example, because trees are classified from the first
+# scans on.
+SEEN = (3, 10, 30)
+# Largest distance between an annotation and its column [m].
+REACH = {"tree": 0.4, "pole": 0.35, "person": 0.5, "bush": 0.9, "other": 0.9}
+CLASS_OF_KIND = {
+    "tree": CLASSES.index(Verdict.TREE),
+    "pole": CLASSES.index(Verdict.POLE),
+    "person": CLASSES.index(Verdict.PERSON),
+    "bush": CLASSES.index(Verdict.BUSH),
+    "other": CLASSES.index(Verdict.OTHER),
+}
+
+
+class ExampleCollector:
+    """Collects the features of the columns at annotations, scan by scan.
+
+    Args:
+        annotations: Annotations of the run, in the frame of its map.
+    """
+
+    def __init__(self, annotations: Sequence[Content]) -> None:
+        from scipy.spatial import cKDTree
+
+        self._annotations = annotations
+        self._place = np.array([[a.x, a.y] for a in annotations]).reshape(-1, 2)
+        self._reach = np.array([REACH[a.kind] for a in annotations])
+        self._nearest = cKDTree(self._place) if len(annotations) else None
+        self._marked: list[list[Float]] = [[] for _ in annotations]
+        self._last: list[Float | None] = [None for _ in annotations]
+        self._before: Columns | None = None
+
+    def add(self, columns: Columns | None) -> None:
+        """Add the columns after a scan; None where there are none."""
+        if columns is None or columns is self._before or self._nearest is None or not len(columns.axis):
+            return
+        self._before = columns
+        for annotation, row in self._pairs(columns.axis[:, :2]):
+            figures, marks = columns.figures[row].copy(), self._marked[annotation]
+            self._last[annotation] = figures
+            if len(marks) < len(SEEN) and columns.present[row] >= SEEN[len(marks)]:
+                marks.append(figures)
+
+    def examples(self, scene: str, *, all_around: bool) -> Examples:
+        """Return the examples. Their axis is the position of the annotation, so that the examples of one
+        object can be recognised; its last one comes last. Annotations without a column are left out."""
+        axis, rows, label = [], [], []
+        for a, marked, last in zip(self._annotations, self._marked, self._last, strict=True):
+            taken = [] if last is None else [*marked, last]
+            rows += taken
+            axis += [[a.x, a.y, 0.0, 0.0, 0.0]] * len(taken)
+            label += [CLASS_OF_KIND[a.kind]] * len(taken)
+        return Examples(
+            scene,
+            False,
+            all_around,
+            np.array(axis, np.float64).reshape(-1, 5),
+            np.array(rows, np.float64).reshape(-1, COUNT),
+            np.array(label, np.int64),
+        )
+
+    def _pairs(self, place: Float) -> list[tuple[int, int]]:
+        """Pairs of an annotation and its nearest column, each at most once."""
+        assert self._nearest is not None  # noqa: S101 - `add` has checked
+        distance, annotation = self._nearest.query(place)
+        near = np.flatnonzero(distance <= self._reach[annotation])
+        order = near[np.argsort(distance[near], kind="stable")]
+        _, first = np.unique(annotation[order], return_index=True)
+        return [(int(annotation[row]), int(row)) for row in order[first]]
+
+
+def object_numbers(examples: Sequence[Examples]) -> Int:
+    """Return a number for each example, equal for all examples of one object, that is of one position in a
+    scene."""
+    key = [
+        (scene, float(x), float(y))
+        for scene, each in enumerate(examples)
+        for x, y in each.axis[:, :2].tolist()
+    ]
+    known: dict[tuple[int, float, float], int] = {}
+    return np.array([known.setdefault(each, len(known)) for each in key], np.int64)
+
 
 Progress = Callable[[str], None]
 
-EVERY_SCANS = 50  # between two words on how far it is
+PROGRESS_SCANS = 50  # scans between two progress messages
 
 
 @dataclass(frozen=True, slots=True)
 class AnnotatedRun:
-    """A run that people annotated, and how it was mapped then.
+    """An annotated run.
 
     Attributes:
-        name, digest: Of its source.
+        name, digest: Name and digest of its source.
         request: Source, odometry, seed, topics and mounting with which it was mapped.
-        parameters: That it was mapped with.
-        annotations: In the frame of its map.
+        parameters: Parameters with which it was mapped.
+        annotations: Annotations in the frame of its map.
     """
 
     name: str
@@ -51,32 +136,31 @@ class AnnotatedRun:
 
 
 def annotated_run(source: AnnotatedSource) -> AnnotatedRun:
-    """A source of the store with the parameters that it was mapped with, those that this version knows."""
+    """Return the run of an annotated source, with the parameters that this version knows."""
     request = source.request
     start = preset(request.preset if request.preset in PRESETS else "forest")
     known = {name: value for name, value in request.parameters.items() if name in start.flat()}
     try:
         parameters = start.replace(known)
-    except ParameterError:  # bounds that were wider once
+    except ParameterError:  # an earlier version had wider bounds
         parameters = start
     return AnnotatedRun(source.name, source.source, request, parameters, source.annotations)
 
 
 def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Examples:
-    """What was gathered of each thing that was annotated: from the folder of kept examples, else the run is
-    mapped once more, and what comes of it is kept there.
+    """Return the examples of a run: those stored in the folder, else the run is mapped and they are stored.
 
     Raises:
-        SourceError: The run cannot be read any more, or is another one.
-        StemmapError: The kept examples are damaged.
+        SourceError: The run cannot be read, or is another recording.
+        StemmapError: The stored examples are damaged.
     """
-    (found,) = kept_or_made(kept, _key(run), partial(_looked_through, run, progress))
+    (found,) = stored_or_computed(kept, _key(run), partial(_map_again, run, progress))
     return found
 
 
 def _key(run: AnnotatedRun) -> str:
-    """What examples hang on: what was recorded, how it is mapped, what was said, what figures there are."""
-    told = [
+    """Everything on which the examples depend: recording, choices, parameters, annotations and features."""
+    parts = [
         run.digest,
         run.request.seed,
         run.request.odometry,
@@ -86,31 +170,31 @@ def _key(run: AnnotatedRun) -> str:
         [*NAMES, *SEEN, *sorted(REACH.items())],
         version(),
     ]
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
-def _looked_through(run: AnnotatedRun, progress: Progress) -> list[Examples]:
+def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
     request = run.request
     with closing(open_any(request.uri, request.options())) as source:
         if isinstance(source, LiveSource):
             raise SourceError(
-                "a robot is not heard again", where=request.uri, remedy="Annotate its recording"
+                "a live run cannot be mapped again", where=request.uri, remedy="Annotate its recording"
             )
         known = source.description
         if (known.digest or known.uri) != run.digest:
-            raise SourceError("it is another recording than the one that was annotated", where=request.uri)
+            raise SourceError("this is another recording than the annotated one", where=request.uri)
         moving, chosen = with_odometry(source, request.odometry)
-        # Columns and their figures are the same whoever votes on them.
+        # Columns and features do not depend on the forest.
         parameters = run.parameters.replace(
             {"classification.method": "columns", "classification.forest": PACKAGE}
         )
         mapper = Mapper(
             parameters, sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=run.request.seed
         )
-        judged = Judged(run.annotations)
+        collector = ExampleCollector(run.annotations)
         for step in steps(moving.records(), odometry=chosen.steps):
-            judged.see(mapper.process(step).columns)
-            if step.index % EVERY_SCANS == 0:
+            collector.add(mapper.process(step).columns)
+            if step.index % PROGRESS_SCANS == 0:
                 of = f" of {known.scans:,}" if known.scans else ""
-                progress(f"Looking through {run.name}: scan {step.index:,}{of}")
-        return [judged.examples(run.name, all_around=known.sensor.rings > 0)]
+                progress(f"Mapping {run.name}: scan {step.index:,}{of}")
+        return [collector.examples(run.name, all_around=known.sensor.rings > 0)]

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from app.training.fit_forest import Examples
-from app.training.keeping import kept_or_made
+from app.training.keeping import stored_or_computed
 from app.training.scene_objects import POLE, SIGN, Furniture
 from app.training.scenes import gathered, label_by_points, labelled_scans, trunks
 from app.training.streets import CONE, PERIOD_NS, SolidStateLidar
@@ -71,7 +71,7 @@ def copies(
     digest, found = digest_of(folder), list[Examples]()
     for copy in range(number):
         make = partial(pasted_examples, folder, copy, parameters, reach)
-        found += kept_or_made(kept, f"{name_of_copy(str(folder), copy)}, {digest}", make)
+        found += stored_or_computed(kept, f"{name_of_copy(str(folder), copy)}, {digest}", make)
     return found
 
 

@@ -1,9 +1,8 @@
-"""Expanding: decision trees that stand already learn from a few more examples.
+"""Structure expansion: extends the trees of a random forest with a few new examples.
 
-A forest that was grown from many examples keeps its questions, and goes on asking where the new ones
-contradict it: each leaf that new examples reach is grown on by them, and what the leaf said before stays as
-if so many examples more had said it (structure expansion; Segev, Harel, Mannor, Crammer, El-Yaniv,
-"Learn on source, refine on target: a model transfer learning framework with random forests", 2017).
+The forest keeps its splits. Each leaf that new examples reach is split further by them; its previous class
+shares enter as PRIOR examples (Segev, Harel, Mannor, Crammer, El-Yaniv, "Learn on source, refine on target: a
+model transfer learning framework with random forests", 2017).
 """
 
 from __future__ import annotations
@@ -17,21 +16,20 @@ from pipeline.classification.features import NAMES, RAYS
 from pipeline.classification.forest import CLASSES, FREE_END, ONE_WAY
 from pipeline.types.records import Float, Int
 
-PRIOR = 3.0  # things that a leaf's shares count as
-LEAST = 2.0  # things in a new leaf
-DEEPER = 4  # questions more at most
+PRIOR = 3.0  # weight of the previous class shares of a leaf, in objects
+LEAST = 2.0  # least weight of a new leaf, in objects
+DEEPER = 4  # largest number of additional splits on a path
 
 
 def all_expanded(
     base: dict[str, Any], kind: str, figures: Float, label: Int, thing: Int, seed: int
 ) -> dict[str, list[dict[str, Any]]]:
-    """All decision trees for a kind of sensor that have learned from examples more, by their key in the JSON:
-    for one that looks one way also those that are asked about what ends in free air, which else would
-    overrule what was learned.
+    """Return the extended trees for a kind of sensor, by their key in the JSON. For sensors that look one way
+    these include the trees for columns with a free upper end, which would overrule the others.
 
     Args:
-        base: JSON of the forest that learns.
-        kind: Of the sensor, a key of PLANS.
+        base: JSON of the forest.
+        kind: Kind of the sensor, a key of PLANS.
         figures, label, thing, seed: See `expanded`.
     """
     grown = {kind: expanded(base[kind], PLANS[kind], figures, label, thing, seed)}
@@ -44,15 +42,15 @@ def all_expanded(
 def expanded(
     trees: list[dict[str, Any]], plan: Plan, figures: Float, label: Int, thing: Int, seed: int
 ) -> list[dict[str, Any]]:
-    """A forest that has learned from examples more.
+    """Return the extended trees of a forest.
 
     Args:
-        trees: As the JSON holds them.
-        plan: By which they were grown.
-        figures: shape (N, figures).
-        label: Place in CLASSES, shape (N,).
-        thing: What the example is one of, shape (N,): each thing counts once, however many examples it gave.
-        seed: Of the choices made at random.
+        trees: Trees as in the JSON.
+        plan: Settings with which they were trained.
+        figures: Features, shape (N, features).
+        label: Index in CLASSES, shape (N,).
+        thing: Number of the object, shape (N,); each object has the same weight, for any number of examples.
+        seed: Random seed.
     """
     _, of, number = np.unique(thing, return_inverse=True, return_counts=True)
     weight = 1.0 / number[of]

@@ -1,4 +1,4 @@
-"""Keeping: examples on disk, because simulating many scenes takes minutes."""
+"""Stores training examples on disk, because simulating many scenes takes minutes."""
 
 from __future__ import annotations
 
@@ -15,9 +15,19 @@ from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
 
 
-def kept_or_made(folder: Path | None, name: str, make: Callable[[], Iterable[Examples]]) -> list[Examples]:
-    """The examples of a scene from the folder, where a name stands for them, or made now and put there (None:
-    kept nowhere)."""
+def stored_or_computed(
+    folder: Path | None, name: str, make: Callable[[], Iterable[Examples]]
+) -> list[Examples]:
+    """Return the examples of a scene from the folder, or compute and store them.
+
+    Args:
+        folder: Folder of the examples; None stores nothing.
+        name: Name of the scene, which must contain everything on which the examples depend.
+        make: Computes the examples.
+
+    Raises:
+        StemmapError: The stored examples are damaged.
+    """
     file = None if folder is None else folder / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
     if file is not None and file.is_file():
         return _read(file)
@@ -42,7 +52,7 @@ def kept_or_made(folder: Path | None, name: str, make: Callable[[], Iterable[Exa
 
 
 def read_examples(folder: Path) -> list[Examples]:
-    """All examples of a folder, scene after scene."""
+    """Return all examples of a folder."""
     return [e for file in sorted(folder.glob("*.npz")) for e in _read(file)]
 
 
@@ -58,17 +68,18 @@ def _read(file: Path) -> list[Examples]:
             ]
     except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError, EOFError) as error:
         raise StemmapError(
-            f"the kept examples are damaged: {error}",
+            f"the stored examples are damaged: {error}",
             where=str(file),
-            remedy="Remove the file: it is made anew",
+            remedy="Delete the file; it will be computed again",
         ) from None
 
 
 def _check_sizes(file: Path) -> None:
-    """Every array lies whole in the file, as numpy writes it: else a few bytes could ask for gigabytes.
+    """Check that each array is complete and uncompressed, because a few bytes could otherwise claim
+    gigabytes.
 
     Raises:
-        ValueError: One does not.
+        ValueError: An array is not.
     """
     with zipfile.ZipFile(file) as archive:
         for entry in archive.infolist():
@@ -78,4 +89,4 @@ def _check_sizes(file: Path) -> None:
                 shape, _, dtype = np.lib.format.read_array_header_1_0(text)
             packed = entry.compress_type != zipfile.ZIP_STORED
             if packed or math.prod(shape) * dtype.itemsize > entry.file_size:
-                raise ValueError(f"{entry.filename} does not lie in the file")
+                raise ValueError(f"{entry.filename} is not complete")

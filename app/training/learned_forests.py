@@ -1,7 +1,7 @@
-"""Decision trees that were learned from annotations, kept in the data folder as JSON.
+"""Random forests that were trained with annotations, stored in the data folder as JSON.
 
-The name of a forest is the digest of what decides in it, so a map with `classification.forest = NAME` is the
-same everywhere, or it is refused.
+The name of a forest is the digest of its trees, so a map with `classification.forest = NAME` is the
+same everywhere or refused.
 """
 
 from __future__ import annotations
@@ -29,35 +29,35 @@ from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
 
 FOLDER = "forests"
-# What the name is the digest of, with FREE_END where it is there; the rest tells where it came from.
+# Keys that enter the name, with FREE_END where it exists; the others are provenance.
 DECIDES = ("classes", ALL_AROUND, ONE_WAY)
 _NAME = re.compile(r"[0-9a-f]{16}")
 
 
 def name_of(data: dict[str, Any]) -> str:
-    """The name of a forest out of what its JSON holds."""
+    """Return the name of a forest from its JSON."""
     decides = [data.get(key) for key in DECIDES] + ([data[FREE_END]] if FREE_END in data else [])
     text = json.dumps(decides, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class Forests:
-    """The forests of a data folder, and that of the package.
+    """The forests of a data folder, and the forest of the package.
 
     Args:
-        folder: The data folder, None where there is none.
+        folder: The data folder; None where there is none.
     """
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = None if folder is None else folder / FOLDER
         self._known: dict[tuple[str, bool], Forest] = {}
-        self._told: dict[str, dict[str, Any]] = {}
+        self._provenance: dict[str, dict[str, Any]] = {}
 
     def __call__(self, name: str, all_around: bool) -> Forest:
-        """A forest by its name, for sensors that see all around or for those that look one way.
+        """Return a forest by its name, for sensors that see all around or for sensors that look one way.
 
         Raises:
-            StemmapError: There is none of this name, or its file is damaged.
+            StemmapError: There is no such forest, or its file is damaged.
         """
         if name == PACKAGE:
             return standard_forest(all_around)
@@ -67,7 +67,7 @@ class Forests:
         return self._known[name, all_around]
 
     def check(self, parameters: Parameters) -> None:
-        """Whether the forest that parameters name is here.
+        """Check that the forest of the parameters exists.
 
         Raises:
             StemmapError: See `__call__`.
@@ -75,48 +75,47 @@ class Forests:
         self(parameters.classification.forest, True)
 
     def read(self, name: str) -> dict[str, Any]:
-        """The JSON of a learned forest, with where it came from.
+        """Return the JSON of a learned forest, with its provenance.
 
         Raises:
             StemmapError: See `__call__`.
         """
         return self._read(name)[0]
 
-    def told_of(self, name: str) -> dict[str, Any] | None:
-        """When a learned forest was grown, from how many things by class and how many runs; None for that of
-        the package, and where the file is not here or does not tell.
-        """
+    def provenance(self, name: str) -> dict[str, Any] | None:
+        """Return date, number of objects by class and number of runs of a learned forest; None for the forest
+        of the package and for files that are missing or have no provenance."""
         if name == PACKAGE:
             return None
-        if name not in self._told:
+        if name not in self._provenance:
             try:
                 learned = self.read(name)["learned"]
                 things = {str(kind): int(n) for kind, n in learned["things"].items()}
                 told = {"date": str(learned["date"]), "things": things, "runs": len(learned["runs"])}
             except (StemmapError, AttributeError, KeyError, TypeError, ValueError):
                 return None
-            self._told[name] = {"name": name, **told}
-        return self._told[name]
+            self._provenance[name] = {"name": name, **told}
+        return self._provenance[name]
 
     def _read(self, name: str) -> tuple[dict[str, Any], list[Forest]]:
         file = self._file(name)
         if file is None or not file.is_file():
             raise StemmapError(
-                f"the decision trees {name} are not in the data folder",
+                f"the random forest {name} is not in the data folder",
                 where=str(file or ""),
-                remedy=f"Put their file there, or choose classification.forest = {PACKAGE}",
+                remedy=f"Copy its file there, or set classification.forest = {PACKAGE}",
             )
         data, forests = read_forests(file, ALL_AROUND, ONE_WAY)
         if name_of(data) != name:
             raise StemmapError(
-                "the decision trees are damaged: they are not those that the name tells",
+                "the random forest is damaged: its name does not fit its contents",
                 where=str(file),
-                remedy=f"Learn them anew, or choose classification.forest = {PACKAGE}",
+                remedy=f"Train it again, or set classification.forest = {PACKAGE}",
             )
         return data, forests
 
     def keep(self, data: dict[str, Any]) -> str:
-        """Write a forest into the data folder; returns its name.
+        """Store a forest in the data folder and return its name.
 
         Raises:
             StemmapError: There is no data folder, or it cannot be written.
@@ -124,9 +123,7 @@ class Forests:
         name = name_of(data)
         file = self._file(name)
         if file is None:
-            raise StemmapError(
-                "there is no data folder for the decision trees", remedy="Name one with STEMMAP_FOLDER"
-            )
+            raise StemmapError("there is no data folder for the random forest", remedy="Set STEMMAP_FOLDER")
         try:
             file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             write_forest(data, file)
@@ -139,14 +136,14 @@ class Forests:
 
 
 def write_forest(data: dict[str, Any], file: Path) -> None:
-    """Write a forest as JSON, a line for each question."""
+    """Write a forest as JSON, one line per split."""
     text = json.dumps(data, separators=(",", ":")).replace('{"figure"', '\n{"figure"')
     with write_beside(file) as beside:
         beside.write_text(text + "\n", encoding="utf-8")
 
 
 def kept_forests() -> Forests:
-    """Those of this process's data folder."""
+    """Return the forests of the data folder of this process."""
     return _of(data_folder(os.environ))
 
 

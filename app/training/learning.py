@@ -1,4 +1,4 @@
-"""Learning: decision trees out of what people annotated, judged against those in force."""
+"""Training of a random forest with annotations, and its comparison with the forest in force."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ import numpy as np
 
 from app.common.text import count
 from app.common.version import version
-from app.training.annotated import things_of
-from app.training.annotated_runs import AnnotatedRun, Progress, examples_of
+from app.training.annotated_runs import AnnotatedRun, Progress, examples_of, object_numbers
 from app.training.expanding import all_expanded
 from app.training.fit_forest import Examples
-from app.training.validating import Validated, groups_of, validate
+from app.training.validating import Rates, Validation, groups_of, validate
 from pipeline.classification.forest import (
     ALL_AROUND,
     CLASSES,
@@ -28,22 +27,25 @@ from pipeline.classification.forest import (
 )
 from pipeline.config.stages import Classification as GatheringParameters
 from pipeline.errors import SourceError, StemmapError
+from pipeline.evaluation import Rate
 
 LEAST_TREES, LEAST_OTHERS = 10, 5
 
-_ABOUT = "Votes on what a column is: those of the package, which learned from annotations."
+_ABOUT = "Random forest of the package, extended with annotations."
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """How to learn.
+class LearningOptions:
+    """Options of a training.
 
     Attributes:
-        in_force: Names the forest that is learned against, and the share of votes that makes a tree.
-        forests: Where it is found; seen: digests of the runs that it learned from.
-        seed: Of every choice made at random; date: that is told with the trees.
-        kept: Folder where examples are kept, for runs that were looked through before.
-        progress: Told in words what is under way.
+        in_force: The parameters in force, with the name of the present forest and its threshold.
+        forests: Finds the present forest.
+        seen: Digests of the runs with which the present forest was trained.
+        seed: Random seed.
+        date: Date that is stored with the forest.
+        kept: Folder that stores the examples of each run.
+        progress: Called with progress messages.
     """
 
     in_force: GatheringParameters
@@ -56,35 +58,36 @@ class Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
-    """What came of it.
+class LearningResult:
+    """A trained forest with its scores.
 
     Attributes:
-        data: JSON of the new decision trees, with where they come from.
-        validated: Old against new, by the kind of sensor.
-        things: That were learned from, by class; warnings: what could not be used, and why.
-        old_saw: Whether the old trees have learned from the same runs, so that their figures flatter them.
+        data: JSON of the new forest, with its provenance.
+        validated: Scores of the present and the new forest, by kind of sensor.
+        things: Number of annotated objects by class.
+        old_saw: Whether the present forest was trained with the same runs, so that its scores are optimistic.
+        warnings: Runs and annotations that could not be used.
     """
 
     data: dict[str, Any]
-    validated: dict[str, Validated]
+    validated: dict[str, Validation]
     things: dict[str, int]
     old_saw: bool
     warnings: list[str] = field(default_factory=list)
 
 
-def learn(runs: Sequence[AnnotatedRun], asked: Asked) -> Learned:
-    """Let the decision trees of the package learn what the annotations of runs say.
+def learn(runs: Sequence[AnnotatedRun], asked: LearningOptions) -> LearningResult:
+    """Extend the forest of the package with the annotations of runs.
 
     Raises:
-        StemmapError: There are too few examples, with how many of what are needed.
+        StemmapError: There are too few examples; the message names the numbers.
     """
     if lacking := too_few(each.kind for run in runs for each in run.annotations):
-        raise StemmapError(f"too little was annotated to learn from: {lacking}")
+        raise StemmapError(f"too few annotations: {lacking}")
     warnings: list[str] = []
-    of_run = _gathered(runs, asked, warnings)
+    of_run = _examples(runs, asked, warnings)
     base, _ = read_forests(FILE, ALL_AROUND, ONE_WAY)
-    grown, validated = dict[str, list[dict[str, Any]]](), dict[str, Validated]()
+    grown, validated = dict[str, list[dict[str, Any]]](), dict[str, Validation]()
     things, used = Counter[str](), list[AnnotatedRun]()
     for kind in (ALL_AROUND, ONE_WAY):
         some = [(run, e) for run, e in of_run if e.all_around == (kind == ALL_AROUND) and len(e.label)]
@@ -93,19 +96,19 @@ def learn(runs: Sequence[AnnotatedRun], asked: Asked) -> Learned:
         if lacking:
             warnings += [f"sensors that see {kind}: {lacking}"] if examples else []
             continue
-        asked.progress("Judging old and new decision trees")
+        asked.progress("Scoring the present and the new forest")
         old, share = asked.forests(asked.in_force.forest, kind == ALL_AROUND), asked.in_force.tree_share
         validated[kind] = validate(examples, base, kind, old, share, asked.seed)
-        asked.progress("Growing the new decision trees")
+        asked.progress("Training the new forest")
         figures, label = (
             np.concatenate([getattr(e, name) for e in examples]) for name in ("figures", "label")
         )
-        grown |= all_expanded(base, kind, figures, label, things_of(examples), asked.seed)
+        grown |= all_expanded(base, kind, figures, label, object_numbers(examples), asked.seed)
         things += things_by_class(examples)
         used += [run for run, _ in some]
     if not validated:
         told = [what_lacks([e for _, e in of_run]) if not warnings else "", *warnings]
-        raise StemmapError("too little was annotated to learn from: " + "; ".join(w for w in told if w))
+        raise StemmapError("too few annotations: " + "; ".join(w for w in told if w))
     about = {
         "date": asked.date,
         "version": version(),
@@ -119,57 +122,88 @@ def learn(runs: Sequence[AnnotatedRun], asked: Asked) -> Learned:
     }
     data = {**base, "about": _ABOUT, "learned": about, **grown}
     old_saw = any(run.digest in asked.seen for run in used)
-    return Learned(data, validated, dict(things), old_saw, warnings)
+    return LearningResult(data, validated, dict(things), old_saw, warnings)
 
 
 def seen_by(data: dict[str, Any]) -> tuple[str, ...]:
-    """Digests of the runs that a learned forest tells to have learned from, out of its JSON."""
+    """Return the digests of the runs with which a learned forest was trained, from its JSON."""
     learned = data.get("learned")
     runs = learned.get("runs") if isinstance(learned, dict) else None
     return tuple(str(run.get("source")) for run in runs or [] if isinstance(run, dict))
 
 
 def things_by_class(examples: Sequence[Examples]) -> Counter[str]:
-    """How many things of each class there are examples of."""
+    """Return the number of objects of each class."""
     label = [int(k) for e in examples for k in e.label]
-    of_thing = dict(zip(things_of(examples).tolist(), label, strict=True))
+    of_thing = dict(zip(object_numbers(examples).tolist(), label, strict=True))
     return Counter(CLASSES[k].label for k in of_thing.values())
 
 
 def too_few(kinds: Iterable[str]) -> str:
-    """Why things of these kinds are too few, "" when they are not."""
+    """Return why there are too few objects of these kinds; "" where there are enough."""
     by_class = Counter(kinds)
     trees = by_class["tree"]
     others = by_class.total() - trees
     if trees >= LEAST_TREES and others >= LEAST_OTHERS:
         return ""
-    needed = f"{LEAST_TREES} trees and {LEAST_OTHERS} other things are needed"
-    return f"{needed}; there are {count(trees, 'tree')} and {count(others, 'other thing')}"
+    needed = f"{LEAST_TREES} trees and {LEAST_OTHERS} other objects are needed"
+    return f"{needed}; there are {count(trees, 'tree')} and {count(others, 'other object')}"
 
 
 def what_lacks(examples: Sequence[Examples]) -> str:
-    """Why these examples are too few, "" when they are not."""
+    """Return why there are too few examples; "" where there are enough."""
     if lacking := too_few(things_by_class(examples).elements()):
         return lacking
     if len(np.unique(groups_of(examples)[1])) < 2:
-        return "all of them stand within a metre of one another, so nothing can be left out to judge by"
+        return "all objects are within a metre of one another, so none can be left out for the scores"
     return ""
 
 
-def _gathered(
-    runs: Sequence[AnnotatedRun], asked: Asked, warnings: list[str]
+def _examples(
+    runs: Sequence[AnnotatedRun], asked: LearningOptions, warnings: list[str]
 ) -> list[tuple[AnnotatedRun, Examples]]:
-    """The examples of each run that can be read."""
+    """The examples of each run that can be mapped."""
     found = []
     for run in runs:
-        asked.progress(f"Looking through {run.name}")
+        asked.progress(f"Mapping {run.name}")
         try:
             examples = examples_of(run, asked.kept, asked.progress)
         except SourceError as error:
             warnings.append(f"{run.name} is left out: {error}")
             continue
         found.append((run, examples))
-        lost = len(run.annotations) - len(np.unique(things_of([examples])))
+        lost = len(run.annotations) - len(np.unique(object_numbers([examples])))
         if lost:
-            warnings.append(f"{run.name}: nothing was gathered at {count(lost, 'annotation')}")
+            warnings.append(f"{run.name}: no column at {count(lost, 'annotation')}")
     return found
+
+
+def table_lines(learned: LearningResult) -> list[str]:
+    """Return a table of TA, FR, TR and FA of the present and the new forest for each kind of sensor."""
+    classes = ", ".join(
+        f"{n} {name}" for name, n in sorted(learned.things.items(), key=lambda item: -item[1])
+    )
+    lines = [f"trained with {count(sum(learned.things.values()), 'annotated object')}: {classes}"]
+    for kind, each in learned.validated.items():
+        lines += [
+            f"sensors that see {kind}; {each.folds} folds, no {each.by} in two of them:",
+            _row("", *("TA", "FR", "TR", "FA")),
+            _row("old", *_cells(each.old)),
+            _row("new", *_cells(each.new)),
+        ]
+    if learned.old_saw:
+        lines.append("the scores of the old forest are optimistic: it was trained with these runs")
+    return lines
+
+
+def _cells(rates: Rates) -> list[str]:
+    return [_cell(rate) for rate in (rates.TA, rates.FR, rates.TR, rates.FA)]
+
+
+def _cell(rate: Rate) -> str:
+    part = "-" if rate.rate is None else f"{100.0 * rate.rate:.1f} %"
+    return f"{rate.count}/{rate.of} ({part})"
+
+
+def _row(*cells: str) -> str:
+    return "  " + cells[0].ljust(5) + "".join(cell.rjust(18) for cell in cells[1:])

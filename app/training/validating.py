@@ -1,4 +1,4 @@
-"""Validating: what decision trees that learn from annotations are worth on things that they never saw."""
+"""Cross-validation of forests that are trained with annotations: scores on objects that were left out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from app.training.annotated import things_of
+from app.training.annotated_runs import object_numbers
 from app.training.expanding import all_expanded
 from app.training.fit_forest import TREE, Examples
 from pipeline.classification.decision_rule import too_few
@@ -17,13 +17,13 @@ from pipeline.evaluation import Rate
 from pipeline.types.records import Bool, Float, Int
 
 FOLDS = 5
-LEAST_RUNS = 3  # from which on whole runs are left out
-SAME_PLACE = 1.0  # m; things nearer to one another are never in two folds, whatever their runs
+LEAST_RUNS = 3  # with so many runs, whole runs are left out
+SAME_PLACE = 1.0  # m; objects within this distance are always in the same fold, also of different runs
 
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """TA and FR of the trees, TR and FA of all else, by the last that was known of each thing."""
+    """TA and FR of trees, TR and FA of other objects, by the last example of each object."""
 
     TA: Rate
     TR: Rate
@@ -32,18 +32,20 @@ class Rates:
 
     @classmethod
     def of(cls, accepted: Bool, tree: Bool) -> Rates:
-        """From what was taken for a tree, and what is one, shape (N,) each."""
+        """Count the rates of accepted objects and true trees, shape (N,) each."""
         trees, others = int(tree.sum()), int((~tree).sum())
         ta, fa = int((accepted & tree).sum()), int((accepted & ~tree).sum())
         return cls(Rate(ta, trees), Rate(others - fa, others), Rate(fa, others), Rate(trees - ta, trees))
 
 
 @dataclass(frozen=True, slots=True)
-class Validated:
-    """Old and new decision trees on the same things, the new ones grown each time without those they judge.
+class Validation:
+    """Scores of the present and the new forest on the same objects. The new forest of each fold is trained
+    without its objects.
 
     Attributes:
-        by: "run" or "place": what was left out as a whole; folds: how many parts there were.
+        by: "run" or "place": the groups that are left out as a whole.
+        folds: Number of folds.
     """
 
     by: str
@@ -54,19 +56,20 @@ class Validated:
 
 def validate(
     examples: Sequence[Examples], base: dict[str, Any], kind: str, old: Forest, share: float, seed: int
-) -> Validated:
-    """Cross-validate what is learned from examples.
+) -> Validation:
+    """Cross-validate the training.
 
     Args:
-        examples: Of runs seen by one kind of sensor; at least two places.
-        base: JSON of the forest that learns; kind: of the sensor.
-        old: The forest that is in force.
-        share: Of the votes for a tree from which on something is one.
-        seed: Of the folds and of what is grown.
+        examples: Examples of one kind of sensor, from at least two places.
+        base: JSON of the forest that is extended.
+        kind: Kind of the sensor.
+        old: The present forest.
+        share: Share of votes that makes a tree.
+        seed: Random seed of the folds and the training.
     """
     figures = np.concatenate([e.figures for e in examples])
     label = np.concatenate([e.label for e in examples])
-    thing = things_of(examples)
+    thing = object_numbers(examples)
     last = np.flatnonzero(np.append(thing[1:] != thing[:-1], True))
     by, group = groups_of(examples)
     accepted_old = _accepted(figures, old, share)
@@ -78,7 +81,7 @@ def validate(
         forest = forest_of({**base, **grown}, kind)
         accepted_new[judged] = _accepted(figures[judged], forest, share)
     tree = label[last] == TREE
-    return Validated(
+    return Validation(
         by,
         len(np.unique(folds)),
         Rates.of(accepted_old[last], tree),
@@ -87,10 +90,10 @@ def validate(
 
 
 def groups_of(examples: Sequence[Examples]) -> tuple[str, Int]:
-    """What is left out as a whole, "run" or "place", and the number of that of each example.
+    """Return the kind of group that is left out, "run" or "place", and the group number of each example.
 
-    Runs that share a place are one, and so are places in one run and in another that have the same
-    coordinates: two drives that began at the same spot saw the same stems.
+    Runs that share a place form one group, and so do places with the same coordinates in two runs, because
+    drives that begin at the same point see the same stems.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -108,10 +111,10 @@ def groups_of(examples: Sequence[Examples]) -> tuple[str, Int]:
 
 
 def fold_of(group: Int, tree: Bool, thing: Int, seed: int) -> Int:
-    """The fold of each example: no group is in two, and each has about its part of the trees."""
+    """Return the fold of each example. A group is in one fold, and the folds have similar shares of trees."""
     from sklearn.model_selection import StratifiedGroupKFold
 
-    _, first = np.unique(thing, return_index=True)  # a thing counts once
+    _, first = np.unique(thing, return_index=True)  # an object counts once
     number = min(FOLDS, len(np.unique(group)))
     split = StratifiedGroupKFold(number, shuffle=True, random_state=seed)
     of_group: dict[int, int] = {}

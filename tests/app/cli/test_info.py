@@ -67,7 +67,7 @@ def test_what_cannot_be_read_is_said_in_one_line(capsys, tmp_path):
 
 
 def test_a_name_from_a_file_cannot_steer_the_terminal():
-    from app.cli.choices import plain
+    from app.cli.flags import plain
 
     assert plain("/points\x1b[2J\n\u202e") == "/points?[2J??"
     assert plain("/wäldchen/points") == "/wäldchen/points"

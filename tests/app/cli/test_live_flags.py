@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from app.cli import WRONG_USAGE, main
-from app.cli.choices import recording_place
+from app.cli.flags import recording_place
 from pipeline.errors import ParameterError
 
 ROBOT, SENSOR = "zenoh:tcp/127.0.0.1:7447", "velodyne:127.0.0.1:2368"

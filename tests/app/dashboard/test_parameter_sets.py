@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from app.cli.choices import chosen_parameters
+from app.cli.flags import chosen_parameters
 from app.dashboard.payload import BeforeAfter, Counts, counts_of
 from app.worker.internal_protocol import Shown
 from pipeline.config import preset

@@ -11,7 +11,7 @@ import pytest
 
 from app.cli import main
 from app.training.fit_forest import Examples
-from app.training.keeping import kept_or_made, read_examples
+from app.training.keeping import read_examples, stored_or_computed
 from pipeline.errors import StemmapError
 
 
@@ -21,8 +21,8 @@ def examples():
 
 
 def test_what_was_kept_is_read_and_not_made_again(tmp_path):
-    made = kept_or_made(tmp_path, "a scene", examples)
-    again = kept_or_made(tmp_path, "a scene", lambda: pytest.fail("made again"))
+    made = stored_or_computed(tmp_path, "a scene", examples)
+    again = stored_or_computed(tmp_path, "a scene", lambda: pytest.fail("made again"))
     assert np.array_equal(made[0].figures, again[0].figures)
     assert (again[0].scene, again[0].simulated, again[0].all_around) == ("a scene", True, False)
 
@@ -59,5 +59,5 @@ def test_a_file_that_cannot_be_written_whole_is_not_there(tmp_path, monkeypatch)
 
     monkeypatch.setattr(np, "savez", half)
     with pytest.raises(StemmapError, match="No space left"):
-        kept_or_made(tmp_path, "a scene", examples)
+        stored_or_computed(tmp_path, "a scene", examples)
     assert not list(tmp_path.iterdir())

@@ -16,7 +16,7 @@ from app.cli import main
 from app.dashboard.parameters import ParameterState
 from app.store.records import Author, Content
 from app.store.store import Store
-from app.training.annotated import CLASS_OF_KIND, SEEN, Judged, things_of
+from app.training.annotated_runs import CLASS_OF_KIND, SEEN, ExampleCollector, object_numbers
 from app.training.expanding import PRIOR, all_expanded, expanded
 from app.training.fit_forest import PLANS, TREE, Examples
 from app.training.learned_forests import FOLDER, Forests, name_of
@@ -65,21 +65,21 @@ def data(**changes: object):
 
 
 def test_what_was_judged_is_taken_after_some_scans_and_as_it_was_last():
-    judged = Judged([Content(1.0, 0.0), Content(5.0, 0.0, "pole"), Content(9.0, 9.0)])
+    judged = ExampleCollector([Content(1.0, 0.0), Content(5.0, 0.0, "pole"), Content(9.0, 9.0)])
     for seen in range(1, SEEN[1] + 1):
         x = 1.0 + 0.001 * seen
-        judged.see(columns((x, 0.0, seen), (5.1, 0.0, 1.0), (1.3, 0.0, 99.0), (7.0, 0.0, 99.0)))
+        judged.add(columns((x, 0.0, seen), (5.1, 0.0, 1.0), (1.3, 0.0, 99.0), (7.0, 0.0, 99.0)))
     found = judged.examples("a", all_around=True)
     # The tree after SEEN[0] and SEEN[1] scans and at the end; the pole at the end; nothing of the third.
     firsts = [1.0 + 0.001 * SEEN[0], 1.0 + 0.001 * SEEN[1], 1.0 + 0.001 * SEEN[1], 5.1]
     assert found.figures[:, 0].tolist() == pytest.approx(firsts)
     assert found.label.tolist() == [TREE, TREE, TREE, POLE]
-    assert things_of([found]).tolist() == [0, 0, 0, 1]
+    assert object_numbers([found]).tolist() == [0, 0, 0, 1]
 
 
 def test_two_annotations_never_share_a_column():
-    judged = Judged([Content(0.0, 0.0), Content(0.3, 0.0, "pole")])
-    judged.see(columns((0.05, 0.0, 9.0)))
+    judged = ExampleCollector([Content(0.0, 0.0), Content(0.3, 0.0, "pole")])
+    judged.add(columns((0.05, 0.0, 9.0)))
     assert judged.examples("a", all_around=True).label.tolist()[-1:] == [TREE]
     assert POLE not in judged.examples("a", all_around=True).label
 
@@ -182,7 +182,7 @@ def test_no_place_and_no_run_is_in_two_folds(runs):
     tree = np.concatenate([e.label for e in some]) == TREE
     if min(tree.sum(), (~tree).sum()) < 5:
         return  # less is never learned from
-    fold = fold_of(group, tree, things_of(some), seed=0)
+    fold = fold_of(group, tree, object_numbers(some), seed=0)
     for fold_a, a in zip(fold, place, strict=True):
         near = np.hypot(*(place - a).T) < SAME_PLACE - 1e-9
         assert (fold[near] == fold_a).all()
@@ -269,16 +269,16 @@ def test_a_run_that_was_annotated_is_learned_from(tmp_path, monkeypatch, capsys)
     base.write_text(json.dumps(data()))
     monkeypatch.setattr("app.training.learning.FILE", base)  # forty large trees take longer to learn
     assert main(["train", "--annotations"]) == 1
-    assert "nothing was annotated yet" in capsys.readouterr().err
+    assert "there are no annotations" in capsys.readouterr().err
     uri = "sim:stand?duration=2&trees=40"
     digest, truth = true_things(uri)
     store = Store(tmp_path)
     run = store.open_run(digest, uri, uri)
     store.add(run, ANN, [c for c in truth if c.kind == "tree"][:3])
     assert main(["train", "--annotations"]) == 1
-    assert "10 trees and 5 other things are needed" in capsys.readouterr().err
+    assert "10 trees and 5 other objects are needed" in capsys.readouterr().err
     assert main(["train", "--annotations", "sim:slope"]) == 2
-    assert "nobody annotated a run 'sim:slope'" in capsys.readouterr().err
+    assert "there is no annotated run 'sim:slope'" in capsys.readouterr().err
     for row in store.annotations(run):
         store.delete(run, ANN, row.id, row.version)
     store.add(run, ANN, truth)

@@ -1,13 +1,17 @@
-"""Flags that several commands share: parameters, seed, odometry."""
+"""Flags and messages that several commands share."""
 
 from __future__ import annotations
 
 import argparse
 import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import ParameterError
+from app.common.text import COMPILING
+from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from pipeline.config import Parameters
@@ -17,56 +21,59 @@ SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of scans (.bin, .pcd, .ply, "
     ".npy, .npz, .las, .laz) or of TreeManagerState_<i>.csv stems, "
     "a whole cloud (.laz, .las, .e57, .ply, .npy, .npz), "
-    "a robot that is heard live (zenoh:tcp/host:7447, dds:?domain=0, velodyne:ADDRESS:PORT?from=SENSOR), "
+    "a live robot (zenoh:tcp/host:7447, dds:?domain=0, velodyne:ADDRESS:PORT?from=SENSOR), "
     "or a simulated run such as sim:stand"
 )
 
 
 def program() -> str:
-    """What to type before the words of a command, so that a line that is printed can be pasted."""
+    """Return how the program is called here, so that a printed command can be pasted."""
     return "uv run stemmap" if os.environ.get("UV_RUN_RECURSION_DEPTH") else "stemmap"
 
 
 def plain(text: str) -> str:
-    """Text from a file without what would steer a terminal."""
+    """Return text without characters that control a terminal."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def add_parameter_flags(parser: argparse.ArgumentParser) -> None:
     """--preset, --config and --set."""
     parser.add_argument(
-        "--preset", metavar="NAME", help="parameters to start from (default: what suits the source)"
+        "--preset",
+        metavar="NAME",
+        help="named parameter set to start from (default: the one that suits the source)",
     )
-    parser.add_argument("--config", metavar="FILE", type=Path, help="TOML file laid over the preset")
+    parser.add_argument(
+        "--config", metavar="FILE", type=Path, help="TOML file whose values replace those of the preset"
+    )
     parser.add_argument(
         "--set",
         metavar="STAGE.NAME=VALUE",
         dest="assignments",
         action="append",
         default=[],
-        help="one value laid over both; may be given again; `stemmap params` lists them",
+        help="value of one parameter; may be repeated; `stemmap params` lists all",
     )
 
 
 def add_force_flag(parser: argparse.ArgumentParser) -> None:
     """--force."""
     parser.add_argument(
-        "--force", action="store_true", help="write over the map of another source that stands in the folder"
+        "--force", action="store_true", help="overwrite the map of another source in the folder"
     )
 
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
     """--seed and --odometry."""
-    parser.add_argument(
-        "--seed", type=seed, default=0, metavar="N", help="of every random number (default: 0)"
-    )
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="random seed (default: 0)")
     parser.add_argument(
         "--odometry",
         type=_odometry,
         metavar="auto|wheels|kiss-icp|static|file:POSES",
         default="auto",
-        help="auto: what the source has, else kiss-icp; wheels: it must have some; kiss-icp: scans are laid "
-        "over one another; static: the robot stands still; file:poses.txt: poses of the LiDAR (TUM, KITTI)",
+        help="source of the motion. auto: odometry of the source, else kiss-icp; wheels: odometry of the "
+        "source; kiss-icp: registration of the scans; static: no motion; "
+        "file:poses.txt: LiDAR poses (TUM or KITTI)",
     )
 
 
@@ -79,14 +86,14 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
         type=_topic,
         action="append",
         default=[],
-        help="topic of a recording for scan, odometry, imu, gnss, pose (another SLAM's) or camera, "
-        "in place of the fullest one",
+        help="topic of a recording for scan, odometry, imu, gnss, pose (of another SLAM) or camera "
+        "(default: the one with the most messages)",
     )
     parser.add_argument(
         "--mount",
         metavar="X,Y,Z,ROLL,PITCH,YAW",
         type=_mount,
-        help="where the LiDAR stands on the robot, in metres and degrees (default: what the source says)",
+        help="pose of the LiDAR on the robot, in metres and degrees (default: that of the source)",
     )
 
 
@@ -97,20 +104,20 @@ def add_live_flags(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.mcap",
         nargs="?",
         const="",
-        help="record a live run, with its results, to be replayed; without a name into the data folder",
+        help="record a live run and its results; without a file name into the data folder",
     )
     parser.add_argument(
         "--publish",
         action="store_true",
-        help="send pose, path and trees of a live run to the robot's network, for RViz and Foxglove",
+        help="publish pose, path and trees of a live run on the robot's network, for RViz and Foxglove",
     )
 
 
 def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
-    """The file that --record means, "" where nothing is recorded.
+    """Return the file of --record; "" without a recording.
 
     Raises:
-        ParameterError: One of the sources is no live one.
+        ParameterError: A source is not live.
     """
     import time
 
@@ -118,18 +125,16 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
 
     asked = arguments.record is not None or arguments.publish
     if asked and not all(is_live(uri) for uri in sources):
-        raise ParameterError(
-            "--record and --publish are of a robot that is heard live", remedy="Leave them away"
-        )
+        raise ParameterError("--record and --publish need a live robot", remedy="Remove them")
     if asked and any(getattr(parse_address(uri), "mapped_there", False) for uri in sources):
         raise ParameterError(
-            "a robot that maps by itself records and publishes by itself",
-            remedy="Leave --record and --publish away, or give them to `stemmap map` on the robot",
+            "a robot that maps itself also records and publishes itself",
+            remedy="Remove --record and --publish here, or give them to `stemmap map` on the robot",
         )
     if arguments.publish and not all(uri.lower().startswith("zenoh:") for uri in sources):
         raise ParameterError(
-            "results are published over Zenoh alone; a sensor and plain DDS are only heard",
-            remedy="Leave --publish away",
+            "results can be published only over Zenoh",
+            remedy="Remove --publish",
         )
     if arguments.record is None:
         return ""
@@ -141,7 +146,7 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
 
 
 def says_parameters(arguments: argparse.Namespace) -> bool:
-    """Whether the command line says anything about the parameters."""
+    """Whether the command line has a preset, a parameter file or values."""
     return bool(arguments.preset or arguments.config or arguments.assignments)
 
 
@@ -171,7 +176,7 @@ def _mount(text: str) -> tuple[float, ...]:
 
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
-    """What the flags say about the source."""
+    """Return the options of the source that the flags give."""
     from math import radians
 
     from pipeline.geometry.poses import Pose3
@@ -187,36 +192,61 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
 
 
 def source(text: str) -> str:
-    """A source from the command line; an empty word is a slip of a script, not the current folder."""
+    """Check a source. An empty word is an error and not the current folder."""
     if not text.strip():
         raise argparse.ArgumentTypeError("the source is empty")
     return text
 
 
 def seed(text: str) -> int:
-    """A seed from a flag: a whole number that is not negative."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if not 0 <= value < 1 << 63:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 on")
-    return value
+    """Parse a random seed: a whole number that is not negative."""
+    return whole_number(0, (1 << 63) - 1)(text)
+
+
+def whole_number(low: int, high: int) -> Callable[[str], int]:
+    """Return a parser of whole numbers from low to high, for argparse."""
+
+    def parse(text: str) -> int:
+        if text.isascii() and text.isdigit() and len(text) < 20 and low <= int(text) <= high:
+            return int(text)
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {low} to {high}")
+
+    return parse
+
+
+def positive_number(limit: float, quantity: str) -> Callable[[str], float]:
+    """Return a parser of numbers above 0 and below a limit, for argparse; `quantity` names them in errors."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = 0.0
+        if not 0.0 < value < limit:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {quantity}")
+        return value
+
+    return parse
+
+
+def cannot_write(error: OSError, place: Path) -> StemmapError:
+    """Return the error of a file or folder that cannot be written."""
+    return StemmapError(f"cannot write: {error.strerror}", where=str(error.filename or place))
 
 
 def chosen_parameters(
     arguments: argparse.Namespace, suggested: str, present: Parameters | None = None
 ) -> tuple[str, Parameters]:
-    """The name of the preset and the parameters that the flags ask for.
+    """Return the name of the preset and the parameters of the flags.
 
     Args:
         arguments: Parsed, with the flags of `add_parameter_flags`.
-        suggested: The preset that suits the source, where none is named.
-        present: What stands for the suggested preset, of a map that is continued.
+        suggested: Preset that suits the source, used where none is named.
+        present: Parameters of a continued map, which replace the suggested preset.
 
     Raises:
-        ParameterError: A name, value or file does not fit.
-        StemmapError: The decision trees that are named are not here.
+        ParameterError: A name, value or file is invalid.
+        StemmapError: The random forest that is named does not exist.
     """
     from pipeline.config import assign, from_toml, preset
 
@@ -237,3 +267,23 @@ def chosen_parameters(
 
         kept_forests().check(parameters)
     return name, parameters
+
+
+@contextmanager
+def compilation_notice() -> Iterator[None]:
+    """Inside, the first kernel that must be compiled is reported on stderr, above a progress bar."""
+    from tqdm import tqdm
+
+    from pipeline.jit import on_compiling
+
+    reported = False
+
+    def report() -> None:
+        nonlocal reported
+        if not reported:
+            reported = True
+            tqdm.write(COMPILING, file=sys.stderr)
+            sys.stderr.flush()
+
+    with on_compiling(report):
+        yield
