@@ -93,7 +93,7 @@ def test_a_map_says_at_its_start_what_lies_in_its_folder(
     half_a_map(tmp_path)
     assert main(["map", "/nowhere.mcap", "--out", str(tmp_path)]) == 1
     first = capsys.readouterr().err.splitlines()[0]
-    assert ".unfinished-abc is left of a run that was ended" in first
+    assert ".unfinished-abc is the partial output of a run that was killed" in first
 
 
 def test_a_map_that_is_still_written_is_not_taken_away_however_silent_it_is(settings: Settings) -> None:
@@ -105,7 +105,7 @@ def test_a_map_that_is_still_written_is_not_taken_away_however_silent_it_is(sett
         os.utime(path, (LONG_AGO_S, LONG_AGO_S))
     name = f"north/{left.name}"
     assert [each.quiet for each in data_folders.partial_outputs(settings, NOW_S)] == [False]
-    with pytest.raises(StemmapError, match="a stemmap is writing there"):
+    with pytest.raises(StemmapError, match="a stemmap process writes to it"):
         data_folders.delete_partial_output(name, settings, NOW_S)
     assert left.is_dir()
     files._detections.close()  # as when the process ends

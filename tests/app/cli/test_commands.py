@@ -366,8 +366,8 @@ def test_evaluating_by_a_table_and_by_other_distances(mapped, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ("", "no ground truth lies within"),
-        ("900,900\n", "no ground truth lies"),
+        ("", "no ground truth is within"),
+        ("900,900\n", "no ground truth is"),
         ("1,0\n", "none of 1 true tree has"),
     ],
 )

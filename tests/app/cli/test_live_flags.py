@@ -32,7 +32,7 @@ def test_robots_are_recorded_to_the_file_that_was_named(tmp_path: Path):
         (asked("x"), (ROBOT, "run.mcap"), "heard live"),
         (asked(publish=True), (SENSOR,), "only heard"),
         (asked(publish=True), ("dds:?domain=1",), "only heard"),
-        (asked("x"), (f"{ROBOT}?mapped=robot",), "maps by itself"),
+        (asked("x"), (f"{ROBOT}?mapped=robot",), "maps itself"),
     ],
 )
 def test_what_cannot_be_recorded_or_published_is_refused(

@@ -191,7 +191,7 @@ def test_the_command_writes_a_set_with_its_provenance(tmp_path, capsys):
     # The same command goes on with its journal, and another one with more trials makes them.
     assert main([*words, "--trials", "4"]) == 0
     said = capsys.readouterr()
-    assert "going on after 3 trials" in said.err
+    assert "continuing after 3 trials" in said.err
     assert provenance_in((tmp_path / "best.toml").read_text())["tuned"]["trials"] == 4
 
 
@@ -212,7 +212,7 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
     process.send_signal(signal.SIGINT)
     said, told = process.communicate(timeout=120)
     assert process.returncode == 3, told
-    assert "the same command goes on" in told
+    assert "the same command continues" in told
     assert provenance_in(out.read_text())["tuned"]["trials"] >= 1
     assert "written to" in said
 
@@ -220,7 +220,7 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
 @pytest.mark.parametrize(
     ("words", "code", "told"),
     [
-        (["sim:stand?duration=1", "--truth", "{far}"], 1, "no ground truth lies within"),
+        (["sim:stand?duration=1", "--truth", "{far}"], 1, "no ground truth is within"),
         (["sim:stand?duration=1", "--truth", "{aside}"], 1, "has a mapped tree within"),
         (["{room}"], 1, "brings no true trees"),
         (["sim:nowhere"], 2, "nowhere"),

@@ -38,7 +38,7 @@ def test_what_is_known_is_not_computed_again_and_a_run_that_fails_is_said(
     monkeypatch.setattr("app.tuning.sweep.workers.COMMAND", ("false",))  # nobody who could compute
     assert evaluate(tmp_path, "--jobs", "1", "--keep", str(here / "keep")) == 3
     told = capsys.readouterr()
-    assert "3 results known from before" in told.err
+    assert "3 stored results used" in told.err
     assert told.err.count("left out: ") == 1
     assert "none.mcap" in told.err
     assert told.out.count("slam.particles=7") >= 1

@@ -95,7 +95,7 @@ def test_truth_far_from_the_path_is_no_score():
     answer = scorer.score(Job(asked, preset("forest").model_dump(), code_digest()))
     scorer.close()
     assert answer.scores is None
-    assert "no ground truth lies within 10 m" in answer.error
+    assert "no ground truth is within 10 m" in answer.error
 
 
 # --- the command ----------------------------------------------------------------------------------
