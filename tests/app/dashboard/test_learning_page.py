@@ -31,7 +31,7 @@ FOREST = {"classes": [c.label for c in CLASSES], ALL_AROUND: [LEAF], ONE_WAY: [L
 # Says what it is given as arguments, line by line; "wait" for ever.
 SAYS = """
 import sys, time
-sys.stdin.read()
+sys.stdin.readline()
 for line in sys.argv[1:]:
     time.sleep(3600 if line == "wait" else 0)
     print("x" * (2 << 20) if line == "long" else line, flush=True)

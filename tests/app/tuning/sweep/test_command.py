@@ -83,7 +83,7 @@ def test_results_of_a_cluster_that_lost_a_worker_are_those_of_a_process_to_the_b
     keep = ("--keep", str(tmp_path / "keep"))
     assert evaluate(tmp_path / "out", "--dask", cluster, *keep) == 3
     assert (tmp_path / "died").exists()
-    assert "1 worker lost in the middle of a set" in capsys.readouterr().err
+    assert "1 worker lost during a job" in capsys.readouterr().err
     for name in FILES:
         assert (here / "out" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
 
