@@ -28,10 +28,10 @@ def test_robots_are_recorded_to_the_file_that_was_named(tmp_path: Path):
 @pytest.mark.parametrize(
     ("flags", "sources", "reason"),
     [
-        (asked("x"), ("sim:stand",), "heard live"),
-        (asked("x"), (ROBOT, "run.mcap"), "heard live"),
-        (asked(publish=True), (SENSOR,), "only heard"),
-        (asked(publish=True), ("dds:?domain=1",), "only heard"),
+        (asked("x"), ("sim:stand",), "live robot"),
+        (asked("x"), (ROBOT, "run.mcap"), "live robot"),
+        (asked(publish=True), (SENSOR,), "only over Zenoh"),
+        (asked(publish=True), ("dds:?domain=1",), "only over Zenoh"),
         (asked("x"), (f"{ROBOT}?mapped=robot",), "maps itself"),
     ],
 )
@@ -44,4 +44,4 @@ def test_what_cannot_be_recorded_or_published_is_refused(
 
 def test_the_command_line_says_so(capsys: pytest.CaptureFixture[str]):
     assert main(["serve", "sim:stand", "sim:paper", "--record", "--no-browser"]) == WRONG_USAGE
-    assert "heard live" in capsys.readouterr().err
+    assert "live robot" in capsys.readouterr().err
