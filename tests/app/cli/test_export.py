@@ -70,7 +70,7 @@ def test_what_is_there_is_not_overwritten(mapped, tmp_path, capsys):
     stemmap(capsys, "export", mapped, "--out", tmp_path / "mine.txt").refused(1, "not empty")
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
     stemmap(capsys, "export", tmp_path, "--out", tmp_path / "new").refused(1, "stemmap map")
-    stemmap(capsys, "export", mapped, "--out", tmp_path / "new", "--reach", "0").refused(2, "no distance")
+    stemmap(capsys, "export", mapped, "--out", tmp_path / "new", "--reach", "0").refused(2, "not a distance")
     stemmap(capsys, "export", mapped, "--out", "/proc/nowhere/new").refused(1, "cannot write")
 
 
