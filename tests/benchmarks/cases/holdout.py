@@ -152,7 +152,7 @@ def _training_examples() -> tuple[list[Examples], list[Examples]]:
     from functools import partial
 
     from app.training.augmentation import FOLDER, copies
-    from app.training.keeping import kept_or_made
+    from app.training.keeping import stored_or_computed
     from app.training.scenes import labelled_examples, stand_examples, stand_name, street_examples
     from pipeline.config import preset
 
@@ -160,14 +160,14 @@ def _training_examples() -> tuple[list[Examples], list[Examples]]:
     p, found = preset("forest"), list["Examples"]()
     for uri, furnished in _stands():
         make = partial(stand_examples, uri, p, EVERY, furnished=furnished)
-        found += kept_or_made(kept, stand_name(uri, furnished), make)
+        found += stored_or_computed(kept, stand_name(uri, furnished), make)
     for seed in STREET_SEEDS:
         for one_way in (False, True):
             make = partial(street_examples, seed, one_way, p, REACH)
-            found += kept_or_made(kept, f"{'park' if one_way else 'street'} {seed}", make)
+            found += stored_or_computed(kept, f"{'park' if one_way else 'street'} {seed}", make)
     parks = [DATA / "park_trunks" / name for names in PARKS for name in names]
     for scene in (*parks, STREET):
-        found += kept_or_made(kept, str(scene), partial(labelled_examples, scene, p, REACH))
+        found += stored_or_computed(kept, str(scene), partial(labelled_examples, scene, p, REACH))
     return found, [e for scene in parks for e in copies(scene, kept / FOLDER, p, REACH, COPIES)]
 
 
