@@ -211,8 +211,8 @@ def test_too_few_examples_are_told_with_what_is_needed():
     places = [(3.0 * k, 0.0) for k in range(LEAST_TREES + LEAST_OTHERS)]
     tree = np.arange(len(places)) < LEAST_TREES
     assert what_lacks([examples(places, tree)]) == ""
-    assert "there are 10 trees and 4 other things" in what_lacks([examples(places[:-1], tree[:-1])])
-    assert "there are 0 trees and 0 other things" in what_lacks([])
+    assert "there are 10 trees and 4 other objects" in what_lacks([examples(places[:-1], tree[:-1])])
+    assert "there are 0 trees and 0 other objects" in what_lacks([])
     assert "within a metre" in what_lacks([examples([(0.0, 0.01 * k) for k in range(15)], tree)])
 
 
@@ -256,7 +256,7 @@ def test_an_unknown_forest_and_a_name_that_is_a_path_are_refused(tmp_path):
     with pytest.raises(StemmapError, match="not in the data folder"):
         Forests(tmp_path)("../../etc/passwd", True)
     for name in ("../../etc/passwd", "0123456789ABCDEF", "", "package\n"):
-        with pytest.raises(ParameterError, match=r"gathering\.forest"):
+        with pytest.raises(ParameterError, match=r"classification\.forest"):
             assign(Parameters(), [f"classification.forest={name}"]).replace({"classification.forest": name})
 
 
