@@ -1,4 +1,4 @@
-"""What happened in the run and when, for the marks on the timeline."""
+"""Events of the run for the marks on the timeline."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from pipeline.types.records import Float, Frame
 
 Kind = Literal["tree", "warning", "change", "health", "annotation"]
 
-_OF_THE_MAP = ("tree", "health")  # come anew when the run is mapped with other parameters
+_OF_THE_MAP = ("tree", "health")  # created again when the run is mapped with other parameters
 _MOST = 400
 _LONGEST = 300
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One mark.
+    """One mark of the timeline.
 
     Attributes:
-        time_s: Since the run's first scan.
-        kind: A tree was confirmed, a warning came, parameters were changed, the pose became better or worse,
-            somebody annotated.
-        text: For people.
+        time_s: Time since the first scan of the run [s].
+        kind: Tree confirmed, warning, parameters changed, pose quality changed, or annotation.
+        text: Description for people.
     """
 
     time_s: float
@@ -35,10 +34,10 @@ class Event:
 
 
 class Events:
-    """The events of a run, at most 400; of more the oldest are forgotten.
+    """Events of a run, at most 400; the oldest are removed first.
 
-    What came later in the run than the scan at which parameters were changed stays as it was, told to be of
-    before the change, until the run gets there again.
+    After a change of parameters, events later than the current scan remain, marked as from before the change,
+    until the run reaches them again.
     """
 
     def __init__(self) -> None:
@@ -51,7 +50,7 @@ class Events:
         self._edits = ("", 0)
 
     def forget(self) -> None:
-        """Another run begins."""
+        """Remove all events, since another run begins."""
         self._events.clear()
         self._before.clear()
         self._confirmed.clear()
@@ -59,18 +58,19 @@ class Events:
         self._edits = ("", 0)
 
     def shown(self, frame: Frame, time_s: float, confirmed_s: Float | None = None) -> bool:
-        """Take a scan's results; returns whether anything happened. A tree that is confirmed again after the
-        run went back has its mark where it was confirmed first.
+        """Add the events of a displayed scan and return whether there are any.
+
+        A tree that is confirmed again after stepping back keeps the mark of its first confirmation.
 
         Args:
-            frame: The picture; on the way to a sought scan not every one is shown.
-            time_s: Of the picture.
-            confirmed_s: When each of its trees was confirmed, NaN where that is not known; None knows none.
+            frame: Displayed frame; while seeking, not every frame is displayed.
+            time_s: Time of the frame [s].
+            confirmed_s: Confirmation time of each tree [s], NaN if unknown; None if all are unknown.
         """
         known = set(self._events)
         passed = {key for key, event in self._before.items() if event.time_s <= time_s}
         self._before = {key: event for key, event in self._before.items() if key not in passed}
-        # Not those whose marks are there: of more trees than marks the forgotten ones would come again.
+        # Without existing marks: removed marks of many trees would otherwise reappear.
         confirmed = set(frame.trees.number[frame.trees.confirmed].tolist())
         at = {} if confirmed_s is None else self._times(frame, confirmed_s)
         for number in sorted(confirmed - self._confirmed):
@@ -84,11 +84,11 @@ class Events:
         return self._events.keys() != known or bool(passed)
 
     def remapped(self, confirmed: list[tuple[int, float]], time_s: float) -> None:
-        """The map is another one.
+        """Replace the tree events after the run was mapped again.
 
         Args:
-            confirmed: Number of each tree that was confirmed on the way to it, and when [s].
-            time_s: Of the standing scan, up to which it was mapped again.
+            confirmed: Number and confirmation time [s] of each tree.
+            time_s: Time of the current scan [s].
         """
         self._set_aside(lambda event: event.time_s > time_s)
         self._events = {k: e for k, e in self._events.items() if e.kind not in _OF_THE_MAP}
@@ -98,7 +98,7 @@ class Events:
             self._note(f"tree {number}", Event(at, "tree", f"Tree {number} confirmed"))
 
     def warned(self, warnings: list[str], time_s: float) -> bool:
-        """Take the warnings that stand; returns whether there is a new one."""
+        """Set the active warnings and return whether there is a new one."""
         new = [warning for warning in warnings if warning not in self._warnings]
         self._warnings = frozenset(warnings)
         for warning in new:
@@ -106,12 +106,13 @@ class Events:
         return bool(new)
 
     def changed(self, before: dict[str, Value], after: dict[str, Value], time_s: float) -> None:
-        """Parameters were changed. What came after this time in the run came under other parameters, and
-        will come anew. Of changes at one time (a slider that moves) what they make together is told.
+        """Add a change of parameters; successive changes at one time (a slider drag) are combined.
+
+        Later events of the run are marked as from before the change.
 
         Args:
             before, after: All values by dotted name.
-            time_s: Of the standing scan.
+            time_s: Time of the current scan [s].
         """
         undone = self._set_aside(lambda event: event.time_s > time_s)
         self._confirmed = {number for number in self._confirmed if f"tree {number}" not in undone}
@@ -126,13 +127,12 @@ class Events:
             self._note(key, Event(time_s, "change", f"{', '.join(texts[:3])}{more}"[:_LONGEST]))
 
     def annotated(self, who: str, number: int, time_s: float) -> None:
-        """Annotations were edited. Of edits at one time (of somebody who goes through the trees while the run
-        stands) one mark tells how many they were.
+        """Add edits of annotations; edits at one time share one mark with their number.
 
         Args:
-            who: Made the last of them; empty where that is not known.
-            number: How many annotations were added, changed or deleted.
-            time_s: Of the standing scan.
+            who: Author of the last edit, empty if unknown.
+            number: Number of added, changed or deleted annotations.
+            time_s: Time of the current scan [s].
         """
         key = f"annotation {time_s:.1f}"
         self._edits = (key, number + (self._edits[1] if self._edits[0] == key else 0))
@@ -141,7 +141,7 @@ class Events:
         self._note(key, Event(time_s, "annotation", f"{who or 'Somebody'} edited {edits}"[:_LONGEST]))
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers, in the order of time; `before` marks what is of before a change."""
+        """Return the events for the page in order of time; `before` marks events from before a change."""
         room = _MOST - len(self._events)
         marks = [(event, False) for event in self._events.values()]
         marks += [(event, True) for event in list(self._before.values())[:room]]
@@ -154,7 +154,7 @@ class Events:
         }
 
     def _set_aside(self, which: Callable[[Event], bool]) -> set[str]:
-        """Of what the map told, some events are of before a change from now on; gives their keys."""
+        """Mark events of the map as from before a change and return their keys."""
         keys = {k for k, event in self._events.items() if event.kind in _OF_THE_MAP and which(event)}
         self._before |= {key: self._events.pop(key) for key in sorted(keys)}
         return keys

@@ -22,13 +22,13 @@ from pipeline.types.records import Frame, Trees, TruthTrees, Verdict
 Float = NDArray[np.float64]
 
 _NS = 1_000_000_000
-# A tenth of a millimetre: finer than any sensor, and short on the wire.
+# 0.1 mm: finer than any sensor, and short in JSON.
 _DIGITS = 4
 JUST_BEGUN = 20  # scans
 
 
 def map_payload(shown: Shown) -> dict[str, Any]:
-    """The message "map" without its path."""
+    """Return the message "map" without its path."""
     frame = shown.frame
     estimate = frame.estimate
     return {
@@ -50,7 +50,7 @@ def map_payload(shown: Shown) -> dict[str, Any]:
 
 
 def layer_counts(frame: Frame) -> dict[str, int]:
-    """How much each layer of the scene shows; the path and the truth the page counts itself."""
+    """Return the number of objects of each layer of the scene, except path and ground truth."""
     return {
         "raw": len(frame.raw),
         "filtered": len(frame.filtered),
@@ -62,7 +62,7 @@ def layer_counts(frame: Frame) -> dict[str, int]:
 
 
 def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
-    """How far the way is free; what is not known, or nowhere, is None."""
+    """Return the clearance of the path; unknown or infinite values are None."""
     if clearance is None:
         return None
     ahead, beside = _known(clearance.ahead), _known(clearance.beside)
@@ -70,8 +70,10 @@ def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
 
 
 def health_word(frame: Frame | None) -> str:
-    """How far the map can be trusted, in a word or two. "good" says that nothing speaks against the pose,
-    which is no praise before there is a map that could."""
+    """Return the pose quality in one or two words.
+
+    "good" means that nothing contradicts the pose; it is not used before there is a map that could.
+    """
     if frame is None:
         return "no scan yet"
     if frame.health.state != "good":
@@ -82,8 +84,7 @@ def health_word(frame: Frame | None) -> str:
 
 
 def health_payload(health: Health) -> dict[str, Any]:
-    """How far the pose can be trusted: one word, why, and the figures behind it; what is not known is
-    None."""
+    """Return the pose quality: word, reason and figures; unknown figures are None."""
     return {
         "state": health.state,
         "reason": health.reason,
@@ -100,7 +101,7 @@ def health_payload(health: Health) -> dict[str, Any]:
 
 
 def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
-    """The clusters of the scan as columns, in the frame of the map; what is not known is None."""
+    """Return the clusters of the scan as columns in the map frame; unknown values are None."""
     clusters = frame.clusters
     base = clusters.centre + frame.sensor_offset[:2]
     place = frame.estimate.T_map_base.apply(base)
@@ -116,12 +117,12 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 
 
 def trees_payload(frame: Frame, start_ns: int) -> list[dict[str, Any]]:
-    """The confirmed trees, one dict each; what is not known is None."""
+    """Return the confirmed trees, one dict each; unknown values are None."""
     return tree_rows(frame.trees, start_ns)
 
 
 def tree_rows(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
-    """The confirmed trees of a table, one dict each; what is not known is None."""
+    """Return the confirmed trees of a table, one dict each; unknown values are None."""
     keep = np.flatnonzero(trees.confirmed)
     columns: dict[str, Sequence[Any]] = {
         "number": trees.number[keep].tolist(),
@@ -140,20 +141,20 @@ def tree_rows(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
 
 
 def ellipses(covariance: Float) -> list[list[float]]:
-    """Half axes [m] and direction of the longer one [rad] of the 1-sigma ellipses of (T, 2, 2)."""
+    """Return half axes [m] and direction of the major axis [rad] of the 1-sigma ellipses of (T, 2, 2)."""
     rows: list[list[float]] = np.round(half_axes(covariance), _DIGITS).tolist()
     return rows
 
 
 def verdict_counts(verdicts: NDArray[np.int32]) -> dict[str, int]:
-    """How many clusters ended with each verdict, in words, the most frequent first."""
+    """Return the number of clusters by verdict, most frequent first."""
     values, counts = np.unique(verdicts, return_counts=True)
     order = np.argsort(-counts, kind="stable")
     return {Verdict(int(values[k])).label: int(counts[k]) for k in order}
 
 
 def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
-    """The ground truth trees, None when there are none."""
+    """Return the ground truth trees, or None."""
     if truth is None:
         return None
     rows = zip(_rounded(truth.x), _rounded(truth.y), _finite(100.0 * truth.dbh), truth.kind, strict=True)
@@ -161,12 +162,12 @@ def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
 
 
 def path_points(path_xy: Float, start: int) -> dict[str, Any]:
-    """The piece of a path (N, 2) from a row on, for a page that has the rows before it."""
+    """Return the rows of a path (N, 2) from a row on, for a page that has the rows before."""
     return {"start": start, "points": np.round(path_xy[start:], 3).tolist()}
 
 
 def first_difference(old: Float | None, new: Float) -> int:
-    """How many rows from the start two paths (N, 2) have in common."""
+    """Return the number of leading rows that two paths (N, 2) have in common."""
     if old is None:
         return 0
     n = min(len(old), len(new))
@@ -189,13 +190,13 @@ def _finite(values: Float) -> list[float | None]:
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """How many clusters of a scan ended with each verdict.
+    """Verdict counts of a scan.
 
     Attributes:
-        index: Of the scan.
-        verdicts: In words.
-        right, wrong: Of those taken for trees, how many stand at a true tree and how many do not; None
-            without truth.
+        index: Index of the scan.
+        verdicts: Number of clusters by verdict.
+        right, wrong: Clusters with the verdict tree that are at a true tree, and those that are not; None
+            without ground truth.
     """
 
     index: int
@@ -209,7 +210,8 @@ class Counts:
 
 
 def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> Counts:
-    """The counts of a scan; `match_distance` [m] is how far a detection may lie from its tree."""
+    """Return the counts of a scan; `match_distance` [m] is the maximum distance of a detection to its
+    tree."""
     verdicts = verdict_counts(frame.clusters.verdict)
     if truth is None:
         return Counts(frame.index, verdicts, None, None)
@@ -222,7 +224,7 @@ def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> 
 
 
 class BeforeAfter:
-    """Remembers how the standing scan looked before the last change."""
+    """Keeps the verdict counts of the current scan before the last change."""
 
     def __init__(self) -> None:
         self._now: Counts | None = None
@@ -233,33 +235,33 @@ class BeforeAfter:
         self._now = self._before = None
 
     def step(self) -> None:
-        """A change begins that is a step of its own."""
+        """Begin a change that is a step of its own."""
         self._before = self._now
 
     def shown(self, counts: Counts) -> dict[str, Any]:
-        """Take the counts of what is shown now; gives what the page needs of them."""
+        """Set the counts of the displayed scan and return the message for the page."""
         self._now = counts
         if self._before is not None and self._before.index != counts.index:
-            self._before = None  # of another scan
+            self._before = None  # from another scan
         before = None if self._before is None else self._before.as_plain()
         return {"right": counts.right, "wrong": counts.wrong, "before": before}
 
 
-REACH = 0.45  # m; a column farther from a tree is another thing
+REACH = 0.45  # m; maximum distance between a tree and its column
 
 
 def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
-    """The confirmed trees with the votes on what was gathered there, the closest to the limit first.
+    """Return the confirmed trees with their votes, the most uncertain first.
 
-    Trees where nothing upright was gathered have no votes and come last.
+    Trees without a voxel column have no votes and come last.
 
     Args:
-        frame: With its columns.
-        tree_share: Share of the votes that makes a tree.
+        frame: Frame with its columns.
+        tree_share: Minimum share of votes of a tree.
     """
     from scipy.spatial import cKDTree
 
-    # As the page sorts them: of equal doubt the one that was seen least often.
+    # Same order as on the page: of equal uncertainty, the least observed tree first.
     rows = np.flatnonzero(frame.trees.confirmed)
     rows = rows[np.lexsort((frame.trees.number[rows], frame.trees.observations[rows]))]
     number = frame.trees.number[rows].tolist()
@@ -285,7 +287,7 @@ _FARTHEST_CM = 32_767
 
 
 def packed(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
-    """The block; see above."""
+    """Return the binary block; see above."""
     table, parts, place = [], [], 0
     for name, array in arrays.items():
         content = np.ascontiguousarray(array).tobytes()
@@ -299,12 +301,12 @@ def packed(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
 
 
 def in_centimetres(points: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Points of shape (N, 3) [m] in whole centimetres; what lies beyond 327 m stands at its edge."""
+    """Return points of shape (N, 3) [m] in whole centimetres, clipped to 327 m."""
     return np.clip(np.round(100.0 * points), -_FARTHEST_CM, _FARTHEST_CM).astype(np.int16)
 
 
 def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """What the header says of a frame's clusters."""
+    """Return the description of the clusters of a frame for the header."""
     counts = counts_of(frame, truth, match_distance)
     return {
         "index": frame.index,
@@ -315,7 +317,7 @@ def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> 
 
 
 def stages_payload(frame: Frame) -> bytes:
-    """The four stages of Fig. 3: the raw scan, what passed the filters, the clusters and the trunks."""
+    """Return the four stages of Fig. 3: raw scan, filtered scan, clusters and trunks."""
     arrays = {"raw": in_centimetres(frame.raw), **_clustered(frame)}
     return packed(described(frame, None, 0.0), arrays)
 
@@ -323,7 +325,7 @@ def stages_payload(frame: Frame) -> bytes:
 def comparison_payload(
     frames: list[Frame], header: dict[str, Any], truth: TruthTrees | None, match_distance: float
 ) -> bytes:
-    """The same scan under several sets; the arrays of the k-th have its number in their names."""
+    """Return one scan under several parameter sets; array names end with the number of the set."""
     arrays = {
         f"{name}{k}": array for k, frame in enumerate(frames) for name, array in _clustered(frame).items()
     }

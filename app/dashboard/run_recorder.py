@@ -1,4 +1,4 @@
-"""Keeps the record of the run that is open: figures, map, parameters and who changed them."""
+"""Records the open run in the store: figures, map, parameters and their changes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 
-# A record is a picture of the run for later: it need not be newer than this while the run plays.
+# Maximum age of a record while the run plays.
 _PAUSE_S = 5.0
 _REVISE_PAUSE_S = 1.0
 MOST_PATH_POINTS = 3000
@@ -35,12 +35,13 @@ MOST_PATH_POINTS = 3000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Glance:
-    """What the dashboard holds of a run at a moment; nothing of it is changed afterwards.
+    """State of a run at one moment; it is not modified afterwards.
 
     Attributes:
-        shown: The picture; path_xy: shape (N, 2) [m].
-        preset, parameters: In force.
-        truth, scores: Known then.
+        shown: Displayed frame.
+        path_xy: Path, shape (N, 2) [m].
+        preset, parameters: Current preset and parameters.
+        truth, scores: Ground truth and scores at that moment.
     """
 
     shown: Shown
@@ -53,7 +54,7 @@ class Glance:
 
 @dataclass(slots=True, eq=False)
 class _Page:
-    """Of one run: `best` is the glance of the last scan that was ever reached."""
+    """Record of one run; `best` is the state at the farthest scan that was reached."""
 
     beginning: Beginning
     all_scans: int | None
@@ -68,10 +69,10 @@ class _Page:
 
 
 class Logbook:
-    """Writes down what becomes of the runs, some seconds after it happens and at their end.
+    """Writes the results of runs to the store, with a delay of some seconds and at their end.
 
     Args:
-        keeper: Of the store.
+        keeper: Asynchronous access to the store.
     """
 
     def __init__(self, keeper: Keeper) -> None:
@@ -83,16 +84,16 @@ class Logbook:
 
     @property
     def record(self) -> int | None:
-        """Number of the open run's record; None before something of it was written."""
+        """Number of the record of the open run; None before it is written."""
         return self._page.record if self._page else None
 
     def begin(self, run: int | None, source: SourceRequest, opened: Opened, *, again: bool) -> None:
-        """A run was opened.
+        """Begin the record of an opened run.
 
         Args:
-            run: Number of its source in the store; None where the store cannot be used.
-            source, opened: What was asked for, and what came of it.
-            again: The worker died and opened the same run once more: its record goes on.
+            run: Number of its source in the store; None if the store cannot be used.
+            source, opened: Requested source and the opened run.
+            again: The worker was restarted and opened the same run again; its record continues.
         """
         if again and self._page is not None and self._page.beginning.request.uri == opened.uri:
             return
@@ -104,7 +105,7 @@ class Logbook:
         self._page = _Page(beginning, opened.scans)
 
     def leave(self) -> None:
-        """The run is left: what is not written yet is written now."""
+        """Write what is pending, since the run is closed."""
         page, self._page = self._page, None
         if self._writer is not None:
             self._writer.cancel()
@@ -115,7 +116,7 @@ class Logbook:
             self._start(self._write(page))
 
     def shown(self, glance: Glance) -> None:
-        """A scan was shown. The farthest one counts: who goes back does not take the map away."""
+        """Record a displayed scan; the farthest scan counts, so that stepping back keeps the map."""
         page = self._page
         if page is None:
             return
@@ -125,7 +126,7 @@ class Logbook:
             self._soon(page)
 
     def scored(self, scores: dict[str, Any] | None) -> None:
-        """The scan that was shown last has this score."""
+        """Record the score of the scan that was displayed last."""
         page = self._page
         if page is None or page.best is None or page.best is not page.newest or scores is None:
             return
@@ -136,7 +137,7 @@ class Logbook:
     def changed(
         self, before: dict[str, Value], after: dict[str, Value], preset: str, revision: int, who: str
     ) -> None:
-        """Parameters were changed: all values by dotted name, before and after."""
+        """Record a change of parameters; all values by dotted name, before and after."""
         changes = {name: [before[name], value] for name, value in after.items() if before[name] != value}
         page = self._page
         if page is None or page.newest is None or not changes:
@@ -144,7 +145,7 @@ class Logbook:
         change = Change(revision, page.newest.shown.time_s, who, preset, changes)
         last = page.changes[-1] if page.changes else None
         if last is not None and last.who == who and last.changes.keys() == changes.keys():
-            # A slider that moves: one change from its first value to its newest.
+            # A slider drag is one change from its first value to its newest.
             merged = {name: [last.changes[name][0], after] for name, (_, after) in changes.items()}
             page.changes[-1] = replace(change, changes=merged)
         else:
@@ -153,7 +154,7 @@ class Logbook:
             page.reviser = self._start(self._revise_soon(page))
 
     async def close(self) -> None:
-        """Write what is left to be written."""
+        """Write what is pending."""
         self.leave()
         while self._tasks:
             await asyncio.gather(*self._tasks)
@@ -193,14 +194,14 @@ class Logbook:
 
             try:
                 page.record = await self._ask(work)
-            except StemmapError:  # it was logged; what was not written is still to be written
+            except StemmapError:  # the error was logged; the rest remains pending
                 page.dirty = True
 
     async def _ask(self, work: Any) -> Any:  # noqa: ANN401 - as the keeper's
         try:
             done = await self._keeper.ask(work)
         except StemmapError as error:
-            if str(error) != self._problem:  # once, not every five seconds
+            if str(error) != self._problem:  # log once, not every five seconds
                 _log.warning("the run is not recorded: %s", error)
             self._problem = str(error)
             raise
@@ -215,7 +216,7 @@ class Logbook:
 
 
 async def _quietly(work: Any) -> None:  # noqa: ANN401 - any coroutine
-    with contextlib.suppress(StemmapError):  # it was logged
+    with contextlib.suppress(StemmapError):  # the error was logged
         await work
 
 
@@ -242,7 +243,7 @@ def _standing(glance: Glance, all_scans: int | None) -> Standing:
 
 
 def thinned(path_xy: Float) -> list[list[float]]:
-    """A path (N, 2) [m] with at most MOST_PATH_POINTS rows, its ends among them."""
+    """Return a path of shape (N, 2) [m] reduced to at most MOST_PATH_POINTS rows including both ends."""
     n = len(path_xy)
     rows = np.unique(np.linspace(0, n - 1, min(n, MOST_PATH_POINTS)).round().astype(np.int64))
     points: list[list[float]] = np.round(path_xy[rows], 3).tolist()

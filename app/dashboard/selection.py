@@ -1,4 +1,4 @@
-"""The selection: one tree or cluster for everybody who looks at the dashboard."""
+"""Selection of one tree or cluster, shared by all browsers of the dashboard."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from app.explain.records import ClusterStory
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """A tree, a cluster with the tree that it is a view of, or nothing.
+    """Selected tree, selected cluster with its tree, or nothing.
 
     Attributes:
-        tree: Its number, None for none.
-        cluster: The cluster as it was when it was selected, a standing picture of its scan.
+        tree: Number of the tree, or None.
+        cluster: Explanation of the cluster at the time of its selection, or None.
     """
 
     tree: int | None = None
@@ -26,7 +26,7 @@ class Selection:
 
     @property
     def ring(self) -> tuple[float, float, float] | None:
-        """Where the cluster stands in the map and how wide it is: x, y, radius [m]."""
+        """Position and size of the cluster in the map: x, y, radius [m]."""
         story = self.cluster
         if story is None:
             return None
@@ -34,7 +34,7 @@ class Selection:
         return (*story.position, reach)
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers; the story itself is asked for by who wants to read it."""
+        """Return the selection for the page; the explanation is requested separately."""
         story = self.cluster
         if story is None:
             return {"tree": self.tree, "cluster": None}
@@ -77,10 +77,10 @@ class Selecting:
         self._select(Selection(number))
 
     async def cluster(self, scan: int, cluster: int) -> None:
-        """Select a cluster, as it stands in a scan that was shown lately, with its tree.
+        """Select a cluster of a recently displayed scan, with its tree.
 
         Raises:
-            NoStoryError: It is not known any more.
+            NoStoryError: The cluster is no longer available.
         """
         run = self._run()
         story = await self.story(scan, cluster)
@@ -88,17 +88,17 @@ class Selecting:
             self._select(Selection(story.tree, story))
 
     def cluster_soon(self, scan: int, cluster: int) -> None:
-        """The same without waiting, for who cannot be told that it is not known any more; of clicks that
-        follow one another the last counts."""
+        """Select a cluster without waiting for the answer; of several clicks the last one counts."""
         self.leave()
         self._task = asyncio.create_task(self._if_known(scan, cluster), name="select")
 
     async def story(self, scan: int | None, cluster: int) -> ClusterStory:
-        """The story of a cluster: the selected one as it was when it was selected, others of scans that were
-        shown lately; None is the newest scan.
+        """Return the explanation of a cluster of a recent scan; None is the newest scan.
+
+        The explanation of the selected cluster is that of the time of its selection.
 
         Raises:
-            NoStoryError: There is none.
+            NoStoryError: The cluster is not available.
         """
         kept = self.selection.cluster
         if kept is not None and (kept.scan, kept.cluster) == (scan, cluster):
@@ -106,13 +106,13 @@ class Selecting:
         return await self._asking.cluster(self._newest() if scan is None else scan, cluster)
 
     def renamed(self, numbers: Mapping[int, int]) -> None:
-        """The map has other numbers: a selected tree that is there no more is selected no more."""
+        """Clear the selection of a tree that no longer exists after renumbering."""
         selected = self.selection
         if selected.tree is not None:
             self._select(Selection(numbers.get(selected.tree), selected.cluster))
 
     def leave(self) -> None:
-        """Wait no more for a story that was asked for."""
+        """Cancel the pending request for an explanation."""
         if self._task is not None:
             self._task.cancel()
 

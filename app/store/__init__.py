@@ -1,5 +1,5 @@
-"""What people say of the trees, kept on disk: runs, annotations and every edit of them.
+"""The store: runs, annotations and parameter sets in a database.
 
-Nothing that was acknowledged is lost, also after a power cut or `kill -9`. All calls block: the server
-makes them in a thread of their own (`app.dashboard.annotations`).
+No acknowledged edit is lost, even after a power cut or `kill -9`. All calls block; the server makes them in a
+separate thread (`async_store`).
 """

@@ -69,7 +69,7 @@ class Keeper:
             self._store = Store(self._folder, database=self._database)
         try:
             return function(self._store)
-        except SQLAlchemyError as error:  # a full disk, a server that went
+        except SQLAlchemyError as error:  # a full disk, a server that stopped
             raise StemmapError(
                 f"the database refused: {reason_of(error)}", remedy="Nothing was changed; try again"
             ) from None

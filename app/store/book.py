@@ -1,4 +1,4 @@
-"""What became of the runs: their figures, maps and parameters, and the recordings that were uploaded."""
+"""Records of runs (figures, maps, parameters) and of uploaded recordings."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from app.store.records import UnknownError
 _records, _maps, _revisions, _uploads = tables.records, tables.maps, tables.revisions, tables.uploads
 
 MOST_LISTED = 500
-# What was deleted can come back for a month.
+# Time during which a deletion can be undone.
 _KEPT_NS = 30 * 86_400 * 1_000_000_000
-# Changes of the same parameters by one person within this time are one: a slider that moves.
+# Changes of the same parameters by one person within this time count as one change (a slider drag).
 _ONE_MOVE_NS = 3_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """How a run begins: number of its source in the store, name, format in words, and how it was opened."""
+    """Start of a run: number of its source in the store, name, format, and the request that opened it."""
 
     run: int
     name: str
@@ -33,15 +33,18 @@ class Beginning:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What became of a run so far.
+    """Current result of a run.
 
     Attributes:
-        scans: Mapped; all_scans: of the source, None where it is not known.
-        time_s: Of the last of them; distance_m: driven.
-        trees: Confirmed ones.
-        preset, parameters: Name, and all values by dotted name.
-        scores: As the page shows them, or None.
-        map: Trees, path and truth, as plain lists.
+        scans: Number of mapped scans.
+        all_scans: Number of scans of the source, None if unknown.
+        time_s: Time of the last mapped scan since the first [s].
+        distance_m: Driven distance [m].
+        trees: Number of confirmed trees.
+        preset: Name of the preset.
+        parameters: All values by dotted name.
+        scores: Scores as shown on the page, or None.
+        map: Trees, path and ground truth as plain lists.
     """
 
     scans: int
@@ -57,7 +60,7 @@ class Standing:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Parameters that somebody changed: `changes` is name to [before, after]."""
+    """A change of parameters by a person; `changes` maps each name to [before, after]."""
 
     revision: int
     time_s: float
@@ -67,11 +70,11 @@ class Change:
 
 
 class RunBook:
-    """The records of all runs. Calls block.
+    """Records of all runs. All calls block.
 
     Args:
-        engine: Of the store.
-        clock: Nanoseconds since 1970.
+        engine: Database engine of the store.
+        clock: Returns the time in nanoseconds since 1970.
     """
 
     def __init__(self, engine: Engine, clock: Callable[[], int]) -> None:
@@ -79,7 +82,7 @@ class RunBook:
         self._clock = clock
 
     def begin(self, beginning: Beginning, standing: Standing) -> int:
-        """Make the record of a run that has begun; returns its number."""
+        """Create the record of a new run and return its number."""
         now = self._clock()
         with self._engine.begin() as connection:
             _forget_deleted(connection, now - _KEPT_NS)
@@ -103,7 +106,7 @@ class RunBook:
             return record
 
     def update(self, record: int, standing: Standing) -> None:
-        """Write what became of a run since."""
+        """Update the record of a run."""
         with self._engine.begin() as connection:
             values = {"changed_ns": self._clock(), **_figures(standing)}
             connection.execute(update(_records).where(_records.c.id == record).values(**values))
@@ -121,7 +124,7 @@ class RunBook:
                 _revise(connection, record, change, now)
 
     def listed(self) -> list[dict[str, Any]]:
-        """The runs, the newest first, without their maps."""
+        """Return the runs without their maps, newest first."""
         query = (
             _with_source()
             .where(_records.c.deleted_ns.is_(None))
@@ -132,10 +135,10 @@ class RunBook:
             return [_plain(row) for row in connection.execute(query).all()]
 
     def whole(self, record: int) -> dict[str, Any]:
-        """A run with its map and the revisions of its parameters, oldest first.
+        """Return a run with its map and its parameter revisions, oldest first.
 
         Raises:
-            UnknownError: There is none, or it was deleted.
+            UnknownError: The run does not exist or was deleted.
         """
         with self._engine.begin() as connection:
             row = _found(connection, record)
@@ -145,20 +148,20 @@ class RunBook:
         return {**_plain(row), "map": stored, "revisions": changes}
 
     def rename(self, record: int, name: str) -> None:
-        """Give a run another name.
+        """Rename a run.
 
         Raises:
-            UnknownError: There is none, or it was deleted.
+            UnknownError: The run does not exist or was deleted.
         """
         with self._engine.begin() as connection:
             _found(connection, record)
             connection.execute(update(_records).where(_records.c.id == record).values(name=name))
 
     def delete(self, record: int) -> None:
-        """Take a run away; for a month it can come back.
+        """Delete a run; the deletion can be undone for one month.
 
         Raises:
-            UnknownError: There is none.
+            UnknownError: The run does not exist.
         """
         with self._engine.begin() as connection:
             _found(connection, record)
@@ -170,7 +173,7 @@ class RunBook:
         """Undo the deletion of a run.
 
         Raises:
-            UnknownError: There is none any more.
+            UnknownError: The run no longer exists.
         """
         with self._engine.begin() as connection:
             found = connection.execute(
@@ -182,13 +185,13 @@ class RunBook:
     # --- uploads ---------------------------------------------------------------------------------
 
     def add_upload(self, file: str, name: str, kind: str, size: int) -> None:
-        """Remember how an uploaded file was called."""
+        """Store the original name of an uploaded file."""
         values = {"name": name[:200], "kind": kind[:200], "bytes": size, "at_ns": self._clock()}
         with self._engine.begin() as connection:
             connection.execute(insert(_uploads).values(file=file, **values))
 
     def uploads(self) -> dict[str, dict[str, Any]]:
-        """What is known of uploaded files, by their names in the folder."""
+        """Return the records of uploaded files by their names in the folder."""
         with self._engine.begin() as connection:
             return {row.file: _plain(row) for row in connection.execute(select(_uploads)).all()}
 
@@ -207,7 +210,7 @@ def _revise(connection: Connection, record: int, change: Change, now: int) -> No
 
 
 def _with_source() -> Select[Any]:
-    """The records with `source`, which two runs of one recording share."""
+    """Return the query of records with `source`, which all runs of one recording share."""
     return select(_records, tables.runs.c.source).join(tables.runs, tables.runs.c.id == _records.c.run)
 
 

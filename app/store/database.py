@@ -27,20 +27,20 @@ from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 from app.store.tables import metadata
 from pipeline.errors import StemmapError
 
-# Oldest first; the last is what `app.store.tables` says.
+# Oldest first; the last one corresponds to `app.store.tables`.
 REVISIONS = ("0001", "0002", "0003", "0004", "0005")
 _FOLDER = Path(__file__).parent / "migrations"
-# As alembic makes and reads it.
+# Version table of alembic.
 _version = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
 _BEFORE_ALEMBIC = "schema_version"
 _OWN_VERSIONS = {1: "0001", 2: "0002"}
 
 
 def bring_up_to_date(connection: Connection) -> None:
-    """Make the tables, or bring those of an older version to this one, within the open transaction.
+    """Create the tables, or migrate those of an older version, within the open transaction.
 
     Raises:
-        StemmapError: They are of a newer version, or not ours.
+        StemmapError: The tables are of a newer version or of another program.
     """
     names = set(inspect(connection).get_table_names())
     if not names:
@@ -70,7 +70,7 @@ def upgrade(connection: Connection, revision: str = "head") -> None:
 
 
 def _leave_own_version(connection: Connection) -> None:
-    """The first databases counted their version in a table of their own."""
+    """Convert the version table of the first databases to that of alembic."""
     own = Table(_BEFORE_ALEMBIC, MetaData(), autoload_with=connection)
     version = connection.execute(select(own.c.version)).scalar()
     if version not in _OWN_VERSIONS:
@@ -94,20 +94,20 @@ def _newer(version: object) -> StemmapError:
 FILE_NAME = "annotations.sqlite"
 _PATIENCE_MS = 5000
 _PATIENCE_S = 5
-# Any number, the same for every stemmap: who writes holds the lock of this number.
+# Number of the advisory lock that every writer holds; any constant.
 _LOCK = 7_330_117
 
 
 def open_engine(folder: Path | None, database: str = "") -> Engine:
-    """The engine on a database, whose tables are made or brought up to date.
+    """Return the engine of a database with current tables.
 
     Args:
-        folder: Of the SQLite file, made if it is not there; None keeps all in memory.
-        database: Address of a PostgreSQL database to be used instead.
+        folder: Folder of the SQLite file, created if necessary; None keeps the database in memory.
+        database: Address of a PostgreSQL database, used instead of the folder.
 
     Raises:
         StemmapError: The folder or the server cannot be used, or the database is damaged or of a newer
-            version; it is left as it is.
+            version; it is not modified.
     """
     if database:
         return _open_server(database)
@@ -144,7 +144,7 @@ def _open_server(database: str) -> Engine:
 
 
 def _sqlite(database: str) -> Engine:
-    # One connection, used by one thread at a time; a memory database lives as long as it.
+    # One connection, used by one thread at a time; an in-memory database exists as long as it.
     engine = create_engine(
         "sqlite+pysqlite://",
         creator=lambda: sqlite3.connect(database, isolation_level=None, check_same_thread=False),
@@ -160,7 +160,7 @@ def _sqlite(database: str) -> Engine:
 
     @event.listens_for(engine, "begin")
     def _(connection: Connection) -> None:
-        # Reads are followed by writes that rest on them: nobody else may write between.
+        # Writes depend on the reads before them: no other writer may come between.
         connection.exec_driver_sql("BEGIN IMMEDIATE")
 
     return engine
@@ -171,13 +171,13 @@ def _postgresql(url: URL) -> Engine:
         url.set(drivername="postgresql+psycopg"),
         pool_size=1,
         max_overflow=0,
-        pool_pre_ping=True,  # the server may have been started anew since
+        pool_pre_ping=True,  # the server may have been restarted
         connect_args={"connect_timeout": _PATIENCE_S, "application_name": "stemmap"},
     )
 
     @event.listens_for(engine, "begin")
     def _(connection: Connection) -> None:
-        # As BEGIN IMMEDIATE above. A lock that is not given in time is an error, not a server that hangs.
+        # Equivalent to BEGIN IMMEDIATE above. A lock that is not granted in time is an error.
         connection.exec_driver_sql(f"SET LOCAL lock_timeout = {_PATIENCE_MS}")
         connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LOCK})")
 
@@ -209,5 +209,5 @@ def _checked(engine: Engine, where: str) -> Engine:
 
 
 def reason_of(error: Exception) -> str:
-    """Why the database refused, in one line."""
+    """Return the reason of a database error in one line."""
     return " ".join(str(getattr(error, "orig", None) or error).lower().split())[:300]

@@ -1,5 +1,4 @@
-"""What the store keeps, as plain records. Lengths are metres in the frame of the map, times nanoseconds
-since 1970."""
+"""Records of the store. Lengths are metres in the map frame, times nanoseconds since 1970."""
 
 from __future__ import annotations
 
@@ -16,21 +15,21 @@ MOST_SETS = 200
 
 
 class StaleError(StemmapError):
-    """An edit of something that somebody else has changed since."""
+    """An edit of an annotation that another person has changed in the meantime."""
 
 
 class UnknownError(StemmapError):
-    """There is no such annotation or set."""
+    """The annotation, run or parameter set does not exist."""
 
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What somebody says to stand somewhere.
+    """Content of an annotation.
 
     Attributes:
-        x, y: [m].
-        kind: One of KINDS.
-        dbh: Diameter at breast height [m], None where nobody measured it.
+        x, y: Position [m].
+        kind: Class, one of KINDS.
+        dbh: Diameter at breast height [m], None if not measured.
     """
 
     x: float
@@ -41,11 +40,11 @@ class Content:
 
 @dataclass(frozen=True, slots=True)
 class Author:
-    """Who makes an edit.
+    """Author of an edit.
 
     Attributes:
-        browser: Whose edits can be undone together: a made-up number of the browser.
-        who: The name that others read.
+        browser: Random identifier of the browser, whose edits share one undo history.
+        who: Name that other people see.
     """
 
     browser: str
@@ -54,13 +53,13 @@ class Author:
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """An annotation as it stands.
+    """Current version of an annotation.
 
     Attributes:
-        id: Stays for ever, also when it was deleted and came back.
-        content: What is said.
-        who, at_ns: The last edit.
-        version: Grows by one with each edit.
+        id: Permanent identifier, also after a deletion was undone.
+        content: Position, class and DBH.
+        who, at_ns: Author and time of the last edit.
+        version: Number of edits.
     """
 
     id: int
@@ -72,12 +71,12 @@ class Annotation:
 
 @dataclass(frozen=True, slots=True)
 class SavedSet:
-    """Parameters that were saved under a name.
+    """A saved parameter set.
 
     Attributes:
-        name: By which people know it; there is one of each.
-        toml: The file that `--config` takes.
-        who, at_ns: Who saved it last, and when.
+        name: Unique name.
+        toml: Content of a file for `--config`.
+        who, at_ns: Author and time of the last save.
     """
 
     name: str
@@ -87,5 +86,5 @@ class SavedSet:
 
 
 def moment(at_ns: int) -> str:
-    """A time for people, to the second."""
+    """Return a time as text with a resolution of one second."""
     return datetime.fromtimestamp(at_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

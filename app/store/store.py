@@ -94,27 +94,27 @@ def request_of_record(row: Row[Any], uri: str) -> SourceRequest:
 
 
 class Sets:
-    """Reads and writes the saved sets.
+    """Saved parameter sets.
 
     Args:
-        engine: On the database.
-        clock: Nanoseconds since 1970.
+        engine: Database engine.
+        clock: Returns the time in nanoseconds since 1970.
     """
 
     def __init__(self, engine: Engine, clock: Callable[[], int]) -> None:
         self._engine, self._clock = engine, clock
 
     def all(self) -> list[SavedSet]:
-        """Every set, by name."""
+        """Return every set, sorted by name."""
         with self._engine.begin() as connection:
             rows = connection.execute(select(table).order_by(table.c.name)).all()
         return [SavedSet(row.name, row.toml, row.who, row.at_ns) for row in rows]
 
     def save(self, name: str, toml: str, who: str) -> None:
-        """Keep a set under a name; one that has the name already makes room for it.
+        """Save a set under a name; it replaces a set of the same name.
 
         Raises:
-            StemmapError: There would be too many.
+            StemmapError: The maximum number of sets is reached.
         """
         with self._engine.begin() as connection:
             connection.execute(delete(table).where(table.c.name == name))
@@ -124,31 +124,31 @@ class Sets:
             connection.execute(insert(table).values(**values))
 
     def delete(self, name: str) -> None:
-        """Forget a set.
+        """Delete a set.
 
         Raises:
-            UnknownError: There is none of this name.
+            UnknownError: No set has this name.
         """
         with self._engine.begin() as connection:
             if connection.execute(delete(table).where(table.c.name == name)).rowcount == 0:
                 raise UnknownError("there is no saved set of this name", where=name)
 
 
-# Longer ones were never the digests that all recordings have.
+# Longer keys are URIs, never digests.
 _LONGEST_KEY = 600
 _annotations, _changes, _steps, _runs = tables.annotated, tables.changes, tables.steps, tables.runs
 
 
 class Store:
-    """The annotations of all runs, and in `book` what became of the runs.
+    """Annotations of all runs; `book` holds the records of the runs.
 
     Args:
-        folder: Where the database is kept; None keeps it in memory.
-        clock: Nanoseconds since 1970.
-        database: Address of a PostgreSQL database in place of the folder.
+        folder: Folder of the database; None keeps it in memory.
+        clock: Returns the time in nanoseconds since 1970.
+        database: Address of a PostgreSQL database, used instead of the folder.
 
     Raises:
-        StemmapError: The database cannot be used; the file is left as it is.
+        StemmapError: The database cannot be used; the file is not modified.
     """
 
     def __init__(
@@ -160,19 +160,19 @@ class Store:
 
     @property
     def sets(self) -> Sets:
-        """The parameters that were saved, of all runs."""
+        """The saved parameter sets."""
         return Sets(self._engine, self._clock)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the database."""
         self._engine.dispose()
 
     def open_run(self, source: str, uri: str, name: str) -> int:
-        """The number of a run; the same source is the same run, wherever it lies.
+        """Return the number of a source; it does not depend on the path of the recording.
 
         Args:
-            source: Digest of what was recorded, else the URI.
-            uri, name: As it was opened now.
+            source: Digest of the recording, or its URI if it has no digest.
+            uri, name: Current URI and name.
         """
         now = {"uri": uri, "name": name, "opened_ns": self._clock()}
         source = _key(source)
@@ -184,21 +184,21 @@ class Store:
             return int(known)
 
     def annotations(self, run: int) -> list[Annotation]:
-        """Those that stand, in the order in which they were first made."""
+        """Return the annotations that are not deleted, in the order of their creation."""
         query = select(_annotations).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
         with self._engine.begin() as connection:
             rows = connection.execute(query.order_by(_annotations.c.id)).all()
         return [Annotation(row.id, _content(row), row.who, row.at_ns, row.version) for row in rows]
 
     def annotated_sources(self) -> list[AnnotatedSource]:
-        """All sources with annotations, and how each was mapped last."""
+        """Return all sources with annotations, and how each was mapped last."""
         return annotated_sources(self._engine)
 
     def add(self, run: int, author: Author, contents: Sequence[Content]) -> list[int]:
-        """Add annotations in one step; returns their ids.
+        """Add annotations in one step and return their ids.
 
         Raises:
-            StemmapError: The run would have too many.
+            StemmapError: The maximum number of annotations is reached.
         """
         with self._engine.begin() as connection:
             standing = select(func.count()).where(
@@ -210,33 +210,34 @@ class Store:
             return [self._add(connection, run, step, author, content) for content in contents]
 
     def change(self, run: int, author: Author, id_: int, version: int, content: Content) -> None:
-        """Say something else.
+        """Change the content of an annotation.
 
         Raises:
-            UnknownError: There is none with this id in the run.
-            StaleError: It is not of this version any more; who changed it and when is said.
+            UnknownError: The run has no annotation with this id.
+            StaleError: The annotation has another version; the message names author and time of the last
+                change.
         """
         self._edit(run, author, id_, version, content)
 
     def delete(self, run: int, author: Author, id_: int, version: int) -> None:
-        """Take it away. Raises as `change` does."""
+        """Delete an annotation; raises the same errors as `change`."""
         self._edit(run, author, id_, version, None)
 
     def undo(self, run: int, author: Author) -> None:
-        """Undo this browser's last step.
+        """Undo the last step of a browser.
 
         Raises:
-            StemmapError: There is none.
-            StaleError: Somebody else has changed since what it changed; the step is passed over from now on.
+            StemmapError: There is no step to undo.
+            StaleError: Another person has changed the annotation since; the step is skipped from now on.
         """
         self._turn(run, author, "undone")
 
     def redo(self, run: int, author: Author) -> None:
-        """Do again the step that this browser undid last. Raises as `undo` does."""
+        """Redo the step that a browser undid last; raises the same errors as `undo`."""
         self._turn(run, author, "done")
 
     def steps(self, run: int, browser: str) -> tuple[int, int]:
-        """How many steps a browser can undo and redo."""
+        """Return the number of steps that a browser can undo and redo."""
         query = select(_steps.c.state, func.count()).where(
             _steps.c.run == run, _steps.c.browser == browser, _steps.c.state != "left"
         )
@@ -260,7 +261,7 @@ class Store:
             self._change(connection, self._step(connection, run, author), author, row, content)
 
     def _step(self, connection: Connection, run: int, author: Author) -> int:
-        """A new step; what was undone before it cannot be done again."""
+        """Create a new step; steps that were undone before can no longer be redone."""
         of_browser = (_steps.c.run == run, _steps.c.browser == author.browser)
         connection.execute(update(_steps).where(*of_browser, _steps.c.state == "undone").values(state="left"))
         said = {"browser": author.browser, "who": author.who, "at_ns": self._clock(), "state": "done"}
@@ -290,7 +291,7 @@ class Store:
     def _put(
         self, connection: Connection, author: Author, row: Row[Any], content: dict[str, Any] | None, by: int
     ) -> None:
-        """Let this stand from now on; None: nothing."""
+        """Set the current content of an annotation; None deletes it."""
         edit = {"who": author.who, "at_ns": self._clock(), "version": row.version + 1, "made_by": by}
         connection.execute(
             update(_annotations)
@@ -314,13 +315,13 @@ class Store:
             for change, row in () if stale is not None else pairs:
                 content, by = (change.before, change.made_before) if back else (change.after, change.id)
                 self._put(connection, author, row, content, by)
-        if stale is not None:  # not before: that the step is passed over must last
+        if stale is not None:  # not earlier: the skip of the step must persist
             raise _stale(stale)
 
 
 def _next_step(connection: Connection, run: int, author: Author, to: str) -> int:
-    """The step to be undone or done again."""
-    # What was undone lies after what stands, and was undone from its end.
+    """Return the next step to undo or redo."""
+    # Undone steps follow the active ones and were undone from the end.
     newest, state = (func.max, "done") if to == "undone" else (func.min, "undone")
     query = select(newest(_steps.c.id)).where(
         _steps.c.run == run, _steps.c.browser == author.browser, _steps.c.state == state
@@ -340,12 +341,12 @@ def _content(row: Row[Any]) -> Content:
 
 
 def _key(source: str) -> str:
-    """A source as it is looked for: an index of PostgreSQL takes no entry of 2,700 bytes."""
+    """Return the lookup key of a source; PostgreSQL index entries are limited to 2,700 bytes."""
     return source if len(source) <= _LONGEST_KEY else f"sha256 {sha256(source.encode()).hexdigest()}"
 
 
 def _made(connection: Connection, statement: Insert) -> int:
-    """Insert a row; returns its id."""
+    """Insert a row and return its id."""
     key = connection.execute(statement).inserted_primary_key
     assert key is not None  # noqa: S101 - one row was inserted
     return int(key[0])

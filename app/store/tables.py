@@ -1,4 +1,4 @@
-"""The tables as this version has them; `app.store.migrations` leads there from older ones."""
+"""Tables of the current version; `app.store.migrations` converts older ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sqlalchemy import (
 
 metadata = MetaData()
 
-# What was recorded: the annotations of a recording are those of all its runs.
+# Sources: all runs of a recording share its annotations.
 runs = Table(
     "runs",
     metadata,
@@ -85,7 +85,7 @@ parameter_sets = Table(
     UniqueConstraint("name"),
 )
 
-# What became of a source under parameters: one row each time that it was opened and mapped.
+# Runs: one row for each time that a source was opened and mapped.
 records = Table(
     "run_records",
     metadata,
@@ -111,7 +111,7 @@ records = Table(
     sqlite_autoincrement=True,
 )
 
-# Apart from the records, so that a list of them stays small.
+# Separate from the records, so that their list is small.
 maps = Table(
     "run_maps",
     metadata,
