@@ -1,4 +1,4 @@
-"""Compiles on two cores what the first scan on a machine would compile on one, while a person waits."""
+"""Compiles the kernels of the mapper on two cores before the first scan."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from app.common.settings import data_folder
 #: A small machine that does other things beside may take half of it; what is kept until then is not lost.
 PATIENCE_S = 1800.0
 _HALVES = ("warm_eyes", "warm_map")
-# Who is ended without a word takes what it started along.
+# A process that is killed takes its children with it.
 _PROGRAM = (
     "from app.common.parent_watch import end_with; end_with({parent}); "
     "from app.worker.numba_warmup import {half}; {half}()"
@@ -25,21 +25,21 @@ _EACH_S = 0.2
 
 
 def compile_ahead() -> None:
-    """Wait until two processes have compiled the mapper's kernels, where nothing is kept of them yet.
+    """Compile the kernels of the mapper in two processes, unless they are cached already.
 
-    Nothing hangs on them: what they leave undone, or cannot keep, is compiled when it is called.
+    Kernels that remain uncompiled are compiled at their first call.
     """
     from pipeline.jit import others_compile
 
     if _cores() < len(_HALVES) or is_compiled():
         return
     with _one_at_a_time():
-        if not is_compiled():  # by who was first
+        if not is_compiled():  # by the process that was first
             _compile(others_compile)
 
 
 def is_compiled() -> bool:
-    """Whether this machine keeps the last kernels of either half, as the sources are now."""
+    """Return whether the kernels of both halves are cached for the current sources."""
     from pipeline.jit import is_kept
     from pipeline.tracking.track_classification import judge, nearest_other
 
@@ -47,7 +47,7 @@ def is_compiled() -> bool:
 
 
 def _cores() -> int:
-    """Those that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
@@ -69,8 +69,10 @@ def _compile(tell: Callable[[], None]) -> None:
 
 @contextmanager
 def _one_at_a_time() -> Iterator[None]:
-    """Inside, no other stemmap of this person compiles ahead: who comes second waits, then finds all kept.
-    Where there is no folder for a lock, or no lock on this system, nobody waits."""
+    """Hold the lock that lets one process of a user compile at a time; the next one then finds the cache.
+
+    Without a folder for the lock or file locks on this system, no process waits.
+    """
     from pipeline.jit import others_compile
 
     with ExitStack() as stack:
@@ -104,5 +106,5 @@ def _started(half: str) -> subprocess.Popen[bytes]:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C in the terminal is for this program, which then ends them
+        start_new_session=True,  # Ctrl-C in the terminal is for this process, which then ends its children
     )

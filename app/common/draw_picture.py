@@ -16,11 +16,11 @@ _DRAW = (sys.executable, "-P", "-m", "app.common.draw_picture")
 
 
 def drawn(told: dict[str, object], data: bytes) -> bytes | None:
-    """The JPEG, None where the process that decodes it dies, takes too long or says too much.
+    """Return a picture as JPEG, or None if the child process fails, takes too long or returns too much.
 
     Args:
-        told: See `app.common.draw_picture.draw`.
-        data: The picture.
+        told: Description of the picture, see `draw`.
+        data: Encoded picture.
     """
     try:
         done = subprocess.run(
@@ -40,16 +40,16 @@ _MODES = {"rgb8": ("RGB", "RGB", 3), "bgr8": ("RGB", "BGR", 3), "mono8": ("L", "
 
 
 def draw(told: dict[str, Any], data: bytes) -> bytes:
-    """The JPEG of a picture, with a box and a word in it where they are given.
+    """Return a picture as JPEG, optionally with a box and a label.
 
     Args:
-        told: encoding, width, height, step of raw pixels (encoding "" for a file); where something is to be
-            marked box: left, top, right, bottom [pixels], and text.
-        data: The picture.
+        told: encoding, width, height and step of raw pixels (encoding "" for an image file); optionally box
+            (left, top, right, bottom [pixels]) and text.
+        data: Encoded picture.
 
     Raises:
-        ValueError: It is too large, or of no known encoding.
-        OSError: It is damaged.
+        ValueError: The picture is too large or has an unknown encoding.
+        OSError: The picture is damaged.
     """
     from PIL import Image, ImageDraw
 
@@ -82,11 +82,11 @@ def draw(told: dict[str, Any], data: bytes) -> bytes:
 
 
 def main() -> None:
-    """Draw the picture that comes."""
+    """Read one picture, draw it and write the JPEG."""
     head, _, data = sys.stdin.buffer.read().partition(b"\n")
     try:
         drawn = draw(json.loads(head), data)
-    except Exception as error:  # whatever damage makes of a decoder
+    except Exception as error:  # a decoder may raise any exception on damaged data
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         sys.exit(1)
     sys.stdout.buffer.write(drawn)

@@ -1,6 +1,7 @@
-"""Whether the process that asked for this one is still there.
+"""Detection of the end of the parent process.
 
-Its number is handed over: who looks it up may look when it has gone already, and then waits for another one.
+The parent passes its process number, since a child that looks it up itself may be started after the parent
+has ended.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ _LOOK_S = 1.0
 
 
 def is_gone(parent: int) -> bool:
-    """Whether the process that started this one has ended; never on Windows, where one stands between."""
+    """Return whether the parent has ended; always False on Windows, where a launcher process is in
+    between."""
     return sys.platform != "win32" and os.getppid() != parent
 
 
 def end_with(parent: int) -> None:
-    """End this process when its parent does, in the middle of whatever it is doing."""
+    """End this process immediately when its parent ends."""
 
     def watch() -> None:
         while not is_gone(parent):

@@ -1,6 +1,6 @@
-"""Settings of a deployment, apart from the parameters of the mapping.
+"""Settings of a deployment, separate from the mapping parameters.
 
-Each can be given in the environment; a flag of the command line wins.
+Each setting has an environment variable; command-line flags take precedence.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Literal
 
 from pipeline.errors import StemmapError
 
-# Name in the environment, and what it means: the table from which the help is made.
+# Environment variables and their descriptions, from which the help text is made.
 VARIABLES: dict[str, str] = {
     "STEMMAP_HOST": "address to listen on, a loopback one (another needs the flag --host)",
     "STEMMAP_PORT": "port to listen on",
@@ -70,12 +70,12 @@ class Settings:
 
     @property
     def uploads(self) -> Path | None:
-        """Folder where uploaded recordings go, None where nothing is kept."""
+        """Folder of uploaded recordings, or None."""
         return self.recordings or (self.folder and self.folder / "recordings")
 
     @property
     def data_folders(self) -> tuple[Path, ...]:
-        """Folders whose recordings and finished runs the page offers, those that are there."""
+        """Existing folders whose recordings and finished runs the page offers."""
         named = (self.recordings, self.folder and self.folder / "recordings")
         return tuple(dict.fromkeys(folder for folder in named if folder is not None and folder.is_dir()))
 
@@ -86,7 +86,7 @@ class Settings:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name means this machine only."""
+    """Return whether an address or name is a loopback address."""
     if host == "localhost":
         return True
     try:
@@ -96,10 +96,10 @@ def is_loopback(host: str) -> bool:
 
 
 def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
-    """Settings from the variables STEMMAP_*.
+    """Return the settings from the environment variables STEMMAP_*.
 
     Raises:
-        StemmapError: A variable has a value that cannot be used.
+        StemmapError: A variable has an invalid value.
     """
     given = os.environ if environment is None else environment
     host = given.get("STEMMAP_HOST", DEFAULT_HOST)
@@ -131,7 +131,7 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
 
 
 def recordings_place(settings: Settings, now_s: float) -> Path:
-    """A new recording's file in the data folder, named by the time [s since 1970].
+    """Return the path of a new recording in the data folder, named by the time [s since 1970].
 
     Raises:
         StemmapError: There is no data folder.
@@ -142,7 +142,7 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
 
 
 def data_folder(given: Mapping[str, str]) -> Path | None:
-    """The data folder: the one that was named, else the usual one of the system."""
+    """Return the data folder: the configured one, or the default of the system."""
     if named := given.get("STEMMAP_FOLDER"):
         return Path(named).expanduser()
     home = given.get("HOME") or given.get("USERPROFILE")

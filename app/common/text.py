@@ -1,4 +1,4 @@
-"""Phrases that several rooms show to users."""
+"""Text that several packages show to users."""
 
 from __future__ import annotations
 
@@ -9,24 +9,27 @@ COMPILING = "compiling for this machine; it takes some minutes the first time, l
 
 
 def count(n: int, one: str, many: str = "") -> str:
-    """A number with its noun: "1 scan", "1,200 scans", "2 spans of scans".
+    """Return a number with its noun: "1 scan", "1,200 scans", "2 spans of scans".
 
     Args:
-        one: The noun; many: its plural where that is not one with an s.
+        n: Number.
+        one: Singular noun.
+        many: Plural, if it is not the singular with an s.
     """
     return f"{n:,} {one if n == 1 else many or f'{one}s'}"
 
 
-MOST = 6  # values that a line names
+MOST = 6  # maximum number of values in a line
 
 
 def changed_values(name: str, parameters: Parameters) -> dict[str, Value]:
-    """The values that differ from the preset of this name, by dotted name; all where there is none."""
+    """Return the values that differ from a preset, by dotted name; all values if the preset does not
+    exist."""
     return parameters.changes_from(preset(name)) if name in PRESETS else dict(parameters.flat())
 
 
 def preset_words(name: str, parameters: Parameters) -> str:
-    """For people: "preset forest", or "preset forest with clustering.eps = 0.2"."""
+    """Return a description such as "preset forest" or "preset forest with clustering.eps = 0.2"."""
     changed = changed_values(name, parameters)
     if not changed:
         return f"preset {name}"

@@ -14,12 +14,12 @@ P = ParamSpec("P")
 
 
 class Throttle(Generic[P]):
-    """Hands calls on at once when it can, and later when the last one was too short ago.
+    """Limits the rate of calls of a function; the newest arguments are used.
 
     Args:
-        function: What is called, on the event loop.
-        pause_s: At least so long from one call to the next.
-        share: At most this part of the loop's time is spent in the calls.
+        function: Function that is called on the event loop.
+        pause_s: Minimum time between two calls [s].
+        share: Maximum fraction of time that is spent in the calls.
     """
 
     def __init__(self, function: Callable[P, None], *, pause_s: float, share: float = 0.3) -> None:
@@ -31,7 +31,7 @@ class Throttle(Generic[P]):
         self._call: Callable[[], None] | None = None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Call now, or with the newest arguments as soon as it is time."""
+        """Call now, or later with the newest arguments."""
         self._call = lambda: self._function(*args, **kwargs)
         loop = asyncio.get_running_loop()
         if self._timer is None and loop.time() >= self._free_at:
@@ -40,7 +40,7 @@ class Throttle(Generic[P]):
             self._timer = loop.call_at(self._free_at, self._run)
 
     def cancel(self) -> None:
-        """Forget the call that waits."""
+        """Cancel the pending call."""
         self._call = None
         if self._timer is not None:
             self._timer.cancel()
@@ -79,7 +79,7 @@ class Stopwatch:
         self._disturbances = 0
 
     def disturb(self) -> None:
-        """What is being measured waits for something else, as for a kernel to be compiled."""
+        """Discard the current measurement, for example because a kernel was compiled meanwhile."""
         self._disturbances += 1
 
     @contextmanager
@@ -95,7 +95,7 @@ class Stopwatch:
 
     @contextmanager
     def whole_scan(self) -> Iterator[None]:
-        """Measure the mapping of one scan, all stages and what lies between them."""
+        """Measure the mapping of one scan including the time between the stages."""
         start, disturbances = self._clock(), self._disturbances
         try:
             yield
@@ -105,7 +105,7 @@ class Stopwatch:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Measure nothing: what is mapped is not of the run."""
+        """Disable measurements, since the mapped scan does not belong to the run."""
         self._aside = True
         try:
             yield
@@ -113,16 +113,16 @@ class Stopwatch:
             self._aside = False
 
     def clear(self) -> None:
-        """Forget what was measured."""
+        """Discard all measurements."""
         self._stages.clear()
         self._totals.clear()
 
     @property
     def scan_ms(self) -> float:
-        """Median time of a scan [ms], 0 before the first."""
+        """Return the median time of a scan [ms], 0 before the first."""
         return 1e3 * median(self._totals) if self._totals else 0.0
 
     @property
     def stage_ms(self) -> dict[str, float]:
-        """Median time of each stage [ms], in the order in which they first ran."""
+        """Return the median time of each stage [ms], in the order of their first run."""
         return {stage: 1e3 * median(times) for stage, times in self._stages.items() if times}

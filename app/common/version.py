@@ -1,10 +1,10 @@
-"""The version of the installed distribution."""
+"""Version of the installed distribution."""
 
 from __future__ import annotations
 
 
 def version() -> str:
-    """E.g. "0.1.0"."""
+    """Return the version, for example "0.1.0"."""
     from importlib.metadata import version as of
 
     return of("stemmap")

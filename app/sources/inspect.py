@@ -1,4 +1,4 @@
-"""What a person can choose of a source before it is opened: topics by role, and where the LiDAR stands."""
+"""Contents of a source before it is opened: topics by role, and the mounting of the LiDAR."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _ROLES = {kind: role for role, kinds in reversed(TYPES_BY_ROLE.items()) for kind
 
 
 def recorded(uri: str) -> dict[str, Any]:
-    """Of a file, folder or simulated run.
+    """Return the contents of a file, folder or simulated run.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The source cannot be read.
     """
     if is_cloud(uri):
         raise SourceError("a whole cloud has no topics", where=uri, remedy="Open it as it is")
@@ -52,10 +52,10 @@ def recorded(uri: str) -> dict[str, Any]:
 
 
 def heard(uri: str) -> dict[str, Any]:
-    """Of a robot that is there now: its topics, and how often those come that something can be made of.
+    """Return the topics of a live robot with the rates of the usable ones.
 
     Raises:
-        SourceError: The address is none.
+        SourceError: The address is invalid.
     """
     address, inbox = parse_address(uri), CountingInbox()
     make_link, _ = link_for(address)
@@ -77,7 +77,7 @@ def heard(uri: str) -> dict[str, Any]:
 
 
 def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, Any]:
-    """A topic for people."""
+    """Return the description of a topic."""
     why = ""
     if listened and not heard.messages and not publisher.topic.endswith("tf_static"):
         why = f"silent for {COUNT_S:g} s"

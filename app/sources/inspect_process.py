@@ -1,7 +1,7 @@
-"""A short process that reads what comes from outside: `python -m app.sources.inspect_process`.
+"""Child process that inspects files from outside: `python -m app.sources.inspect_process`.
 
-One question comes as JSON on stdin, one answer goes as JSON to stdout; both are plain values. Whatever a
-damaged or hostile file does to a reader, it does it here and not to the server.
+It reads one question as JSON from stdin and writes one answer as JSON to stdout. A damaged or hostile file
+can affect only this process and not the server.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ HYPOTHESES = 1_000_000
 
 
 def recording(question: dict[str, Any]) -> dict[str, Any]:
-    """What is in a recording, recognised by its contents."""
+    """Return a description of a recording, which is recognised by its contents."""
     from pipeline.io.readers import open_source
 
     with closing(open_source(question["path"])) as source:
@@ -35,7 +35,7 @@ def recording(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def inside(question: dict[str, Any]) -> dict[str, Any]:
-    """The topics of a source, what they are read as, and where the LiDAR stands."""
+    """Return the topics of a source with their roles, and the mounting of the LiDAR."""
     from app.robot.address import is_live
     from app.sources.inspect import heard, recorded
 
@@ -43,7 +43,7 @@ def inside(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def finished(question: dict[str, Any]) -> dict[str, Any]:
-    """The map and the figures in a folder that `stemmap map` wrote."""
+    """Return map and figures of a folder that `stemmap map` wrote."""
     import numpy as np
 
     from app.batch.run_folder import read_run, read_run_record
@@ -73,7 +73,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def laid(question: dict[str, Any]) -> dict[str, Any]:
-    """The pose of one map in another, found by the distances between the stems."""
+    """Return the pose of one map in another, found by stem matching."""
     import numpy as np
 
     from pipeline.config import preset
@@ -106,7 +106,7 @@ QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 
 def answer(text: str) -> dict[str, Any]:
-    """The answer to a question, or the error for people."""
+    """Return the answer to a question, or an error message."""
     question = json.loads(text)
     try:
         return {"answer": QUESTIONS[question["ask"]](question)}
@@ -117,7 +117,7 @@ def answer(text: str) -> dict[str, Any]:
 
 
 def _scores(evaluation: object) -> dict[str, Any] | None:
-    """The scores as the page shows them, from run.json."""
+    """Return the scores from run.json as the page shows them."""
     if not isinstance(evaluation, dict):
         return None
     known = {name: _number(value) for name, value in evaluation.items()}
@@ -153,11 +153,11 @@ def _number(value: object) -> float | int | None:
 def main() -> None:
     """Answer one question."""
     outgoing = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # a library may print
+    os.dup2(2, 1)  # libraries may print
     told = json.dumps(answer(sys.stdin.read()), allow_nan=False)
     outgoing.write(told)
     outgoing.flush()
-    os._exit(0)  # nothing is left to be saved
+    os._exit(0)  # there is nothing to save
 
 
 if __name__ == "__main__":

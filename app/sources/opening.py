@@ -20,12 +20,12 @@ Method = Literal["source", "kiss-icp", "static", "file"]
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What tells the motion of a source.
+    """Selected source of motion.
 
     Attributes:
-        method: "source" is what the source itself tells.
-        words: For people: what it is, and why.
-        warning: What a person should know of it, "" for nothing.
+        method: "source" uses the odometry of the source itself.
+        words: Description and reason for people.
+        warning: Warning for people, or "".
     """
 
     method: Method
@@ -34,19 +34,19 @@ class Chosen:
 
     @property
     def steps(self) -> OdometryChoice:
-        """The choice as the synchroniser needs it."""
+        """The choice in the form that the synchroniser needs."""
         return "static" if self.method == "static" else "auto"
 
 
 def choose_odometry(known: SourceDescription, choice: str) -> Chosen:
-    """What a choice means for a source.
+    """Return the source of motion for a choice of the user.
 
     Args:
-        known: Of the source.
+        known: Description of the source.
         choice: "auto", "wheels", "kiss-icp", "static", or "file:" and a path.
 
     Raises:
-        SourceError: What is asked for cannot be had of this source.
+        SourceError: The choice is not available for this source.
     """
     if choice.startswith(FILE):
         return Chosen("file", f"poses from {choice.removeprefix(FILE)}, as asked")
@@ -76,7 +76,7 @@ def choose_odometry(known: SourceDescription, choice: str) -> Chosen:
 
 
 def _no_matching(known: SourceDescription) -> str:
-    """Why scans of a source cannot be laid over one another, "" when they can."""
+    """Return why LiDAR odometry is not available for a source, or ""."""
     if known.preset == "stems":
         return "stems are no scans"
     if known.sensor.rings == 1:
@@ -85,10 +85,10 @@ def _no_matching(known: SourceDescription) -> str:
 
 
 def motion_of(known: SourceDescription, choice: str, chosen: Chosen) -> OdometryEstimator | None:
-    """What makes the motion; None where the source tells it, or nobody does.
+    """Return the reader of the motion; None if the source provides it or there is none.
 
     Raises:
-        SourceError: A file of poses cannot be read.
+        SourceError: A pose file cannot be read.
     """
     if chosen.method == "kiss-icp":
         from pipeline.odometry.lidar_odometry import LidarOdometry
@@ -102,10 +102,10 @@ def motion_of(known: SourceDescription, choice: str, chosen: Chosen) -> Odometry
 
 
 def with_odometry(source: Source, choice: str) -> tuple[Source, Chosen]:
-    """The source with the motion that is chosen, and what that is.
+    """Return the source with the selected motion, and the selection.
 
     Raises:
-        SourceError: What is asked for cannot be had of this source.
+        SourceError: The choice is not available for this source.
     """
     from pipeline.io.readers.base import digest_of
 
@@ -119,9 +119,9 @@ def with_odometry(source: Source, choice: str) -> tuple[Source, Chosen]:
 
 
 def open_any(uri: str, options: SourceOptions) -> Source | LiveSource:
-    """Open what a user named.
+    """Open a source named by the user.
 
     Raises:
-        SourceError: It is not there, of a kind that cannot be read, or damaged.
+        SourceError: The source does not exist, has an unknown format, or is damaged.
     """
     return open_live(uri, options) if is_live(uri) else open_source(uri, options)

@@ -1,4 +1,4 @@
-"""Asks `app.sources.inspect_process` in a process of its own, which may not take long, nor say too much."""
+"""Runs `app.sources.inspect_process` in a child process with limits on time and output."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from weakref import WeakKeyDictionary
 
 from pipeline.errors import SourceError, StemmapError
 
-# -P: a folder that holds a file `app.py` must not decide what runs.
+# -P: a file `app.py` in the working directory must not replace this package.
 EXAMINE = (sys.executable, "-P", "-m", "app.sources.inspect_process")
 PATIENCE_S = 120.0
 LARGEST_ANSWER = 64 << 20
 
 _MOST_AT_ONCE = 2
-# A semaphore belongs to the loop in which somebody first waited for it.
+# A semaphore belongs to the event loop of its first use.
 _rooms: WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Semaphore] = WeakKeyDictionary()
 
 
 class TookTooLongError(StemmapError):
-    """The process was ended because it took too long."""
+    """The child process was ended because it took too long."""
 
 
 async def ask(
     question: dict[str, Any], *, patience_s: float = PATIENCE_S, command: Sequence[str] = EXAMINE
 ) -> dict[str, Any]:
-    """The answer to a question of `app.sources.inspect_process.QUESTIONS`.
+    """Return the answer to a question of `app.sources.inspect_process.QUESTIONS`.
 
     Raises:
-        SourceError: What was asked about cannot be read; the error says why.
+        SourceError: The source cannot be read; the error gives the reason.
         TookTooLongError: There was no answer in time.
     """
     async with _room():
@@ -54,7 +54,7 @@ async def ask(
 
 
 def _room() -> asyncio.Semaphore:
-    """Of the running loop."""
+    """Return the semaphore of the running event loop."""
     return _rooms.setdefault(asyncio.get_running_loop(), asyncio.Semaphore(_MOST_AT_ONCE))
 
 

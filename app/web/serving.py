@@ -33,8 +33,12 @@ _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="refe
 
 @contextlib.contextmanager
 def page_that_leads_to(link: str) -> Iterator[Path]:
-    """A file that only its owner can read and that leads a browser on to a link: what a program is
-    called with, everybody on the machine can read. It is removed at the end."""
+    """Create a file, readable only by its owner, that redirects a browser to a link, and remove it at the
+    end.
+
+    Command-line arguments are visible to all users of a machine, so the link with its token is not passed to
+    the browser.
+    """
     number, name = tempfile.mkstemp(prefix="stemmap-", suffix=".html")  # readable by its owner only
     page = Path(name)
     try:
@@ -46,7 +50,7 @@ def page_that_leads_to(link: str) -> Iterator[Path]:
 
 
 def show_in_browser(page: Path) -> None:
-    """Have the person's browser open a file; where there is none, nothing happens."""
+    """Open a file in the default browser, if there is one."""
     import webbrowser
 
     with contextlib.suppress(webbrowser.Error):
@@ -54,7 +58,7 @@ def show_in_browser(page: Path) -> None:
 
 
 _PORTS_TRIED = 10
-# Less waits in the kernel for a browser behind a slow radio link; what waits is old when it arrives.
+# A small send buffer: data that waits in the kernel for a slow link is outdated when it arrives.
 _SEND_BUFFER = 128 * 1024
 _GRACE_S = 1
 _OF_THE_PORT = (errno.EADDRINUSE, errno.EACCES)
@@ -69,10 +73,10 @@ def serve(
     open_browser: bool,
     viewer: bool = False,
 ) -> int:
-    """Serve the dashboard until SIGINT or SIGTERM; with `viewer` print the link for looking only too.
+    """Serve the dashboard until SIGINT or SIGTERM; `viewer` also prints the view-only link.
 
     Raises:
-        StemmapError: The port is in use, or the address is not one of this machine.
+        StemmapError: The port is in use, or the address is not an address of this machine.
     """
     listening = bind(settings)
     port = listening.getsockname()[1]
@@ -88,30 +92,30 @@ def serve(
 
 
 def link_of(settings: Settings, port: int, token: str) -> str:
-    """The link that opens the page."""
+    """Return the link that opens the page."""
     return f"http://{_name(settings.host)}:{port}/?token={token}"
 
 
 def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
-    """How the application is served."""
+    """Return the uvicorn configuration of the application."""
     return uvicorn.Config(
         app,
         ws="websockets-sansio",
         ws_max_size=settings.message_limit,
-        ws_per_message_deflate=False,  # points do not get smaller, and it costs a core
+        ws_per_message_deflate=False,  # point clouds do not compress well, and compression costs a core
         timeout_graceful_shutdown=_GRACE_S,
         server_header=False,
         log_level="warning",
-        access_log=False,  # the token is in the first address
+        access_log=False,  # the first address contains the token
         lifespan="on",
     )
 
 
 def bind(settings: Settings) -> socket.socket:
-    """A listening socket on the port asked for, or where none was, on the first free one.
+    """Return a listening socket on the requested port or, without one, on the first free port.
 
     Raises:
-        StemmapError: There is none.
+        StemmapError: No port is free.
     """
     first = DEFAULT_PORT if settings.port is None else settings.port
     ports = [first] if settings.port is not None else range(first, first + _PORTS_TRIED)
@@ -140,15 +144,15 @@ def bind(settings: Settings) -> socket.socket:
 
 
 def bound(host: str, port: int) -> socket.socket:
-    """A listening socket on a port.
+    """Return a listening socket on a port.
 
     Raises:
-        OSError: It is not free, or not of this machine.
+        OSError: The port is in use, or the address is not an address of this machine.
     """
     family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     listening = socket.socket(family, kind, protocol)
     try:
-        if os.name == "posix":  # elsewhere it would let two servers have one port
+        if os.name == "posix":  # on other systems it would permit two servers on one port
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         listening.bind(address)
@@ -160,7 +164,7 @@ def bound(host: str, port: int) -> socket.socket:
 
 
 class LinkedServer(uvicorn.Server):
-    """Says where it is once it is ready, and ends without a traceback."""
+    """uvicorn server that prints its link when it is ready and ends without a traceback."""
 
     def __init__(self, config: uvicorn.Config, settings: Settings, link: str, *, open_browser: bool) -> None:
         super().__init__(config)
@@ -184,7 +188,7 @@ class LinkedServer(uvicorn.Server):
             threading.Thread(target=show_in_browser, args=(page,), daemon=True).start()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End, and leave no file behind."""
+        """Shut down and remove temporary files."""
         self._until_the_end.close()
         await super().shutdown(sockets)
 
@@ -206,7 +210,7 @@ def _has_display() -> bool:
 
 
 def _name(host: str) -> str:
-    """The host as it stands in a link."""
+    """Return the host as it is written in a link."""
     if host in ("0.0.0.0", "::"):  # noqa: S104 - compared with, not bound to
         return socket.gethostname()
     return f"[{host}]" if ":" in host else host

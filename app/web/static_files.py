@@ -1,4 +1,4 @@
-"""Where the page's files lie: beside the source, in the installed package, and in plotly."""
+"""Locations of the static files: source checkout, installed package, and plotly."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pipeline.errors import StemmapError
 
 @cache
 def page_folder() -> Path:
-    """The folder of index.html: `app/static` of an installed package, or `static/` of a checkout.
+    """Return the folder of index.html: `app/static` of an installed package, or `static/` of a checkout.
 
     Raises:
-        StemmapError: Neither is there.
+        StemmapError: Neither folder exists.
     """
     package = Path(str(files("app")))
     for folder in (package / "static", package.parent / "static"):
@@ -26,7 +26,7 @@ def page_folder() -> Path:
 
 @cache
 def plotly_script() -> Path:
-    """plotly.min.js of the installed plotly, found without importing it (which takes long).
+    """Return the path of plotly.min.js without importing plotly, which is slow.
 
     Raises:
         StemmapError: plotly is not installed.

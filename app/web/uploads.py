@@ -1,4 +1,4 @@
-"""Recordings that come from a browser: streamed into the data folder, and kept only when they can be read."""
+"""Uploaded recordings: streamed into the data folder, and kept only if they can be read."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from app.sources import sandbox
 from app.store.async_store import Keeper
 from pipeline.errors import StemmapError
 
-# What a disk keeps free for the system and for the annotations.
+# Free disk space that is reserved for the system and for annotations.
 SPARE_BYTES = 1 << 30
 MOST_AT_ONCE = 2
 _CHUNK = 4 << 20
 _STALLED_S = 60.0
-# A part that nobody has written to for so long is of a server that ended.
+# An incomplete file that has not been written for this long belongs to a terminated server.
 _ABANDONED_S = 3600.0
 _PART = ".upload-"
 _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}\Z")
 
 
 class UploadError(StemmapError):
-    """An upload that is refused; nothing of it stays. `status` is that of the answer."""
+    """An upload that is refused and removed; `status` is the HTTP status of the response."""
 
     def __init__(self, status: int, what: str, *, where: str = "", remedy: str = "") -> None:
         super().__init__(what, where=where, remedy=remedy)
@@ -36,21 +36,21 @@ class UploadError(StemmapError):
 
 
 class Uploads:
-    """Takes uploads into a folder.
+    """Stores uploads in a folder.
 
     Args:
-        folder: Made when it is first needed; None where nothing is kept.
-        limit: Largest file [bytes].
-        keeper: Of the store, which remembers how a file was called.
+        folder: Created with the first upload; None refuses uploads.
+        limit: Maximum size of a file [bytes].
+        keeper: Access to the store, which records the original names.
     """
 
     def __init__(self, folder: Path | None, limit: int, keeper: Keeper) -> None:
         self._folder, self.limit, self._keeper = folder, limit, keeper
         self._under_way = 0
-        self._awaited = 0  # bytes that uploads under way have not written yet
+        self._awaited = 0  # bytes that active uploads have not written yet
 
     def room(self) -> int:
-        """Bytes that an upload may have now.
+        """Return the maximum size of an upload at present [bytes].
 
         Raises:
             UploadError: There is no folder for uploads.
@@ -58,10 +58,10 @@ class Uploads:
         return max(0, min(self.limit, self._free() - self._awaited))
 
     async def take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
-        """Take a file of so many bytes; returns where it lies and what it is.
+        """Receive a file of the announced size and return its path and description.
 
         Raises:
-            UploadError: It is too large, does not come whole, or cannot be read.
+            UploadError: The file is too large, incomplete, or cannot be read.
         """
         if self._under_way >= MOST_AT_ONCE:
             raise UploadError(409, f"{MOST_AT_ONCE} uploads are under way", remedy="Wait until one is done")
@@ -75,7 +75,7 @@ class Uploads:
         free = await asyncio.to_thread(self._free)
         room = max(
             0, min(self.limit, free - self._awaited)
-        )  # what others were promised while this waited too
+        )  # includes space reserved by other uploads in the meantime
         if size > room:
             why = "the limit" if size > self.limit else "what the disk has free"
             raise UploadError(
@@ -83,7 +83,7 @@ class Uploads:
             )
         if size <= 0:
             raise UploadError(422, "the file is empty", where=name)
-        # The reader looks at the contents first, but a file of bare floats has nothing but its name.
+        # Readers inspect the contents first, but a file of plain floats is recognised only by its name.
         suffix = Path(name).suffix.lower()
         suffix = suffix if _SUFFIX.match(suffix) else ""
         part = self._place() / f"{_PART}{secrets.token_hex(8)}{suffix}"
@@ -97,7 +97,7 @@ class Uploads:
             raise UploadError(507, f"the file cannot be kept: {error.strerror}", where=name) from None
         finally:
             part.unlink(missing_ok=True)
-        with contextlib.suppress(StemmapError):  # then it is listed under its made-up name
+        with contextlib.suppress(StemmapError):  # it is then listed under its generated name
             await self._keeper.ask(lambda store: store.book.add_upload(made_up, _shown(name), kind, size))
         return {"uri": str(place), "name": _shown(name), "kind": kind, "bytes": size}
 
@@ -119,7 +119,7 @@ class Uploads:
             self._awaited -= awaited
 
     def clear(self) -> None:
-        """Remove what servers left that were ended in the middle of an upload."""
+        """Remove incomplete uploads of servers that were terminated."""
         if self._folder is None or not self._folder.is_dir():
             return
         for part in self._folder.glob(f"{_PART}*"):
@@ -140,13 +140,13 @@ class Uploads:
 
 
 async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Callable[[int], None]) -> None:
-    """Write the file in large pieces, each in a thread; `wrote` is told the length of each.
+    """Write the file in large blocks, each in a thread; `wrote` is called with the length of each block.
 
     Raises:
-        UploadError: The browser left, sends nothing any more, or sends another length than it said.
+        UploadError: The browser disconnected, stalled, or sent another length than announced.
     """
     written, waiting = 0, bytearray()
-    # Not in a thread: who is cancelled meanwhile would not know of the file that comes after all.
+    # Not in a thread: a cancelled request would not notice the file that is created afterwards.
     file = part.open("xb")
     try:
         async for piece in _in_time(stream):
@@ -176,20 +176,20 @@ async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 
 async def _look_at(part: Path, name: str) -> str:
-    """What the file is, in words, found out by a process of its own."""
+    """Return a description of the file, found by a child process."""
     try:
         told = await sandbox.ask({"ask": "recording", "path": str(part)})
     except sandbox.TookTooLongError:
-        return "not looked through yet"  # a very large one; opening it will tell
+        return "not looked through yet"  # a very large file; errors appear when it is opened
     except StemmapError as error:
-        # The path is of the part; the person knows the file by its name.
+        # The path is that of the incomplete file; the person knows the original name.
         what, remedy = (text.replace(str(part), name) for text in (error.what, error.remedy))
         raise UploadError(422, what, where=_shown(name), remedy=remedy) from None
     return str(told["kind"])
 
 
 def _shown(name: str) -> str:
-    """The name without folders and without what would steer a terminal."""
+    """Return the name without folders and without control characters."""
     last = name.replace("\\", "/").rpartition("/")[2]
     return "".join(letter for letter in last if letter.isprintable())[:200] or "recording"
 

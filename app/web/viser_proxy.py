@@ -1,8 +1,8 @@
-"""viser behind our own port: its page, and a bridge between the websocket of a browser and that of viser.
+"""Proxy to viser: its client page, and a bridge between the websocket of a browser and that of viser.
 
-viser has no login. It listens on this machine only, requires a secret that only the bridge knows, and
-receives only the messages that a browser may send: viser would open a public tunnel, or accept a file,
-for anybody.
+viser has no authentication. It listens on loopback only, requires a secret that only the bridge knows, and
+receives only
+permitted messages: without the filter, any browser could open a public tunnel or upload files.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _Value = bool | int | float | _Text | Annotated[list[bool | int | float | _Text]
 
 
 class _FromBrowser(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="type"):
-    """viser names the kind of a message in its field `type`."""
+    """Message of a browser; viser stores the kind of a message in the field `type`."""
 
 
 class _Camera(_FromBrowser, frozen=True, tag="ViewerCameraMessage"):
@@ -101,7 +101,7 @@ class _ControlsEnd(_FromBrowser, frozen=True, tag="TransformControlsDragEndMessa
 
 
 class _Updates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Only the value of a control may be changed, not how it looks or what it shows."""
+    """Permitted changes of a control: only its value."""
 
     value: _Value
 
@@ -117,12 +117,12 @@ class _Command(_FromBrowser, frozen=True, tag="CommandTriggerMessage"):
 
 _Allowed = _Camera | _Pointer | _Click | _Drag | _Controls | _ControlsStart | _ControlsEnd | _Gui | _Command
 _decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_Allowed)
-# A camera is a browser's own; all else is everybody's.
+# Each browser has its own camera; all other messages affect everybody.
 _viewers_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_Camera)
 
 
 def is_allowed(message: bytes, *, looks_only: bool = False) -> bool:
-    """Whether a browser, or one that may look and not touch, may send this to viser."""
+    """Return whether a browser, or a view-only browser, may send a message to viser."""
     if len(message) > LARGEST:
         return False
     try:
@@ -145,14 +145,14 @@ def _is_finite(value: object) -> bool:
 _log = logging.getLogger(__name__)
 
 _LARGEST_FROM_VISER = 64 * 1024 * 1024
-# Little is kept between viser and a slow browser: what waits there is old when it arrives.
+# Short queues between viser and a slow browser: waiting data is outdated when it arrives.
 _QUEUE, _SOCKET_BUFFER = 2, 256 * 1024
 _PROTOCOLS = 4
 _TRY_AGAIN_LATER = 1013
 
 
 class ViserServer(Protocol):
-    """Where viser listens; the port may change when it is renewed."""
+    """Port and secret of viser; the port may change when viser is restarted."""
 
     @property
     def port(self) -> int: ...
@@ -161,7 +161,7 @@ class ViserServer(Protocol):
 
 
 def client_page() -> Path:
-    """The page of the installed viser, which speaks the protocol of exactly this version."""
+    """Return the client page of the installed viser version."""
     import viser
 
     return Path(viser.__file__).parent / "client" / "build" / "index.html"
@@ -193,7 +193,7 @@ async def bridge(
         await browser.accept(upstream.subprotocol)
         await _carry(browser, upstream, looks_only)
     if browser.application_state is WebSocketState.CONNECTED:
-        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # it has just left by itself
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # it has disconnected
             await browser.close()
 
 
@@ -220,7 +220,7 @@ async def _connect(viser: ViserServer, user: str, protocols: list[Subprotocol]) 
 
 
 async def _carry(browser: WebSocket, upstream: ClientConnection, looks_only: bool) -> None:
-    """Both directions at once; the first that ends, ends the other."""
+    """Forward both directions; the first one that ends also ends the other."""
     directions = {
         asyncio.create_task(_to_browser(browser, upstream)),
         asyncio.create_task(_to_viser(browser, upstream, looks_only)),
@@ -237,7 +237,7 @@ async def _carry(browser: WebSocket, upstream: ClientConnection, looks_only: boo
 
 
 async def _to_browser(browser: WebSocket, upstream: ClientConnection) -> None:
-    # Sending waits while the browser's socket is full, and then nothing more is taken from viser.
+    # Sending blocks while the socket of the browser is full; nothing is then received from viser.
     with contextlib.suppress(ConnectionClosed, WebSocketDisconnect):
         async for message in upstream:
             await (browser.send_bytes(message) if isinstance(message, bytes) else browser.send_text(message))

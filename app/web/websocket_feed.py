@@ -1,4 +1,4 @@
-"""What browsers are told over a websocket, as long as they listen."""
+"""Feed of state changes to a browser over a websocket."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from app.dashboard.broadcast import Listener, Live
 
 @contextlib.asynccontextmanager
 async def telling(browser: WebSocket, live: Live) -> AsyncIterator[None]:
-    """Inside, a browser is told all that changes."""
+    """Send all state changes to a browser while the context is active."""
     with live.listener() as listener:
         sending = asyncio.create_task(_send(browser, listener))
         try:
