@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,7 +57,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--viewer", action="store_true", help="also print a view-only link")
     parser.add_argument("--no-browser", action="store_true", help="print the link without opening a browser")
     width = max(map(len, VARIABLES))
-    table = "\n".join(f"  {name:{width}}  {meaning}" for name, meaning in VARIABLES.items())
+    table = "\n".join(
+        textwrap.fill(meaning, 110, initial_indent=f"  {name:{width}}  ", subsequent_indent=" " * (width + 4))
+        for name, meaning in VARIABLES.items()
+    )
     parser.epilog = f"Settings in the environment (flags win):\n{table}"
 
 

@@ -26,8 +26,8 @@ VARIABLES: dict[str, str] = {
     "STEMMAP_RECORDINGS": "folder whose recordings the page offers",
     "STEMMAP_FOLDER": "folder for runs, annotations and uploads (default: stemmap in your folder for data)",
     "STEMMAP_DATABASE": "PostgreSQL database for runs and annotations, postgresql://name@host/database",
-    "STEMMAP_FILES": "files that the owner's link may open: any, or folders for those of the data folder only"
-    " (default: any from this machine, folders from elsewhere; set folders behind a proxy or tunnel)",
+    "STEMMAP_FILES": "files that the owner's link may open: any, or folders (only those in the data folders);"
+    " default: any for requests from this machine, folders for others; set folders behind a proxy or tunnel",
     "STEMMAP_UPLOAD_GB": "largest recording that a browser may upload, in GB (default: 20)",
 }
 

@@ -94,7 +94,7 @@ class _Table:
             raise SourceError(
                 f"line {self.lines[row]}: {name} = {text!r} is out of range",
                 where=self.where,
-                remedy=f"Numbers must be below {COORDINATE_LIMIT:.0e}.",
+                remedy=f"Give numbers between -{COORDINATE_LIMIT:,.0f} and {COORDINATE_LIMIT:,.0f}",
             )
         return value
 

@@ -289,9 +289,9 @@ def test_a_mapping_says_what_came_of_it(tmp_path, capsys):
     assert all(line.startswith("warning: ") for line in told.err.splitlines())
     assert told.out.startswith(f"{RUN}: 20 scans, 1.9 s")
     for words in (
-        "found (TA) ",
-        "left out (TR) ",
-        "for trees (FA) ",
+        "trees found (TA) ",
+        "other objects left out (TR) ",
+        "mapped as trees (FA) ",
         "missed (FR) ",
         "completeness",
         "mean pair error",
@@ -441,7 +441,7 @@ def test_the_map_of_another_source_is_overwritten_when_asked_alone(mapped, tmp_p
     stemmap(capsys, "map", RUN, "--out", folder).refused(1, "sim:paper?duration=4", "--force")
     assert (folder / "trees.csv").read_bytes() == (mapped / "trees.csv").read_bytes()
     told = stemmap(capsys, "map", "sim:paper?duration=4", "--out", folder, "--stop-after", "3")
-    assert f"files in {folder}, in place of" in told.out
+    assert f"files in {folder} (replaced)" in told.out
     assert stemmap(capsys, "map", RUN, "--out", folder, "--force").code == 0
     assert json.loads((folder / "run.json").read_text())["source"]["uri"] == RUN
     (folder / "run.json").write_text("{")

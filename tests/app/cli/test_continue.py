@@ -90,9 +90,9 @@ def test_the_same_recording_twice_is_warned_of(stand, tmp_path, capsys):
         "5",
     ]
     assert main([*words, "--start", "0,0,0"]) == 0
-    assert "in the map already" in capsys.readouterr().err
+    assert "already part of the map" in capsys.readouterr().err
     assert main([*words, "--start", "resume"]) == 0
-    assert "in the map already" not in capsys.readouterr().err
+    assert "already part of the map" not in capsys.readouterr().err
 
 
 def test_another_stand_is_not_found_in_the_map(stand, tmp_path, capsys):

@@ -121,7 +121,7 @@ def test_merging_twice_gives_the_same_bytes(runs, tmp_path):
 def test_another_stand_is_refused(runs, tmp_path, capsys):
     words = ["merge", str(runs / "a"), str(runs / "other"), "--out", str(tmp_path / "out")]
     assert main(words) == 1
-    assert "do not fit" in capsys.readouterr().err
+    assert "do not match" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

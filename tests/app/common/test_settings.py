@@ -24,6 +24,7 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         "STEMMAP_RECORDINGS": str(tmp_path),
         "STEMMAP_FOLDER": str(tmp_path / "kept"),
         "STEMMAP_DATABASE": "postgresql://ann@server/stand",
+        "STEMMAP_FILES": "folders",
         "STEMMAP_UPLOAD_GB": "2.5",
     }
     assert set(given) == set(VARIABLES)
@@ -36,6 +37,7 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         folder=tmp_path / "kept",
         database="postgresql://ann@server/stand",
         upload_limit=2_500_000_000,
+        files="folders",
     )
 
 
@@ -66,6 +68,7 @@ def test_annotations_are_kept_where_the_system_keeps_data(given: dict[str, str],
         ("STEMMAP_TOKEN", "with a\nline break in it"),
         ("STEMMAP_TOKEN", "öööööööööööööööööö"),
         ("STEMMAP_RECORDINGS", "/no/such/folder"),
+        ("STEMMAP_FILES", "all"),
     ],
 )
 def test_what_cannot_be_used_names_the_variable(name: str, value: str) -> None:

@@ -63,7 +63,7 @@ def test_what_is_compared_is_not_measured_and_a_failure_leaves_the_run_whole():
     with pytest.raises(StemmapError, match="nothing is mapped"):
         session.compare([Parameters()])
     session.open("fake:", "auto", 0)
-    with pytest.raises(StemmapError, match="no scan stands here"):
+    with pytest.raises(StemmapError, match="no scan is mapped yet"):
         session.compare([Parameters()])
     first = stand_at(session, 2)
     run = session._run

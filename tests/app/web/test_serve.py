@@ -176,7 +176,7 @@ async def ended(*words: str) -> tuple[int | None, str]:
     [
         (["sim:nope"], 2, "there is no scenario 'nope' (sim:nope)"),
         (["no/such/run.mcap"], 1, "there is no such file or folder (no/such/run.mcap)"),
-        (["serve", "--port", "x"], 2, "not a port"),
+        (["serve", "--port", "x"], 2, "--port: 'x' is not a whole number"),
         (["serve", "--preset", "best"], 2, "no preset 'best'"),
         (["serve", "--set", "clustering.eps=99"], 2, "clustering.eps"),
         (["serve", "--host", "203.0.113.9", "--port", "0"], 1, "an address of this machine with --host"),
