@@ -153,7 +153,9 @@ def data_folder(given: Mapping[str, str]) -> Path | None:
 def _port(text: str) -> int:
     if text.isdecimal() and int(text) <= 65535:
         return int(text)
-    raise StemmapError(f"{text!r} is no port", where="STEMMAP_PORT", remedy="Give a number from 0 to 65535")
+    raise StemmapError(
+        f"{text!r} is not a port", where="STEMMAP_PORT", remedy="Give a number from 0 to 65535"
+    )
 
 
 def _files(text: str) -> Files:
@@ -167,11 +169,11 @@ def _gigabytes(text: str) -> int:
     with contextlib.suppress(ValueError, OverflowError):
         if 0.0 < float(text) <= 1e6:
             return round(1e9 * float(text))
-    raise StemmapError(f"{text!r} is no size", where="STEMMAP_UPLOAD_GB", remedy="Give a number of GB")
+    raise StemmapError(f"{text!r} is not a size", where="STEMMAP_UPLOAD_GB", remedy="Give a number of GB")
 
 
 def _folder(text: str) -> Path:
     folder = Path(text).expanduser()
     if folder.is_dir():
         return folder
-    raise StemmapError(f"{text} is no folder", where="STEMMAP_RECORDINGS")
+    raise StemmapError(f"{text} is not a folder", where="STEMMAP_RECORDINGS")

@@ -226,7 +226,8 @@ class Annotating:
             raise StemmapError(self.problem)
         if run != self.run:
             raise StaleError(
-                "another run was opened", remedy="Your edit was not made; look at what stands now"
+                "another run was opened",
+                remedy="Your edit was not saved; repeat it in the run that is open now",
             )
         own, against, generation = self._own, self.against, self._generation
 

@@ -57,7 +57,7 @@ def choose_odometry(known: SourceDescription, choice: str) -> Chosen:
         raise SourceError(
             "the source has no odometry",
             where=known.uri,
-            remedy="--odometry kiss-icp finds it from the scans, static maps it as standing still",
+            remedy="--odometry kiss-icp computes the motion from the scans; --odometry static assumes none",
         )
     obstacle = _no_matching(known)
     if choice == "kiss-icp":

@@ -255,4 +255,4 @@ def _plain(row: Row[Any]) -> dict[str, Any]:
 
 
 def _unknown(record: int) -> UnknownError:
-    return UnknownError("there is no such run", where=f"run {record}", remedy="Load the list anew")
+    return UnknownError("there is no such run", where=f"run {record}", remedy="Load the list again")

@@ -50,7 +50,7 @@ def bring_up_to_date(connection: Connection) -> None:
     if _BEFORE_ALEMBIC in names and _version.name not in names:
         _leave_own_version(connection)
     elif _version.name not in names:
-        raise StemmapError("it is a database of another program")
+        raise StemmapError("this database belongs to another program")
     standing = connection.execute(select(_version.c.version_num)).scalar()
     if standing not in REVISIONS:
         raise _newer(standing)
@@ -130,7 +130,7 @@ def _open_server(database: str) -> Engine:
     try:
         url = make_url(database)
     except (ArgumentError, ValueError):
-        raise StemmapError("this is no address of a database", remedy=remedy) from None
+        raise StemmapError("this is not the address of a database", remedy=remedy) from None
     if url.drivername not in ("postgresql", "postgresql+psycopg"):
         raise StemmapError(f"{url.drivername} is not supported", where="STEMMAP_DATABASE", remedy=remedy)
     where = url.render_as_string(hide_password=True)

@@ -356,5 +356,5 @@ def _stale(row: Row[Any]) -> StaleError:
     done = "deleted" if row.deleted else "changed"
     return StaleError(
         f"annotation {row.id} was {done} by {row.who} at {moment(row.at_ns)}",
-        remedy="Your edit was not made; look at what stands now, and try again",
+        remedy="Your edit was not saved; check the current state and try again",
     )

@@ -161,7 +161,7 @@ async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Cal
     finally:
         file.close()
     if written != size:
-        raise UploadError(422, f"{written} of {size} bytes came", remedy="Upload the file again")
+        raise UploadError(422, f"only {written} of {size} bytes arrived", remedy="Upload the file again")
 
 
 async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
@@ -172,7 +172,9 @@ async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
         except StopAsyncIteration:
             return
         except TimeoutError:
-            raise UploadError(408, f"nothing came for {_STALLED_S:.0f} s", remedy="Upload it again") from None
+            raise UploadError(
+                408, f"no data arrived for {_STALLED_S:.0f} s", remedy="Upload it again"
+            ) from None
 
 
 async def _look_at(part: Path, name: str) -> str:

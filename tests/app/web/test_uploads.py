@@ -149,7 +149,7 @@ async def test_an_upload_that_breaks_off_leaves_nothing(recordings: Path) -> Non
     async def short() -> AsyncIterator[bytes]:
         yield b"good"
 
-    with pytest.raises(UploadError, match="4 of 100 bytes came"):
+    with pytest.raises(UploadError, match="only 4 of 100 bytes arrived"):
         await uploads.take("a.mcap", 100, short())
     begun = asyncio.Event()
 
@@ -176,7 +176,7 @@ async def test_an_upload_that_stalls_is_ended(recordings: Path, monkeypatch: pyt
         yield b"good"
         await asyncio.Event().wait()
 
-    with pytest.raises(UploadError, match="nothing came") as refused:
+    with pytest.raises(UploadError, match="no data arrived") as refused:
         await Uploads(recordings, 10**9, Keeper(None)).take("a.mcap", 100, stalls())
     assert refused.value.status == 408
     assert kept(recordings) == []
