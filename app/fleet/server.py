@@ -144,7 +144,7 @@ def serve_fleet(
         make_parameters: The parameters that each dashboard begins with.
         watched: A router whose robots are added as they come, and how they are opened.
         open_browser: Whether to show the page.
-        viewer: Whether to print the link for looking only too.
+        viewer: Whether to print the view-only link.
 
     Raises:
         StemmapError: The port is in use, or the address is not one of this machine.
@@ -153,7 +153,7 @@ def serve_fleet(
     port = listening.getsockname()[1]
     token = settings.token or new_token()
     if viewer:
-        print(f"for looking only: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
+        print(f"View-only link: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
 
     async def served() -> bool:
         fleet = Fleet(replace(settings, port=port), port, token, make_parameters, warm=warmed)

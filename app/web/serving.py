@@ -84,7 +84,7 @@ def serve(
     app = build(settings, port=port, token=token, source=source, parameter_state=parameter_state)
     link = link_of(settings, port, token)
     if viewer:
-        print(f"for looking only: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
+        print(f"View-only link: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
     server = LinkedServer(uvicorn_config(app, settings), settings, link, open_browser=open_browser)
     with contextlib.closing(listening):
         asyncio.run(server.serve(sockets=[listening]))

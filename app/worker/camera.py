@@ -1,4 +1,4 @@
-"""What the run's camera saw at the time of a scan; found by the mapping process, decoded elsewhere."""
+"""Camera picture at the time of a scan; the worker finds it, another process decodes it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pipeline.odometry.odometry_override import OdometryOverride
 
 
 class CameraPicture(msgspec.Struct, frozen=True):
-    """A picture as it was recorded, and how the camera stands.
+    """An encoded picture with the pose of its camera.
 
     Attributes:
-        picture: Not decoded.
-        camera: None where nobody tells where things stand in it.
-        why: There is none.
-        told: How many pictures came of a live run, in words; "" of a recording.
+        picture: Encoded picture.
+        camera: Camera model and pose, None if unknown.
+        why: Reason why the camera model is unknown.
+        told: Number of received pictures of a live run as text; "" for a recording.
     """
 
     picture: Picture
@@ -29,12 +29,12 @@ class CameraPicture(msgspec.Struct, frozen=True):
 
 
 def has_camera(description: SourceDescription) -> bool:
-    """Whether a source has pictures."""
+    """Return whether a source has pictures."""
     return any(t.read_as == "camera" and t.type in (IMAGE, COMPRESSED_IMAGE) for t in description.topics)
 
 
 def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
-    """The picture nearest to a time.
+    """Return the picture closest to a time.
 
     Raises:
         StemmapError: There is none, and why.

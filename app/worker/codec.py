@@ -18,18 +18,18 @@ from app.worker.internal_protocol import FromWorker, ToWorker
 M = TypeVar("M")
 
 LENGTH_BYTES = 4
-# A scan of 4 million points with all its layers; far above any sensor, far below the machine's memory.
+# A scan of 4 million points with all its layers, more than any sensor produces.
 LARGEST_MESSAGE = 128 * 1024 * 1024
 _DTYPES = frozenset({"<f4", "<f8", "<i4", "<i8", "|b1"})
 _MOST_DIMENSIONS = 3
 
 
 class WireError(Exception):
-    """A message that is too large, cut, or not of the types agreed upon."""
+    """A message that is too large, incomplete, or of an unexpected type."""
 
 
 class _Array(msgspec.Struct, frozen=True, array_like=True):
-    """An array as it travels."""
+    """Encoded array."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -50,7 +50,7 @@ class Channel(Generic[M]):
         )
 
     def encode(self, message: M) -> bytes:
-        """The message with its length before it.
+        """Return the encoded message with its length as prefix.
 
         Raises:
             WireError: It is larger than LARGEST_MESSAGE.
@@ -63,7 +63,7 @@ class Channel(Generic[M]):
         return bytes(packed)
 
     def decode(self, body: bytes) -> M:
-        """A message from its bytes, without the length before it.
+        """Return the message decoded from its bytes without the length prefix.
 
         Raises:
             WireError: It is not one of the agreed types.
@@ -74,7 +74,7 @@ class Channel(Generic[M]):
             raise WireError(f"a message of {len(body)} bytes cannot be read: {error}") from None
 
     def read(self, stream: BinaryIO) -> M | None:
-        """The next message of a blocking stream; None at its end.
+        """Return the next message of a blocking stream; None at its end.
 
         Raises:
             WireError: The stream ends within a message, or the message is not as agreed.
@@ -101,17 +101,17 @@ def check_size(size: int) -> None:
 
 
 def to_worker() -> Channel[ToWorker]:
-    """The direction from the web process to the worker."""
+    """Return the channel from the web process to the worker."""
     return Channel(ToWorker)
 
 
 def from_worker() -> Channel[FromWorker]:
-    """The direction from the worker to the web process."""
+    """Return the channel from the worker to the web process."""
     return Channel(FromWorker)
 
 
 def _read_exactly(stream: BinaryIO, size: int) -> bytes:
-    """Up to `size` bytes: fewer only at the end of the stream (a pipe gives what it has)."""
+    """Read `size` bytes, or fewer at the end of the stream."""
     parts: list[bytes] = []
     while size > 0 and (part := stream.read(size)):
         parts.append(part)
@@ -142,5 +142,5 @@ def _from_plain(expected: Any, plain: object) -> object:  # noqa: ANN401 - the h
         raise ValueError(f"an array of the shape {array.shape[:4]}")
     if math.prod(array.shape) * want.itemsize != len(array.content):
         raise ValueError(f"{len(array.content)} bytes are no array of {array.dtype} {array.shape}")
-    # A copy, for memory that is aligned and does not hold on to the whole message.
+    # A copy, which is aligned and does not reference the whole message.
     return np.frombuffer(array.content, dtype=want).reshape(array.shape).copy()

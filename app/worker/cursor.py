@@ -1,9 +1,8 @@
-"""Reads the steps of a source in order, and again from any scan that was read before.
+"""Cursor over the steps of a source, which can return to any step that was read before.
 
-Reading again starts a second before the scan, so that the synchroniser has what it needs; what it had
-learnt until then is kept and given to it. That is checked: where the scan before it does not come out
-exactly as the first time, all is read from the start. So going back never changes what is mapped; at
-worst it is slow.
+To return, the cursor reads from one second before the scan and restores the state that the synchroniser had
+there. If the preceding scan differs from the first reading, everything is read from the start. Stepping back
+therefore never changes what is mapped; in the worst case it is slow.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ _LEAD_IN_NS = 1_000_000_000
 
 
 class Cursor:
-    """Stands before a step of a source.
+    """Position before a step of a source.
 
     Args:
-        source: What is read. The cursor does not close it.
-        synchronise: Joins records to steps; it is called anew for every place that is read from.
+        source: Source that is read; the cursor does not close it.
+        synchronise: Joins records to steps; it is called for every position from which the source is read.
     """
 
     def __init__(self, source: Source, synchronise: StepsFunction) -> None:
@@ -54,22 +53,24 @@ class Cursor:
 
     @property
     def known(self) -> int:
-        """How many steps from the start were read so far."""
+        """Number of steps that were read so far."""
         return len(self._stamps)
 
     def stamp_ns(self, index: int) -> int:
-        """Time of a step that was read before."""
+        """Return the time of a step that was read before [ns]."""
         return self._stamps[index]
 
     def index_at(self, stamp_ns: int) -> int | None:
-        """The last step not later than a time (the first, if all are later); None when steps that
-        were not read yet may be meant."""
+        """Return the last step not later than a time, or the first step if all are later.
+
+        None if the time may belong to steps that were not read yet.
+        """
         if not self._stamps or stamp_ns > self._stamps[-1]:
             return None
         return max(0, bisect_right(self._stamps, stamp_ns) - 1)
 
     def peek(self) -> Step | None:
-        """The next step without taking it; None at the end of the run.
+        """Return the next step without advancing; None at the end of the run.
 
         Raises:
             SourceError: Nothing more can be read.
@@ -86,7 +87,7 @@ class Cursor:
         return self._ahead
 
     def take(self) -> Step | None:
-        """The next step; None at the end of the run.
+        """Return the next step and advance; None at the end of the run.
 
         Raises:
             SourceError: Nothing more can be read.
@@ -103,7 +104,7 @@ class Cursor:
         return step
 
     def go_to(self, index: int) -> None:
-        """Stand before a step of at most `known`.
+        """Move to the position before a step, at most `known`.
 
         Raises:
             SourceError: The source does not give the same steps again.
@@ -125,9 +126,10 @@ class Cursor:
         return self._synchronise(self._source.records(start_ns), after=after)
 
     def _resumed(self, anchor: int) -> Iterator[Step] | None:
-        """Steps after `anchor`, read from shortly before it; None when it comes out differently."""
+        """Return an iterator of the steps after step `anchor`, read from shortly before it; None if that step
+        differs."""
         stamp_ns = self._stamps[anchor]
-        # Scans of equal time cannot be told apart by it, so they are counted.
+        # Scans of equal time are distinguished by counting.
         wanted = anchor - bisect_left(self._stamps, stamp_ns)
         steps = self._read(stamp_ns - _LEAD_IN_NS, self._learnt[anchor])
         for step in steps:
@@ -141,7 +143,7 @@ class Cursor:
         return None
 
     def _recounted(self, anchor: int) -> Iterator[Step]:
-        """Steps after `anchor`, read from the start."""
+        """Return an iterator of the steps after step `anchor`, read from the start."""
         steps = self._read(None)
         for index, step in enumerate(steps):
             if index == anchor and _mark(step) == self._marks[anchor]:
@@ -156,7 +158,7 @@ class Cursor:
 
 
 def _mark(step: Step) -> int:
-    """A number that differs when what the mapper sees of the motion or the scan's size differs."""
+    """Return a checksum of the motion and the size of a scan."""
     return hash(
         (
             step.scan.stamp_ns,
@@ -172,11 +174,11 @@ def _mark(step: Step) -> int:
 
 
 class LiveCursor:
-    """Stands before the next step, as `app.worker.cursor.Cursor` does; where that finds none, none came yet.
+    """Position before the next step of a live robot, with the interface of `Cursor`.
 
     Args:
-        source: The robot. The cursor does not close it.
-        chosen: What tells the motion.
+        source: The robot; the cursor does not close it.
+        chosen: Source of the motion.
         moving: The robot with that motion.
     """
 
@@ -190,19 +192,19 @@ class LiveCursor:
 
     @property
     def known(self) -> int:
-        """How many steps were read so far."""
+        """Number of steps that were read so far."""
         return len(self._stamps)
 
     def stamp_ns(self, index: int) -> int:
-        """Time of a step that was read before."""
+        """Return the time of a step that was read before [ns]."""
         return self._stamps[index]
 
     def index_at(self, stamp_ns: int) -> None:
-        """Nobody can go to a time of a live run."""
+        """Return None, since a live run has no seeking."""
         del stamp_ns
 
     def peek(self) -> Step | None:
-        """The next step without taking it; None when it has not come.
+        """Return the next step without advancing; None if it has not arrived.
 
         Raises:
             SourceError: What comes cannot be read.
@@ -218,7 +220,7 @@ class LiveCursor:
         return self._ready[0]
 
     def take(self) -> Step | None:
-        """The next step; None when it has not come.
+        """Return the next step and advance; None if it has not arrived.
 
         Raises:
             SourceError: What comes cannot be read.
@@ -231,7 +233,7 @@ class LiveCursor:
         return step
 
     def go_to(self, index: int) -> None:
-        """Stand before the next step, which is where it stands.
+        """Accept only the current position, since a live run cannot go back.
 
         Raises:
             SourceError: Another is asked for.

@@ -1,5 +1,4 @@
-"""What the worker and the web process say beside `Status` and the commands of people. Plain data: it
-travels as msgpack."""
+"""Messages between worker and web process in addition to `Status` and the commands of people."""
 
 from __future__ import annotations
 
@@ -18,15 +17,15 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
     """A source was opened and waits for `Begin`.
 
     Attributes:
-        run: Counts the sources opened by this worker.
-        uri: As the user wrote it.
-        kind: The format in words.
-        preset: The preset that suits this kind of source.
-        scans: Number of scans, None where it is not known.
-        end_s: Time of the last scan since the first, None where it is not known.
-        truth: What is known for certain to stand there, or None.
-        digest: Of what was recorded; empty where it is not known.
-        asked: The URI of the `Open` that this answers; empty where it is not known.
+        run: Number of sources that this worker has opened.
+        uri: URI as written by the user.
+        kind: Name of the format.
+        preset: Preset for this kind of source.
+        scans: Number of scans, None if unknown.
+        end_s: Time of the last scan since the first [s], None if unknown.
+        truth: Ground truth of the source, or None.
+        digest: Digest of the recording, empty if unknown.
+        asked: URI of the `Open` that this message answers, empty if unknown.
     """
 
     uri: str
@@ -41,17 +40,18 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
 
 
 class Shown(msgspec.Struct, frozen=True, tag="shown"):
-    """The picture of a scan. The path comes in pieces: cut what is there to `path_start` rows, then
-    append `path`.
+    """Displayed frame of a scan.
+
+    The path is sent incrementally: the receiver cuts its path to `path_start` rows and appends `path`.
 
     Attributes:
-        run: Counts the sources opened by this worker; tells late pictures of an older run apart.
-        time_s: Of the scan since the run's first one.
-        frame: All that came of the scan.
-        path_start: How many rows of the path sent before still hold.
-        path: The rows from there on.
-        confirmed_s: When each tree of the frame was confirmed, NaN where that is not known; None knows none.
-            Not every scan is shown, so a picture alone does not tell it.
+        run: Number of the run, which identifies late frames of an older run.
+        time_s: Time of the scan since the first scan of the run [s].
+        frame: Results of the scan.
+        path_start: Number of rows sent before that remain valid.
+        path: Rows of the path from there on.
+        confirmed_s: Confirmation time of each tree [s], NaN if unknown; None if all are unknown. Since not
+            every scan is displayed, it does not follow from the frames.
     """
 
     run: int
@@ -63,19 +63,18 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):
-    """How the run goes."""
+    """Status of the run."""
 
     status: Status
 
 
 class Begin(msgspec.Struct, frozen=True, tag="begin"):
-    """The answer to `Opened`: begin with these parameters. Meant for one run: if another was opened since,
-    it is left aside.
+    """Answer to `Opened`: begin with these parameters; ignored if another run was opened meanwhile.
 
     Attributes:
-        run: Of the `Opened` that is answered.
+        run: Number of the run in `Opened`.
         values, revision: As in `SetParameters`.
-        play: Play, unless a person has said otherwise since the opening; else show the first scan.
+        play: Play unless a person has paused since the opening; else show the first scan.
     """
 
     run: int
@@ -85,12 +84,12 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
 
 
 class AskCluster(msgspec.Struct, frozen=True, tag="ask_cluster"):
-    """Tell the story of a cluster of a scan that was shown lately.
+    """Request the explanation of a cluster of a recently displayed scan.
 
     Attributes:
-        ticket: Comes back with the answer.
-        run: That the scan is of.
-        scan, cluster: Number of the scan, and of the cluster in it.
+        ticket: Identifier that the answer repeats.
+        run: Number of the run.
+        scan, cluster: Index of the scan, and of the cluster in it.
     """
 
     ticket: int
@@ -100,11 +99,11 @@ class AskCluster(msgspec.Struct, frozen=True, tag="ask_cluster"):
 
 
 class AskTree(msgspec.Struct, frozen=True, tag="ask_tree"):
-    """Tell the story of a tree as it stands.
+    """Request the explanation of a tree.
 
     Attributes:
         ticket, run: As in `AskCluster`.
-        tree: Its number.
+        tree: Number of the tree.
     """
 
     ticket: int
@@ -113,11 +112,11 @@ class AskTree(msgspec.Struct, frozen=True, tag="ask_tree"):
 
 
 class AskCompare(msgspec.Struct, frozen=True, tag="ask_compare"):
-    """Map the standing scan under other parameters; the run stays as it is.
+    """Request the current scan mapped with other parameter sets, without a change of the run.
 
     Attributes:
         ticket, run: As in `AskCluster`.
-        sets: Parameters, already validated, as nested values.
+        sets: Parameter sets as validated nested values.
     """
 
     ticket: int
@@ -126,11 +125,11 @@ class AskCompare(msgspec.Struct, frozen=True, tag="ask_compare"):
 
 
 class AskCamera(msgspec.Struct, frozen=True, tag="ask_camera"):
-    """Tell what the run's camera saw.
+    """Request the camera picture.
 
     Attributes:
         ticket, run: As in `AskCluster`.
-        stamp_ns: About when.
+        stamp_ns: Approximate time of the picture [ns].
     """
 
     ticket: int
@@ -139,13 +138,13 @@ class AskCamera(msgspec.Struct, frozen=True, tag="ask_camera"):
 
 
 class Answer(msgspec.Struct, frozen=True, tag="answer"):
-    """What was asked for.
+    """Answer to a question.
 
     Attributes:
-        ticket: Of the question.
-        cluster, tree, frames, camera: One of them is told, unless `missing` says why there is none; the
-            frames one for each set, without raw points.
-        missing: Why there is none, and what to do.
+        ticket: Identifier of the question.
+        cluster, tree, frames, camera: One of them is set unless `missing` is; `frames` has one frame per
+            parameter set, without raw points.
+        missing: Reason why there is no answer, and the remedy.
     """
 
     ticket: int
@@ -157,11 +156,11 @@ class Answer(msgspec.Struct, frozen=True, tag="answer"):
 
 
 class Remapped(msgspec.Struct, frozen=True, tag="remapped"):
-    """The run was mapped again: the pictures from here on are of another map.
+    """The run was mapped again; the following frames belong to the new map.
 
     Attributes:
         run: As in `Shown`.
-        changes: What is different.
+        changes: Differences between the maps.
     """
 
     run: int
@@ -169,12 +168,12 @@ class Remapped(msgspec.Struct, frozen=True, tag="remapped"):
 
 
 class Rough(msgspec.Struct, frozen=True, tag="rough"):
-    """Where trees will be, roughly, once the run is mapped again.
+    """Preview of the trees of the map that is being computed.
 
     Attributes:
         run: As in `Shown`.
-        revision: Of the parameters.
-        trees: Without diameters; their numbers hold for nothing else.
+        revision: Revision of the parameters.
+        trees: Preview trees without diameters; their numbers are valid only in this message.
     """
 
     run: int

@@ -1,6 +1,6 @@
-"""Has the mapper's compiled code ready before it is needed: a robot's first scan would not wait for it.
+"""Compilation of the kernels of the mapper before the first scan.
 
-What looks at a scan and what makes a map of trees share hardly a kernel: two processes compile a half each.
+The front end and the mapping of trees share few kernels, so that two processes compile one half each.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SCENE = "sim:stand?duration=1"
 
 
 def warm_up(parameters: Parameters | None = None) -> None:
-    """Map a second of a simulated stand; the first time on a machine this takes minutes."""
+    """Map one second of a simulated stand; the first time on a machine this takes minutes."""
     from pipeline.io.readers import open_source
     from pipeline.mapper import Mapper
     from pipeline.odometry.synchroniser import steps
@@ -104,7 +104,7 @@ def warm_map() -> None:
 
 
 def _stems() -> Iterator[Step]:
-    """A robot that drives half a metre a scan between trees three metres apart."""
+    """Return the steps of a robot that drives 0.5 m per scan between trees at distances of 3 m."""
     from pipeline.geometry.poses import Pose2
     from pipeline.types.records import Scan, Stems, Step
 

@@ -1,4 +1,4 @@
-"""From the worker's loop to the pipe: the newest picture wins, everything else is kept."""
+"""Outgoing messages of the worker: only the newest frame is sent, all other messages are kept."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from app.worker.internal_protocol import FromWorker, Opened, Report, Shown
 from app.worker.thin_frame import picture_of
 from pipeline.types.records import HeightMap, Path
 
-# Faster pictures nobody sees; they would only fill the pipe and the browsers' sockets.
+# A higher frame rate is not visible and would only fill the pipe and the sockets.
 _SHORTEST_PAUSE_S = 0.05
-# Answers and notices; a web process that reads none of so many is gone or hangs.
+# Answers and notices; a web process that reads none of this many has ended or hangs.
 MOST_MESSAGES = 500
 
 
 class Mailbox:
-    """Writes messages to a stream in a thread of its own, so that a slow reader never stops the map.
+    """Writes messages to a stream in a separate thread, so that a slow reader never stops the mapping.
 
-    Pictures wait in one slot: a newer one replaces it, as a newer status replaces the one before it. Other
-    messages are sent in order; beyond MOST_MESSAGES the oldest is dropped. After `Opened` no picture of an
-    older run is sent. A message that cannot be sent is left out, and the status reports it.
+    A newer frame replaces a waiting frame, and a newer status a waiting status. Other messages are sent in
+    order; beyond MOST_MESSAGES the oldest is dropped. After `Opened`, no frame of an older run is sent. A
+    message that cannot be sent is dropped, and the status reports it.
 
     Args:
-        stream: Where the bytes go; closed by nobody here.
-        recent: Remembers the pictures that are sent.
+        stream: Output stream, which is not closed here.
+        recent: Stores the frames that are sent.
     """
 
     def __init__(self, stream: BinaryIO, recent: RecentScans | None = None) -> None:
@@ -53,7 +53,7 @@ class Mailbox:
         self._thread.start()
 
     def put(self, message: FromWorker) -> None:
-        """Send a message; of pictures the newest one only."""
+        """Send a message; of several frames only the newest one."""
         with self._changed:
             if isinstance(message, Shown):
                 self._picture = message
@@ -69,7 +69,7 @@ class Mailbox:
             self._changed.notify()
 
     def close(self, timeout_s: float = 0.3) -> None:
-        """Send what waits, then end the thread."""
+        """Send the waiting messages and end the thread."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -85,7 +85,7 @@ class Mailbox:
             return  # the web process is gone; the reader of commands ends the worker
 
     def _packed(self, message: FromWorker) -> list[bytes]:
-        """A message in bytes; instead of one that cannot be sent, a status that says so."""
+        """Return the encoded message, or an encoded status that reports that it cannot be sent."""
         try:
             return [self._channel.encode(self._made_ready(message))]
         except WireError as error:
@@ -125,7 +125,7 @@ class Mailbox:
                 self._changed.wait(wait if self._picture is not None else None)
 
     def _with_new_path_only(self, shown: Shown) -> Shown:
-        """The same picture with the path cut to what was not sent before."""
+        """Return the frame with only the rows of the path that were not sent before."""
         old, self._sent_path = self._sent_path, shown.path
         start = 0 if old is None or shown.run != self._sent_run else rows_in_common(old, shown.path)
         picture = picture_of(shown.frame)
@@ -138,7 +138,7 @@ class Mailbox:
 
 
 def rows_in_common(old: Path, new: Path) -> int:
-    """How many rows from the start are equal in two paths."""
+    """Return the number of equal leading rows of two paths."""
     n = min(old.x.size, new.x.size)
     differs = np.zeros(n, dtype=np.bool_)
     for name in ("stamp_ns", "x", "y", "yaw", "sigma_xy"):
@@ -147,14 +147,14 @@ def rows_in_common(old: Path, new: Path) -> int:
 
 
 def rows_from(path: Path, start: int) -> Path:
-    """The rows of a path from a row on."""
+    """Return the rows of a path from a row onwards."""
     return Path(
         path.stamp_ns[start:], path.x[start:], path.y[start:], path.yaw[start:], path.sigma_xy[start:]
     )
 
 
 def joined(old: Path | None, start: int, tail: Path) -> Path:
-    """The path of which `tail` is the new part from row `start` on."""
+    """Return the path with the rows from `start` onwards replaced by `tail`."""
     if old is None or start == 0:
         return tail
     return Path(

@@ -1,4 +1,4 @@
-"""What the web process and the worker say to one another. Plain data: it travels as msgpack."""
+"""Messages between the web process and the worker, encoded as msgpack."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ State = Literal["starting", "playing", "paused", "finished", "waiting", "failed"
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """How the run goes. Times are seconds since the run's first scan.
+    """Status of the run. Times are seconds since the first scan of the run.
 
     Attributes:
         state: "waiting" is a live source from which nothing comes; "failed" says why in `detail`.
@@ -85,37 +85,39 @@ class Status:
 
 
 class Play(msgspec.Struct, frozen=True, tag="play"):
-    """Go on; from the start again when the run is at its end."""
+    """Continue the run; at its end, play from the start."""
 
 
 class Pause(msgspec.Struct, frozen=True, tag="pause"):
-    """Stand still at the scan that is shown."""
+    """Pause at the displayed scan."""
 
 
 class Advance(msgspec.Struct, frozen=True, tag="advance"):
-    """Pause and go some scans forward (or back, when negative)."""
+    """Pause and step forward by a number of scans, or back if it is negative."""
 
     scans: Annotated[int, Meta(ge=-MOST_SCANS, le=MOST_SCANS)] = 1
 
 
 class Seek(msgspec.Struct, frozen=True, tag="seek"):
-    """Go to a time [s since the first scan]; the map becomes what it was then."""
+    """Seek to a time [s since the first scan]; the map becomes that of this time."""
 
     time_s: Annotated[float, Meta(ge=0.0, le=LONGEST_S)]
 
 
 class SetSpeed(msgspec.Struct, frozen=True, tag="set_speed"):
-    """Replay faster or slower than the clock; 0 is as fast as it can."""
+    """Set the replay speed as a factor of real time; 0 is the maximum speed."""
 
     factor: Annotated[float, Meta(ge=0.0, le=FASTEST)]
 
 
 class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
-    """Parameters, already validated, as nested values; they act on the next scan, and when paused on
-    the standing scan at once. If `whole` says so, the run is mapped again with them from its first scan.
+    """Set parameters, given as validated nested values.
+
+    They apply from the next scan onwards or, if paused, to the current scan. With `whole`, the run is mapped
+    again from its first scan.
 
     Attributes:
-        step: Those of one step, as of a slider that is held, are compared with the map before its first;
+        step: Changes with the same step (a slider drag) are compared with the map before the first of them;
             None is a step of its own.
     """
 
@@ -126,7 +128,7 @@ class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
 
 
 class Open(SourceRequest, frozen=True, tag="open"):
-    """Leave the current run and open this source. Its parameters arrive with `Begin`.
+    """Close the current run and open this source. Its parameters arrive with `Begin`.
 
     Attributes:
         record: Path of the file to which a live run is recorded; empty for none. No browser can set it.

@@ -1,4 +1,4 @@
-"""Answers to what people ask of the run. Nobody who asks changes how the run goes."""
+"""Answers to questions about the run; a question never changes the run."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pipeline.errors import StemmapError
 
 
 class QueryAnswerer:
-    """Answers from a session.
+    """Answers questions from a session.
 
     Args:
-        session: Where the run is.
-        recent: The pictures that were sent, of which people may ask.
+        session: Session of the run.
+        recent: Recently sent frames, to which questions refer.
     """
 
     def __init__(self, session: Session, recent: RecentScans) -> None:
@@ -27,11 +27,11 @@ class QueryAnswerer:
         self._recent = recent
 
     def answer(self, question: Question, run: int) -> Answer:
-        """The answer, or why there is none.
+        """Return the answer, or why there is none.
 
         Args:
-            question: Of any kind.
-            run: Number of the run that is open.
+            question: Question of any kind.
+            run: Number of the open run.
         """
         try:
             if question.run != run:

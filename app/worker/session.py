@@ -1,5 +1,6 @@
-"""A run as a person drives it: play, pause, step, seek, tune. No thread, no socket and no clock: a
-driver asks for the `pace` and calls `work` as often as it likes.
+"""Session: a run that a person controls (play, pause, step, seek, tune).
+
+It has no thread, no socket and no clock; the loop of the worker reads `pace` and calls `work`.
 """
 
 from __future__ import annotations
@@ -88,8 +89,8 @@ class Session:
 
     @property
     def pace(self) -> Pace:
-        """Whether a scan is to be mapped at once (on the way to a sought scan), in its time, as soon as it
-        comes (of a robot that is heard live), or not."""
+        """When the next scan is mapped: immediately (while seeking), at its replay time, on arrival (live),
+        or not."""
         if self._state == "failed" or (self._run is None and self._robot is None):
             return "idle"
         if self._robot is not None:
@@ -100,27 +101,27 @@ class Session:
 
     @property
     def frame(self) -> Frame | None:
-        """The picture of the standing scan."""
+        """Frame of the current scan."""
         return self._run.frame if self._run else None
 
     @property
     def path(self) -> Path | None:
-        """Where the robot was up to the standing scan."""
+        """Path up to the current scan."""
         return self._run.path if self._run else None
 
     @property
     def time_s(self) -> float:
-        """Of the picture, since the run's first scan."""
+        """Time of the current scan since the first scan of the run [s]."""
         frame = self.frame
         return 0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / _NS
 
     @property
     def run(self) -> Run | None:
-        """What is mapped, None before it is open."""
+        """The open run, or None."""
         return self._run
 
     def next_ns(self) -> int | None:
-        """Time of the next scan; None at the end of the run."""
+        """Time of the next scan [ns]; None at the end of the run."""
         return self._run.peek_ns() if self._run else None
 
     def open(
@@ -159,7 +160,7 @@ class Session:
         return self._begin(source, odometry, seed)
 
     def listen(self) -> Opened | None:
-        """Of a robot: what was opened, once it is heard; None before and after.
+        """Return the opened run of a live robot once its data arrive; None before and after.
 
         Raises:
             SourceError: What it sends cannot be read.
@@ -177,7 +178,7 @@ class Session:
         return opened_of(self._run)
 
     def prepare(self) -> None:
-        """Have all ready for the first scan, which can take a minute the first time on a machine.
+        """Prepare the first scan, which can take a minute the first time on a machine.
 
         Raises:
             SourceError: There is no scan.
@@ -188,13 +189,15 @@ class Session:
             stories.warm_up(self._run.source.description.sensor)
 
     def disturb(self) -> None:
-        """What is being mapped waits for something that is no part of the mapping: its times do not count."""
+        """Discard the current time measurement, since the mapping waits for something else."""
         if self._run is not None:
             self._run.stopwatch.disturb()
 
     def work(self) -> Frame | None:
-        """Map one scan if one is wanted. None when there was none: the run is at its end, or the
-        sought scan was already reached."""
+        """Map the next scan and return its frame.
+
+        None at the end of the run, or if the seek target was already reached.
+        """
         run = self._run
         if run is None or self.pace == "idle":
             return None
@@ -213,10 +216,10 @@ class Session:
         return frame
 
     def play(self) -> Opened | None:
-        """Go on; from the start when the run is at its end. A run that has failed is opened again.
+        """Continue the run; at its end, play from the start. A failed run is opened again.
 
         Returns:
-            What was opened again, if so.
+            The run that was opened again, or None.
 
         Raises:
             SourceError: It cannot be read.
@@ -233,12 +236,12 @@ class Session:
         return opened
 
     def pause(self) -> None:
-        """Stand still; on the way to a sought scan, once it is reached."""
+        """Pause; while seeking, pause once the target is reached."""
         if self._state == "playing":
             self._state = "paused"
 
     def advance(self, scans: int) -> None:
-        """Pause, and stand so many scans further or back."""
+        """Pause and step forward by a number of scans, or back if it is negative."""
         if self._run is None or self._is_live():
             return
         here = self._run.standing if self._target.index is None else self._target.index
@@ -246,7 +249,7 @@ class Session:
         self._target.to_scan(max(0, here + scans))
 
     def seek(self, time_s: float) -> None:
-        """Stand at the last scan not later than a time; the run then goes on as it did before."""
+        """Seek to the last scan not later than a time; playing or pausing then continues as before."""
         if self._run is None or not math.isfinite(time_s) or self._is_live():
             return
         if self._state != "playing":
@@ -285,12 +288,16 @@ class Session:
 
     @property
     def is_remapping(self) -> bool:
-        """Whether `remap` has work that can be done now."""
+        """Whether `remap` can continue now."""
         return self._run is not None and self._run.remapped is not None and not self._target.sought
 
     def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
-        """Map so many scans of the run again. Once all are, the map is another one: gives the standing scan
-        with it, and what it changes."""
+        """Map a number of scans of the run again.
+
+        Returns:
+            After the last scan, the frame of the current scan in the new map and the differences; before,
+            None.
+        """
         run, shown = self._run, self.frame
         if run is None or shown is None:
             return None
@@ -308,7 +315,7 @@ class Session:
         return frame, changes
 
     def cluster_story(self, frame: Frame, cluster: int) -> ClusterStory:
-        """The story of a cluster of a frame of this run, which may have lost its raw points.
+        """Return the explanation of a cluster of a frame, which may lack its raw points.
 
         Raises:
             StemmapError: There is no such cluster.
@@ -316,7 +323,7 @@ class Session:
         return stories.cluster_story(self._run, frame, cluster)
 
     def tree_story(self, number: int) -> TreeStory:
-        """The story of a tree as the standing scan knows it.
+        """Return the explanation of a tree at the current scan.
 
         Raises:
             StemmapError: There is no such tree now.
@@ -324,7 +331,7 @@ class Session:
         return stories.tree_story(self._run, number)
 
     def compare(self, sets: Sequence[Parameters]) -> list[Frame]:
-        """The standing scan under each of other parameters; the run stays as it is.
+        """Return the current scan mapped with other parameter sets, without a change of the run.
 
         Raises:
             StemmapError: There is none, or a set cannot be mapped with.
@@ -334,14 +341,14 @@ class Session:
         return self._run.map_with(sets)
 
     def fail(self, detail: str) -> None:
-        """Say that the run cannot go on, and why."""
+        """Set the state of the run to failed, with the reason."""
         self._state, self._detail = "failed", detail
         self._target.forget()
         if self._run is not None:
             self._run.stay()
 
     def status(self) -> Status:
-        """The status of the run; speed, rate and scans behind are left at 0."""
+        """Return the status of the run; speed, rate and scans behind remain 0."""
         run, robot = self._run, self._robot
         status = Status(
             state=self._state,
@@ -357,18 +364,18 @@ class Session:
         return status if robot is None else with_robot(status, robot)
 
     def close(self) -> None:
-        """Let go of the source."""
+        """Close the source."""
         self._leave()
 
     def end_recording(self) -> bool:
-        """Finish the recording of a live run; whether the run is live. May be called from any thread."""
+        """Finish the recording of a live run and return whether the run is live; callable from any thread."""
         robot = self._robot
         if robot is not None:
             robot.end_recording()
         return robot is not None
 
     def _is_live(self) -> bool:
-        """Whether the run is of a robot, in whose time nobody can go; a person is told so."""
+        """Return whether the run is live and reports that seeking is not possible."""
         if self._robot is not None:
             self._warn(["a live run goes on as it comes: to step and seek, open its recording"])
         return self._robot is not None
@@ -409,7 +416,7 @@ class Session:
 
 
 def with_robot(status: Status, robot: LiveSource) -> Status:
-    """The status with that of the robot of a live run."""
+    """Return the status with that of the robot of a live run."""
     # While scans wait the robot was heard, whatever its link had no time to note while a machine compiled.
     is_asked = status.state in ("playing", "waiting") and not robot.scans_waiting
     silent = robot.waiting_for() if is_asked else ""
@@ -426,7 +433,7 @@ def with_robot(status: Status, robot: LiveSource) -> Status:
 
 
 def _with_run(status: Status, run: Run) -> Status:
-    """The status with the figures of a run."""
+    """Return the status with the figures of a run."""
     description = run.source.description
     losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
     frame = run.frame
@@ -449,7 +456,7 @@ def _with_run(status: Status, run: Run) -> Status:
 
 
 def opened_of(run: Run) -> Opened:
-    """The message that a source is opened."""
+    """Return the message for an opened source."""
     description = run.source.description
     truth = run.source.truth()
     end_s = None

@@ -1,5 +1,4 @@
-"""What a session remembers of a run, to go back in it: states of the mapper, and which parameters were
-in force from which scan on."""
+"""States and parameters that a session keeps to step back in a run."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ _MOST_BYTES = 256 << 20
 
 
 def nbytes(state: object) -> int:
-    """Bytes of the arrays in a state: of dataclasses, lists and tuples, however deep."""
+    """Return the number of bytes of all arrays in nested dataclasses, lists and tuples."""
     if isinstance(state, np.ndarray | Genealogy | Smoother):
         return state.nbytes
     if isinstance(state, list | tuple):
@@ -33,14 +32,14 @@ def nbytes(state: object) -> int:
 
 
 class Snapshots(Generic[S]):
-    """States of the mapper by the number of scans they hold (0: before the first).
+    """States of the mapper by the number of scans they contain (0: before the first scan).
 
-    At most 40 are kept, and at most 256 MB of them: when there is more, every second goes and the spacing
-    doubles, so that a run of any length takes the same memory. The first always stays.
+    At most 40 states and 256 MB are kept: beyond that, every second state is dropped and the spacing doubles,
+    so that the memory is bounded for a run of any length. The first state is always kept.
 
     Args:
-        start: The state before the first scan.
-        size_of: Bytes that a state takes.
+        start: State before the first scan.
+        size_of: Returns the size of a state [bytes].
     """
 
     def __init__(self, start: S, size_of: Callable[[S], int] = nbytes) -> None:
@@ -51,11 +50,11 @@ class Snapshots(Generic[S]):
 
     @property
     def nbytes(self) -> int:
-        """Of all states."""
+        """Total size of all states [bytes]."""
         return sum(self._sizes[n] for n in self._states)
 
     def within(self, most_bytes: int) -> Snapshots[S]:
-        """The same with fewer of them: every second goes until they take no more than so much."""
+        """Return a copy with every second state dropped until the size limit is met."""
         fewer = copy(self)
         while len(fewer._states) > 1 and fewer.nbytes > most_bytes:
             fewer._spacing *= 2
@@ -64,7 +63,7 @@ class Snapshots(Generic[S]):
         return fewer
 
     def offer(self, scans: int, state: S) -> None:
-        """Keep a state if it is due."""
+        """Store a state if it is due."""
         if not self.is_due(scans):
             return
         self._states[scans], self._sizes[scans] = state, self._size_of(state)
@@ -76,50 +75,52 @@ class Snapshots(Generic[S]):
         return len(self._states) > _MOST_STATES or self.nbytes > _MOST_BYTES
 
     def is_due(self, scans: int) -> bool:
-        """Whether `offer` would keep a state of so many scans."""
+        """Return whether `offer` would store a state with this number of scans."""
         return scans % self._spacing == 0 and scans not in self._states
 
     def next_due(self, scans: int, most: int) -> int:
-        """The first number of scans beyond this one that `offer` may keep a state of, `most` if none is."""
+        """Return the next number of scans at which `offer` stores a state, at most `most`."""
         return min(scans - scans % self._spacing + self._spacing, most)
 
     def first(self, scans: int) -> dict[int, S]:
-        """The states that hold at most so many scans."""
+        """Return the states with at most this number of scans."""
         return {known: state for known, state in self._states.items() if known <= scans}
 
     def newest(self, scans: int) -> tuple[int, S]:
-        """The newest state that holds at most so many scans, with its number of scans."""
+        """Return the newest state with at most this number of scans, and its number of scans."""
         best = max(n for n in self._states if n <= scans)
         return best, self._states[best]
 
     def forget_after(self, scans: int) -> None:
-        """Drop the states that hold more scans."""
+        """Drop the states with more scans."""
         self._states = {n: s for n, s in self._states.items() if n <= scans}
 
 
 class ParameterHistory:
-    """Which parameters each scan of the run was mapped with."""
+    """Parameters with which each scan of the run was mapped."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._starts = [0]
         self._sets = [parameters]
 
     def at(self, index: int) -> Parameters:
-        """The parameters that a scan was or will be mapped with."""
+        """Return the parameters with which a scan was or will be mapped."""
         return self._sets[bisect_right(self._starts, index) - 1]
 
     def until(self, scans: int) -> int:
-        """Of the first scans, how many were mapped with the parameters of the first one."""
+        """Return the number of leading scans that were mapped with the parameters of the first scan."""
         return min([scans, *self._starts[1:2]])
 
     def were_always(self, parameters: Parameters, aside: set[str]) -> bool:
-        """Whether each scan was mapped with these values, those of some stages left aside."""
+        """Return whether every scan was mapped with these values, except those of some stages."""
         wanted = parameters.model_dump(exclude=aside)
         return all(known.model_dump(exclude=aside) == wanted for known in self._sets)
 
     def set_from(self, index: int, parameters: Parameters) -> bool:
-        """From a scan on, these are in force. Returns whether anything became different: if not,
-        what is known of later scans still holds."""
+        """Set the parameters from a scan onwards and return whether any value changes.
+
+        Without a change, the results of later scans remain valid.
+        """
         if self.at(index) == parameters and self._starts[-1] <= index:
             return False
         kept = max(1, sum(start < index for start in self._starts))
