@@ -262,11 +262,11 @@ def test_learning_says_what_it_needs_begins_when_asked_and_is_stopped(person: Da
     grow.click()
     stop = learn.get_by_role("button", name="Stop")
     expect(stop).to_be_visible()
-    expect(learn).to_contain_text("Looking through sim:stand")
+    expect(learn).to_contain_text("Mapping sim:stand")
     stop.click()
     expect(grow).to_be_enabled()
     person.until_server("/api/learning", "it.state === 'idle' && it.learned === null")
-    person.until_server("/api/parameters", "it.values['gathering.forest'] === 'package'")
+    person.until_server("/api/parameters", "it.values['classification.forest'] === 'package'")
     assert person.errors == []
 
 
@@ -288,15 +288,15 @@ def test_learned_trees_are_shown_beside_the_old_ones_and_used_when_asked(chromiu
         use = learn.get_by_role("button", name="Use the new ones")
         expect(use).to_be_visible(timeout=1000 * COMPILING_S)
         expect(learn.get_by_role("row", name=re.compile("^new"))).to_contain_text(" of ")
-        person.until_server("/api/parameters", "it.values['gathering.forest'] === 'package'")
+        person.until_server("/api/parameters", "it.values['classification.forest'] === 'package'")
         use.click()
         expect(learn.locator("#learn-used")).to_contain_text(
             re.compile(r"In use: trained 20\d\d-.* from \d+ trees, .* in 1 run")
         )
         name = person.ask("/api/learning")["learned"]["name"]
-        person.until_server("/api/parameters", f"it.values['gathering.forest'] === '{name}'")
+        person.until_server("/api/parameters", f"it.values['classification.forest'] === '{name}'")
         learn.get_by_role("button", name="Use the built-in ones").click()
-        person.until_server("/api/parameters", "it.values['gathering.forest'] === 'package'")
+        person.until_server("/api/parameters", "it.values['classification.forest'] === 'package'")
         assert person.errors == []
 
 

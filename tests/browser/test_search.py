@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, expect
 from tests.browser.conftest import opened
 from tests.browser.serving import Server
 
-SHARE = "it.values['gathering.tree_share']"
+SHARE = "it.values['classification.tree_share']"
 
 
 def test_a_better_set_is_found_used_undone_and_saved(chromium: Browser, tmp_path: Path):
@@ -23,7 +23,7 @@ def test_a_better_set_is_found_used_undone_and_saved(chromium: Browser, tmp_path
         dashboard.tab("Tune")
         # With this share a few columns alone are trees.
         page.locator("#tune-find").fill("tree_share")
-        share = page.locator("[id='tune-gathering.tree_share']")
+        share = page.locator("[id='tune-classification.tree_share']")
         share.fill("0.9")
         share.press("Enter")
         dashboard.until_server("/api/parameters", f"{SHARE} === 0.9")
@@ -34,7 +34,7 @@ def test_a_better_set_is_found_used_undone_and_saved(chromium: Browser, tmp_path
         for name in ("detection.e_max", "detection.arc_min", "tracking.hits_to_confirm"):
             page.locator(f"[data-axis='{name}'] button").click()
         expect(rows).to_have_count(5)
-        low = page.locator("[data-axis='gathering.tree_share'] input").first
+        low = page.locator("[data-axis='classification.tree_share'] input").first
         low.fill("0.9")
         page.locator("#search-trials").fill("5")
         page.locator("#search-start").click()  # its bounds contradict one another

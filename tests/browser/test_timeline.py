@@ -117,7 +117,7 @@ def test_a_seek_says_that_it_goes_there_and_compiling_counts_from_its_start(dash
     compiling = {"state": "waiting", "detail": "Compiling", "compiling_since_s": time.time() - 100.0}
     word, notice, _ = page.evaluate(UNDER, compiling)
     assert word == "Waiting"
-    passed = re.search(r" (\d+) s so far", notice)
+    passed = re.search(r"Compiling\. (\d+) s so far", notice)
     assert passed is not None, notice
     assert int(passed[1]) >= 98, "from its start, not from the opening of the page"
     expect(page.locator("#state b")).to_have_text("Paused")

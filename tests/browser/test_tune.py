@@ -71,7 +71,7 @@ def test_a_slider_moves_by_its_step_and_shows_the_same_in_the_scene(dashboard: D
 def test_what_is_refused_is_told_and_goes_back(dashboard: Dashboard):
     page = dashboard.page
     lowest = value(page, "detection.e_min")
-    for typed, words in (("900", "must be less than"), ("many", "is no number"), ("-3", "greater than")):
+    for typed, words in (("900", "must be less than"), ("many", "is not a number"), ("-3", "greater than")):
         lowest.fill(typed)
         lowest.press("Enter")
         expect(page.locator("#tune-error")).to_contain_text(words)

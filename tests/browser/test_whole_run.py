@@ -24,7 +24,7 @@ def trees(dashboard: Dashboard) -> int:
 def opened(dashboard: Dashboard) -> Locator:
     """The value of a parameter that decides what is a tree, in a stage that is folded at first."""
     dashboard.page.locator("#tune-find").fill("tree_share")
-    return dashboard.page.locator("[id='tune-gathering.tree_share']")
+    return dashboard.page.locator("[id='tune-classification.tree_share']")
 
 
 def drag(page: Page, slider: Locator, begin: float, ends: list[float]) -> None:
@@ -67,7 +67,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     before = float(share.input_value())
     dashboard.drawn()
     picture = drawn(page)
-    slider = page.locator("[data-parameter='gathering.tree_share'] input[type=range]")
+    slider = page.locator("[data-parameter='classification.tree_share'] input[type=range]")
     drag(page, slider, before, [0.75, 0.95])
     expect(told).to_contain_text("Re-mapped to 0:15.0: ", timeout=60_000)
     assert 0.9 < float(share.input_value()) < 1.0
@@ -147,7 +147,7 @@ def test_how_much_a_parameter_matters_is_drawn_and_a_click_sets_it(dashboard: Da
     dashboard.tab("Tune")
     page = dashboard.page
     share = opened(dashboard)
-    row = page.locator("[data-parameter='gathering.tree_share']")
+    row = page.locator("[data-parameter='classification.tree_share']")
     row.hover()
     row.locator(".matter").click()
     section = page.locator(".sensitivity")
@@ -166,6 +166,6 @@ def test_how_much_a_parameter_matters_is_drawn_and_a_click_sets_it(dashboard: Da
     box = picture.bounding_box()
     assert box is not None
     picture.click(position={"x": 0.9 * box["width"], "y": 0.5 * box["height"]})
-    dashboard.until_server("/api/parameters", "it.values['gathering.tree_share'] > 0.8")
+    dashboard.until_server("/api/parameters", "it.values['classification.tree_share'] > 0.8")
     expect(share).not_to_have_value("0.4")
     assert dashboard.errors == []

@@ -157,7 +157,7 @@ function compilingFor({ compiling_since_s: since }) {
   compiledAt = performance.now();
   if (ahead === null) askClock();
   const passed = Math.floor((Date.now() + ahead) / 1000 - since);
-  return passed >= 10 ? ` ${passed} s so far; a slow or busy machine takes longer.` : "";
+  return passed >= 10 ? `. ${passed} s so far; a slow or busy machine takes longer.` : "";
 }
 
 // The changing part of the notice, which a screen reader does not announce.
