@@ -84,11 +84,11 @@ def test_what_is_refused_is_told_and_goes_back(dashboard: Dashboard):
 
 def test_parameters_are_found_by_their_words(dashboard: Dashboard):
     page = dashboard.page
-    page.locator("#tune-find").fill("Heading metre")
+    page.locator("#tune-find").fill("Heading distance")
     rows = page.locator(".tune-row:visible")
     expect(rows.first).to_be_visible()
     names = rows.evaluate_all("all => all.map(row => row.dataset.words)")
-    assert all("heading" in words and "metre" in words for words in names)
+    assert all("heading" in words and "distance" in words for words in names)
     page.locator("#tune-find").fill("eps")
     titles = page.locator(".tune-row:visible label")
     expect(titles.first).to_have_text(re.compile("Radius eps"))
