@@ -157,17 +157,19 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
         stem = fit_stems(members, bounds, sensor.range_sigma, sensor.azimuth_step)
     else:
         stem = _centroids_as_stems(members, bounds, centroid, sensor.range_sigma)
+    # Contiguous, like clusters that are read from a cache: kernels are compiled for one memory layout only.
+    radius, radius_sigma, radial_std, arc = np.ascontiguousarray(stem[:, 5:9].T)
     return Clusters(
         size=size,
         centroid=centroid,
         eigenvalues=eigenvalues,
         eccentricity=eccentricity(eigenvalues),
-        centre=stem[:, 0:2],
-        covariance=stem[:, [2, 3, 3, 4]].reshape(-1, 2, 2),
-        radius=stem[:, 5],
-        radius_sigma=stem[:, 6],
-        radial_std=stem[:, 7],
-        arc=stem[:, 8],
+        centre=np.ascontiguousarray(stem[:, 0:2]),
+        covariance=np.take(stem, [2, 3, 3, 4], axis=1).reshape(-1, 2, 2),
+        radius=radius,
+        radius_sigma=radius_sigma,
+        radial_std=radial_std,
+        arc=arc,
         extent=extent,
         hidden=labels.hidden,
         cut=np.zeros(len(size), np.bool_),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -140,3 +142,12 @@ def test_no_clusters_are_columns_of_length_zero():
         assert told.centre.shape == (0, 2)
         assert told.covariance.shape == (0, 2, 2)
         assert len(told.eccentricity) == len(told.verdict) == len(told.radius) == 0
+
+
+@pytest.mark.parametrize("shape", [PAPER, FOREST], ids=["paper", "forest"])
+def test_columns_are_contiguous_like_those_of_a_cached_scan(shape):
+    label = np.repeat(np.arange(3, dtype=np.int32), 3)
+    labels = Labels(label, 3, np.zeros(3, np.bool_))
+    clusters = describe(np.ones((9, 3), np.float32), labels, SENSOR, shape)
+    for column in fields(clusters):
+        assert getattr(clusters, column.name).flags.c_contiguous, column.name
