@@ -228,7 +228,7 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
         (["zenoh:tcp/127.0.0.1:7447"], 2, "live run"),
         ([RUN, "--over", "detection.e_min=9..1"], 2, "must be less"),
         ([RUN, "--storage", "mysql://somewhere"], 2, "not the address of a PostgreSQL"),
-        ([RUN, OTHER, "--truth", "{far}"], 2, "Say which run each is of"),
+        ([RUN, OTHER, "--truth", "{far}"], 2, "Name the run of each file"),
     ],
 )
 def test_bad_input_is_told_in_a_line(words, code, told, tmp_path, capsys):
