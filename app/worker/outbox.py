@@ -26,9 +26,9 @@ MOST_MESSAGES = 500
 class Mailbox:
     """Writes messages to a stream in a separate thread, so that a slow reader never stops the mapping.
 
-    A newer frame replaces a waiting frame, and a newer status a waiting status. Other messages are sent in
-    order; beyond MOST_MESSAGES the oldest is dropped. After `Opened`, no frame of an older run is sent. A
-    message that cannot be sent is dropped, and the status reports it.
+    A newer frame replaces a waiting frame. A newer status replaces a waiting status if source and state are
+    the same. Other messages are sent in order; beyond MOST_MESSAGES the oldest is dropped. After `Opened`, no
+    frame of an older run is sent. A message that cannot be sent is dropped, and the status reports it.
 
     Args:
         stream: Output stream, which is not closed here.
@@ -60,8 +60,8 @@ class Mailbox:
             else:
                 if isinstance(message, Opened):
                     self._picture = None  # of the run before
-                if isinstance(message, Report) and self._messages and isinstance(self._messages[-1], Report):
-                    self._messages.pop()  # the newer state replaces one that was not sent yet
+                if self._messages and _replaces(message, self._messages[-1]):
+                    self._messages.pop()
                 if len(self._messages) >= MOST_MESSAGES:
                     self._messages.popleft()
                     self._refused = "the web process reads too slowly: messages were left out"
@@ -135,6 +135,16 @@ class Mailbox:
             self._sent_ground = picture.ground
         self._sent_run = shown.run
         return structs.replace(shown, frame=picture, path_start=start, path=rows_from(shown.path, start))
+
+
+def _replaces(newer: FromWorker, older: FromWorker) -> bool:
+    """Return whether a status replaces a waiting status.
+
+    Each change of source or state is sent: the web process follows an opening by the states in turn.
+    """
+    if not isinstance(newer, Report) or not isinstance(older, Report):
+        return False
+    return (newer.status.source, newer.status.state) == (older.status.source, older.status.state)
 
 
 def rows_in_common(old: Path, new: Path) -> int:

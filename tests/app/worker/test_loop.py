@@ -271,7 +271,7 @@ def test_the_newest_picture_wins_and_other_messages_are_all_sent() -> None:
             xs.append(float(k))
             mailbox.put(Shown(1, 0.1 * k, frame(k, k), 0, path(xs)))
             if k % 10 == 0:
-                mailbox.put(Report(make_session(FakeSource(1)).status()))
+                mailbox.put(Answer(k))
         collected: list[FromWorker] = []
         known: Path | None = None
         while not collected or not isinstance(collected[-1], Shown) or collected[-1].frame.index < 299:
@@ -282,9 +282,32 @@ def test_the_newest_picture_wins_and_other_messages_are_all_sent() -> None:
                 known = joined(known, message.path_start, message.path)
                 assert known.x.tolist() == xs[: message.frame.index + 1]
         mailbox.close()
-    assert sum(isinstance(message, Report) for message in collected) == 30
+    assert [message.ticket for message in collected if isinstance(message, Answer)] == list(range(0, 300, 10))
     assert shown(collected) == sorted(set(shown(collected)))
     assert len(shown(collected)) < 300
+
+
+def test_a_status_replaces_an_unsent_status_of_the_same_state_only() -> None:
+    class SlowStream(io.BytesIO):
+        """Its first write waits until all messages are in the mailbox."""
+
+        def write(self, data: Any) -> int:
+            begun.set()
+            assert may_write.wait(20.0)
+            return super().write(data)
+
+    begun, may_write = threading.Event(), threading.Event()
+    stream = SlowStream()
+    mailbox = Mailbox(stream)
+    mailbox.put(Answer(1))
+    assert begun.wait(20.0)
+    mailbox.put(Report(Status(state="starting", source="missing:")))
+    for k in range(3):
+        mailbox.put(Report(Status(state="failed", source="missing:", revision=k)))
+    may_write.set()
+    mailbox.close(20.0)
+    statuses = [message.status for message in received(stream) if isinstance(message, Report)]
+    assert [(status.state, status.revision) for status in statuses] == [("starting", 0), ("failed", 2)]
 
 
 def test_no_picture_of_the_run_before_follows_an_opening() -> None:

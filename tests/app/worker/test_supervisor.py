@@ -199,18 +199,34 @@ async def test_a_live_run_has_time_to_finish_its_recording(
     assert (tmp_path / "finished").exists()
 
 
-async def test_a_source_that_never_finishes_opening_is_ended_and_reported() -> None:
-    said = Said()
-    worker = WorkerProcess(said, FAKE, opening_limit_s=4.0)
-    await worker.start()
-    try:
+async def test_a_source_that_never_finishes_opening_is_ended_and_reported(
+    both: tuple[WorkerProcess, Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker, said = both
+    await said.wait(lambda m: isinstance(m, Report))  # the process has started, which takes some seconds
+    with monkeypatch.context() as short:
+        short.setattr(worker, "_opening_limit_s", 0.5)
         await worker.send(Open("hangs:"))
-        assert "took longer than 4 s" in (await said.state("failed")).detail
-        await worker.send(Open("fake:5"))
-        await said.opened()
-        assert worker.restarts == 0
-    finally:
-        await worker.close()
+        assert "took longer than 0.5 s" in (await said.state("failed")).detail
+    await worker.send(Open("fake:5"))
+    await said.opened()
+    assert worker.restarts == 0
+
+
+async def test_a_refused_source_is_no_longer_being_opened(
+    both: tuple[WorkerProcess, Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its refusal follows its first status at once, and neither may be lost on the way."""
+    worker, said = both
+    await said.wait(lambda m: isinstance(m, Report))
+    pid = worker.pid
+    monkeypatch.setattr(worker, "_opening_limit_s", 0.5)
+    for _ in range(5):
+        await worker.send(Open("missing:"))
+        await said.state("failed")
+    await asyncio.sleep(1.0)
+    assert worker.pid == pid
+    assert worker._opening == ""
 
 
 async def test_another_source_replaces_one_that_does_not_finish_opening(
