@@ -74,8 +74,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Score the runs and print the scores."""
     if len(arguments.truth) not in (0, 1, len(arguments.runs)):
+        from app.common.text import count
+
         raise ParameterError(
-            f"{len(arguments.truth)} tables of true trees for {len(arguments.runs)} runs",
+            f"{count(len(arguments.truth), 'table')} of true trees for {count(len(arguments.runs), 'run')}",
             remedy="Give --truth once for all of them, or once for each in their order",
         )
     if arguments.param_grid:

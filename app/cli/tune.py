@@ -204,8 +204,10 @@ def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
             named[run] = text.removeprefix(f"{run}=")
     others = [uri for uri in uris if uri not in named]
     if bare and len(bare) != len(others):
+        from app.common.text import count
+
         raise ParameterError(
-            f"{len(bare)} files of true trees for {len(others)} runs",
+            f"{count(len(bare), 'file')} of true trees for {count(len(others), 'run')}",
             where=bare[0],
             remedy="Name the run of each file: --truth RUN=FILE",
         )

@@ -110,7 +110,7 @@ def test_truth_far_from_the_path_is_no_score():
         ([RUN, "--param-grid", "slam.gate=2", "--jobs", "0"], 2, "1 to 1024"),
         ([RUN, "--param-grid", "slam.gate=2", "--dask", "http://x:1"], 2, "tcp://host:port"),
         ([RUN, "--out", "x"], 2, "--param-grid"),
-        ([RUN, "--truth", "a", "--truth", "b"], 2, "2 tables of true trees for 1 runs"),
+        ([RUN, "--truth", "a", "--truth", "b"], 2, "2 tables of true trees for 1 run."),
     ],
     ids=str,
 )  # fmt: skip
