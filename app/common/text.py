@@ -1,9 +1,16 @@
-"""Text that several packages show to users."""
+"""Text that several packages show to users.
+
+`pipeline.config` is imported inside the functions, because `--help` imports this module and has to answer at
+once.
+"""
 
 from __future__ import annotations
 
-from pipeline.config import PRESETS, Parameters, preset
-from pipeline.config.model import Value
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pipeline.config import Parameters
+    from pipeline.config.model import Value
 
 COMPILING = "compiling for this machine; it takes some minutes the first time, less for a new kind of source"
 
@@ -25,6 +32,8 @@ MOST = 6  # maximum number of values in a line
 def changed_values(name: str, parameters: Parameters) -> dict[str, Value]:
     """Return the values that differ from a preset, by dotted name; all values if the preset does not
     exist."""
+    from pipeline.config import PRESETS, preset
+
     return parameters.changes_from(preset(name)) if name in PRESETS else dict(parameters.flat())
 
 

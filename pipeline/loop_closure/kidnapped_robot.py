@@ -176,4 +176,5 @@ def _stems(slam: FastSlam, parameters: Parameters) -> Stems:
 
 def local_seed(seed: int) -> int:
     """The seed of the local map: independent of the seeds of all runs, also of those with a near seed."""
-    return int(np.random.SeedSequence(seed, spawn_key=(LOCAL_MAP,)).generate_state(1)[0])
+    sequence = np.random.SeedSequence(seed, spawn_key=(LOCAL_MAP,))
+    return int(sequence.generate_state(1)[0])
