@@ -78,13 +78,13 @@ class ScanCache:
         self.refusal = self.notice = ""
         self._end = len(header)
         if file is None:
-            self._refuse("no folder can be written to")
+            self.refusal = "no scan is cached: no folder can be written to"
             return
         weakref.finalize(self, file.close)
         try:
             self._open(header)
         except OSError as error:
-            self._refuse(error.strerror or str(error))
+            self.refusal = f"no scan is cached: {error.strerror or error}"
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -105,19 +105,19 @@ class ScanCache:
         try:
             head, block = pack(step, scan)
             if self._end + ROW.itemsize + len(block) > self._most:
-                self._refuse(f"the cache is limited to {self._most / 1e9:.1f} GB")
+                self._refuse(step.index, f"the cache is limited to {self._most / 1e9:.1f} GB")
                 return
             if step.index % SCANS_BETWEEN_CHECKS == 0 and free_space(self._folder) < SPARE_BYTES + len(block):
-                self._refuse(f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
+                self._refuse(step.index, f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
                 return
             row = np.array((len(block), zlib.crc32(block), head, 0), ROW)
             row["row_crc"] = _checksum(row)
             _write(self._file, self._end, row.tobytes() + block)
         except TooLargeError as error:
-            self._refuse(str(error))
+            self._refuse(step.index, str(error))
             return
         except OSError as error:
-            self._refuse(error.strerror or str(error))
+            self._refuse(step.index, error.strerror or str(error))
             return
         self._rows[step.index] = (self._end + ROW.itemsize, row)
         self._end += ROW.itemsize + len(block)
@@ -171,8 +171,9 @@ class ScanCache:
             self.notice = DAMAGED.format(len(self._rows))
             self._file.truncate(self._end)
 
-    def _refuse(self, why: str) -> None:
-        self.refusal = f"from scan {len(self._rows)} on nothing is cached: {why}"
+    def _refuse(self, index: int, why: str) -> None:
+        """Report the first scan that is not stored; later ones may be smaller and fit."""
+        self.refusal = self.refusal or f"scan {index} and possibly later scans are not cached: {why}"
 
 
 class ScanCaches:
