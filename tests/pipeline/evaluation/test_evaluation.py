@@ -88,7 +88,7 @@ def test_a_truth_that_few_trees_match_is_doubted(right, elsewhere, missed, doubt
     told = truth_in_doubt(score)
     assert bool(told) is doubtful
     if doubtful:
-        assert told.startswith(f"only 1 of {right + missed} true trees lies" if right else "none of 16")
+        assert told.startswith(f"only 1 of {right + missed} true trees is near" if right else "none of 16")
         assert f"warning: {told}" in evaluation_lines(score)
 
 

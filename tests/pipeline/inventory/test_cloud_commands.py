@@ -38,11 +38,11 @@ def test_info_tells_what_is_in_a_cloud_and_what_to_do_with_it(cloud, capsys, mon
     monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
     told = stemmap(capsys, "info", cloud)
     assert (told.code, told.err) == (0, "")
-    said = {line[:10].strip(): line[10:] for line in told.out.splitlines()}
+    said = {line[:11].strip(): line[11:] for line in told.out.splitlines()}
     assert said["kind"].startswith("whole cloud, LAS 1.4 compressed")
     assert said["CRS"] == "NAD83 / UTM zone 12N (EPSG:26912)"
     assert said["extent"].startswith("15.0 x 15.0 m, ")
-    assert "intensity" in said["each has"]
+    assert "intensity" in said["attributes"]
     assert f"stemmap map {cloud} --out out" in told.out
     record = json.loads(stemmap(capsys, "info", cloud, "--json").out)
     assert record["points"] == int(said["points"].replace(",", ""))
@@ -85,9 +85,9 @@ def test_the_map_of_a_cloud_is_judged_as_a_whole(mapped, tmp_path, capsys):
 
 
 def test_what_needs_a_drive_is_refused_for_a_cloud_in_its_own_words(mapped, cloud, tmp_path, capsys):
-    stemmap(capsys, "export", mapped, "--out", tmp_path / "states").refused(1, "nobody drove")
+    stemmap(capsys, "export", mapped, "--out", tmp_path / "states").refused(1, "has no poses")
     words = ["map", "sim:paper?duration=2", "--continue", mapped, "--out", tmp_path / "both"]
-    stemmap(capsys, *words).refused(1, "whole cloud", "no drive goes on")
+    stemmap(capsys, *words).refused(1, "whole cloud", "cannot be continued")
     stemmap(capsys, "merge", mapped, mapped, "--out", tmp_path / "both").refused(1, "whole cloud")
     stemmap(capsys, "map", cloud, "--continue", mapped, "--out", tmp_path / "both").refused(2, "--continue")
     assert not (tmp_path / "both").exists()

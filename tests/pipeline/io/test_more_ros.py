@@ -181,8 +181,8 @@ def test_a_lidar_is_taken_before_the_bumper_and_info_says_why(
     assert chosen.description.sensor.rings == 1
     assert main(["info", str(path)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert any("/scan" in line and "not read: /points sees in space, could be scan" in line for line in lines)
-    assert any("/points" in line and "10.0 Hz" in line and "read as scan" in line for line in lines)
+    assert any("/scan" in line and "not used: /points sees in space, could be scan" in line for line in lines)
+    assert any("/points" in line and "10.0 Hz" in line and "used as scan" in line for line in lines)
 
 
 @pytest.mark.parametrize(
