@@ -9,7 +9,7 @@ from playwright.sync_api import expect
 from tests.browser.dashboard import Dashboard
 
 FOUND = {
-    "tree_share": "Votes for a tree",
+    "tree_share": "Tree threshold",
     "how much does radius eps": "Sensitivity of Radius eps",
     "tune for me": "Tune for me",
     "learn train": "Learn: train",

@@ -54,7 +54,7 @@ def test_the_eps_slider_moves_by_the_keyboard(dashboard: Dashboard):
 
 
 def test_a_value_that_contradicts_another_goes_back_and_says_why(dashboard: Dashboard):
-    box = dashboard.row("Eccentricity min").locator("input[type=text]")
+    box = dashboard.row("Minimum eccentricity").locator("input[type=text]")
     box.fill("900")
     box.press("Tab")
     expect(dashboard.scene.get_by_text("must be less than")).to_be_visible()
