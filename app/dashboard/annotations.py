@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from app.store.async_store import Keeper
+from app.store.async_store import AsyncStore
 from app.store.records import Annotation, Content, StaleError
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
@@ -155,7 +155,7 @@ class Annotating:
         serial: Grows with each edit, so that a page knows when it has seen what it did.
     """
 
-    def __init__(self, keeper: Keeper) -> None:
+    def __init__(self, keeper: AsyncStore) -> None:
         self.run: int | None = None
         self.rows: list[Annotation] = []
         self.truth: TruthTrees | None = None

@@ -30,7 +30,7 @@ from app.dashboard.scores import Scores, score_payload
 from app.dashboard.selection import Selecting
 from app.explain.client import WorkerClient
 from app.sources.request import SourceRequest
-from app.store.async_store import Keeper
+from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
 from app.tuning.sweep.sensitivity import Sensitivity, question_of
 from app.worker.internal_protocol import (
@@ -101,9 +101,9 @@ class Dashboard:
     worker: WorkerLike
     scene: SceneLike
 
-    def __init__(self, parameters: ParameterState, live: Live, keeper: Keeper | None = None) -> None:
+    def __init__(self, parameters: ParameterState, live: Live, keeper: AsyncStore | None = None) -> None:
         self.parameters = parameters
-        self.keeper = keeper or Keeper(None)
+        self.keeper = keeper or AsyncStore(None)
         self.logbook = Logbook(self.keeper)
         self.annotating = Annotating(self.keeper)
         self.annotating.changed, self.annotating.edited = self._use_truth, self._mark_edits

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from app.common.child_process import ChildProcess, python_module
-from app.store.async_store import Keeper
+from app.store.async_store import AsyncStore
 from app.store.store import AnnotatedSource
 from app.training.learned_forests import Forests
 from pipeline.classification.forest import PACKAGE
@@ -37,7 +37,7 @@ class Learning:
 
     def __init__(
         self,
-        keeper: Keeper,
+        keeper: AsyncStore,
         folder: Path | None,
         tell: Callable[[dict[str, Any]], None],
         command: Sequence[str] = LEARN,

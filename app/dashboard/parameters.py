@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from app.store.async_store import Keeper
+from app.store.async_store import AsyncStore
 from app.store.records import SavedSet, UnknownError
 from pipeline.config import PRESETS, Parameters, field_specs, from_toml, preset, to_toml
 from pipeline.config.model import Value
@@ -244,7 +244,7 @@ class ParameterSets:
         changed: Called when others stand there.
     """
 
-    def __init__(self, keeper: Keeper, changed: Callable[[], None]) -> None:
+    def __init__(self, keeper: AsyncStore, changed: Callable[[], None]) -> None:
         self._keeper, self._changed = keeper, changed
         self._sets: dict[str, SavedSet] = {}
         self._values: dict[str, tuple[str, Parameters]] = {}

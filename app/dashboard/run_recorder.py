@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from app.dashboard.payload import trees_payload, truth_payload
 from app.sources.request import SourceRequest
-from app.store.async_store import Keeper
-from app.store.book import Beginning, Change, Standing
+from app.store.async_store import AsyncStore
+from app.store.book import Change, NewRun, RunFigures
 from app.store.store import Store
 from app.worker.internal_protocol import Opened, Shown
 from pipeline.config.model import Value
@@ -56,7 +56,7 @@ class Glance:
 class _Page:
     """Record of one run; `best` is the state at the farthest scan that was reached."""
 
-    beginning: Beginning
+    beginning: NewRun
     all_scans: int | None
     record: int | None = None
     best: Glance | None = None
@@ -75,7 +75,7 @@ class Logbook:
         keeper: Asynchronous access to the store.
     """
 
-    def __init__(self, keeper: Keeper) -> None:
+    def __init__(self, keeper: AsyncStore) -> None:
         self._keeper = keeper
         self._page: _Page | None = None
         self._writer: asyncio.Task[None] | None = None
@@ -101,7 +101,7 @@ class Logbook:
         if run is None:
             return
         name = FilePath(opened.uri.rstrip("/")).name or opened.uri
-        beginning = Beginning(run, name, opened.kind, msgspec.structs.replace(source, uri=opened.uri))
+        beginning = NewRun(run, name, opened.kind, msgspec.structs.replace(source, uri=opened.uri))
         self._page = _Page(beginning, opened.scans)
 
     def leave(self) -> None:
@@ -220,12 +220,12 @@ async def _quietly(work: Any) -> None:  # noqa: ANN401 - any coroutine
         await work
 
 
-def _standing(glance: Glance, all_scans: int | None) -> Standing:
+def _standing(glance: Glance, all_scans: int | None) -> RunFigures:
     shown = glance.shown
     frame = shown.frame
     trees = trees_payload(frame, start_ns=frame.stamp_ns - round(shown.time_s * 1e9))
     truth = truth_payload(glance.truth)
-    return Standing(
+    return RunFigures(
         scans=frame.index + 1,
         all_scans=all_scans,
         time_s=round(shown.time_s, 3),

@@ -23,7 +23,7 @@ class StoreBusyError(StemmapError):
     """Too many requests wait for the database. The same request may succeed later."""
 
 
-class Keeper:
+class AsyncStore:
     """Opens the store with the first request, and runs one request after the other.
 
     Args:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from sqlalchemy import Connection, Engine, Row, Select, delete, insert, select, update
 
 from app.sources.request import SourceRequest
-from app.store import tables
+from app.store.database import maps as _maps
+from app.store.database import records as _records
+from app.store.database import revisions as _revisions
+from app.store.database import runs as _runs
+from app.store.database import uploads as _uploads
 from app.store.records import UnknownError
-
-_records, _maps, _revisions, _uploads = tables.records, tables.maps, tables.revisions, tables.uploads
 
 MOST_LISTED = 500
 # Time during which a deletion can be undone.
@@ -22,7 +24,7 @@ _ONE_MOVE_NS = 3_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Beginning:
+class NewRun:
     """Start of a run: number of its source in the store, name, format, and the request that opened it."""
 
     run: int
@@ -32,7 +34,7 @@ class Beginning:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class RunFigures:
     """Current result of a run.
 
     Attributes:
@@ -53,9 +55,9 @@ class Standing:
     distance_m: float
     trees: int
     preset: str
-    parameters: Mapping[str, Any]
-    scores: Mapping[str, Any] | None
-    map: Mapping[str, Any] = field(repr=False)
+    parameters: dict[str, Any]
+    scores: dict[str, Any] | None
+    map: dict[str, Any] = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ class Change:
     changes: dict[str, list[Any]]
 
 
-class RunBook:
+class RunRecords:
     """Records of all runs. All calls block.
 
     Args:
@@ -81,40 +83,36 @@ class RunBook:
         self._engine = engine
         self._clock = clock
 
-    def begin(self, beginning: Beginning, standing: Standing) -> int:
+    def begin(self, run: NewRun, figures: RunFigures) -> int:
         """Create the record of a new run and return its number."""
         now = self._clock()
         with self._engine.begin() as connection:
             _forget_deleted(connection, now - _KEPT_NS)
-            uploaded = select(_uploads.c.name).where(_uploads.c.file == beginning.name)
+            uploaded = select(_uploads.c.name).where(_uploads.c.file == run.name)
             values = {
-                "run": beginning.run,
-                "name": connection.execute(uploaded).scalar() or beginning.name[:200],
-                "uri": beginning.request.uri,
-                "kind": beginning.kind[:200],
-                "odometry": beginning.request.odometry,
-                "seed": beginning.request.seed,
-                "chosen": beginning.request.kept_choices(),
+                "run": run.run,
+                "name": connection.execute(uploaded).scalar() or run.name[:200],
+                "uri": run.request.uri,
+                "kind": run.kind[:200],
+                "odometry": run.request.odometry,
+                "seed": run.request.seed,
+                "chosen": run.request.kept_choices(),
                 "begun_ns": now,
                 "changed_ns": now,
-                **_figures(standing),
+                **_figures(figures),
             }
             key = connection.execute(insert(_records).values(**values)).inserted_primary_key
             assert key is not None  # noqa: S101 - one row was inserted
             record = int(key[0])
-            connection.execute(insert(_maps).values(record=record, map=dict(standing.map)))
+            connection.execute(insert(_maps).values(record=record, map=figures.map))
             return record
 
-    def update(self, record: int, standing: Standing) -> None:
+    def update(self, record: int, figures: RunFigures) -> None:
         """Update the record of a run."""
         with self._engine.begin() as connection:
-            values = {"changed_ns": self._clock(), **_figures(standing)}
+            values = {"changed_ns": self._clock(), **_figures(figures)}
             connection.execute(update(_records).where(_records.c.id == record).values(**values))
-            connection.execute(update(_maps).where(_maps.c.record == record).values(map=dict(standing.map)))
-
-    def revise(self, record: int, change: Change) -> None:
-        """Store a change of parameters; changes by one movement of a slider become one."""
-        self.revise_all(record, [change])
+            connection.execute(update(_maps).where(_maps.c.record == record).values(map=figures.map))
 
     def revise_all(self, record: int, changes: Sequence[Change]) -> None:
         """Store changes of parameters in one transaction, the oldest first."""
@@ -211,20 +209,12 @@ def _revise(connection: Connection, record: int, change: Change, now: int) -> No
 
 def _with_source() -> Select[Any]:
     """Return the query of records with `source`, which all runs of one recording share."""
-    return select(_records, tables.runs.c.source).join(tables.runs, tables.runs.c.id == _records.c.run)
+    return select(_records, _runs.c.source).join(_runs, _runs.c.id == _records.c.run)
 
 
-def _figures(standing: Standing) -> dict[str, Any]:
-    return {
-        "scans": standing.scans,
-        "all_scans": standing.all_scans,
-        "time_s": standing.time_s,
-        "distance_m": standing.distance_m,
-        "trees": standing.trees,
-        "preset": standing.preset,
-        "parameters": dict(standing.parameters),
-        "scores": None if standing.scores is None else dict(standing.scores),
-    }
+def _figures(figures: RunFigures) -> dict[str, Any]:
+    """The columns of `run_records` that change while a run plays."""
+    return {each.name: getattr(figures, each.name) for each in fields(figures) if each.name != "map"}
 
 
 def _is_one_move(last: Row[Any], change: Change, now: int) -> bool:

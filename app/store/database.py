@@ -1,4 +1,4 @@
-"""Opens the database durably, creates its tables and migrates those of older versions."""
+"""Opens the database durably and creates its tables, or checks their version."""
 
 from __future__ import annotations
 
@@ -7,14 +7,23 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import (
+    JSON,
     URL,
+    BigInteger,
+    Boolean,
     Column,
     Connection,
     Engine,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
     MetaData,
     StaticPool,
     String,
     Table,
+    Text,
+    UniqueConstraint,
     create_engine,
     event,
     insert,
@@ -24,71 +33,34 @@ from sqlalchemy import (
 )
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
-from app.store.tables import metadata
 from pipeline.errors import StemmapError
 
-# Oldest first; the last one corresponds to `app.store.tables`.
-REVISIONS = ("0001", "0002", "0003", "0004", "0005")
-_FOLDER = Path(__file__).parent / "migrations"
-# Version table of alembic.
+# Version of the tables, in a table that keeps the name under which Alembic reads it.
+VERSION = "0005"
 _version = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
-_BEFORE_ALEMBIC = "schema_version"
-_OWN_VERSIONS = {1: "0001", 2: "0002"}
 
 
-def bring_up_to_date(connection: Connection) -> None:
-    """Create the tables, or migrate those of an older version, within the open transaction.
+def _prepare_tables(connection: Connection) -> None:
+    """Create the tables of a new database, or check the version of an existing one.
 
     Raises:
-        StemmapError: The tables are of a newer version or of another program.
+        StemmapError: The tables are of another version or of another program.
     """
-    names = set(inspect(connection).get_table_names())
+    names = inspect(connection).get_table_names()
     if not names:
         metadata.create_all(connection)
-        _stamp(connection, REVISIONS[-1])
+        _version.create(connection)
+        connection.execute(insert(_version).values(version_num=VERSION))
         return
-    if _BEFORE_ALEMBIC in names and _version.name not in names:
-        _leave_own_version(connection)
-    elif _version.name not in names:
+    if _version.name not in names:
         raise StemmapError("this database belongs to another program")
-    standing = connection.execute(select(_version.c.version_num)).scalar()
-    if standing not in REVISIONS:
-        raise _newer(standing)
-    if standing != REVISIONS[-1]:
-        upgrade(connection)
-
-
-def upgrade(connection: Connection, revision: str = "head") -> None:
-    """Run the migrations up to a revision."""
-    from alembic import command
-    from alembic.config import Config
-
-    config = Config()
-    config.set_main_option("script_location", str(_FOLDER).replace("%", "%%"))
-    config.attributes["connection"] = connection
-    command.upgrade(config, revision)
-
-
-def _leave_own_version(connection: Connection) -> None:
-    """Convert the version table of the first databases to that of alembic."""
-    own = Table(_BEFORE_ALEMBIC, MetaData(), autoload_with=connection)
-    version = connection.execute(select(own.c.version)).scalar()
-    if version not in _OWN_VERSIONS:
-        raise _newer(version)
-    own.drop(connection)
-    _stamp(connection, _OWN_VERSIONS[version])
-
-
-def _stamp(connection: Connection, revision: str) -> None:
-    _version.create(connection)
-    connection.execute(insert(_version).values(version_num=revision))
-
-
-def _newer(version: object) -> StemmapError:
-    return StemmapError(
-        f"it was written by a newer stemmap (tables {version}, this one knows {REVISIONS[-1]})",
-        remedy="Start the newer stemmap",
-    )
+    version = str(connection.execute(select(_version.c.version_num)).scalar())
+    if version != VERSION:
+        author = "a newer stemmap" if version > VERSION else "an older stemmap"
+        raise StemmapError(
+            f"it was written by {author} (tables {version}, this one reads {VERSION})",
+            remedy="Start that version",
+        )
 
 
 FILE_NAME = "annotations.sqlite"
@@ -118,7 +90,7 @@ def open_engine(folder: Path | None, database: str = "") -> Engine:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
         raise StemmapError(
-            f"annotations cannot be kept: {(error.strerror or str(error)).lower()}",
+            f"annotations cannot be stored: {(error.strerror or str(error)).lower()}",
             where=str(folder),
             remedy="Name another folder with STEMMAP_FOLDER",
         ) from None
@@ -185,14 +157,14 @@ def _postgresql(url: URL) -> Engine:
 
 
 def _checked(engine: Engine, where: str) -> Engine:
-    keep = "It is left as it is: move it away to begin anew, or bring back a copy"
+    keep = "It was not changed: move it away to start with an empty one, or restore a copy"
     try:
         with engine.begin() as connection:
             if engine.dialect.name == "sqlite":
-                said = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
-                if said != "ok":
+                result = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
+                if result != "ok":
                     raise StemmapError("the annotations are damaged", where=where, remedy=keep)
-            bring_up_to_date(connection)
+            _prepare_tables(connection)
     except StemmapError as error:
         engine.dispose()
         if error.where:
@@ -201,7 +173,9 @@ def _checked(engine: Engine, where: str) -> Engine:
         raise StemmapError(what, where=where, remedy=error.remedy or keep) from None
     except (SQLAlchemyError, sqlite3.Error) as error:
         engine.dispose()
-        remedy = keep if engine.dialect.name == "sqlite" else "Look whether the server runs and lets you in"
+        remedy = (
+            keep if engine.dialect.name == "sqlite" else "Check that the server runs and accepts this user"
+        )
         raise StemmapError(
             f"the annotations cannot be read: {reason_of(error)}", where=where, remedy=remedy
         ) from None
@@ -211,3 +185,129 @@ def _checked(engine: Engine, where: str) -> Engine:
 def reason_of(error: Exception) -> str:
     """Return the reason of a database error in one line."""
     return " ".join(str(getattr(error, "orig", None) or error).lower().split())[:300]
+
+
+metadata = MetaData()
+
+# Sources: all runs of a recording share its annotations.
+runs = Table(
+    "runs",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("source", String(4200), nullable=False, comment="digest of what was recorded, else the URI"),
+    Column("uri", String(4096), nullable=False),
+    Column("name", String(200), nullable=False),
+    Column("opened_ns", BigInteger, nullable=False),
+    UniqueConstraint("source"),
+)
+
+annotated = Table(
+    "annotations",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("run", ForeignKey("runs.id"), nullable=False, index=True),
+    Column("x", Float, nullable=False),
+    Column("y", Float, nullable=False),
+    Column("kind", String(10), nullable=False),
+    Column("dbh", Float),
+    Column("who", String(60), nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+    Column("version", Integer, nullable=False),
+    Column("deleted", Boolean, nullable=False),
+    Column("made_by", Integer, nullable=False, comment="the change that led to what stands; 0 none"),
+    sqlite_autoincrement=True,
+)
+
+steps = Table(
+    "steps",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("run", ForeignKey("runs.id"), nullable=False),
+    Column("browser", String(60), nullable=False),
+    Column("who", String(60), nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+    Column("state", String(10), nullable=False, comment="done, undone, or left: no longer to be undone"),
+    Index("steps_of_a_browser", "run", "browser", "state", "id"),
+    sqlite_autoincrement=True,
+)
+
+changes = Table(
+    "changes",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("step", ForeignKey("steps.id"), nullable=False, index=True),
+    Column("annotation", ForeignKey("annotations.id"), nullable=False),
+    Column("before", JSON(none_as_null=True)),
+    Column("after", JSON(none_as_null=True)),
+    Column("made_before", Integer, nullable=False, comment="the change that led to `before`"),
+    sqlite_autoincrement=True,
+)
+
+parameter_sets = Table(
+    "parameter_sets",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("name", String(60), nullable=False),
+    Column("toml", Text, nullable=False, comment="the file that --config takes"),
+    Column("who", String(60), nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+    UniqueConstraint("name"),
+)
+
+# Runs: one row for each time that a source was opened and mapped.
+records = Table(
+    "run_records",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("run", ForeignKey("runs.id"), nullable=False, index=True),
+    Column("name", String(200), nullable=False),
+    Column("uri", String(4096), nullable=False),
+    Column("kind", String(200), nullable=False),
+    Column("odometry", String(4096), nullable=False),
+    Column("seed", BigInteger, nullable=False),
+    Column("chosen", JSON(none_as_null=True), comment="topics and mounting, see SourceRequest.kept_choices"),
+    Column("begun_ns", BigInteger, nullable=False),
+    Column("changed_ns", BigInteger, nullable=False),
+    Column("deleted_ns", BigInteger),
+    Column("scans", Integer, nullable=False, comment="mapped; figures, parameters and map are of the last"),
+    Column("all_scans", Integer),
+    Column("time_s", Float, nullable=False),
+    Column("distance_m", Float, nullable=False),
+    Column("trees", Integer, nullable=False),
+    Column("preset", String(100), nullable=False),
+    Column("parameters", JSON(none_as_null=True), nullable=False),
+    Column("scores", JSON(none_as_null=True)),
+    sqlite_autoincrement=True,
+)
+
+# Separate from the records, so that their list is small.
+maps = Table(
+    "run_maps",
+    metadata,
+    Column("record", ForeignKey("run_records.id"), primary_key=True),
+    Column("map", JSON(none_as_null=True), nullable=False),
+)
+
+revisions = Table(
+    "parameter_revisions",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("record", ForeignKey("run_records.id"), nullable=False, index=True),
+    Column("revision", Integer, nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+    Column("time_s", Float, nullable=False, comment="of the scan that stood in the run"),
+    Column("who", String(60), nullable=False),
+    Column("preset", String(100), nullable=False),
+    Column("changes", JSON(none_as_null=True), nullable=False, comment="name: [before, after]"),
+    sqlite_autoincrement=True,
+)
+
+uploads = Table(
+    "uploads",
+    metadata,
+    Column("file", String(100), primary_key=True, comment="name in the folder of uploads"),
+    Column("name", String(200), nullable=False, comment="that it had where it came from"),
+    Column("kind", String(200), nullable=False),
+    Column("bytes", BigInteger, nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+)

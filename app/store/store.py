@@ -17,9 +17,14 @@ from typing import Any, Literal
 from sqlalchemy import Connection, Engine, Insert, Row, delete, func, insert, select, update
 
 from app.sources.request import SourceRequest, request_of_kept
-from app.store import tables
-from app.store.book import RunBook
+from app.store.book import RunRecords
+from app.store.database import annotated as _annotations
+from app.store.database import changes as _changes
 from app.store.database import open_engine
+from app.store.database import parameter_sets as _sets
+from app.store.database import records as _records
+from app.store.database import runs as _runs
+from app.store.database import steps as _steps
 from app.store.records import (
     MOST_ANNOTATIONS,
     MOST_SETS,
@@ -31,10 +36,7 @@ from app.store.records import (
     UnknownError,
     moment,
 )
-from app.store.tables import parameter_sets as table
 from pipeline.errors import StemmapError
-
-_runs, _annotations, _records = tables.runs, tables.annotated, tables.records
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,45 +56,6 @@ class AnnotatedSource:
     annotations: tuple[Content, ...]
 
 
-def annotated_sources(engine: Engine) -> list[AnnotatedSource]:
-    """All sources with annotations, in the order in which they were first opened."""
-    a = _annotations.c
-    query = select(a.run, a.x, a.y, a.kind, a.dbh).where(a.deleted.is_(False)).order_by(a.id)
-    with engine.begin() as connection:
-        contents: dict[int, list[Content]] = {}
-        for row in connection.execute(query):
-            contents.setdefault(row.run, []).append(Content(row.x, row.y, row.kind, row.dbh))
-        found = []
-        for run in connection.execute(select(_runs).where(_runs.c.id.in_(contents)).order_by(_runs.c.id)):
-            newest = connection.execute(
-                select(_records)
-                .where(_records.c.run == run.id, _records.c.deleted_ns.is_(None), _records.c.scans > 0)
-                .order_by(_records.c.changed_ns.desc(), _records.c.id.desc())
-                .limit(1)
-            ).one_or_none()
-            found.append(
-                AnnotatedSource(
-                    run.source,
-                    run.name,
-                    SourceRequest(run.uri) if newest is None else request_of_record(newest, run.uri),
-                    tuple(contents[run.id]),
-                )
-            )
-    return found
-
-
-def request_of_record(row: Row[Any], uri: str) -> SourceRequest:
-    """Return how a recorded run was mapped, with the path at which its source was opened last."""
-    return request_of_kept(
-        uri,
-        odometry=row.odometry,
-        seed=row.seed,
-        choices=row.chosen,
-        preset=row.preset,
-        parameters=row.parameters,
-    )
-
-
 class Sets:
     """Saved parameter sets.
 
@@ -107,7 +70,7 @@ class Sets:
     def all(self) -> list[SavedSet]:
         """Return every set, sorted by name."""
         with self._engine.begin() as connection:
-            rows = connection.execute(select(table).order_by(table.c.name)).all()
+            rows = connection.execute(select(_sets).order_by(_sets.c.name)).all()
         return [SavedSet(row.name, row.toml, row.who, row.at_ns) for row in rows]
 
     def save(self, name: str, toml: str, who: str) -> None:
@@ -117,11 +80,11 @@ class Sets:
             StemmapError: The maximum number of sets is reached.
         """
         with self._engine.begin() as connection:
-            connection.execute(delete(table).where(table.c.name == name))
-            if connection.execute(select(func.count()).select_from(table)).scalar_one() >= MOST_SETS:
+            connection.execute(delete(_sets).where(_sets.c.name == name))
+            if connection.execute(select(func.count()).select_from(_sets)).scalar_one() >= MOST_SETS:
                 raise StemmapError(f"there are {MOST_SETS} saved sets already", remedy="Delete some first")
             values = {"name": name, "toml": toml, "who": who, "at_ns": self._clock()}
-            connection.execute(insert(table).values(**values))
+            connection.execute(insert(_sets).values(**values))
 
     def delete(self, name: str) -> None:
         """Delete a set.
@@ -130,13 +93,12 @@ class Sets:
             UnknownError: No set has this name.
         """
         with self._engine.begin() as connection:
-            if connection.execute(delete(table).where(table.c.name == name)).rowcount == 0:
+            if connection.execute(delete(_sets).where(_sets.c.name == name)).rowcount == 0:
                 raise UnknownError("there is no saved set of this name", where=name)
 
 
 # Longer keys are URIs, never digests.
 _LONGEST_KEY = 600
-_annotations, _changes, _steps, _runs = tables.annotated, tables.changes, tables.steps, tables.runs
 
 
 class Store:
@@ -156,7 +118,7 @@ class Store:
     ) -> None:
         self._engine = open_engine(folder, database)
         self._clock = clock
-        self.book = RunBook(self._engine, clock)
+        self.book = RunRecords(self._engine, clock)
 
     @property
     def sets(self) -> Sets:
@@ -179,7 +141,7 @@ class Store:
         with self._engine.begin() as connection:
             known = connection.execute(select(_runs.c.id).where(_runs.c.source == source)).scalar()
             if known is None:
-                return _made(connection, insert(_runs).values(source=source, **now))
+                return _inserted(connection, insert(_runs).values(source=source, **now))
             connection.execute(update(_runs).where(_runs.c.id == known).values(**now))
             return int(known)
 
@@ -191,8 +153,19 @@ class Store:
         return [Annotation(row.id, _content(row), row.who, row.at_ns, row.version) for row in rows]
 
     def annotated_sources(self) -> list[AnnotatedSource]:
-        """Return all sources with annotations, and how each was mapped last."""
-        return annotated_sources(self._engine)
+        """Return all sources with annotations, in the order in which they were first opened, and how each was
+        mapped last."""
+        a = _annotations.c
+        query = select(a.run, a.x, a.y, a.kind, a.dbh).where(a.deleted.is_(False)).order_by(a.id)
+        with self._engine.begin() as connection:
+            contents: dict[int, list[Content]] = {}
+            for row in connection.execute(query):
+                contents.setdefault(row.run, []).append(Content(row.x, row.y, row.kind, row.dbh))
+            runs = select(_runs).where(_runs.c.id.in_(contents)).order_by(_runs.c.id)
+            return [
+                AnnotatedSource(run.source, run.name, _request_of(connection, run), tuple(contents[run.id]))
+                for run in connection.execute(runs)
+            ]
 
     def add(self, run: int, author: Author, contents: Sequence[Content]) -> list[int]:
         """Add annotations in one step and return their ids.
@@ -264,14 +237,14 @@ class Store:
         """Create a new step; steps that were undone before can no longer be redone."""
         of_browser = (_steps.c.run == run, _steps.c.browser == author.browser)
         connection.execute(update(_steps).where(*of_browser, _steps.c.state == "undone").values(state="left"))
-        said = {"browser": author.browser, "who": author.who, "at_ns": self._clock(), "state": "done"}
-        return _made(connection, insert(_steps).values(run=run, **said))
+        values = {"browser": author.browser, "who": author.who, "at_ns": self._clock(), "state": "done"}
+        return _inserted(connection, insert(_steps).values(run=run, **values))
 
     def _add(self, connection: Connection, run: int, step: int, author: Author, content: Content) -> int:
         edit = {"who": author.who, "at_ns": self._clock(), "version": 1, "deleted": False, "made_by": 0}
-        id_ = _made(connection, insert(_annotations).values(run=run, **asdict(content), **edit))
+        id_ = _inserted(connection, insert(_annotations).values(run=run, **asdict(content), **edit))
         values = {"step": step, "annotation": id_, "before": None, "after": asdict(content), "made_before": 0}
-        change = _made(connection, insert(_changes).values(**values))
+        change = _inserted(connection, insert(_changes).values(**values))
         connection.execute(update(_annotations).where(_annotations.c.id == id_).values(made_by=change))
         return id_
 
@@ -285,7 +258,7 @@ class Store:
             "after": None if content is None else asdict(content),
             "made_before": row.made_by,
         }
-        change = _made(connection, insert(_changes).values(**values))
+        change = _inserted(connection, insert(_changes).values(**values))
         self._put(connection, author, row, values["after"], change)
 
     def _put(
@@ -319,6 +292,27 @@ class Store:
             raise _stale(stale)
 
 
+def _request_of(connection: Connection, run: Row[Any]) -> SourceRequest:
+    """How a source was mapped last, with the path at which it was opened last; the defaults where it was
+    never mapped."""
+    newest = connection.execute(
+        select(_records)
+        .where(_records.c.run == run.id, _records.c.deleted_ns.is_(None), _records.c.scans > 0)
+        .order_by(_records.c.changed_ns.desc(), _records.c.id.desc())
+        .limit(1)
+    ).one_or_none()
+    if newest is None:
+        return SourceRequest(run.uri)
+    return request_of_kept(
+        run.uri,
+        odometry=newest.odometry,
+        seed=newest.seed,
+        choices=newest.chosen,
+        preset=newest.preset,
+        parameters=newest.parameters,
+    )
+
+
 def _next_step(connection: Connection, run: int, author: Author, to: str) -> int:
     """Return the next step to undo or redo."""
     # Undone steps follow the active ones and were undone from the end.
@@ -345,7 +339,7 @@ def _key(source: str) -> str:
     return source if len(source) <= _LONGEST_KEY else f"sha256 {sha256(source.encode()).hexdigest()}"
 
 
-def _made(connection: Connection, statement: Insert) -> int:
+def _inserted(connection: Connection, statement: Insert) -> int:
     """Insert a row and return its id."""
     key = connection.execute(statement).inserted_primary_key
     assert key is not None  # noqa: S101 - one row was inserted

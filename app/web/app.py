@@ -22,7 +22,7 @@ from app.dashboard.broadcast import Live
 from app.dashboard.dashboard import Dashboard, SceneLike, WorkerLike
 from app.dashboard.learning import Learning
 from app.dashboard.parameters import ParameterState
-from app.store.async_store import Keeper, StoreBusyError
+from app.store.async_store import AsyncStore, StoreBusyError
 from app.store.records import UnknownError
 from app.training.learned_forests import Forests
 from app.web.auth import Guard, viewer_token
@@ -95,7 +95,7 @@ def build(
         fleet: The fleet that the dashboard belongs to, if any.
     """
     parameter_state.check = Forests(settings.folder).check
-    dashboard = Dashboard(parameter_state, Live(), Keeper(settings.folder, settings.database))
+    dashboard = Dashboard(parameter_state, Live(), AsyncStore(settings.folder, settings.database))
 
     learning = Learning(
         dashboard.keeper, settings.folder, lambda state: dashboard.live.tell("learning", state)

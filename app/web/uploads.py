@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from app.sources import sandbox
-from app.store.async_store import Keeper
+from app.store.async_store import AsyncStore
 from pipeline.errors import StemmapError
 
 # Free disk space that is reserved for the system and for annotations.
@@ -44,7 +44,7 @@ class Uploads:
         keeper: Access to the store, which records the original names.
     """
 
-    def __init__(self, folder: Path | None, limit: int, keeper: Keeper) -> None:
+    def __init__(self, folder: Path | None, limit: int, keeper: AsyncStore) -> None:
         self._folder, self.limit, self._keeper = folder, limit, keeper
         self._under_way = 0
         self._awaited = 0  # bytes that active uploads have not written yet

@@ -174,7 +174,7 @@ def _from(change: Callable[[Pose2], Pose2 | None]) -> Callable[[Sequence[Pose2]]
 
 
 def _stuck(first: int, scans: int) -> Callable[[Sequence[Pose2]], Told]:
-    """Standing still for so many scans, and counting on then."""
+    """RunFigures still for so many scans, and counting on then."""
 
     def stuck(told: Sequence[Pose2]) -> Told:
         last = min(first + scans, len(told)) - 1

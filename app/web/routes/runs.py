@@ -16,7 +16,7 @@ from app.batch.data_folders import delete_partial_output, finished_folders, part
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.sources.request import request_of_kept
-from app.store.book import RunBook
+from app.store.book import RunRecords
 from app.store.records import UnknownError
 from app.web.responses import LARGEST_NUMBER, BadRequestError, Body, Number, error_reply, json_reply
 from app.web.routes.access import AnyFile, Dash, Deployment, ViewerTurn
@@ -116,7 +116,7 @@ async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: Any
     return json_reply({}, 202)
 
 
-async def _done(dashboard: Dashboard, number: int, work: Callable[[RunBook], None]) -> Response:
+async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], None]) -> Response:
     await dashboard.keeper.ask(lambda store: work(store.book))
     return json_reply({"id": number})
 

@@ -19,7 +19,7 @@ from websockets.typing import Origin
 from app.common.settings import Settings
 from app.dashboard.annotations import Annotating, contents_of, counted, laid_over, truth_of
 from app.dashboard.dashboard import Dashboard
-from app.store.async_store import Keeper
+from app.store.async_store import AsyncStore
 from app.store.records import Annotation, Content
 from app.web.auth import session_value
 from app.worker.internal_protocol import Shown
@@ -353,7 +353,7 @@ async def test_a_store_that_cannot_be_used_is_said_and_the_map_goes_on(tmp_path:
 async def test_the_store_works_beside_the_event_loop() -> None:
     import threading
 
-    keeper = Keeper(None)
+    keeper = AsyncStore(None)
     annotating = Annotating(keeper)
     await annotating.begin("d", "u", None)
     assert annotating.run is not None

@@ -23,7 +23,7 @@ from app.fleet.frames import Frames
 from app.fleet.robots import named
 from app.fleet.server import build_fleet, warmed
 from app.sources.request import SourceRequest
-from app.store.book import Beginning
+from app.store.book import NewRun
 from app.web.auth import viewer_token
 from app.web.serving import bind
 from app.worker.protocol import Open
@@ -248,7 +248,7 @@ async def test_a_run_that_is_open_in_any_dashboard_is_not_deleted():
     async with served("red", "blue") as (_, fleet), httpx.AsyncClient() as client:
         red, blue = fleet.members.values()
         blue.dashboard.logbook._page = _Page(
-            Beginning(0, "run", "fake", SourceRequest("fake:blue")), 3, record=7
+            NewRun(0, "run", "fake", SourceRequest("fake:blue")), 3, record=7
         )
         for member, words in ((red, "of another robot"), (blue, "is open")):
             place = f"http://127.0.0.1:{member.port}/api/runs/7"

@@ -140,7 +140,7 @@ def test_the_map_is_made_of_the_same_with_pictures_and_without(run: Path):
         each.source.close()
 
 
-class Standing:
+class RunFigures:
     """What `mapped` needs of a frame."""
 
     def __init__(self, stamp_ns: int) -> None:
@@ -162,7 +162,7 @@ def test_each_tree_gets_a_picture_of_those_that_were_put_aside(run: Path, tmp_pa
         assert keep_pictures(live, trees_at((5.0, 0.0)), way(stamps), tmp_path) == (0, "")
         live.keep_pictures(tmp_path / "not" / "there" / "yet")
         for k in range(1, len(stamps) + 1):
-            frame: Any = Standing(stamps[k - 1])
+            frame: Any = RunFigures(stamps[k - 1])
             live.mapped(frame, way(stamps[:k]))
         assert live.picture_stamps() == stamps[::2], "one a metre"
         kept, problem = keep_pictures(live, trees_at((5.0, 0.0), (-9.0, 0.0)), way(stamps), tmp_path)

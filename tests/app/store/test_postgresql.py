@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from app.sources.request import SourceRequest
-from app.store.book import Beginning, Change, Standing
+from app.store.book import Change, NewRun, RunFigures
 from app.store.records import Author, Content, StaleError
 from app.store.store import Store
 from pipeline.errors import StemmapError
@@ -31,7 +31,7 @@ def store(server: str) -> Iterator[Store]:
         yield opened
 
 
-STANDING = Standing(
+STANDING = RunFigures(
     3, None, 0.2, 1.5, 1, "forest", {"clustering.eps": 0.15}, {"f1": 1.0}, {"trees": [], "path": []}
 )
 
@@ -54,10 +54,10 @@ def test_annotations_are_kept_and_stale_edits_refused(store: Store, server: str)
 def test_runs_are_written_renamed_deleted_and_brought_back(store: Store):
     run = store.open_run("d", "u", "n")
     record = store.book.begin(
-        Beginning(run, "north", "rosbag2", SourceRequest("run.mcap", "auto", 2**63 - 1)), STANDING
+        NewRun(run, "north", "rosbag2", SourceRequest("run.mcap", "auto", 2**63 - 1)), STANDING
     )
-    store.book.revise(record, Change(1, 0.2, "Ann", "forest", {"clustering.eps": [0.15, 0.2]}))
-    store.book.revise(record, Change(2, 0.2, "Ann", "forest", {"clustering.eps": [0.2, 0.3]}))
+    store.book.revise_all(record, [Change(1, 0.2, "Ann", "forest", {"clustering.eps": [0.15, 0.2]})])
+    store.book.revise_all(record, [Change(2, 0.2, "Ann", "forest", {"clustering.eps": [0.2, 0.3]})])
     store.book.rename(record, "north stand")
     whole = store.book.whole(record)
     assert (whole["name"], whole["seed"], whole["map"]) == (

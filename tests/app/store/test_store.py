@@ -234,6 +234,7 @@ def spoil(path: Path, statement: str) -> None:
         (lambda path: path.write_bytes(b"no database" * 400), "not a database"),
         (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "malformed|damaged"),
         (lambda path: spoil(path, "UPDATE alembic_version SET version_num = '9999'"), "newer stemmap"),
+        (lambda path: spoil(path, "UPDATE alembic_version SET version_num = '0003'"), "older stemmap"),
         (lambda path: spoil(path, "DROP TABLE alembic_version"), "another program"),
     ],
 )

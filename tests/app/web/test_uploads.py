@@ -16,7 +16,7 @@ import pytest
 
 from app.common.settings import Settings
 from app.sources import sandbox
-from app.store.async_store import Keeper
+from app.store.async_store import AsyncStore
 from app.web import uploads
 from app.web.uploads import UploadError, Uploads
 from pipeline.errors import SourceError
@@ -116,7 +116,7 @@ async def test_two_uploads_at_once_share_the_room(recordings: Path, monkeypatch:
     async def quick(size: int) -> AsyncIterator[bytes]:
         yield b"good".ljust(size)
 
-    room_of_uploads = Uploads(recordings, 1000, Keeper(None))
+    room_of_uploads = Uploads(recordings, 1000, AsyncStore(None))
     assert room_of_uploads.room() == 100
     first = asyncio.create_task(room_of_uploads.take("a.mcap", 70, slow()))
     async with asyncio.timeout(30):
@@ -144,7 +144,7 @@ async def test_without_a_folder_nothing_is_taken() -> None:
 
 
 async def test_an_upload_that_breaks_off_leaves_nothing(recordings: Path) -> None:
-    uploads = Uploads(recordings, 10**9, Keeper(None))
+    uploads = Uploads(recordings, 10**9, AsyncStore(None))
 
     async def short() -> AsyncIterator[bytes]:
         yield b"good"
@@ -177,7 +177,7 @@ async def test_an_upload_that_stalls_is_ended(recordings: Path, monkeypatch: pyt
         await asyncio.Event().wait()
 
     with pytest.raises(UploadError, match="no data arrived") as refused:
-        await Uploads(recordings, 10**9, Keeper(None)).take("a.mcap", 100, stalls())
+        await Uploads(recordings, 10**9, AsyncStore(None)).take("a.mcap", 100, stalls())
     assert refused.value.status == 408
     assert kept(recordings) == []
 
@@ -220,7 +220,7 @@ def test_what_a_killed_server_left_is_removed_when_nobody_writes_to_it(recording
     for part in (old, new):
         part.write_bytes(b"x")
     os.utime(old, (time.time() - 7200, time.time() - 7200))
-    Uploads(recordings, 1, Keeper(None)).clear()
+    Uploads(recordings, 1, AsyncStore(None)).clear()
     assert kept(recordings) == [new.name]
 
 
