@@ -38,7 +38,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
 def pytest_sessionstart(session: pytest.Session) -> None:
     """The whole suite compiles the mapper once, on both cores, before its two processes would do so each."""
     if getattr(session.config.option, "numprocesses", None):
-        from app.common.compile_ahead import compile_ahead
+        from app.worker.numba_warmup import compile_ahead
 
         compile_ahead()
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from app.sources import sandbox
+from app.sources import inspection
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
 
@@ -57,7 +57,7 @@ async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
 async def align(a: Run, b: Run) -> tuple[Pose2 | None, str]:
     """Return the pose of map b in map a and how it was found; where it is unknown, None and the reason."""
     try:
-        found = await sandbox.ask({"ask": "laid", "local": _stems(b), "reference": _stems(a)})
+        found = await inspection.ask({"ask": "alignment", "local": _stems(b), "reference": _stems(a)})
     except StemmapError as error:
         return None, error.what
     if found["pose"] is None:

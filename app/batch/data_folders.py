@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from app.common.settings import Settings
-from app.sources import sandbox
+from app.sources import inspection
 from app.store.records import UnknownError
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import UNFINISHED, is_held
@@ -49,7 +49,7 @@ async def read_folder(name: str, settings: Settings) -> dict[str, Any]:
     path = finished_folders(settings).get(name)
     if path is None:
         raise UnknownError("there is no such run in the data folders", where=name[:200])
-    return {**await sandbox.ask({"ask": "finished", "path": str(path)}), "name": name}
+    return {**await inspection.ask({"ask": "finished", "path": str(path)}), "name": name}
 
 
 def _is_finished(path: Path, folder: Path) -> bool:

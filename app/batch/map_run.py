@@ -27,7 +27,7 @@ from app.common.text import changed_values, count, preset_words
 from app.common.timers import Stopwatch
 from app.common.version import version
 from app.sources.opening import Chosen, with_odometry
-from app.training.learned_forests import kept_forests
+from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import Evaluation, PathError, evaluate, path_error
@@ -138,14 +138,7 @@ def _map(
     moving, chosen = with_odometry(plan.source, plan.odometry)
     plan = replace(plan, source=moving)
     description = plan.source.description
-    mapper = Mapper(
-        plan.parameters,
-        sensor=description.sensor,
-        T_base_lidar=description.T_base_lidar,
-        seed=plan.seed,
-        timer=stopwatch,
-        forests=kept_forests(),
-    )
+    mapper = mapper_of(description, plan.parameters, plan.seed, stopwatch)
     begun = _beginning(plan, mapper, chosen)
     left_out = Counter[str]()
     to_map = begun.steps(plan.source, chosen.steps, left_out)

@@ -7,7 +7,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from app.common.draw_picture import drawn
+from app.common.draw_picture import Drawing, draw_safely
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.readers.base import Source
 from pipeline.io.readers.camera import Camera, PictureSource, nearest
@@ -97,9 +97,7 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
     kept = refused = 0
     for picture in origin.pictures({view.stamp_ns for view in views}):
         for view in (each for each in views if each.stamp_ns == picture.stamp_ns):
-            told = {"encoding": picture.encoding, "width": picture.width, "height": picture.height,
-                    "step": picture.step, "box": view.box, "text": f"tree {view.tree}"}  # fmt: skip
-            content = drawn(told, picture.data)
+            content = draw_safely(Drawing.of(picture, view.box, f"tree {view.tree}"))
             if content is None:
                 refused += 1
                 continue

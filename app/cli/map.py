@@ -129,8 +129,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     from app.batch.map_run import OfflineRun, map_run
     from app.batch.run_folder import check_folder
     from app.cli.live_commands import begin_recording, heard, recording_of, told_of_frames
-    from app.common.compile_ahead import compile_ahead
     from app.sources.opening import open_any
+    from app.worker.numba_warmup import compile_ahead
     from app.worker.run_factory import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
 

@@ -102,8 +102,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
     """Search and write the best set."""
-    from app.common.compile_ahead import compile_ahead
     from app.tuning.search import Search
+    from app.worker.numba_warmup import compile_ahead
 
     plan = _plan(arguments)
     compile_ahead()

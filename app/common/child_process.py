@@ -21,7 +21,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
-from typing import BinaryIO, NoReturn, TypeVar
+from typing import BinaryIO, NoReturn, SupportsFloat, TypeVar
 
 import msgspec
 
@@ -92,7 +92,7 @@ class ChildProcess:
     async def send(self, message: object) -> None:
         """Send a message. A child that has ended is not an error here; `receive` reports it."""
         with contextlib.suppress(ConnectionError):
-            self._stdin.write(msgspec.json.encode(message) + b"\n")
+            self._stdin.write(_encoded(message))
             await self._stdin.drain()
 
     async def receive(self, kind: type[T], timeout_s: float | None = None) -> T | None:
@@ -177,7 +177,7 @@ class BlockingChildProcess:
     def send(self, message: object) -> None:
         """Send a message. A child that has ended is not an error here; `receive` reports it."""
         with contextlib.suppress(ConnectionError):
-            self._stdin.write(msgspec.json.encode(message) + b"\n")
+            self._stdin.write(_encoded(message))
             self._stdin.flush()
 
     def receive(self, kind: type[T], timeout_s: float | None = None) -> T | None:
@@ -250,7 +250,7 @@ class ParentConnection:
 
     def send(self, message: object) -> None:
         """Send a message."""
-        self._outgoing.write(msgspec.json.encode(message) + b"\n")
+        self._outgoing.write(_encoded(message))
         self._outgoing.flush()
 
     def _read(self) -> None:
@@ -308,6 +308,17 @@ def _limit_memory(limit: int) -> None:
 def _environment(one_thread: bool) -> dict[str, str]:
     """The parent's environment; a thread number that is set there stays."""
     return {**(dict.fromkeys(_THREAD_VARIABLES, "1") if one_thread else {}), **os.environ}
+
+
+def _encoded(message: object) -> bytes:
+    return msgspec.json.encode(message, enc_hook=_number) + b"\n"
+
+
+def _number(value: object) -> object:
+    """The number of a scalar of NumPy, for JSON."""
+    if isinstance(value, SupportsFloat):
+        return value.item() if hasattr(value, "item") else float(value)
+    raise NotImplementedError(f"{type(value).__name__} cannot be sent")
 
 
 def _decoded(line: bytes, kind: type[T]) -> T | None:

@@ -1,51 +1,81 @@
-"""Decodes a picture from outside and writes it smaller, in a child process that may fail."""
+"""Decodes a picture from outside and encodes it smaller, in a child process that may fail."""
 
 from __future__ import annotations
 
 import io
-import json
-import subprocess
 import sys
-from typing import Any
+from typing import TYPE_CHECKING
 
-#: Bytes of a JPEG.
-LARGEST = 1 << 20
+import msgspec
+
+from app.common.child_process import (
+    BlockingChildProcess,
+    ParentConnection,
+    ProtocolError,
+    python_module,
+    run_child,
+)
+
+if TYPE_CHECKING:
+    from pipeline.io.readers.camera import Picture
+
+_COMMAND = python_module("app.common.draw_picture")
+_LINE_LIMIT = 2 << 20  # of a JPEG in base 64 [bytes]
 _PATIENCE_S = 60.0
-#: -P: a folder that holds a file `app.py` must not decide what runs.
-_DRAW = (sys.executable, "-P", "-m", "app.common.draw_picture")
-
-
-def drawn(told: dict[str, object], data: bytes) -> bytes | None:
-    """Return a picture as JPEG, or None if the child process fails, takes too long or returns too much.
-
-    Args:
-        told: Description of the picture, see `draw`.
-        data: Encoded picture.
-    """
-    try:
-        done = subprocess.run(
-            _DRAW, input=json.dumps(told).encode() + b"\n" + data, capture_output=True, timeout=_PATIENCE_S,
-            check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return None
-    return done.stdout if done.returncode == 0 and 0 < len(done.stdout) <= LARGEST else None
-
-
 PIXEL_LIMIT = 40_000_000
 LARGEST_SIDE = 960
 QUALITY = 80
-_MODES = {"rgb8": ("RGB", "RGB", 3), "bgr8": ("RGB", "BGR", 3), "mono8": ("L", "L", 1),
-          "rgba8": ("RGB", "RGBX", 4), "bgra8": ("RGB", "BGRX", 4)}  # fmt: skip
+# Mode of Pillow, and its name of the raw pixels, by ROS encoding.
+_MODES = {
+    "rgb8": ("RGB", "RGB"),
+    "bgr8": ("RGB", "BGR"),
+    "mono8": ("L", "L"),
+    "rgba8": ("RGB", "RGBX"),
+    "bgra8": ("RGB", "BGRX"),
+}
+_YELLOW = (255, 208, 0)
 
 
-def draw(told: dict[str, Any], data: bytes) -> bytes:
-    """Return a picture as JPEG, optionally with a box and a label.
+class Drawing(msgspec.Struct, frozen=True):
+    """A picture to be drawn. The child process does not import the readers, which would take longer than to
+    draw.
 
-    Args:
-        told: encoding, width, height and step of raw pixels (encoding "" for an image file); optionally box
-            (left, top, right, bottom [pixels]) and text.
-        data: Encoded picture.
+    Attributes:
+        encoding, width, height, step, data: As in `Picture`.
+        box: Left, top, right, bottom of a frame [pixels]; None draws none.
+        text: Label of the box.
+    """
+
+    encoding: str
+    width: int
+    height: int
+    step: int
+    data: bytes
+    box: tuple[float, float, float, float] | None = None
+    text: str = ""
+
+    @classmethod
+    def of(
+        cls, picture: Picture, box: tuple[float, float, float, float] | None = None, text: str = ""
+    ) -> Drawing:
+        """Return the drawing of a picture of a camera."""
+        return cls(picture.encoding, picture.width, picture.height, picture.step, picture.data, box, text)
+
+
+def draw_safely(drawing: Drawing) -> bytes | None:
+    """Return a picture as JPEG, or None if the child process fails, takes too long or returns too much."""
+    child = BlockingChildProcess(_COMMAND, line_limit=_LINE_LIMIT)
+    try:
+        child.send(drawing)
+        return child.receive(bytes, _PATIENCE_S)
+    except ProtocolError:
+        return None
+    finally:
+        child.end()
+
+
+def draw(drawing: Drawing) -> bytes:
+    """Return a picture as JPEG, at most `LARGEST_SIDE` pixels wide and high.
 
     Raises:
         ValueError: The picture is too large or has an unknown encoding.
@@ -54,14 +84,15 @@ def draw(told: dict[str, Any], data: bytes) -> bytes:
     from PIL import Image, ImageDraw
 
     Image.MAX_IMAGE_PIXELS = PIXEL_LIMIT
-    if told["encoding"]:
-        if told["encoding"] not in _MODES:
+    if drawing.encoding:
+        if drawing.encoding not in _MODES:
             raise ValueError("an encoding that is not known")
-        mode, raw, _ = _MODES[told["encoding"]]
-        size = (int(told["width"]), int(told["height"]))
-        picture = Image.frombytes(mode, size, data, "raw", raw, int(told["step"]))
+        mode, raw = _MODES[drawing.encoding]
+        picture = Image.frombytes(
+            mode, (drawing.width, drawing.height), drawing.data, "raw", raw, drawing.step
+        )
     else:
-        picture = Image.open(io.BytesIO(data), formats=("JPEG", "PNG"))
+        picture = Image.open(io.BytesIO(drawing.data), formats=("JPEG", "PNG"))
         if picture.width * picture.height > PIXEL_LIMIT:
             raise ValueError("too many pixels")
         picture.load()
@@ -71,26 +102,24 @@ def draw(told: dict[str, Any], data: bytes) -> bytes:
         picture = picture.resize(
             (max(1, round(picture.width * factor)), max(1, round(picture.height * factor)))
         )
-    if "box" in told:
+    if drawing.box is not None:
         pen = ImageDraw.Draw(picture)
-        left, top, right, bottom = (factor * float(side) for side in told["box"])
-        pen.rectangle([left, top, max(right, left + 1), max(bottom, top + 1)], outline=(255, 208, 0), width=3)
-        pen.text((left + 5, top + 4), str(told["text"])[:60], fill=(255, 208, 0))
+        left, top, right, bottom = (factor * side for side in drawing.box)
+        pen.rectangle([left, top, max(right, left + 1), max(bottom, top + 1)], outline=_YELLOW, width=3)
+        pen.text((left + 5, top + 4), drawing.text[:60], fill=_YELLOW)
     out = io.BytesIO()
     picture.save(out, "JPEG", quality=QUALITY)
     return out.getvalue()
 
 
-def main() -> None:
-    """Read one picture, draw it and write the JPEG."""
-    head, _, data = sys.stdin.buffer.read().partition(b"\n")
+def _answer(parent: ParentConnection) -> None:
+    """Draw one picture."""
     try:
-        drawn = draw(json.loads(head), data)
+        picture = draw(parent.receive(Drawing))
     except Exception as error:  # a decoder may raise any exception on damaged data
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
-        sys.exit(1)
-    sys.stdout.buffer.write(drawn)
+        sys.exit(f"{type(error).__name__}: {error}")
+    parent.send(picture)
 
 
 if __name__ == "__main__":
-    main()
+    run_child(_answer)

@@ -8,7 +8,7 @@ import time
 from collections import OrderedDict
 from typing import Any
 
-from app.common.draw_picture import drawn
+from app.common.draw_picture import Drawing, draw_safely
 from app.dashboard.camera_marks import marks_of, motion
 from app.explain.client import NoStoryError, WorkerClient
 from pipeline.types.records import Frame, Path
@@ -60,9 +60,7 @@ class CameraDesk:
             self._check(of)
             picture = found.picture
             if picture.stamp_ns not in self._kept:
-                told = {"encoding": picture.encoding, "width": picture.width, "height": picture.height,
-                        "step": picture.step}  # fmt: skip
-                content = await asyncio.to_thread(drawn, told, picture.data)
+                content = await asyncio.to_thread(draw_safely, Drawing.of(picture))
                 if content is None:
                     raise NoStoryError(
                         "this picture cannot be decoded", remedy="It is damaged, or of an unknown encoding"

@@ -26,7 +26,7 @@ from app.dashboard.map_changes import MapChanges
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, Counts, counts_of, map_payload, truth_payload
 from app.dashboard.run_recorder import Glance, Logbook
-from app.dashboard.scores import Scores, score_payload
+from app.dashboard.scores import Scores, score_map
 from app.dashboard.selection import Selecting
 from app.explain.client import WorkerClient
 from app.sources.request import SourceRequest
@@ -336,7 +336,7 @@ class Dashboard:
         score = None
         if self.truth is not None:
             evaluation = self.parameters.parameters.evaluation
-            score = await asyncio.to_thread(score_payload, trees, self.truth, evaluation, self.path_xy)
+            score = await asyncio.to_thread(score_map, trees, self.truth, evaluation, self.path_xy)
             if run != self._run:  # another one was opened meanwhile
                 return
         places = np.round(trees.position, 3).tolist()

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.batch.summary import truth_in_doubt
-from pipeline.config.stages import Evaluation
+from pipeline.config.stages import Evaluation as Parameters
+from pipeline.evaluation import Evaluation, evaluate, match, pair_distances, pair_errors
 from pipeline.types.records import Trees, TruthTrees
 
 Float = NDArray[np.float64]
@@ -37,11 +38,11 @@ class Scores:
     def __init__(self, tell: Callable[[dict[str, Any] | None], None]) -> None:
         self.latest: dict[str, Any] | None = None
         self._tell = tell
-        self._asked: tuple[Trees, TruthTrees, Evaluation, Float] | None = None
+        self._asked: tuple[Trees, TruthTrees, Parameters, Float] | None = None
         self._task: asyncio.Task[None] | None = None
         self._runs = 0
 
-    def ask(self, trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> None:
+    def ask(self, trees: Trees, truth: TruthTrees, parameters: Parameters, path_xy: Float) -> None:
         """Have the map scored soon, against the truth near the path (N, 2)."""
         self._asked = (trees, truth, parameters, path_xy)
         if self._task is None or self._task.done():
@@ -63,7 +64,7 @@ class Scores:
             asked, self._asked = self._asked, None
             run = self._runs
             try:
-                score = await asyncio.to_thread(score_payload, *asked)
+                score = await asyncio.to_thread(score_map, *asked)
             except Exception:  # a score that fails must not end those that follow
                 _log.exception("the map could not be scored")
             else:
@@ -73,11 +74,13 @@ class Scores:
             await asyncio.sleep(_PAUSE_S)
 
 
-def score_payload(trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> dict[str, Any]:
-    """The score with the units in the names; what nothing was matched for is None."""
-    from pipeline.evaluation import evaluate
+def score_map(trees: Trees, truth: TruthTrees, parameters: Parameters, path_xy: Float) -> dict[str, Any]:
+    """Return the scores of a map for the page, see `score_payload`."""
+    return score_payload(evaluate(trees, truth, parameters, path_xy))
 
-    score = evaluate(trees, truth, parameters, path_xy)
+
+def score_payload(score: Evaluation) -> dict[str, Any]:
+    """Return scores for the page, with units in the names. An undefined score is None."""
     rates = {"TA": score.TA, "TR": score.TR, "FA": score.FA, "FR": score.FR}
     return {
         **{name: {"count": r.count, "of": r.of, "rate": r.rate} for name, r in rates.items()},
@@ -102,8 +105,6 @@ def pairs_payload(trees: Trees, truth: TruthTrees | None, match_distance: float)
 
     A matrix of more than MOST_PAIRED trees is no picture any more: the first of them are taken.
     """
-    from pipeline.evaluation import match, pair_distances, pair_errors
-
     rows = np.flatnonzero(trees.confirmed)
     kept = rows[:MOST_PAIRED]
     position = trees.position[kept]

@@ -270,7 +270,7 @@ class Fleet:
     async def _begin_when_warm(self, warming: Awaitable[None]) -> None:
         try:
             await warming
-        except OSError:  # the workers compile then
+        except StemmapError:  # the workers compile then
             _log.exception("the kernels were not compiled before the workers start")
         self._is_warm = True
         for member in self.members.values():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import sys
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -13,7 +12,7 @@ from fastapi import APIRouter, FastAPI, Request
 from starlette.responses import Response
 from starlette.websockets import WebSocket
 
-from app.common.compile_ahead import PATIENCE_S
+from app.common.child_process import ChildProcess, ProtocolError, python_module
 from app.common.settings import Settings
 from app.dashboard.parameters import ParameterState
 from app.fleet.fleet import Fleet
@@ -27,27 +26,24 @@ from app.web.routes.page import access, lead_on, page_answer, page_file
 from app.web.serving import LinkedServer, bind, link_of, uvicorn_config
 from app.web.static_files import page_folder
 from app.web.websocket_feed import telling
+from app.worker.numba_warmup import PATIENCE_S
 from app.worker.protocol import Open
 
-WARMING = (sys.executable, "-P", "-c", "from app.worker.numba_warmup import warm_up; warm_up()")
+WARMING = python_module("app.worker.numba_warmup", "warm_up")
 
 
-async def warmed(command: Sequence[str] = WARMING) -> None:
-    """Wait until a process of its own has compiled what every worker needs; it may fail, they then do it."""
-    process = await asyncio.create_subprocess_exec(
-        *command,
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.DEVNULL,
-        stderr=asyncio.subprocess.DEVNULL,
-        start_new_session=True,  # Ctrl-C in the terminal is for the server
-    )
+async def warm_kernels(command: Sequence[str] = WARMING) -> None:
+    """Compile the kernels of the mapper in a child process, so that not every worker does.
+
+    Raises:
+        StemmapError: The process cannot be started.
+    """
+    child = await ChildProcess.start(command)
     try:
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(process.wait(), PATIENCE_S)
+        with contextlib.suppress(TimeoutError, ProtocolError):
+            await child.receive(object, PATIENCE_S)  # None when it ends
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
+        await child.end()
 
 
 _TRY_AGAIN_LATER, _REFUSED = 1013, 1003
@@ -156,7 +152,7 @@ def serve_fleet(
         print(f"View-only link: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
 
     async def served() -> bool:
-        fleet = Fleet(replace(settings, port=port), port, token, make_parameters, warm=warmed)
+        fleet = Fleet(replace(settings, port=port), port, token, make_parameters, warm=warm_kernels)
         for name, source in sources.items():
             fleet.add(name, source)
         watching: Watching | RemoteRobots | None = None

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from app.sources import sandbox
+from app.sources import inspection
 from app.store.async_store import AsyncStore
 from pipeline.errors import StemmapError
 
@@ -180,8 +180,8 @@ async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 async def _look_at(part: Path, name: str) -> str:
     """Return a description of the file, found by a child process."""
     try:
-        told = await sandbox.ask({"ask": "recording", "path": str(part)})
-    except sandbox.TookTooLongError:
+        told = await inspection.ask({"ask": "recording", "path": str(part)})
+    except inspection.TookTooLongError:
         return "not looked through yet"  # a very large file; errors appear when it is opened
     except StemmapError as error:
         # The path is that of the incomplete file; the person knows the original name.

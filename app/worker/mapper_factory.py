@@ -1,4 +1,4 @@
-"""The mapper of a source, with the decision trees that this machine keeps."""
+"""The mapper of a source, with the random forests of this machine."""
 
 from __future__ import annotations
 
@@ -6,19 +6,25 @@ from app.training.learned_forests import kept_forests
 from pipeline.config import Parameters
 from pipeline.io.readers import SourceDescription
 from pipeline.mapper import Mapper
+from pipeline.stage_timer import StageTimer, no_timer
 
 
-def mapper_of(known: SourceDescription, parameters: Parameters, seed: int) -> Mapper:
-    """A mapper at the beginning of a run.
+def mapper_of(
+    source: SourceDescription, parameters: Parameters, seed: int, timer: StageTimer = no_timer
+) -> Mapper:
+    """Return a mapper before the first scan of a source.
 
     Args:
-        known: Of the source; tells the sensor and where it stands on the robot.
-        seed: Of its random numbers.
+        source: Description with the sensor and its mounting.
+        parameters: Parameters of the mapper.
+        seed: Random seed.
+        timer: See `Mapper`.
     """
     return Mapper(
         parameters,
-        sensor=known.sensor,
-        T_base_lidar=known.T_base_lidar,
+        sensor=source.sensor,
+        T_base_lidar=source.T_base_lidar,
         seed=seed,
+        timer=timer,
         forests=kept_forests(),
     )

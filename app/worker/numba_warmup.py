@@ -1,48 +1,120 @@
 """Compilation of the kernels of the mapper before the first scan.
 
-The front end and the mapping of trees share few kernels, so that two processes compile one half each.
+The front end and the mapping of trees share few kernels, so that two processes compile one half each:
+`python -m app.worker.numba_warmup warm_front_end` and `... warm_tree_map`.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.common.compile_ahead import compile_ahead
-from app.common.timers import Stopwatch
+from app.common.child_process import BlockingChildProcess, python_module, run_child
+from app.common.settings import data_folder
 from app.training.learned_forests import kept_forests
+from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 
 if TYPE_CHECKING:
     from pipeline.types.records import Step
 
+#: Longest wait for another process that compiles. Kernels that are compiled until then are cached.
+PATIENCE_S = 1800.0
+_HALVES = ("warm_front_end", "warm_tree_map")
+_POLL_S = 0.2
+
+
+def compile_ahead() -> None:
+    """Compile the kernels of the mapper in two processes, unless they are cached already.
+
+    Kernels that remain uncompiled are compiled at their first call.
+    """
+    if _cores() < len(_HALVES) or is_compiled():
+        return
+    with _one_at_a_time():
+        if not is_compiled():  # another process may have compiled them meanwhile
+            _compile()
+
+
+def is_compiled() -> bool:
+    """Return whether the kernels of both halves are cached for the current sources."""
+    from pipeline.jit import is_kept
+    from pipeline.tracking.track_classification import judge, nearest_other
+
+    return is_kept(nearest_other) and is_kept(judge)
+
+
+def _cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def _start(half: str) -> BlockingChildProcess:
+    return BlockingChildProcess(python_module("app.worker.numba_warmup", half))
+
+
+def _compile() -> None:
+    from pipeline.jit import others_compile
+
+    with contextlib.ExitStack() as stack:
+        children = []
+        for half in _HALVES:
+            children.append(_start(half))
+            stack.callback(children[-1].end)
+        until_s = time.monotonic() + PATIENCE_S
+        while any(child.returncode is None for child in children) and time.monotonic() < until_s:
+            others_compile()
+            time.sleep(_POLL_S)
+
+
+@contextlib.contextmanager
+def _one_at_a_time() -> Iterator[None]:
+    """Hold the lock that lets one process of a user compile at a time; the next one then finds the cache.
+
+    Without a folder for the lock or file locks on this system, no process waits.
+    """
+    from pipeline.jit import others_compile
+
+    until_s = time.monotonic() + PATIENCE_S
+    with contextlib.ExitStack() as stack:
+        folder = data_folder(os.environ)
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                lock = stack.enter_context((folder / "compiling.lock").open("a"))
+                while time.monotonic() < until_s:
+                    with contextlib.suppress(BlockingIOError):
+                        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                        break
+                    others_compile()
+                    time.sleep(_POLL_S)
+        yield
+
+
 _SCENE = "sim:stand?duration=1"
 
 
-def warm_up(parameters: Parameters | None = None) -> None:
+def warm_up() -> None:
     """Map one second of a simulated stand; the first time on a machine this takes minutes."""
     from pipeline.io.readers import open_source
-    from pipeline.mapper import Mapper
     from pipeline.odometry.synchroniser import steps
 
     compile_ahead()
     source = open_source(_SCENE)
-    known = source.description
-    mapper = Mapper(
-        parameters or Parameters(),
-        sensor=known.sensor,
-        T_base_lidar=known.T_base_lidar,
-        seed=0,
-        timer=Stopwatch(),
-        forests=kept_forests(),
-    )
+    mapper = mapper_of(source.description, Parameters(), seed=0)
     for step in steps(source.records()):
         mapper.process(step)
 
 
-def warm_eyes() -> None:
+def warm_front_end() -> None:
     """Segment the scans of that second, cache them, and integrate them into columns and terrain at the poses
     of the odometry: all of the mapper but SLAM and the Kalman filters of the trees."""
     from contextlib import closing
@@ -83,7 +155,7 @@ def warm_eyes() -> None:
     nearest_other(place, place, 1.0)  # as the preview does
 
 
-def warm_map() -> None:
+def warm_tree_map() -> None:
     """Map detected stems, and compute a preview: SLAM and the Kalman filters of the trees."""
     from pipeline.classification import no_columns
     from pipeline.config import preset
@@ -115,3 +187,8 @@ def _stems() -> Iterator[Step]:
         upright = np.tile([0.0, 0.0, 1.0], (x.size, 1))
         scan = Scan(100_000_000 * index, places, stems=Stems(upright, np.full(x.size, 0.3)))
         yield Step(index, scan, Pose2(along, 0.0, 0.0))
+
+
+if __name__ == "__main__":
+    _programs = {"warm_up": warm_up, "warm_front_end": warm_front_end, "warm_tree_map": warm_tree_map}
+    run_child(lambda _: _programs[sys.argv[1]]())

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 from app.common.text import COMPILING
-from app.common.timers import Stopwatch
 from app.explain.history import RecentScans
 from app.worker.codec import WireError, to_worker
 from app.worker.internal_protocol import ToWorker
@@ -28,7 +27,6 @@ from app.worker.outbox import Mailbox
 from app.worker.run_factory import caches_in, unnamed_caches
 from app.worker.session import Session
 from pipeline.config import Parameters
-from pipeline.io.readers.base import Source
 from pipeline.jit import on_compiling
 
 # A scan that is being mapped, or a large file that is being opened, may take a moment to notice. A robot is
@@ -42,29 +40,16 @@ def new_session(folder: Path | None = None) -> Session:
     Args:
         folder: Where what scans show is kept for the next opening of a recording; None keeps nothing.
     """
-    from app.common.compile_ahead import compile_ahead
     from app.sources.opening import open_any
-    from app.training.learned_forests import kept_forests
-    from app.worker.numba_warmup import warm_up
-    from pipeline.mapper import Mapper
+    from app.worker.mapper_factory import mapper_of
+    from app.worker.numba_warmup import compile_ahead, warm_up
     from pipeline.odometry.synchroniser import OdometryChoice, steps
 
     choices: dict[str, OdometryChoice] = {"auto": "auto", "wheels": "wheels", "static": "static"}
 
-    def make_mapper(source: Source, parameters: Parameters, seed: int, watch: Stopwatch) -> Mapper:
-        known = source.description
-        return Mapper(
-            parameters,
-            sensor=known.sensor,
-            T_base_lidar=known.T_base_lidar,
-            seed=seed,
-            timer=watch,
-            forests=kept_forests(),
-        )
-
     return Session(
         open_source=open_any,
-        make_mapper=make_mapper,
+        make_mapper=lambda source, *rest: mapper_of(source.description, *rest),
         make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
         parameters=Parameters(),
         open_caches=unnamed_caches if folder is None else caches_in(folder),

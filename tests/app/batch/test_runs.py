@@ -16,7 +16,7 @@ from app.common.settings import Settings
 from app.dashboard import run_recorder
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.run_recorder import MOST_PATH_POINTS, thinned
-from app.sources import sandbox
+from app.sources import inspection
 from app.sources.request import SourceRequest, request_of_kept, request_of_options
 from app.store.records import Author, Content
 from app.training.annotated_runs import annotated_run
@@ -320,12 +320,12 @@ async def test_a_reader_that_dies_or_hangs_is_an_error_for_people() -> None:
 
     dies = (sys.executable, "-c", "import os; os.abort()")
     with pytest.raises(SourceError, match="ended without an answer"):
-        await sandbox.ask({"ask": "recording", "path": "x"}, command=dies)
+        await inspection.ask({"ask": "recording", "path": "x"}, command=dies)
     hangs = (sys.executable, "-c", "import threading; threading.Event().wait()")
-    with pytest.raises(sandbox.TookTooLongError):
-        await sandbox.ask({"ask": "recording", "path": "x"}, command=hangs, patience_s=0.2)
+    with pytest.raises(inspection.TookTooLongError):
+        await inspection.ask({"ask": "recording", "path": "x"}, command=hangs, patience_s=0.2)
     with pytest.raises(SourceError, match="no such file"):
-        await sandbox.ask({"ask": "recording", "path": "/no/such.mcap"})
+        await inspection.ask({"ask": "recording", "path": "/no/such.mcap"})
 
 
 def test_a_long_path_is_thinned_and_keeps_its_ends() -> None:

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from app.batch.tree_pictures import best_views, keep_pictures
-from app.common.draw_picture import draw
+from app.common.draw_picture import Drawing, draw
 from pipeline.io.readers import open_source
 from pipeline.io.readers.camera import nearest
 from pipeline.io.readers.ros import RosSource
@@ -22,7 +22,10 @@ from pipeline.io.recording.rendering import CAMERA, rendered, with_pictures
 from pipeline.types.records import Path as Way
 from pipeline.types.records import Trees, Truth, TruthTrees
 
-FILE = {"encoding": "", "width": 0, "height": 0, "step": 0, "box": [10, 10, 50, 90], "text": "tree 7"}
+
+def drawing(data: bytes, encoding: str = "", width: int = 0, height: int = 0, step: int = 0) -> Drawing:
+    """A picture with a box."""
+    return Drawing(encoding, width, height, step, data, (10.0, 10.0, 50.0, 90.0), "tree 7")
 
 
 def trees_at(*places: tuple[float, float]) -> Trees:
@@ -118,8 +121,8 @@ def test_the_nearest_pictures_are_taken_and_none_of_another_place():
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "rgba8", "bgra8"])
 def test_raw_pictures_of_usual_encodings_are_drawn(encoding: str):
     depth = {"mono8": 1, "rgba8": 4, "bgra8": 4}.get(encoding, 3)
-    told = {**FILE, "encoding": encoding, "width": 64, "height": 48, "step": 64 * depth + 8}
-    drawn = draw(told, bytes((64 * depth + 8) * 48))
+    step = 64 * depth + 8
+    drawn = draw(drawing(bytes(step * 48), encoding, 64, 48, step))
     assert Image.open(io.BytesIO(drawn)).size == (64, 48)
 
 
@@ -134,13 +137,15 @@ def bomb() -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("told", "data"),
+    "picture",
     [
-        (FILE, b""), (FILE, b"\xff\xd8\xff\xe0 no picture"), (FILE, bomb()),
-        ({**FILE, "encoding": "16UC1", "width": 4, "height": 4, "step": 8}, bytes(32)),
-        ({**FILE, "encoding": "rgb8", "width": 4000, "height": 4000, "step": 12000}, bytes(32)),
+        drawing(b""),
+        drawing(b"\xff\xd8\xff\xe0 no picture"),
+        drawing(bomb()),
+        drawing(bytes(32), "16UC1", 4, 4, 8),
+        drawing(bytes(32), "rgb8", 4000, 4000, 12000),
     ],
-)  # fmt: skip
-def test_what_is_no_picture_is_refused(told: dict[str, object], data: bytes):
+)
+def test_what_is_no_picture_is_refused(picture: Drawing):
     with pytest.raises(Exception, match=r".+"):
-        draw(told, data)
+        draw(picture)

@@ -21,7 +21,7 @@ from app.fleet import fleet as fleet_module
 from app.fleet.fleet import Fleet
 from app.fleet.frames import Frames
 from app.fleet.robots import named
-from app.fleet.server import build_fleet, warmed
+from app.fleet.server import build_fleet, warm_kernels
 from app.sources.request import SourceRequest
 from app.store.book import NewRun
 from app.web.auth import viewer_token
@@ -206,12 +206,12 @@ async def test_robots_begin_when_what_they_need_is_compiled():
 
 @pytest.mark.parametrize("code", ["pass", "raise SystemExit(3)"])
 async def test_compiling_may_fail_and_is_waited_for(code: str):
-    await warmed([sys.executable, "-c", code])
+    await warm_kernels([sys.executable, "-c", code])
 
 
 async def test_a_fleet_that_ends_while_it_compiles_leaves_nothing():
     forever = [sys.executable, "-c", "import time; time.sleep(1000)"]
-    waiting = Fleet(SETTINGS, 40000, TOKEN, warm=lambda: warmed(forever))
+    waiting = Fleet(SETTINGS, 40000, TOKEN, warm=lambda: warm_kernels(forever))
     waiting.add("red", Open("fake:red"))
     waiting.start()
     await asyncio.sleep(0.05)

@@ -13,7 +13,7 @@ import pytest
 from app.common.settings import Settings
 from app.robot.inbox import Inbox
 from app.robot.topics import Publisher
-from app.sources import inspect
+from app.sources import inspection
 from app.sources.opening import open_any
 from app.sources.request import SourceRequest
 from app.worker.protocol import Open
@@ -59,7 +59,7 @@ async def test_a_recording_tells_its_topics_and_where_the_lidar_stands(both: Run
 
 
 def test_what_has_no_topics_says_so():
-    told = inspect.recorded("sim:paper?duration=1")
+    told = inspection.recorded("sim:paper?duration=1")
     assert (told["topics"], told["mount"]) == ([], None)
 
 
@@ -90,10 +90,10 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
     names = [("points", POINT_CLOUD), ("fix", NAV_SAT_FIX), ("image", IMAGE), ("depth", "a/msg/Large")]
     topics = [Publisher("red", f"/red/{name}", kind) for name, kind in names]
     link = (lambda _, inbox: Announced(inbox, *topics), "")
-    monkeypatch.setattr(inspect, "link_for", lambda _address: link)
-    monkeypatch.setattr(inspect, "SETTLE_S", 0.3)
-    monkeypatch.setattr(inspect, "COUNT_S", 0.01)
-    told = inspect.heard("zenoh:tcp/127.0.0.1:7447")
+    monkeypatch.setattr(inspection, "link_for", lambda _address: link)
+    monkeypatch.setattr(inspection, "SETTLE_S", 0.3)
+    monkeypatch.setattr(inspection, "COUNT_S", 0.01)
+    told = inspection.heard("zenoh:tcp/127.0.0.1:7447")
     found = {name: (t["fits"], t["messages"], t["rate_hz"]) for name, t in by_name(told).items()}
     assert found == {
         "/red/points": ("scan", 21, 10.0),
@@ -103,9 +103,9 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
     }
     assert "silent" in by_name(told)["/red/fix"]["why_not"]
     assert (told["mount"], told["warnings"]) == (None, [])
-    monkeypatch.setattr(inspect, "link_for", lambda _address: (lambda _, inbox: Announced(inbox), ""))
-    monkeypatch.setattr(inspect, "LISTEN_S", 0.1)
-    assert "no topic was announced" in inspect.heard("velodyne:127.0.0.1:2368")["warnings"][0]
+    monkeypatch.setattr(inspection, "link_for", lambda _address: (lambda _, inbox: Announced(inbox), ""))
+    monkeypatch.setattr(inspection, "LISTEN_S", 0.1)
+    assert "no topic was announced" in inspection.heard("velodyne:127.0.0.1:2368")["warnings"][0]
 
 
 async def test_the_choice_goes_to_the_worker(both: Running) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
-from app.common import compile_ahead
+from app.common.child_process import BlockingChildProcess
+from app.worker import numba_warmup
 from pipeline.jit import on_compiling
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from app.worker.numba_warmup import warm_eyes, warm_map, warm_up
+from app.worker.numba_warmup import warm_front_end, warm_tree_map, warm_up
 from app.worker.process import new_session
 from pipeline.config import Parameters
 
@@ -30,8 +30,8 @@ def seen():
         for signature in kernel.signatures
     }
 
-warm_eyes()
-warm_map()
+warm_front_end()
+warm_tree_map()
 before = seen()
 assert len(before) > 20, before
 warm_up()
@@ -58,26 +58,26 @@ def test_the_halves_compile_what_the_mapper_and_a_slider_call():
 
 
 def test_nobody_is_started_where_all_is_kept(monkeypatch):
-    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: True)
-    monkeypatch.setattr(compile_ahead, "_started", lambda half: pytest.fail(half))
-    compile_ahead.compile_ahead()
+    monkeypatch.setattr(numba_warmup, "is_compiled", lambda: True)
+    monkeypatch.setattr(numba_warmup, "_start", lambda half: pytest.fail(half))
+    numba_warmup.compile_ahead()
 
 
 def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
     started = []
 
-    def start(half: str) -> subprocess.Popen[bytes]:
+    def start(half: str) -> BlockingChildProcess:
         program = f"import time; time.sleep(0.5); open({str(tmp_path / half)!r}, 'w').close()"
-        started.append(subprocess.Popen([sys.executable, "-c", program]))
+        started.append(BlockingChildProcess([sys.executable, "-c", program]))
         return started[-1]
 
-    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: False)
-    monkeypatch.setattr(compile_ahead, "_started", start)
-    monkeypatch.setattr(compile_ahead, "_cores", lambda: 2)
+    monkeypatch.setattr(numba_warmup, "is_compiled", lambda: False)
+    monkeypatch.setattr(numba_warmup, "_start", start)
+    monkeypatch.setattr(numba_warmup, "_cores", lambda: 2)
     told = []
     with on_compiling(lambda: told.append(1)):
-        compile_ahead.compile_ahead()
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["warm_eyes", "warm_map"]
+        numba_warmup.compile_ahead()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["warm_front_end", "warm_tree_map"]
     assert [process.returncode for process in started] == [0, 0]
     assert told
 
@@ -87,60 +87,28 @@ def test_who_comes_second_waits_and_finds_all_kept(monkeypatch, tmp_path):
     monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path))
     first = (tmp_path / "compiling.lock").open("w")
     fcntl.flock(first, fcntl.LOCK_EX)
-    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: first.closed)
-    monkeypatch.setattr(compile_ahead, "_started", lambda half: pytest.fail(half))
-    monkeypatch.setattr(compile_ahead, "_cores", lambda: 2)
+    monkeypatch.setattr(numba_warmup, "is_compiled", lambda: first.closed)
+    monkeypatch.setattr(numba_warmup, "_start", lambda half: pytest.fail(half))
+    monkeypatch.setattr(numba_warmup, "_cores", lambda: 2)
     with on_compiling(first.close):  # the first is done while the second waits
-        compile_ahead.compile_ahead()
+        numba_warmup.compile_ahead()
     assert first.closed
 
 
 def test_a_person_who_waits_no_longer_leaves_none_behind(monkeypatch):
     started = []
 
-    def start(half: str) -> subprocess.Popen[bytes]:
+    def start(half: str) -> BlockingChildProcess:
         del half
-        started.append(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]))
+        started.append(BlockingChildProcess([sys.executable, "-c", "import time; time.sleep(60)"]))
         return started[-1]
 
     def interrupt() -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(compile_ahead, "is_compiled", lambda: False)
-    monkeypatch.setattr(compile_ahead, "_started", start)
-    monkeypatch.setattr(compile_ahead, "_cores", lambda: 2)
+    monkeypatch.setattr(numba_warmup, "is_compiled", lambda: False)
+    monkeypatch.setattr(numba_warmup, "_start", start)
+    monkeypatch.setattr(numba_warmup, "_cores", lambda: 2)
     with on_compiling(interrupt), pytest.raises(KeyboardInterrupt):
-        compile_ahead.compile_ahead()
-    assert [process.poll() is None for process in started] == [False, False]
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-def test_who_is_ended_without_a_word_takes_both_along():
-    program = """
-import os, sys, time
-from app.common import compile_ahead
-compile_ahead._PROGRAM = (
-    "from app.common.parent_watch import end_with; end_with({parent}); import time; time.sleep(60)"
-)
-print(*(compile_ahead._started(half).pid for half in ("a", "b")), flush=True)
-time.sleep(0.5)
-os._exit(0)
-"""
-    told = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    left = [int(pid) for pid in told.stdout.split()]
-    assert len(left) == 2
-    until = time.monotonic() + 60.0
-    while left and time.monotonic() < until:
-        left = [pid for pid in left if is_alive(pid)]
-        time.sleep(0.1)
-    assert not left
-
-
-def is_alive(pid: int) -> bool:
-    """Whether it runs; one that nobody waited for yet does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
+        numba_warmup.compile_ahead()
+    assert None not in [process.returncode for process in started]
