@@ -1,4 +1,4 @@
-"""Import contracts, forbidden calls and docstrings of `app` and `pipeline`."""
+"""Forbidden calls and docstrings of `app` and `pipeline`. `.ci/run` checks the import contracts."""
 
 from __future__ import annotations
 
@@ -44,19 +44,6 @@ def imports(path: Path) -> Iterator[str]:
 
 PIPELINE = files("pipeline")
 EVERYTHING = files("pipeline", "app")
-
-
-def test_import_contracts():
-    """The contracts of import-linter in pyproject.toml hold."""
-    result = subprocess.run(
-        [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
 
 
 def calls(path: Path) -> Iterator[ast.Call]:

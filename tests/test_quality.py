@@ -1,10 +1,9 @@
-"""Lint, format and strict types are part of the tests; README and the parameters say the same."""
+"""Texts of the parameters, and rules for the files of the repository. `.ci/run` checks style and types."""
 
 from __future__ import annotations
 
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,45 +14,28 @@ from pipeline.config.model import FieldSpec
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def run(*words: str) -> str:
-    """Run a tool of this environment on the whole project; what it said when it was not content."""
-    told = subprocess.run(
-        [sys.executable, "-m", *words], cwd=ROOT, capture_output=True, text=True, timeout=900, check=False
-    )
-    return "" if told.returncode == 0 else f"{told.stdout}\n{told.stderr}"
-
-
-def test_lint():
-    assert run("ruff", "check", ".") == ""
-
-
-def test_format():
-    assert run("ruff", "format", "--check", ".") == ""
-
-
-def test_types():
-    assert run("mypy") == ""
-
-
-# --- what people read -----------------------------------------------------------------------------
-
-
 def test_the_parameter_table_is_current():
     table = markdown_table({name: preset(name) for name in PRESETS})
     text = (ROOT / "docs" / "parameters.md").read_text(encoding="utf-8")
     assert text.endswith(table), "generate it with: stemmap params --format markdown > docs/parameters.md"
 
 
-@pytest.mark.parametrize("spec", field_specs(), ids=lambda s: s.name)
-def test_a_parameter_is_named_and_said_in_full(spec: FieldSpec):
-    assert re.fullmatch(r"[a-z]+\.[a-zA-Z][a-z0-9_]*", spec.name)
-    assert spec.doc[0].isupper() or spec.doc[0].isdigit()
-    assert spec.doc.endswith(".")
-    assert not spec.title.endswith(".")
-    assert len(spec.title) <= 30, "a slider has no room for more"
-    if spec.kind == "choice":
-        assert len(spec.choices) >= 2
-        assert spec.default in spec.choices
+def flaws(spec: FieldSpec) -> list[str]:
+    """Rules for the name, the title and the description of a parameter that it breaks."""
+    rules = {
+        "its name is no dotted name": re.fullmatch(r"[a-z]+\.[a-zA-Z][a-z0-9_]*", spec.name) is not None,
+        "its description does not begin a sentence": spec.doc[0].isupper() or spec.doc[0].isdigit(),
+        "its description has no full stop": spec.doc.endswith("."),
+        "its title ends with a full stop": not spec.title.endswith("."),
+        "its title is too long for a slider": len(spec.title) <= 30,
+        "it has fewer than two choices": spec.kind != "choice" or len(spec.choices) >= 2,
+        "its default is not a choice": spec.kind != "choice" or spec.default in spec.choices,
+    }
+    return [f"{spec.name}: {rule}" for rule, holds in rules.items() if not holds]
+
+
+def test_every_parameter_is_named_and_described_in_full():
+    assert [flaw for spec in field_specs() for flaw in flaws(spec)] == []
 
 
 def test_titles_within_a_stage_differ():
@@ -62,14 +44,11 @@ def test_titles_within_a_stage_differ():
         assert len(titles) == len(set(titles))
 
 
-# --- what is in the repository ---------------------------------------------------------------------
-
-
 def tracked() -> list[str]:
-    """The files of the repository."""
+    """Return the files under version control."""
     try:
         told = subprocess.run(
-            ["git", "ls-files", "-z"],  # noqa: S607 - whichever git the person has
+            ["git", "ls-files", "-z"],  # noqa: S607 - git of the search path
             cwd=ROOT,
             capture_output=True,
             text=True,
@@ -91,34 +70,38 @@ FOREIGN = re.compile(
 )
 
 
-def test_no_address_of_a_registry_and_no_path_of_somebody_s_machine():
+def test_no_registry_address_and_no_path_of_a_machine():
     here = Path(__file__).name
+    offenders = []
     for name in tracked():
         path = ROOT / name
         if path.suffix in (".png", ".jpg", ".ico", ".woff2") or path.name in (here, "uv.lock"):
             continue
         text = path.read_text(encoding="utf-8", errors="replace")
-        assert not FOREIGN.search(text), f"{name}: {FOREIGN.search(text)}"
+        offenders += [f"{name}: {found[0]}" for found in FOREIGN.finditer(text)]
+    assert offenders == []
 
 
-def test_no_large_file_and_nothing_left_to_do():
+def test_no_large_file_and_no_open_task():
     left = re.compile(r"\b(TODO|FIXME|XXX|coming soon)\b")
     here = Path(__file__).name
+    offenders = []
     for name in tracked():
         path = ROOT / name
-        assert path.stat().st_size < 2_000_000, name
-        if path.suffix in (".py", ".js", ".css", ".html", ".md", ".toml") and path.name != here:
-            assert not left.search(path.read_text(encoding="utf-8")), name
+        is_text = path.suffix in (".py", ".js", ".css", ".html", ".md", ".toml") and path.name != here
+        if path.stat().st_size >= 2_000_000 or (is_text and left.search(path.read_text(encoding="utf-8"))):
+            offenders.append(name)
+    assert offenders == []
 
 
-def test_words_that_say_nothing_name_no_file():
-    for name in tracked():
-        # A command's file is called as the command is, and `info` is what bag tools call this one.
-        if name.endswith(".py") and name != "app/cli/info.py":
-            assert Path(name).stem not in {"utils", "helpers", "manager", "common", "misc", "data2", "info"}
+def test_no_file_has_a_name_without_meaning():
+    empty = {"utils", "helpers", "manager", "common", "misc", "data2", "info"}
+    # The file of a command has the name of the command.
+    allowed = {"app/cli/info.py"}
+    assert [n for n in tracked() if n.endswith(".py") and Path(n).stem in empty and n not in allowed] == []
 
 
-def test_viser_is_pinned_and_both_open3d_are_never_wanted_together():
+def test_viser_is_pinned_and_both_open3d_are_never_required_together():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     assert '"viser==1.1.1"' in text
     assert re.search(r'"open3d-cpu[^"]*;[^"]*==', text)

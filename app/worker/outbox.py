@@ -28,7 +28,9 @@ class Mailbox:
 
     A newer frame replaces a waiting frame. A newer status replaces a waiting status if source and state are
     the same. Other messages are sent in order; beyond MOST_MESSAGES the oldest is dropped. After `Opened`, no
-    frame of an older run is sent. A message that cannot be sent is dropped, and the status reports it.
+    frame of an older run is sent. The status of a paused or finished run is sent after its frame, so that the
+    web process never knows the time of a scan that it cannot show. A message that cannot be sent is dropped,
+    and the status reports it.
 
     Args:
         stream: Output stream, which is not closed here.
@@ -114,7 +116,7 @@ class Mailbox:
     def _next(self) -> FromWorker | None:
         with self._changed:
             while True:
-                if self._messages:
+                if self._messages and (self._picture is None or not _is_standing(self._messages[0])):
                     return self._messages.popleft()
                 wait = self._sent_at + _SHORTEST_PAUSE_S - time.monotonic()
                 if self._picture is not None and (wait <= 0 or self._closing):
@@ -135,6 +137,11 @@ class Mailbox:
             self._sent_ground = picture.ground
         self._sent_run = shown.run
         return structs.replace(shown, frame=picture, path_start=start, path=rows_from(shown.path, start))
+
+
+def _is_standing(message: FromWorker) -> bool:
+    """Return whether a message is the status of a run that does not play."""
+    return isinstance(message, Report) and message.status.state in ("paused", "finished")
 
 
 def _replaces(newer: FromWorker, older: FromWorker) -> bool:

@@ -30,7 +30,7 @@ from app.worker.internal_protocol import (
 )
 from app.worker.loop import WorkerLoop
 from app.worker.outbox import Mailbox, joined, rows_in_common
-from app.worker.protocol import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
+from app.worker.protocol import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, State, Status
 from app.worker.thin_frame import MOST_POINTS, picture_of
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
@@ -308,6 +308,20 @@ def test_a_status_replaces_an_unsent_status_of_the_same_state_only() -> None:
     mailbox.close(20.0)
     statuses = [message.status for message in received(stream) if isinstance(message, Report)]
     assert [(status.state, status.revision) for status in statuses] == [("starting", 0), ("failed", 2)]
+
+
+@pytest.mark.parametrize("state", ["paused", "finished"])
+def test_a_standing_status_follows_the_frame_of_its_scan(state: State) -> None:
+    stream = io.BytesIO()
+    mailbox = Mailbox(stream)
+    for k in range(3):  # within the shortest pause between two frames
+        mailbox.put(Shown(1, 0.1 * k, frame(k, k), 0, path([0.0])))
+        mailbox.put(Report(Status(state=state, scan_index=k)))
+    mailbox.close(5.0)
+    *_, before, last = received(stream)
+    assert isinstance(before, Shown)
+    assert isinstance(last, Report)
+    assert before.frame.index == last.status.scan_index == 2
 
 
 def test_no_picture_of_the_run_before_follows_an_opening() -> None:
