@@ -28,10 +28,9 @@ from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from app.batch.run_folder import FinishedRun
-    from app.tuning.sweep.comparison import Comparison
     from app.tuning.sweep.jobs import PreparedRun, SweepPlan
-    from app.tuning.sweep.sweep import Outcome
-    from app.tuning.sweep.workers import Workers
+    from app.tuning.sweep.report import Comparison
+    from app.tuning.sweep.sweep import Outcome, Workers
     from pipeline.config import Parameters
     from pipeline.config.model import Value
     from pipeline.evaluation import Evaluation
@@ -261,8 +260,8 @@ def run_grid(arguments: argparse.Namespace) -> int:
     if not runs:
         return 1
 
-    from app.tuning.sweep.comparison import compare_answers
     from app.tuning.sweep.jobs import plan_jobs
+    from app.tuning.sweep.report import compare_answers
 
     plan = plan_jobs(runs, sets, lambda run, changes: _base(arguments, run, changes))
     numbers = list(plan.jobs)
@@ -323,7 +322,7 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> Outcome:
 
 @contextlib.contextmanager
 def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
-    from app.tuning.sweep.workers import DaskWorkers, Processes
+    from app.tuning.sweep.sweep import DaskWorkers, Processes
 
     workers: Workers
     if arguments.dask is not None:

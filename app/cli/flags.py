@@ -229,6 +229,17 @@ def positive_number(limit: float, quantity: str) -> Callable[[str], float]:
     return parse
 
 
+def share(text: str) -> float:
+    """Parse a number from 0 to 1."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value <= 1.0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 to 1")
+    return value
+
+
 def cannot_write(error: OSError, place: Path) -> StemmapError:
     """Return the error of a file or folder that cannot be written."""
     return StemmapError(f"cannot write: {error.strerror}", where=str(error.filename or place))

@@ -14,6 +14,7 @@ from app.cli.flags import (
     chosen_parameters,
     compilation_notice,
     positive_number,
+    share,
     source,
     whole_number,
 )
@@ -66,7 +67,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "pair error with F1 not below that of the start",
     )  # fmt: skip
     parser.add_argument(
-        "--false-max", metavar="SHARE", type=float, default=0.1,
+        "--false-max", metavar="SHARE", type=share, default=0.1,
         help="with --goal ta: largest share of false trees in the map (default: 0.1)",
     )  # fmt: skip
     parser.add_argument(
@@ -119,9 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _plan(arguments: argparse.Namespace) -> Plan:
     from app.robot.address import is_live
-    from app.tuning.goal import goal_of
-    from app.tuning.plan import Plan
-    from app.tuning.search_space import SENSIBLE, axes_of
+    from app.tuning.plan import SENSIBLE, Plan, axes_of
 
     for uri in (*arguments.runs, *arguments.held_out):
         if is_live(uri):
@@ -130,7 +129,6 @@ def _plan(arguments: argparse.Namespace) -> Plan:
                 where=uri,
                 remedy="Record it, and name the recording",
             )
-    goal = goal_of(arguments.goal, arguments.false_max)
     preset_name, parameters = chosen_parameters(arguments, _suggested(arguments.runs[0]))
     if not arguments.out.absolute().parent.is_dir():
         raise StemmapError("the folder for --out does not exist", where=str(arguments.out.absolute().parent))
@@ -140,8 +138,8 @@ def _plan(arguments: argparse.Namespace) -> Plan:
         start=parameters.model_dump(),
         storage=_storage(arguments),
         preset=preset_name,
-        goal=goal.name,
-        false_max=goal.false_max,
+        goal=arguments.goal,
+        false_max=arguments.false_max,
         seed=arguments.seed,
         odometry=arguments.odometry,
         trials=arguments.trials,
@@ -235,7 +233,7 @@ def _search(search: Search, number: int) -> tuple[bool, int]:
     processes."""
     import time
 
-    from app.tuning.search_processes import SearchWorkers
+    from app.tuning.search import SearchWorkers
 
     plan = search.plan
     workers: SearchWorkers | None = None
@@ -327,7 +325,7 @@ class _Bar:
         self._best = best.loss
         told = f"trial {best.number}: {self._goal.shown(best.loss)}"
         if best.held_out:
-            from app.tuning.goal import pool
+            from app.tuning.plan import pool
 
             told += f"   held out: F1 {pool(best.held_out).f1:.3f}"
         self._bar.set_postfix_str(self._goal.shown(best.loss), refresh=False)

@@ -1,21 +1,380 @@
-"""The records of a search: what is searched for, the runs with their true trees, and the trials."""
+"""The records of a search: its goal, the parameters that it varies, its runs and its trials."""
 
 from __future__ import annotations
 
 import hashlib
 import math
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from app.common.version import version
 from app.sources.request import SourceRequest
-from app.tuning.goal import Goal, GoalName, RunScore
-from app.tuning.search_space import Axis
-from pipeline.config import Parameters
+from pipeline.config import FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value, validated
+from pipeline.errors import ParameterError
+from pipeline.evaluation import Evaluation
 from pipeline.types.records import TruthTrees
+
+# --- goal -------------------------------------------------------------------------------------------
+
+GoalName = Literal["f1", "ta", "position", "pairs"]
+GOALS: dict[GoalName, str] = {
+    "f1": "F1",
+    "ta": "true acceptance (TA), false trees bounded",
+    "position": "position RMSE, F1 not below that of the start",
+    "pairs": "mean pair error, F1 not below that of the start",
+}
+# Loss from which on a set breaks the bound of its goal; larger than any TA, RMSE [m] or pair error [%] of a
+# set that keeps it.
+_BROKEN: dict[GoalName, float] = {"f1": 1.0, "ta": 2.0, "position": 1e3, "pairs": 1e6}
+
+
+class RunScore(msgspec.Struct, frozen=True):
+    """Counts and errors of one run.
+
+    Attributes:
+        TA, FR: True trees that were found, and that were missed.
+        FA, TR: Other objects that were mapped as trees, and that were not.
+        spurious: Mapped trees where no object is known.
+        position_rmse: Of the TA matched trees [m]; None without any.
+        pair_error: Mean error of the distances between each two of them [%]; None with fewer than two.
+    """
+
+    TA: int
+    FR: int
+    FA: int
+    TR: int
+    spurious: int
+    position_rmse: float | None
+    pair_error: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Pooled:
+    """Scores of several runs together. Each tree has the same weight, and each pair within a run.
+
+    Attributes:
+        f1: 2 TA / (2 TA + FR + FA + spurious).
+        ta: TA / (TA + FR).
+        false_share: (FA + spurious) / (TA + FA + spurious), the share of mapped trees that are false; 0 for
+            an empty map.
+        position_rmse: sqrt(sum TA_k rmse_k^2 / sum TA_k) [m].
+        pair_error: Mean over all pairs [%].
+    """
+
+    f1: float
+    ta: float
+    false_share: float
+    position_rmse: float | None
+    pair_error: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """The goal of a search.
+
+    Attributes:
+        name: See `GOALS`.
+        false_max: Largest share of false trees that the goal "ta" allows.
+    """
+
+    name: GoalName = "f1"
+    false_max: float = 0.1
+
+    def loss(self, pooled: Pooled, start: Pooled) -> float:
+        """The value that the search minimises. A set that breaks the goal's bound is worse than every set
+        that keeps it, and the more so the larger the violation; otherwise an empty map would have the
+        smallest errors.
+
+        Args:
+            pooled: Scores of the set.
+            start: Scores of the parameters with which the search began.
+        """
+        if self.name == "f1":
+            return 1.0 - pooled.f1
+        if self.name == "ta":
+            beyond = pooled.false_share - self.false_max
+            return 1.0 - pooled.ta if beyond <= 0.0 else _BROKEN["ta"] + beyond
+        error = pooled.position_rmse if self.name == "position" else pooled.pair_error
+        short = start.f1 - pooled.f1
+        return _BROKEN[self.name] + max(short, 0.0) if error is None or short > 1e-12 else error
+
+    def is_kept(self, loss: float) -> bool:
+        """Whether a loss is that of a set that keeps the goal's bound."""
+        return self.name == "f1" or loss < _BROKEN[self.name]
+
+    def figure(self, loss: float) -> float:
+        """A loss as the goal's figure, in `unit`."""
+        if self.name in ("f1", "ta"):
+            return 1.0 - loss
+        return 100.0 * loss if self.name == "position" else loss
+
+    def figure_of(self, pooled: Pooled) -> float | None:
+        """The goal's figure of pooled scores, in `unit`; None where it is unknown."""
+        value = {
+            "f1": pooled.f1,
+            "ta": pooled.ta,
+            "position": pooled.position_rmse,
+            "pairs": pooled.pair_error,
+        }
+        figure = value[self.name]
+        return 100.0 * figure if self.name == "position" and figure is not None else figure
+
+    def shown(self, loss: float) -> str:
+        """A loss as text: the figure with its unit."""
+        if not self.is_kept(loss):
+            return "outside the bound"
+        digits = 2 if self.name == "position" else 3
+        return f"{self.label} {self.figure(loss):.{digits}f} {self.unit}".rstrip()
+
+    @property
+    def label(self) -> str:
+        """The figure's short name."""
+        return {"f1": "F1", "ta": "TA", "position": "RMSE", "pairs": "pair error"}[self.name]
+
+    @property
+    def unit(self) -> str:
+        """The figure's unit."""
+        return {"position": "cm", "pairs": "%"}.get(self.name, "")
+
+    @property
+    def words(self) -> str:
+        """The goal as text."""
+        bound = f" (at most {100.0 * self.false_max:g} % of the mapped trees)" if self.name == "ta" else ""
+        return GOALS[self.name] + bound
+
+
+def score_of(e: Evaluation) -> RunScore:
+    """Return the scores that a search stores of an evaluation."""
+    return RunScore(
+        e.TA.count,
+        e.FR.count,
+        e.FA.count,
+        e.TR.count,
+        e.spurious,
+        e.position_rmse,
+        e.mean_pair_error_percent,
+    )
+
+
+def pool(scores: Sequence[RunScore]) -> Pooled:
+    """Pool the scores of several runs, see `Pooled`."""
+    ta, fr = sum(s.TA for s in scores), sum(s.FR for s in scores)
+    wrong = sum(s.FA + s.spurious for s in scores)
+    squares = [(s.TA, s.position_rmse**2) for s in scores if s.position_rmse is not None]
+    pairs = [(s.TA * (s.TA - 1) // 2, s.pair_error) for s in scores if s.pair_error is not None]
+    rms = _mean(squares)
+    return Pooled(
+        f1=2.0 * ta / (2.0 * ta + fr + wrong) if ta else 0.0,
+        ta=ta / (ta + fr) if ta else 0.0,
+        false_share=wrong / (ta + wrong) if wrong else 0.0,
+        position_rmse=None if rms is None else math.sqrt(rms),
+        pair_error=_mean(pairs),
+    )
+
+
+def _mean(weighed: list[tuple[int, float]]) -> float | None:
+    whole = sum(weight for weight, _ in weighed)
+    return sum(weight * value for weight, value in weighed) / whole if whole else None
+
+
+# --- search space -----------------------------------------------------------------------------------
+
+# The parameters with the largest effect on which clusters and columns become trees, within plausible bounds.
+SENSIBLE = (
+    "detection.e_max=10..200",
+    "detection.cylindrical_stddev_thresh=0.02..0.2",
+    "detection.radius_min=0..0.1",
+    "detection.height_extent_min=0.1..1.2",
+    "detection.arc_min=0..120",
+    "classification.tree_share=0.1..0.8",
+    "tracking.hits_to_confirm=1..10",
+    "tracking.proximity_radius=0.2..1",
+)
+_NO_PART_OF_THE_MAP = {
+    "evaluation": "decides how a map is scored, not how it is made",
+    "obstacles": "does not change the map",
+}
+_LOG_FROM = 100.0  # a range whose ends differ by more than this factor is searched by its logarithm
+_DIGITS = 4  # significant digits of a value, so that the file stays readable
+_CORNERS = 4096
+
+
+class Axis(msgspec.Struct, frozen=True):
+    """A parameter of a search.
+
+    Attributes:
+        low, high: Of a number.
+        choices: Of a choice or a switch.
+    """
+
+    name: str
+    kind: Literal["float", "int", "choice"]
+    low: float = 0.0
+    high: float = 0.0
+    choices: tuple[str | bool, ...] = ()
+
+    def suggest(self, trial: Any) -> None:  # noqa: ANN401 - Optuna has no types
+        """Let a trial of Optuna choose a value; it is in the trial's `params` afterwards."""
+        log = self.low > 0.0 and self.high >= _LOG_FROM * self.low
+        if self.kind == "choice":
+            trial.suggest_categorical(self.name, self.choices)
+        elif self.kind == "int":
+            trial.suggest_int(self.name, int(self.low), int(self.high), log=log)
+        else:
+            trial.suggest_float(self.name, self.low, self.high, log=log)
+
+    def value_of(self, suggested: Any) -> Value:  # noqa: ANN401
+        """Return the parameter's value for a suggestion of Optuna: few digits, within the bounds."""
+        if self.kind == "choice":
+            return suggested if isinstance(suggested, bool) else str(suggested)
+        if self.kind == "int":
+            return int(suggested)
+        return min(max(float(f"{suggested:.{_DIGITS}g}"), self.low), self.high)
+
+    def holds(self, value: Value) -> bool:
+        """Whether a value is within the bounds."""
+        if self.kind == "choice":
+            return any(type(c) is type(value) and c == value for c in self.choices)
+        return not isinstance(value, str) and self.low <= value <= self.high
+
+    @property
+    def words(self) -> str:
+        """The axis in the syntax of --over."""
+        if self.kind == "choice":
+            return f"{self.name}={','.join(_word(c) for c in self.choices)}"
+        return f"{self.name}={self.low:g}..{self.high:g}"
+
+
+def axes_of(texts: Sequence[str]) -> tuple[Axis, ...]:
+    """Return the axes of `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`.
+
+    Raises:
+        ParameterError: A name is unknown or named twice, or its bounds contradict its declaration.
+    """
+    axes = tuple(_axis(text) for text in texts)
+    names = [axis.name for axis in axes]
+    for name in names:
+        if names.count(name) > 1:
+            raise ParameterError(f"{name} is given twice", remedy="Name it once")
+    return axes
+
+
+def check(axes: Iterable[Axis], start: Parameters) -> None:
+    """Check that the bounds contain a set without contradictions.
+
+    Raises:
+        ParameterError: All corners of the space contradict themselves; the message names the contradiction.
+    """
+    ends = [[(axis.name, value) for value in _ends(axis)] for axis in axes]
+    refusal: ParameterError | None = None
+    if math.prod(len(values) for values in ends) > _CORNERS:
+        return  # each trial is checked anyway
+    for corner in product(*ends):
+        try:
+            start.replace(dict(corner))
+        except ParameterError as error:
+            refusal = refusal or error
+        else:
+            return
+    if refusal is not None:
+        raise ParameterError(
+            f"all sets within these bounds contradict themselves: {refusal.what}",
+            remedy="Widen the bounds, or set the other value with --set",
+        )
+
+
+def values_of(axes: Iterable[Axis], suggested: Mapping[str, Any]) -> dict[str, Value]:
+    """Return the values of the parameters by name."""
+    return {axis.name: axis.value_of(suggested[axis.name]) for axis in axes}
+
+
+def _axis(text: str) -> Axis:
+    name, given, bounds = (part.strip() for part in text.partition("="))
+    spec = next((spec for spec in field_specs() if spec.name == name), None)
+    if spec is None:
+        Parameters().replace({name: 0})  # raises an error that names the nearest parameter
+        raise ParameterError(f"there is no parameter {name!r}")
+    why = _NO_PART_OF_THE_MAP.get(name.partition(".")[0])
+    if why is not None:
+        raise ParameterError(f"{name} {why}; it cannot be searched over", remedy="Set it with --set")
+    if spec.kind == "name":
+        return _names(spec, bounds)
+    if spec.minimum is None or spec.maximum is None:
+        return _choice(spec, bounds) if given else Axis(name, "choice", choices=_all_choices(spec))
+    low, high = _range(spec, bounds) if given else (spec.minimum, spec.maximum)
+    return Axis(name, "int" if spec.kind == "int" else "float", low, high)
+
+
+def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
+    first, dots, last = bounds.partition("..")
+    try:
+        if not dots:
+            raise ValueError
+        whole = spec.kind == "int"
+        low, high = (float(int(end)) if whole else float(end) for end in (first, last))
+    except (ValueError, OverflowError):
+        kind = "whole numbers" if spec.kind == "int" else "numbers"
+        raise ParameterError(
+            f"{spec.name}={bounds}: not two {kind} with .. between", remedy=f"E.g. {_example(spec)}"
+        ) from None
+    assert spec.minimum is not None  # noqa: S101 - it is a number
+    assert spec.maximum is not None  # noqa: S101
+    if not low < high:
+        raise ParameterError(f"{spec.name}={bounds}: the lower bound must be less than the upper one")
+    if not (spec.minimum <= low and high <= spec.maximum):
+        raise ParameterError(
+            f"{spec.name}={bounds} is outside of the parameter's range",
+            remedy=f"It goes from {spec.minimum:g} to {spec.maximum:g}",
+        )
+    return low, high
+
+
+def _choice(spec: FieldSpec, words: str) -> Axis:
+    known = {_word(choice): choice for choice in _all_choices(spec)}
+    asked = [word.strip() for word in words.split(",")]
+    unknown = [word for word in asked if word not in known]
+    if unknown or len(set(asked)) < 2:
+        what = f"{unknown[0]!r} is not one of its values" if unknown else "at least two values are needed"
+        raise ParameterError(f"{spec.name}={words}: {what}", remedy=f"Choose from {', '.join(known)}")
+    return Axis(spec.name, "choice", choices=tuple(known[word] for word in dict.fromkeys(asked)))
+
+
+def _names(spec: FieldSpec, words: str) -> Axis:
+    asked = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
+    if len(asked) < 2:
+        raise ParameterError(
+            f"{spec.name} is a name and has no bounds", remedy=f"Give at least two names: {spec.name}=A,B"
+        )
+    for word in asked:
+        Parameters().replace({spec.name: word})  # raises an error that says how a name is written
+    return Axis(spec.name, "choice", choices=asked)
+
+
+def _all_choices(spec: FieldSpec) -> tuple[str | bool, ...]:
+    return spec.choices or (False, True)
+
+
+def _ends(axis: Axis) -> tuple[Value, ...]:
+    if axis.kind == "choice":
+        return axis.choices
+    return axis.value_of(axis.low), axis.value_of(axis.high)
+
+
+def _word(choice: str | bool) -> str:
+    return str(choice).lower() if isinstance(choice, bool) else choice
+
+
+def _example(spec: FieldSpec) -> str:
+    return f"{spec.name}={spec.minimum:g}..{spec.maximum:g}"
+
+
+# --- plan and trials --------------------------------------------------------------------------------
 
 FORMAT = 1
 #: Prefix of the folder with the journal of a search of the page.
@@ -72,7 +431,7 @@ class Plan(msgspec.Struct, frozen=True):
         start: All parameters with which the search begins, by stage. They are the first trial.
         storage: Path of a journal, or address of a PostgreSQL database.
         preset: Name of the preset from which the parameters come.
-        goal, false_max: See `app.tuning.goal.Goal`.
+        goal, false_max: See `app.tuning.plan.Goal`.
         seed: Random seed of the mapping and of the sampler.
         odometry: Default source of the motion, see `app.sources.opening`.
         trials: Number of trials in all, earlier ones included.

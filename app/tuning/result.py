@@ -14,8 +14,7 @@ import tomli_w
 from app.common.text import count
 from app.common.version import version
 from app.dashboard.parameters import file_of
-from app.tuning.goal import Goal, GoalName, Pooled, RunScore, pool
-from app.tuning.plan import Plan, Trial
+from app.tuning.plan import Goal, Plan, RunScore, Trial, pool
 from pipeline.config import Parameters
 from pipeline.config.model import Value
 
@@ -251,12 +250,16 @@ def for_page(
         result: The result, once the search has ended.
     """
     goal, best = plan.aim, best_of(trials, start)
-    points = [(t.number, _shown(goal.name, t.loss)) for t in trials if goal.is_kept(t.loss or 0.0)]
+    points = [
+        (t.number, None if t.loss is None else goal.figure(t.loss))
+        for t in trials
+        if goal.is_kept(t.loss or 0.0)
+    ]
     every = -(-len(points) // _POINTS_LIMIT) or 1
     return {
         "goal": goal.words,
         "label": goal.label,
-        "unit": {"position": "cm", "pairs": "%"}.get(goal.name, ""),
+        "unit": goal.unit,
         "over": [axis.words for axis in plan.axes],
         "wanted": plan.trials,
         "made": len(trials),
@@ -291,27 +294,19 @@ def _figures(scores: Sequence[RunScore]) -> dict[str, Any]:
 
 def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str, Any]]:
     """Scores of the search runs and of the held-out runs, at the start and with the best set."""
-    held = sum(run.held_out for run in plan.runs)
     if start is None or best is None:
         return []
-    rows: list[dict[str, Any]] = [
+    counts = {held_out: sum(run.held_out is held_out for run in plan.runs) for held_out in (False, True)}
+    return [
         {
-            "held_out": False,
-            "runs": len(plan.runs) - held,
-            "start": _figures(start.training),
-            "best": _figures(best.training),
+            "held_out": held_out,
+            "runs": runs,
+            "start": _figures(_scores(start, held_out)),
+            "best": _figures(_scores(best, held_out)),
         }
+        for held_out, runs in counts.items()
+        if runs
     ]
-    if held:
-        rows.append(
-            {
-                "held_out": True,
-                "runs": held,
-                "start": _figures(start.held_out),
-                "best": _figures(best.held_out),
-            }
-        )
-    return rows
 
 
 def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float | None]]:
@@ -320,23 +315,8 @@ def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float |
     for trial in trials:
         if trial.held_out and trial.loss is not None and trial.loss < best and goal.is_kept(trial.loss):
             best = trial.loss
-            held.append((trial.number, _figure(goal.name, pool(trial.held_out))))
+            held.append((trial.number, goal.figure_of(pool(trial.held_out))))
     return held
-
-
-def _figure(goal: GoalName, pooled: Pooled) -> float | None:
-    if goal in ("f1", "ta"):
-        return pooled.f1 if goal == "f1" else pooled.ta
-    if goal == "pairs":
-        return pooled.pair_error
-    return None if pooled.position_rmse is None else 100.0 * pooled.position_rmse
-
-
-def _shown(goal: GoalName, loss: float | None) -> float | None:
-    """A loss as the figure of the chart; None for contradicting values."""
-    if loss is None:
-        return None
-    return 1.0 - loss if goal in ("f1", "ta") else 100.0 * loss if goal == "position" else loss
 
 
 def _changes(plan: Plan, result: Result) -> list[list[Any]]:

@@ -1,4 +1,4 @@
-"""A comparison as text for a terminal, as tables and as a web page.
+"""Comparison of parameter sets: rows, means and best sets, as text, as tables and as a web page.
 
 Times are in a file of their own, so that the tables and the JSON have the same bytes for the same runs and
 parameters, wherever they were computed.
@@ -9,16 +9,202 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from app.common.text import count
 from app.common.version import version
-from app.tuning.sweep.comparison import COLUMNS, SHOWN, Comparison, Row, figure_words
-from app.tuning.sweep.grid import words_of
-from app.tuning.sweep.report_html import page
+from app.tuning.sweep.grid import shown, words_of
+from app.tuning.sweep.jobs import Answer, SweepPlan
 from pipeline.io.atomic_files import write_beside
+
+Figures = dict[str, float | int | None]
+
+# Figure, heading, unit and factor from the stored value to the shown one.
+SHOWN: tuple[tuple[str, str, str, float], ...] = (
+    ("TA", "TA", "", 1.0),
+    ("FR", "FR", "", 1.0),
+    ("TR", "TR", "", 1.0),
+    ("FA", "FA", "", 1.0),
+    ("spurious", "spurious", "", 1.0),
+    ("completeness", "compl.", "%", 100.0),
+    ("correctness", "corr.", "%", 100.0),
+    ("f1", "F1", "%", 100.0),
+    ("position_rmse_m", "RMSE", "cm", 100.0),
+    ("position_bias_m", "bias", "cm", 100.0),
+    ("mean_pair_error_percent", "pairs", "%", 1.0),
+)
+COLUMNS = (
+    "TA", "TA_of", "FR", "TR", "TR_of", "FA", "spurious", "completeness", "correctness", "f1",
+    "position_rmse_m", "position_bias_m", "dbh_rmse_m", "dbh_bias_m", "mean_pair_error_percent",
+    "scans", "trees",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """The result of a set on one run, or its mean over all runs.
+
+    Attributes:
+        set_number: Number of the set, from 1 on.
+        run: Number of the run, from 1 on; 0 for the mean.
+        figures: Scores by name, see COLUMNS; empty for a failure.
+        seconds: Computing time [s]; for a mean the sum.
+        looked: Whether the front end ran in this time.
+        error: Reason of the failure.
+    """
+
+    set_number: int
+    run: int
+    figures: Figures
+    seconds: float = 0.0
+    looked: bool = False
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Criterion:
+    """A criterion for the best set.
+
+    Attributes:
+        words: Its name.
+        value: Value of a row's figures, larger is better; None where it is unknown.
+    """
+
+    words: str
+    value: Callable[[Figures], tuple[float, ...] | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """All rows.
+
+    Attributes:
+        rows: By set and run.
+        means: A row per set.
+        best: Number of the best set by name of the goal; 0 where all sets are equal or unknown.
+    """
+
+    plan: SweepPlan
+    rows: tuple[Row, ...]
+    means: tuple[Row, ...]
+    best: dict[str, int]
+
+    @property
+    def failed(self) -> list[Row]:
+        """Rows without figures."""
+        return [row for row in self.rows if row.error]
+
+
+def _most(name: str) -> Callable[[Figures], tuple[float, ...] | None]:
+    return lambda f: None if f[name] is None else (float(f[name] or 0.0),)
+
+
+def _least(name: str) -> Callable[[Figures], tuple[float, ...] | None]:
+    return lambda f: None if f[name] is None else (-float(f[name] or 0.0), float(f["f1"] or 0.0))
+
+
+def _careful(f: Figures) -> tuple[float, ...] | None:
+    wrong = float(f["FA"] or 0) + float(f["spurious"] or 0)
+    return (-wrong, float(f["TA"] or 0))
+
+
+CRITERIA = (
+    Criterion("F1", _most("f1")),
+    Criterion("completeness", _most("completeness")),
+    Criterion("fewest false trees, then most true ones", _careful),
+    Criterion("position RMSE", _least("position_rmse_m")),
+    Criterion("pair error", _least("mean_pair_error_percent")),
+)
+
+
+def compare_answers(plan: SweepPlan, answers: dict[tuple[int, int], Answer]) -> Comparison:
+    """Return rows, means and the best sets."""
+    rows, means = [], []
+    for s in range(len(plan.sets)):
+        of_set = [_row(plan, answers, s, r) for r in range(len(plan.runs))]
+        rows += of_set
+        means.append(_mean(s + 1, of_set))
+    return Comparison(
+        plan, tuple(rows), tuple(means), {goal.words: best_of(means, goal) for goal in CRITERIA}
+    )
+
+
+def _row(plan: SweepPlan, answers: dict[tuple[int, int], Answer], s: int, r: int) -> Row:
+    if (s, r) in plan.left_out:
+        return Row(s + 1, r + 1, {}, error=plan.left_out[s, r])
+    answer = answers[s, r]
+    if answer.scores is None:
+        return Row(s + 1, r + 1, {}, error=answer.error)
+    return Row(s + 1, r + 1, figures(answer.scores), answer.seconds, answer.looked)
+
+
+def figures(scores: dict[str, Any]) -> Figures:
+    """Return the columns of a worker's scores."""
+    columns: Figures = {name: scores[name]["count"] for name in ("TA", "FR", "TR", "FA")}
+    columns["TA_of"], columns["TR_of"] = scores["TA"]["of"], scores["TR"]["of"]
+    for name in COLUMNS:
+        if name not in columns:
+            columns[name] = scores[name.removesuffix("_m")]
+    return columns
+
+
+def _mean(set_number: int, rows: Sequence[Row]) -> Row:
+    """Counts are summed over the runs; all other figures are means of the runs that have them, with equal
+    weights. A set that failed on a run has no mean, because it could not be compared with the others."""
+    failed = [row for row in rows if row.error]
+    seconds = sum(row.seconds for row in rows)
+    if failed:
+        return Row(set_number, 0, {}, seconds, error=failed[0].error)
+    mean: Figures = {}
+    for name in COLUMNS:
+        known = [value for row in rows if (value := row.figures[name]) is not None]
+        if all(isinstance(value, int) for value in known) and known:
+            mean[name] = sum(known)
+        else:
+            mean[name] = math.fsum(known) / len(known) if known else None
+    return Row(set_number, 0, mean, seconds, any(row.looked for row in rows))
+
+
+def best_of(means: Sequence[Row], goal: Criterion) -> int:
+    """Return the number of the best set, the first of equals; 0 where no value is known or all are equal."""
+    values = [
+        (value, -m.set_number) for m in means if m.figures and (value := goal.value(m.figures)) is not None
+    ]
+    equal = len(values) > 1 and max(values)[0] == min(values)[0]
+    return -max(values)[1] if values and not equal else 0
+
+
+def figure_words(figures: Figures, name: str, scale: float) -> str:
+    """A figure as text; TA and TR with their totals."""
+    value = figures[name]
+    if value is None:
+        return "-"
+    if name in ("TA", "TR"):
+        return f"{value}/{figures[f'{name}_of']}"
+    return str(value) if isinstance(value, int) and scale == 1.0 else f"{scale * value:.2f}"
+
+
+def is_valid(answer: Answer) -> bool:
+    """Whether the scores of an answer have all figures, each a finite number or None; for a failure, whether
+    it has a reason."""
+    if answer.scores is None:
+        return bool(answer.error)
+    try:
+        columns = figures(answer.scores)
+    except (KeyError, TypeError):
+        return False
+    if any(columns[name] is None for name in ("TA", "TA_of", "FR", "TR", "TR_of", "FA", "spurious")):
+        return False
+    return math.isfinite(answer.seconds) and all(
+        value is None or (type(value) in (int, float) and math.isfinite(value)) for value in columns.values()
+    )
+
+
+# --- text and tables ---------------------------------------------------------------------------------
 
 MOST_LINES = 60
 _COMPUTED = ("=", "+", "-", "@", "\t", "\r")
@@ -179,3 +365,79 @@ def _best_lines(comparison: Comparison) -> list[str]:
         elif len(comparison.plan.sets) > 1:
             lines.append(f"best {goal}: none; all sets are equal or unknown")
     return lines
+
+
+# --- web page ----------------------------------------------------------------------------------------
+
+# Figures whose smallest value is best.
+_LEAST = {"FR", "FA", "spurious", "position_rmse_m", "position_bias_m", "mean_pair_error_percent"}
+
+
+def page(comparison: Comparison) -> str:
+    """Return the comparison as one HTML file without scripts or links."""
+    from jinja2 import Environment, PackageLoader
+
+    environment = Environment(
+        loader=PackageLoader("app.tuning.sweep", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    plan, means = comparison.plan, comparison.means
+    tables = [
+        (run.name, "", [row for row in comparison.rows if row.run == r]) for r, run in enumerate(plan.runs, 1)
+    ]
+    if len(plan.runs) > 1:
+        note = "Counts are summed; other figures are means of the runs."
+        tables.insert(0, ("Means over the runs", note, list(means)))
+    return environment.get_template("report.html.j2").render(
+        title=f"{count(len(plan.sets), 'set')} of parameters on {count(len(plan.runs), 'run')}",
+        version=version(),
+        plan=plan,
+        failed=count(len(comparison.failed), "result") if comparison.failed else "",
+        best_sets=comparison.best,
+        charts=[_chart(axis, points) for axis, points in _f1_by_value(comparison).items()],
+        axes=["set", *(plan.sets[0] if plan.sets else ())],
+        tables=[(heading, note, rows, _best(rows)) for heading, note, rows in tables],
+        shown=SHOWN,
+        words_of=words_of,
+        value_words=shown,
+        figure_words=figure_words,
+    )
+
+
+def _best(rows: list[Row]) -> dict[str, float | None]:
+    """The best value of each figure; None where there is nothing to compare."""
+    best: dict[str, float | None] = {}
+    for name, _, _, _ in SHOWN:
+        known = [value for row in rows if not row.error and (value := row.figures[name]) is not None]
+        best[name] = (min if name in _LEAST else max)(known) if len(rows) > 1 and known else None
+    return best
+
+
+def _f1_by_value(comparison: Comparison) -> dict[str, dict[float, list[float]]]:
+    """F1 [%] of all sets by the value of each numeric parameter with at least two values."""
+    plan, found = comparison.plan, {}
+    for axis in plan.sets[0] if plan.sets else ():
+        points: dict[float, list[float]] = {}
+        for mean in comparison.means:
+            value, f1 = plan.sets[mean.set_number - 1][axis], mean.figures.get("f1")
+            if isinstance(value, int | float) and not isinstance(value, bool) and f1 is not None:
+                points.setdefault(float(value), []).append(100.0 * f1)
+        if len(points) > 1:
+            found[axis] = points
+    return found
+
+
+def _chart(axis: str, points: dict[float, list[float]]) -> dict[str, Any]:
+    """Coordinates of the lines through the best and the mean F1 of the sets with each value."""
+    xs = sorted(points)
+    best, mean = [max(points[x]) for x in xs], [sum(points[x]) / len(points[x]) for x in xs]
+    low, high = min(mean), max(best)
+    low, high = (low - 1.0, high + 1.0) if high - low < 1e-9 else (low, high)
+
+    def line(ys: list[float]) -> list[str]:
+        return [
+            f"{50 + 280 * (x - xs[0]) / (xs[-1] - xs[0]):.1f},{125 - 100 * (y - low) / (high - low):.1f}"
+            for x, y in zip(xs, ys, strict=True)
+        ]
+
+    limits = {"low": f"{low:.1f}", "high": f"{high:.1f}", "first": f"{xs[0]:g}", "last": f"{xs[-1]:g}"}
+    return {"axis": axis, "best": line(best), "mean": line(mean), **limits}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated, Literal
+from typing import Annotated
 
 from fastapi import APIRouter, Request
 from pydantic import Field
@@ -12,31 +12,16 @@ from starlette.responses import Response
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
-from app.tuning.goal import GOALS
-from app.tuning.plan import Plan
-from app.tuning.request import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
-from app.tuning.search_space import SENSIBLE
+from app.tuning.job import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
+from app.tuning.plan import GOALS, SENSIBLE, Plan
 from app.tuning.sweep.sensitivity import MOST_VALUES
-from app.web.responses import Body, Id, UserName, Value, Word, json_reply
+from app.web.responses import Body, UserName, Value, Word, json_reply
 from app.web.routes.access import AnyFile, Dash, Deployment
 from app.web.routes.parameters import SetName
 from app.web.routes.run import permitted_uri
 from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api")
-
-
-class _Search(Body):
-    """A search: `over` as after `stemmap tune --over`; `also` and `held_out` are numbers of recorded runs
-    that are searched over besides the open run, or only scored."""
-
-    over: Annotated[list[Annotated[str, Field(max_length=200)]], Field(min_length=1, max_length=30)]
-    goal: Literal["f1", "ta", "position", "pairs"] = "f1"
-    false_max: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
-    trials: Annotated[int, Field(ge=1, le=5000)] = 200
-    minutes: Annotated[float, Field(gt=0.0, le=24 * 60.0)] = 10.0
-    also: list[Id] = Field(default_factory=list, max_length=MOST_OTHERS)
-    held_out: list[Id] = Field(default_factory=list, max_length=MOST_OTHERS)
 
 
 class _Save(Body):
@@ -66,10 +51,11 @@ async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile)
 
 
 @router.post("/search")
-async def start_search(body: _Search, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
+async def start_search(
+    body: SearchRequest, dashboard: Dash, settings: Deployment, any_file: AnyFile
+) -> Response:
     """Search over the open run, from its first scan to its last, and over other recorded runs."""
-    wanted = SearchRequest(**body.model_dump())
-    await dashboard.search.start(await _plan(dashboard, settings, any_file, wanted), wanted)
+    await dashboard.search.start(await _plan(dashboard, settings, any_file, body), body)
     return json_reply(dashboard.search.as_plain(), 202)
 
 

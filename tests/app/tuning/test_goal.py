@@ -10,10 +10,20 @@ from hypothesis import strategies as st
 
 from app.dashboard.parameters import read_file
 from app.sources.request import SourceRequest
-from app.tuning.goal import Goal, RunScore, goal_of, pool
-from app.tuning.plan import Plan, PlannedRun, Trial
+from app.tuning.plan import (
+    SENSIBLE,
+    Axis,
+    Goal,
+    Plan,
+    PlannedRun,
+    RunScore,
+    Trial,
+    axes_of,
+    check,
+    pool,
+    values_of,
+)
 from app.tuning.result import Result, best_parameters, provenance_in, toml_of, warning_of
-from app.tuning.search_space import SENSIBLE, Axis, axes_of, check, values_of
 from pipeline.config import field_specs, preset
 from pipeline.errors import ParameterError
 
@@ -80,12 +90,6 @@ def test_the_start_itself_is_within_the_bound_of_errors():
     assert Goal("pairs").loss(start, start) == start.pair_error
     assert Goal("f1").loss(start, start) == 1 - start.f1
     assert Goal("position").shown(0.0123) == "RMSE 1.23 cm"
-
-
-@pytest.mark.parametrize(("name", "share", "words"), [("best", 0.1, "Goals: f1"), ("ta", 1.5, "not a share")])
-def test_a_goal_that_is_none_is_refused(name, share, words):
-    with pytest.raises(ParameterError, match=words):
-        goal_of(name, share)
 
 
 # --- the space ------------------------------------------------------------------------------------

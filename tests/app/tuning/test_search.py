@@ -17,11 +17,9 @@ from app.cli import main
 from app.cli.tune import files_of
 from app.dashboard.parameters import read_file
 from app.sources.request import SourceRequest
-from app.tuning.plan import Plan, PlannedRun, Trial, TruthTable
+from app.tuning.plan import Plan, PlannedRun, Trial, TruthTable, axes_of
 from app.tuning.result import provenance_in, result_of
-from app.tuning.search import Search, StoppedError
-from app.tuning.search_processes import SearchWorkers
-from app.tuning.search_space import axes_of
+from app.tuning.search import Search, SearchWorkers, StoppedError
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
 

@@ -13,8 +13,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from app.tuning.goal import RunScore
-from app.tuning.plan import Plan, Trial
+from app.tuning.plan import Plan, RunScore, Trial
 from app.tuning.search import Search, SearchRun
 from pipeline.config import Parameters
 from tests.app.tuning.test_search import exhaust, plan, searched

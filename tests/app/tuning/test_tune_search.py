@@ -15,11 +15,9 @@ import pytest
 import pytest_asyncio
 
 from app.sources.request import SourceRequest
-from app.tuning.goal import RunScore
 from app.tuning.job import TuneSearch
-from app.tuning.plan import Plan, PlannedRun, Trial, TruthTable
+from app.tuning.plan import Plan, PlannedRun, RunScore, Trial, TruthTable, axes_of
 from app.tuning.result import Result, SearchMessage, provenance_in
-from app.tuning.search_space import axes_of
 from app.worker.protocol import Open
 from pipeline.config import preset
 from pipeline.errors import StemmapError

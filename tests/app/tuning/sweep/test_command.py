@@ -35,7 +35,7 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_is_known_is_not_computed_again_and_a_run_that_fails_is_said(
     here, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr("app.tuning.sweep.workers.COMMAND", ("false",))  # nobody who could compute
+    monkeypatch.setattr("app.tuning.sweep.sweep.COMMAND", ("false",))  # nobody who could compute
     assert evaluate(tmp_path, "--jobs", "1", "--keep", str(here / "keep")) == 3
     told = capsys.readouterr()
     assert "3 stored results used" in told.err
@@ -62,7 +62,7 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def test_a_worker_of_a_cluster_that_is_killed_is_survived_and_counted(tmp_path, cluster):
-    from app.tuning.sweep.workers import DaskWorkers
+    from app.tuning.sweep.sweep import DaskWorkers
     from tests.app.tuning.sweep.dask_work import dies_once_for_nothing
 
     jobs = [job(0.1), job(0.2, particles=7), job(0.3), job(0.4)]
@@ -90,7 +90,7 @@ def test_results_of_a_cluster_that_lost_a_worker_are_those_of_a_process_to_the_b
 
 def test_a_scheduler_that_does_not_answer_is_said():
     pytest.importorskip("distributed", reason="the extra dask is not installed")
-    from app.tuning.sweep.workers import DaskWorkers
+    from app.tuning.sweep.sweep import DaskWorkers
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with pytest.raises(StemmapError, match="no Dask scheduler answers"):

@@ -10,10 +10,17 @@ from html.parser import HTMLParser
 
 import pytest
 
-from app.tuning.sweep.comparison import GOALS, Comparison, best_of, compare_answers
 from app.tuning.sweep.jobs import Answer, PreparedRun, SweepPlan
-from app.tuning.sweep.report import files, json_text, lines
-from app.tuning.sweep.report_html import page
+from app.tuning.sweep.report import (
+    CRITERIA,
+    Comparison,
+    best_of,
+    compare_answers,
+    files,
+    json_text,
+    lines,
+    page,
+)
 from pipeline.config.model import Value
 from tests.app.tuning.sweep.jobs import job, scores
 
@@ -55,7 +62,7 @@ def test_a_set_that_failed_somewhere_is_best_at_nothing(comparison):
 def test_sets_that_are_alike_in_a_goal_have_no_best(comparison):
     figures = comparison.means[1].figures
     alike = [replace(row, figures=figures, error="") for row in comparison.means[:2]]
-    goal = next(goal for goal in GOALS if goal.words == "F1")
+    goal = next(goal for goal in CRITERIA if goal.words == "F1")
     assert best_of(alike, goal) == 0
     assert best_of(alike[:1], goal) == alike[0].set_number
     told = lines(replace(comparison, best=dict.fromkeys(comparison.best, 0)))

@@ -12,8 +12,7 @@ import msgspec
 import pytest
 
 from app.tuning.sweep.jobs import Answer, Job, code_digest
-from app.tuning.sweep.sweep import MOST_LOSSES, KeptAnswers, sweep
-from app.tuning.sweep.workers import Done, Event, Lost, Processes
+from app.tuning.sweep.sweep import MOST_LOSSES, Done, Event, KeptAnswers, Lost, Processes, sweep
 from tests.app.tuning.sweep.jobs import job, scores
 
 NOTHING = KeptAnswers(None)
