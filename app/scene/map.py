@@ -10,10 +10,9 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene import colours, nodes
-from app.scene.ground import GroundNode
 from app.scene.labels import NUMBER_WIDTH, Label, Labels, apart
 from app.scene.layers import View
-from app.scene.nodes import Batch, Circles, Cloud
+from app.scene.nodes import Batch, Circles, Cloud, Float, GroundNode, Segments, first_change
 from pipeline.config.stages import Evaluation
 from pipeline.types.records import Frame, Trees, TruthTrees
 
@@ -66,8 +65,8 @@ class MapNodes:
         """Show the same map after a choice of layers, of a tree, or of a cluster that stands at `ring`: x, y
         and radius [m] in the frame of the map."""
         self.ground.visible = view.layers["ground"]
-        self._trees.wanted = view.layers["trees"]
-        self._truth.wanted = view.layers["truth"]
+        self._trees.visible = view.layers["trees"]
+        self._truth.visible = view.layers["truth"]
         trees = confirmed(frame.trees)
         pose = frame.estimate.T_map_base
         foot = self.ground.heights(trees.position, frame.base_z)
@@ -80,12 +79,12 @@ class MapNodes:
         """Rings where trees and others really stand; None takes them away."""
         self._truth_trees = trees
         if trees is None:
-            self._truth.show(np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3), dtype=np.uint8))
+            self._truth.show(np.zeros((0, 2, 3)), np.zeros((0, 3), dtype=np.uint8))
             return
         radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh, UNKNOWN_RADIUS) + 0.12
         is_tree = np.array([kind == "tree" for kind in trees.kind], dtype=bool)
         place = np.column_stack([trees.x, trees.y])
-        self._truth.show(
+        self._truth.show_at(
             place,
             radius,
             colours.choose(is_tree, colours.TRUTH, colours.OTHER),
@@ -113,7 +112,7 @@ class MapNodes:
         if ring is not None:
             places, radii = np.vstack([places, ring[:2]]), [*radii, ring[2] + 0.12]
         each = np.tile(np.array([colours.SELECTION], dtype=np.uint8), (len(radii), 1))
-        self._mark.show(places, np.array(radii), each, self.ground.heights(places, base_z))
+        self._mark.show_at(places, np.array(radii), each, self.ground.heights(places, base_z))
 
 
 def confirmed(trees: Trees) -> Trees:
@@ -159,33 +158,25 @@ def _tree_text(trees: Trees, row: int, selected: bool) -> str:
     )
 
 
-Float = NDArray[np.float64]
-
 TIMES = 10.0  # magnification of position errors, which are centimetres
 CROSS = 0.45  # half the width of the cross of a missed tree [m]
 AROUND = 0.6  # radius of the ring of a false tree [m]
 HEIGHT = 0.08  # above the ground [m]
 
 
-class ErrorNode:
+class ErrorNode(Segments):
     """Errors of the map against the ground truth, as lines: offsets, missed trees and false trees."""
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._node = scene.add_line_segments(
-            "/world/errors",
-            np.zeros((1, 2, 3), dtype=np.float32),
-            np.zeros((1, 2, 3), dtype=np.uint8),
-            thickness=3.0,
-            thickness_units="screen",
-            visible=False,
-        )
+        super().__init__(scene, "/world/errors", 3.0)
         self.count = 0
 
     def hide(self) -> None:
         """Hide all errors."""
-        self.count, self._node.visible = 0, False
+        self.count = 0
+        self._update(False)
 
-    def show(
+    def show_errors(
         self, trees: Trees, truth: TruthTrees | None, path: Float, wanted: Evaluation, ground: GroundNode
     ) -> None:
         """Show the errors against the ground truth within reach of the path, shape (N, 2) [m]."""
@@ -199,17 +190,10 @@ class ErrorNode:
             _crosses(missed),
             nodes.circles(false, np.full(len(false), AROUND), np.zeros(len(false)))[:, :, :2],
         ]
-        sizes = [len(each) for each in lines]
         flat = np.concatenate(lines).reshape(-1, 2)
-        self._node.visible = len(flat) > 0
-        if not len(flat):
-            return
         xyz = np.column_stack([flat, ground.heights(flat, 0.0) + HEIGHT]).reshape(-1, 2, 3)
-        self._node.points = xyz.astype(np.float32)
         each = np.array([colours.SELECTION, colours.ERROR, colours.ERROR], dtype=np.uint8)
-        self._node.colors = np.repeat(colours.of_lines(np.repeat(each, sizes, axis=0)), 2, axis=0).reshape(
-            -1, 2, 3
-        )
+        self.show(xyz, np.repeat(each, [len(part) for part in lines], axis=0))
 
 
 def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> tuple[Float, Float, Float]:
@@ -338,9 +322,7 @@ class MapCloud:
             block.visible = visible and number * BLOCK < len(self._sent)
 
     def _send(self, points: NDArray[np.float32]) -> None:
-        shared = min(len(points), len(self._sent))
-        changed = np.flatnonzero(np.any(points[:shared] != self._sent[:shared], axis=1))
-        first = int(changed[0]) if len(changed) else shared
+        first = first_change(points, self._sent)
         if first == len(points) == len(self._sent):
             return
         self._sent = points

@@ -1,11 +1,11 @@
-"""Building blocks of the scene: meshes, batches of meshes, point clouds and lines.
+"""Building blocks of the scene: meshes, batches of meshes, point clouds, lines, and the ground.
 
 Each block is sent to the browsers only when it changed.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 import viser
@@ -13,14 +13,20 @@ from numpy.typing import NDArray
 
 from app.scene import colours
 from app.scene.colours import Colours, Rgb
+from pipeline.types.records import HeightMap
 
 SIDES = 32  # of a circle
 
+N = TypeVar("N", bound=viser.SceneNodeHandle)
+Float = NDArray[np.float64]
+Points = NDArray[np.floating]
 Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
+Precision = Literal["float16", "float32"]
 
 
-def cylinder(sides: int = 20) -> Mesh:
+def cylinder() -> Mesh:
     """Return a closed cylinder of radius 1 and height 1 whose base is centred on the origin."""
+    sides = 20
     angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     low = np.column_stack([rim, np.zeros(sides)])
@@ -68,11 +74,35 @@ def polyline(points: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.stack([xyz[:-1], xyz[1:]], axis=1)
 
 
-class Batch:
+class LayerNode(Generic[N]):
+    """A node of a layer. It is visible while the layer is on and there is something to show; viser's client
+    logs an error for an empty node."""
+
+    def __init__(self, node: N) -> None:
+        self.node = node
+        self._on, self._filled = True, False
+
+    @property
+    def visible(self) -> bool:
+        """Whether the layer is on."""
+        return self._on
+
+    @visible.setter
+    def visible(self, on: bool) -> None:
+        self._on = on
+        self._update(self._filled)
+
+    def _update(self, filled: bool) -> None:
+        self._filled = filled
+        if self.node.visible != (self._on and filled):
+            self.node.visible = self._on and filled
+
+
+class Batch(LayerNode[viser.BatchedMeshHandle]):
     """Upright copies of one mesh as one node: viser is slow with a thousand nodes."""
 
     def __init__(self, scene: viser.SceneApi, name: str, mesh: Mesh, **look: Any) -> None:  # noqa: ANN401
-        self.node = scene.add_batched_meshes_simple(
+        node = scene.add_batched_meshes_simple(
             name,
             *mesh,
             batched_wxyzs=_upright(1),
@@ -85,22 +115,10 @@ class Batch:
             visible=False,
             **look,
         )
+        super().__init__(node)
         self.count = 0
-        self._wanted = True
 
-    @property
-    def wanted(self) -> bool:
-        """Whether the layer is on; without copies the node is hidden anyway."""
-        return self._wanted
-
-    @wanted.setter
-    def wanted(self, wanted: bool) -> None:
-        self._wanted = wanted
-        self.node.visible = wanted and self.count > 0
-
-    def show(
-        self, positions: NDArray[np.floating], scales: NDArray[np.floating], colours: NDArray[np.uint8]
-    ) -> None:
+    def show(self, positions: Points, scales: Points, colours: NDArray[np.uint8]) -> None:
         """Replace the copies.
 
         Args:
@@ -116,26 +134,20 @@ class Batch:
             self.node.batched_scales = scales.astype(np.float32)
             self.node.batched_colors = colours
         self.count = len(positions)
-        self.node.visible = self._wanted and self.count > 0
+        self._update(self.count > 0)
 
 
 def _upright(count: int) -> NDArray[np.float32]:
     return np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (count, 1))
 
 
-class Cloud:
+class Cloud(LayerNode[viser.PointCloudHandle]):
     """One point cloud. While it is hidden nothing is sent; the newest points are sent when it is shown."""
 
     def __init__(
-        self,
-        scene: viser.SceneApi,
-        name: str,
-        size: float,
-        *,
-        precision: Literal["float16", "float32"] = "float16",
-        visible: bool = True,
+        self, scene: viser.SceneApi, name: str, size: float, *, precision: Precision = "float16"
     ) -> None:
-        self.node = scene.add_point_cloud(
+        node = scene.add_point_cloud(
             name,
             np.zeros((1, 3), dtype=np.float32),
             np.zeros((1, 3), dtype=np.uint8),
@@ -145,10 +157,10 @@ class Cloud:
             precision=precision,
             visible=False,
         )
-        self._wanted, self._empty = visible, True
-        self._waiting: tuple[NDArray[np.floating], Colours] | None = None
+        super().__init__(node)
+        self._waiting: tuple[Points, Colours] | None = None
 
-    def show(self, points: NDArray[np.floating], colours: Colours | Rgb) -> None:
+    def show(self, points: Points, colours: Colours | Rgb) -> None:
         """Replace the points.
 
         Args:
@@ -158,31 +170,52 @@ class Cloud:
         each = np.asarray(colours, dtype=np.uint8)
         if each.shape not in ((3,), points.shape):  # viser accepts a wrong length silently
             raise ValueError(f"{len(points)} points have colours of shape {each.shape}")
-        if each.ndim == 1:
-            each = np.broadcast_to(each, points.shape)
-        self._waiting = (points, each)
-        self._send()
+        self._waiting = (points, np.broadcast_to(each, points.shape))
+        self._update(self._filled)
 
-    @property
-    def visible(self) -> bool:
-        """Whether the layer is on; without points the node is hidden anyway."""
-        return self._wanted
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        self._wanted = visible
-        self._send()
-
-    def _send(self) -> None:
-        if self._waiting is not None and self._wanted:
-            points, colours = self._waiting
-            self._empty, self._waiting = len(points) == 0, None
-            if not self._empty:  # viser's client logs an error for an empty cloud
+    def _update(self, filled: bool) -> None:
+        if self._waiting is not None and self._on:
+            (points, colours), self._waiting = self._waiting, None
+            filled = len(points) > 0
+            if filled:
                 self.node.points, self.node.colors = points, colours
-        self.node.visible = self._wanted and not self._empty
+        super()._update(filled)
 
 
-Float = NDArray[np.float64]
+class Segments(LayerNode[viser.LineSegmentsHandle]):
+    """Line segments as one node, which keep their colour; meshes are shaded."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, thickness: float) -> None:
+        node = scene.add_line_segments(
+            name,
+            np.zeros((1, 2, 3), dtype=np.float32),
+            np.zeros((1, 2, 3), dtype=np.uint8),
+            thickness=thickness,
+            thickness_units="screen",
+            visible=False,
+        )
+        super().__init__(node)
+
+    def show(self, segments: Points, each: Colours) -> None:
+        """Replace the segments, shape (S, 2, 3) [m], with a colour for each, shape (S, 3)."""
+        if len(segments):
+            self.node.points = segments.astype(np.float32)
+            self.node.colors = np.repeat(colours.of_lines(each), 2, axis=0).reshape(-1, 2, 3)
+        self._update(len(segments) > 0)
+
+
+class Circles(Segments):
+    """Circles at a height above the ground [m]."""
+
+    def __init__(self, scene: viser.SceneApi, name: str, height: float, thickness: float) -> None:
+        super().__init__(scene, name, thickness)
+        self._height = height
+
+    def show_at(self, centres: Float, radii: Float, each: Colours, ground: Float) -> None:
+        """Show circles at centres (N, 2) [m] with radii (N,) [m] in N colours, above the ground at heights
+        (N,) [m]."""
+        self.show(circles(centres, radii, self._height + ground), np.repeat(each, SIDES, axis=0))
+
 
 CHUNK = 200  # segments per node, so that a long path is not sent again with each scan
 
@@ -190,29 +223,24 @@ CHUNK = 200  # segments per node, so that a long path is not sent again with eac
 class Line:
     """A growing line in chunks; only the chunks that changed are sent."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, colour: colours.Rgb, height: float) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str, colour: Rgb, height: float) -> None:
         self._scene, self._name, self._height = scene, name, height
         self._colour = colours.of_lines(np.array(colour, dtype=np.uint8))
         self._chunks: list[viser.LineSegmentsHandle] = []
         self._sent: Float = np.zeros((0, 3))
         self._visible = True
 
-    def show(self, places: Float, ground: Float | None = None) -> None:
+    def show(self, places: Float, ground: Float | float = 0.0) -> None:
         """Show the line through places (N, 2) [m], above the heights of the ground there, shape (N,) [m]."""
         places = np.array(places, dtype=np.float64).reshape(-1, 2)
-        points = np.column_stack(
-            [places, self._height + (np.zeros(len(places)) if ground is None else ground)]
-        )
-        shared = min(len(points), len(self._sent))
-        changed = np.nonzero(np.any(points[:shared] != self._sent[:shared], axis=1))[0]
-        first = int(changed[0]) if len(changed) else shared
+        points = np.column_stack([places, np.broadcast_to(self._height + ground, len(places))])
+        first = first_change(points, self._sent)
         if first == len(points) == len(self._sent):
             return
         self._sent = points
-        needed = max(-(-(len(points) - 1) // CHUNK), 0)
-        for number in range(max(first - 1, 0) // CHUNK, needed):
+        for number in range(max(first - 1, 0) // CHUNK, self._needed):
             self._send(number, points[number * CHUNK : (number + 1) * CHUNK + 1])
-        for chunk in self._chunks[needed:]:
+        for chunk in self._chunks[self._needed :]:
             chunk.visible = False
 
     @property
@@ -223,9 +251,13 @@ class Line:
     @visible.setter
     def visible(self, visible: bool) -> None:
         self._visible = visible
-        needed = max(-(-(len(self._sent) - 1) // CHUNK), 0)
-        for chunk in self._chunks[:needed]:
+        for chunk in self._chunks[: self._needed]:
             chunk.visible = visible
+
+    @property
+    def _needed(self) -> int:
+        """Number of chunks of the line."""
+        return max(-(-(len(self._sent) - 1) // CHUNK), 0)
 
     def _send(self, number: int, points: Float) -> None:
         segments = polyline(points)
@@ -245,38 +277,98 @@ class Line:
         )
 
 
-class Circles:
-    """Circles on the ground as one node of lines, which keep their colour; meshes are shaded."""
+def first_change(new: Points, old: Points) -> int:
+    """Return the first row that differs, or the number of rows that both have."""
+    shared = min(len(new), len(old))
+    changed = np.flatnonzero(np.any(new[:shared] != old[:shared], axis=1))
+    return int(changed[0]) if len(changed) else shared
 
-    def __init__(self, scene: viser.SceneApi, name: str, height: float, thickness: float) -> None:
-        self._height = height
-        self._node = scene.add_line_segments(
-            name,
-            np.zeros((1, 2, 3), dtype=np.float32),
-            np.zeros((1, 2, 3), dtype=np.uint8),
-            thickness=thickness,
-            thickness_units="screen",
+
+MOST_CELLS = 40_000  # of the mesh; in a larger map two by two cells are averaged
+NOTHING = np.full((1, 1), np.nan)
+
+
+class GroundNode(LayerNode[viser.MeshHandle]):
+    """The mesh of the ground over the known cells of the terrain map, and its heights for the other nodes.
+
+    The mesh is sent again only for another height map.
+    """
+
+    def __init__(self, scene: viser.SceneApi) -> None:
+        node = scene.add_mesh_simple(
+            "/world/surface",
+            np.eye(3, dtype=np.float32),
+            np.array([[0, 1, 2]], dtype=np.uint32),
+            color=colours.GROUND,
+            opacity=colours.GROUND_OPACITY,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
             visible=False,
         )
-        self._wanted, self._count = True, 0
+        super().__init__(node)
+        self.faces = 0
+        self._shown: HeightMap | None = None
+        self._raster, self._low, self._cell = NOTHING, np.zeros(2), 1.0
 
-    def show(self, centres: Float, radii: Float, each: colours.Colours, ground: Float | None = None) -> None:
-        """Show circles at centres (N, 2) [m] with radii (N,) [m] in N colours, above the ground at heights
-        (N,) [m]."""
-        self._count = len(centres)
-        if self._count:
-            self._node.points = circles(
-                centres, radii, self._height + (np.zeros(len(centres)) if ground is None else ground)
-            )
-            self._node.colors = np.repeat(colours.of_lines(each), 2 * SIDES, axis=0).reshape(-1, 2, 3)
-        self.wanted = self._wanted
+    def show(self, ground: HeightMap | None) -> bool:
+        """Show a height map; None keeps the present one. Return whether the height map changed."""
+        if ground is None or ground is self._shown:
+            return False
+        self._shown = ground
+        self._raster, self._low, self._cell = raster(ground)
+        vertices, faces = surface(self._raster, self._low, self._cell)
+        self.faces = len(faces)
+        if self.faces:
+            self.node.vertices = vertices
+            if not np.array_equal(faces, self.node.faces):
+                self.node.faces = faces
+        self._update(self.faces > 0)
+        return True
 
-    @property
-    def wanted(self) -> bool:
-        """Whether the layer is on; without circles the node is hidden anyway."""
-        return self._wanted
+    def heights(self, places: NDArray[np.floating], otherwise: float) -> Float:
+        """Return the height of the ground at places (N, 2) [m]; `otherwise` where it is unknown."""
+        cell = np.floor((np.asarray(places, np.float64).reshape(-1, 2) - self._low) / self._cell)
+        inside = np.all((cell >= 0) & (cell < self._raster.shape), axis=1)
+        i, j = np.where(inside[:, None], cell, 0).astype(np.int64).T
+        height = np.where(inside, self._raster[i, j], np.nan)
+        return np.where(np.isfinite(height), height, otherwise)
 
-    @wanted.setter
-    def wanted(self, wanted: bool) -> None:
-        self._wanted = wanted
-        self._node.visible = wanted and self._count > 0
+
+def raster(ground: HeightMap) -> tuple[Float, Float, float]:
+    """Return the heights of a grid around all known cells, its lower corner, and the side of a cell.
+
+    Heights have shape (I, J) [m] and are NaN where unknown; the corner has shape (2,) [m]. A map with more
+    than `MOST_CELLS` cells gets larger cells.
+    """
+    place, height, cell = ground.place.astype(np.int64), ground.height.astype(np.float64), ground.cell
+    if len(place) == 0:
+        return NOTHING, np.zeros(2), cell
+    while len(place) > MOST_CELLS or np.prod(np.ptp(place, axis=0) + 1.0) > 100 * MOST_CELLS:
+        place, which = np.unique(place // 2, axis=0, return_inverse=True)
+        which = which.reshape(-1)
+        height, cell = np.bincount(which, height) / np.bincount(which), 2.0 * cell
+    low = place.min(axis=0)
+    grid = np.full(place.max(axis=0) - low + 1, np.nan)
+    grid[tuple((place - low).T)] = height
+    return grid, low * cell, cell
+
+
+def surface(grid: Float, low: Float, cell: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return a mesh through the centres of the known cells: vertices (V, 3) [m] and faces (F, 3).
+
+    Four neighbouring known centres become two triangles.
+    """
+    known = np.isfinite(grid)
+    square = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]
+    used = np.zeros_like(known)
+    i, j = np.nonzero(square)
+    for di, dj in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        used[i + di, j + dj] = True
+    number = np.full(grid.shape, -1)
+    number[used] = np.arange(np.count_nonzero(used))
+    a, b, c, d = number[i, j], number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    at = np.stack(np.nonzero(used), axis=1)
+    vertices = np.column_stack([low + (at + 0.5) * cell, grid[used]])
+    return vertices.astype(np.float32), faces.astype(np.uint32)

@@ -7,16 +7,13 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene import colours, nodes
-from app.scene.ground import GroundNode
 from app.scene.layers import View
-from app.scene.nodes import Cloud, Line
+from app.scene.nodes import Cloud, Float, GroundNode, Line, Segments
 from app.scene.viser_server import add_posed
 from pipeline.config.stages import Obstacles
 from pipeline.geometry.poses import Pose2
 from pipeline.types.clearance import Clearance, Zone
 from pipeline.types.records import Frame
-
-Float = NDArray[np.float64]
 
 ROBOT = "/world/robot"
 STEP = 0.05  # m
@@ -115,25 +112,17 @@ OF_ZONE = {
 }
 
 
-class WayNode:
+class WayNode(Segments):
     """The path ahead of the robot with its stop and slow zones and the nearest obstacle, as lines."""
 
     def __init__(self, scene: viser.SceneApi, robot: str) -> None:
-        self._node = scene.add_line_segments(
-            f"{robot}/way",
-            np.zeros((1, 2, 3), dtype=np.float32),
-            np.zeros((1, 2, 3), dtype=np.uint8),
-            thickness=3.0,
-            thickness_units="screen",
-            visible=False,
-        )
+        super().__init__(scene, f"{robot}/way", 3.0)
         self._drawn: tuple[object, ...] | None = None
 
-    def show(self, clearance: Clearance | None, parameters: Obstacles, wanted: bool) -> None:
+    def show_ahead(self, clearance: Clearance | None, parameters: Obstacles, visible: bool) -> None:
         """Show the path ahead of a scan; hide it if there is none or the layer is off."""
-        if clearance is None or not wanted:
-            if self._node.visible:
-                self._node.visible = False
+        self.visible = visible and clearance is not None
+        if clearance is None or not visible:
             return
         bend = round(clearance.curvature / BEND) * BEND
         place = (
@@ -147,11 +136,9 @@ class WayNode:
             if place:
                 ring = nodes.circles(np.array([place]), np.array([RING]), np.array([HEIGHT]))
                 segments = np.vstack([segments, ring])
-            each = np.tile(np.array(OF_ZONE[clearance.zone], dtype=np.uint8), (len(segments) * 2, 1))
-            self._node.points = segments
-            self._node.colors = colours.of_lines(each).reshape(-1, 2, 3)
-        if not self._node.visible:
-            self._node.visible = True
+            self.show(
+                segments, np.tile(np.array(OF_ZONE[clearance.zone], dtype=np.uint8), (len(segments), 1))
+            )
 
 
 def way_lines(curvature: float, backward: bool, begins: float, parameters: Obstacles) -> NDArray[np.float32]:

@@ -13,11 +13,10 @@ from app.scene import colours, nodes
 from app.scene.colours import Colours
 from app.scene.labels import Labels, cluster_labels, shown_height
 from app.scene.layers import View
-from app.scene.nodes import Batch, Cloud
+from app.scene.nodes import Batch, Cloud, Float
 from app.scene.viser_server import add_posed
 from pipeline.types.records import Frame
 
-Float = NDArray[np.float64]
 Vector = tuple[float, float, float]
 OnCluster = Callable[[int | None, Vector, Vector], None]
 
@@ -65,11 +64,11 @@ class ScanNodes:
 
     def repaint(self, frame: Frame, view: View) -> None:
         """Update the same scan after a change of colours, labels or layers."""
-        for cloud, layer in ((self._raw, "raw"), (self._filtered, "filtered"), (self._clusters, "clusters")):
-            if cloud.visible != view.layers[layer]:
-                cloud.visible = view.layers[layer]
-        self._fits.wanted = view.layers["fits"]
-        self._markers.wanted = view.layers["clusters"]
+        self._raw.visible = view.layers["raw"]
+        self._filtered.visible = view.layers["filtered"]
+        self._clusters.visible = view.layers["clusters"]
+        self._fits.visible = view.layers["fits"]
+        self._markers.visible = view.layers["clusters"]
         self._raw.show(frame.raw, self._ramp_or(frame.raw, view, colours.RAW))
         self._filtered.show(frame.filtered, self._ramp_or(frame.filtered, view, colours.FILTERED))
         member = frame.labels >= 0
@@ -175,7 +174,7 @@ class VoxelNode:
 
         `count` is the number of all voxels; at most MOST_VOXELS are drawn.
         """
-        self._boxes.wanted = visible
+        self._boxes.visible = visible
         if not visible or size <= 0.0:
             self.count = 0
             self._boxes.show(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
@@ -190,17 +189,16 @@ class VoxelNode:
 Int = NDArray[np.int64]
 
 
+REACH = 0.5  # largest distance between the places of one cluster in consecutive scans [m]
+
+
 class ClusterNumbers:
     """Gives clusters the numbers of the clusters at the same places in the previous scan.
 
     Colours and labels follow these numbers, so that they do not flicker.
-
-    Args:
-        reach: Largest distance between the places of one cluster in consecutive scans [m].
     """
 
-    def __init__(self, reach: float = 0.5) -> None:
-        self._reach = reach
+    def __init__(self) -> None:
         self._places: Float = np.zeros((0, 2))
         self._numbers: Int = np.zeros(0, dtype=np.int64)
         self._next = 0
@@ -217,7 +215,7 @@ class ClusterNumbers:
         numbers = np.full(len(places), -1, dtype=np.int64)
         if len(places) and len(self._places):
             gaps = np.linalg.norm(places[:, None, :] - self._places[None, :, :], axis=2)
-            for row, column in _nearest_first(gaps, self._reach):
+            for row, column in _nearest_first(gaps, REACH):
                 numbers[row] = self._numbers[column]
         new = numbers < 0
         numbers[new] = self._next + np.arange(int(new.sum()))

@@ -13,13 +13,12 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from app.scene.camera import WORLD, Follower, add_hotkeys
 from app.scene.layers import View
 from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
 from app.scene.panel import SceneCommands, TunePanel, Tuning, Value
 from app.scene.robot import ROBOT, RobotNodes, WayNode
 from app.scene.scan import ScanNodes, Vector, VoxelNode
-from app.scene.viser_server import messages_sent, silenced, start_server
+from app.scene.viser_server import add_posed, messages_sent, silenced, start_server
 from pipeline.config import Parameters, preset
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Frame, TruthTrees
@@ -213,10 +212,10 @@ class Scene:
         """Show the layers that are computed only while they are visible."""
         size = self._parameters.filters.voxel_size
         self._voxels.show(frame.filtered, size, self._view.layers["voxels"])
-        self._way.show(frame.clearance, self._parameters.obstacles, self._view.layers["way"])
+        self._way.show_ahead(frame.clearance, self._parameters.obstacles, self._view.layers["way"])
         if self._view.layers["errors"]:
             wanted = self._parameters.evaluation
-            self._errors.show(frame.trees, self._truth, self._path, wanted, self._map.ground)
+            self._errors.show_errors(frame.trees, self._truth, self._path, wanted, self._map.ground)
         else:
             self._errors.hide()
 
@@ -268,3 +267,71 @@ class Scene:
 
     def _put_back(self) -> None:
         self.show_parameters(self._parameters, self._preset)
+
+
+WORLD = "/world"  # parent of all nodes; its children are in the frame of the map
+BEHIND = (-8.0, -4.5, 6.0)  # position of a camera relative to its target [m]
+ABOVE = (0.0, -0.01, 28.0)
+
+
+class Follower:
+    """Keeps the robot at the origin of the viewer by moving the world instead of the cameras.
+
+    The pose of a camera arrives from the browser some frames late, so that moving it from here would
+    interfere with the person who turns it. The pose of the world is sent in one group with the points. When
+    following ends, the world keeps its pose.
+
+    Args:
+        server: Server of viser, to which the frame of the world is added.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._world = add_posed(server.scene, WORLD)
+        self._server = server
+        server.initial_camera.position = BEHIND
+        server.initial_camera.look_at = (0.0, 0.0, 0.5)
+
+    def show(self, pose: Pose2, z: float, follow: bool) -> None:
+        """Move the robot at this pose and height [m] to the origin, if `follow`."""
+        if follow:
+            self._world.position = (-pose.x, -pose.y, -z)
+
+    @property
+    def shift(self) -> NDArray[np.float64]:
+        """Position of the origin of the map in the world of viser, shape (3,) [m]."""
+        return np.array(self._world.position, dtype=np.float64)
+
+    def look(self, client: viser.ClientHandle, pose: Pose2, z: float, *, from_above: bool) -> None:
+        """Turn one browser's camera to the robot at this pose and height [m]."""
+        target = np.array([pose.x, pose.y, z]) + self._world.position
+        with client.atomic():
+            client.camera.up_direction = np.array([0.0, 0.0, 1.0])
+            client.camera.position = target + (ABOVE if from_above else BEHIND)
+            client.camera.look_at = target
+
+
+OnCamera = Callable[[str, viser.ClientHandle], None]
+
+
+def add_hotkeys(gui: viser.GuiApi, on_camera: OnCamera, on_follow: Callable[[], None]) -> None:
+    """Add commands with keys, which work while the scene has the focus; the page forwards the keys.
+
+    Args:
+        gui: viser's panel.
+        on_camera: Called in the thread of viser with "top" or "behind" and the client.
+        on_follow: Called in the thread of viser to start or stop following.
+    """
+
+    @gui.add_command("Top view", description="Look down on the robot", hotkey="T").on_trigger
+    async def _(event: viser.CommandEvent) -> None:
+        if event.client is not None:
+            on_camera("top", event.client)
+
+    @gui.add_command("Behind the robot", description="Look from behind", hotkey="B").on_trigger
+    async def _(event: viser.CommandEvent) -> None:
+        if event.client is not None:
+            on_camera("behind", event.client)
+
+    @gui.add_command("Follow the robot", description="Start or stop following", hotkey="F").on_trigger
+    async def _(_event: viser.CommandEvent) -> None:
+        on_follow()

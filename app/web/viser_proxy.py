@@ -13,7 +13,7 @@ import logging
 import math
 import socket
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Protocol
 from urllib.parse import quote
 
 import msgspec
@@ -52,14 +52,6 @@ class _Camera(_FromBrowser, frozen=True, tag="ViewerCameraMessage"):
     up_direction: _Vector
 
 
-class _Pointer(_FromBrowser, frozen=True, tag="ScenePointerMessage"):
-    event_type: Literal["click", "rect-select"]
-    ray_origin: _Vector | None
-    ray_direction: _Vector | None
-    screen_pos: Annotated[list[_Pixel], Meta(max_length=8)]
-    modifier: _Modifier = None
-
-
 class _Click(_FromBrowser, frozen=True, tag="SceneNodeClickMessage"):
     name: _Name
     instance_index: _Index
@@ -67,36 +59,6 @@ class _Click(_FromBrowser, frozen=True, tag="SceneNodeClickMessage"):
     ray_direction: _Vector
     screen_pos: _Pixel
     modifier: _Modifier = None
-    owner: _Name = ""
-
-
-class _Drag(_FromBrowser, frozen=True, tag="SceneNodeDragMessage"):
-    phase: Literal["start", "update", "end"]
-    name: _Name
-    instance_index: _Index
-    start_position: _Vector
-    start_screen_pos: _Pixel
-    end_position: _Vector
-    end_screen_pos: _Pixel
-    button: Literal["left", "middle", "right"]
-    modifier: _Modifier = None
-    owner: _Name = ""
-
-
-class _Controls(_FromBrowser, frozen=True, tag="TransformControlsUpdateMessage"):
-    name: _Name
-    wxyz: tuple[float, float, float, float]
-    position: _Vector
-    owner: _Name = ""
-
-
-class _ControlsStart(_FromBrowser, frozen=True, tag="TransformControlsDragStartMessage"):
-    name: _Name
-    owner: _Name = ""
-
-
-class _ControlsEnd(_FromBrowser, frozen=True, tag="TransformControlsDragEndMessage"):
-    name: _Name
     owner: _Name = ""
 
 
@@ -115,7 +77,7 @@ class _Command(_FromBrowser, frozen=True, tag="CommandTriggerMessage"):
     uuid: _Id
 
 
-_Allowed = _Camera | _Pointer | _Click | _Drag | _Controls | _ControlsStart | _ControlsEnd | _Gui | _Command
+_Allowed = _Camera | _Click | _Gui | _Command
 _decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_Allowed)
 # Each browser has its own camera; all other messages affect everybody.
 _viewers_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_Camera)

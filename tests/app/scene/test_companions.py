@@ -14,7 +14,7 @@ places = st.lists(st.tuples(st.integers(-9, 9), st.integers(-9, 9)), max_size=12
 
 
 def test_a_cluster_keeps_its_number_while_it_trembles():
-    companions = ClusterNumbers(reach=0.5)
+    companions = ClusterNumbers()
     first = companions.follow(np.array([[0.0, 0.0], [5.0, 0.0]]))
     later = companions.follow(np.array([[5.1, 0.1], [0.0, 0.2], [9.0, 9.0]]))
     assert list(later[:2]) == [first[1], first[0]]
@@ -22,7 +22,7 @@ def test_a_cluster_keeps_its_number_while_it_trembles():
 
 
 def test_a_cluster_that_jumps_is_another():
-    companions = ClusterNumbers(reach=0.5)
+    companions = ClusterNumbers()
     first = companions.follow(np.array([[0.0, 0.0]]))
     assert companions.follow(np.array([[0.6, 0.0]]))[0] != first[0]
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from app.scene import Scene
-from app.scene.ground import MOST_CELLS, raster, surface
+from app.scene.nodes import MOST_CELLS, raster, surface
 from pipeline.types.records import HeightMap
 from tests.app.scene.frames import make_frame
 
