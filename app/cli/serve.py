@@ -155,7 +155,7 @@ def _check_source(uri: str) -> None:
 
         parse_address(uri)
     if scheme == "sim":
-        from pipeline.simulation.uri import parse_uri
+        from pipeline.simulation.scenarios import parse_uri
 
         parse_uri(uri)  # reports an unknown scenario; the worker builds the scene
 

@@ -16,7 +16,7 @@ from pipeline.errors import StemmapError, UsageError
 if TYPE_CHECKING:
     from app.store.store import Store
     from app.training.annotated_runs import AnnotatedRun
-    from app.training.fit_forest import Examples
+    from app.training.examples import Examples
 
 HELP = "train the random forest that classifies trees"
 SCENES = "stand,slope,dense"
@@ -72,9 +72,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise UsageError("--out is missing", remedy="Add --out FILE")
     arguments.labelled = [Path(place) for place in arguments.places]
-    from app.training.fit_forest import as_json, grow_all
+    from app.training.fit_forest import as_json, fit_all
     from app.training.learned_forests import write_forest
-    from app.training.leave_one_out import leave_one_out
+    from app.training.validation import leave_one_out
     from pipeline.config import preset
 
     _look_for(arguments)
@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     for line in leave_one_out(examples, pasted, preset("forest").classification.tree_share):
         print(line)
     scenes = _scenes(arguments)
-    write_forest(as_json(grow_all(examples, pasted, seed=arguments.seed), scenes), arguments.out)
+    write_forest(as_json(fit_all(examples, pasted, seed=arguments.seed), scenes), arguments.out)
     print(f"{len(examples)} sets of examples, written to {arguments.out}")
     return 0
 
@@ -117,8 +117,8 @@ def _scenes(arguments: argparse.Namespace) -> list[str]:
 def _examples(arguments: argparse.Namespace) -> list[Examples]:
     from functools import partial
 
-    from app.training.keeping import stored_or_computed
-    from app.training.scenes import labelled_examples, stand_examples, stand_name, street_examples
+    from app.training.examples import stored_or_computed
+    from app.training.labelled_scenes import labelled_examples, stand_examples, stand_name, street_examples
     from pipeline.config import preset
 
     forest = preset("forest")
@@ -154,7 +154,7 @@ def _pasted(arguments: argparse.Namespace) -> list[Examples]:
 
 def _one_way(arguments: argparse.Namespace) -> list[Path]:
     """The labelled scans of forward-looking sensors."""
-    from app.training.scenes import looks_all_around
+    from app.training.labelled_scenes import looks_all_around
 
     return [folder for folder in arguments.labelled if not looks_all_around(folder)]
 

@@ -19,28 +19,21 @@ from app.sources.opening import open_any, with_odometry
 from app.sources.request import SourceRequest
 from app.store.records import Content
 from app.store.store import AnnotatedSource
-from app.training.fit_forest import Examples
-from app.training.keeping import stored_or_computed
+from app.training.examples import Examples, stored_or_computed
 from pipeline.classification.features import COUNT, NAMES
 from pipeline.classification.forest import CLASSES, PACKAGE
 from pipeline.config import PRESETS, Parameters, preset
 from pipeline.errors import ParameterError, SourceError
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.types.records import Columns, Float, Int, Verdict
+from pipeline.types.records import Columns, Float, Verdict
 
 # Numbers of observations at which an object gives an example, because trees are classified from the first
 # scans on.
 SEEN = (3, 10, 30)
 # Largest distance between an annotation and its column [m].
 REACH = {"tree": 0.4, "pole": 0.35, "person": 0.5, "bush": 0.9, "other": 0.9}
-CLASS_OF_KIND = {
-    "tree": CLASSES.index(Verdict.TREE),
-    "pole": CLASSES.index(Verdict.POLE),
-    "person": CLASSES.index(Verdict.PERSON),
-    "bush": CLASSES.index(Verdict.BUSH),
-    "other": CLASSES.index(Verdict.OTHER),
-}
+CLASS_OF_KIND = {kind: CLASSES.index(Verdict[kind.upper()]) for kind in REACH}
 
 
 class ExampleCollector:
@@ -98,18 +91,6 @@ class ExampleCollector:
         order = near[np.argsort(distance[near], kind="stable")]
         _, first = np.unique(annotation[order], return_index=True)
         return [(int(annotation[row]), int(row)) for row in order[first]]
-
-
-def object_numbers(examples: Sequence[Examples]) -> Int:
-    """Return a number for each example, equal for all examples of one object, that is of one position in a
-    scene."""
-    key = [
-        (scene, float(x), float(y))
-        for scene, each in enumerate(examples)
-        for x, y in each.axis[:, :2].tolist()
-    ]
-    known: dict[tuple[int, float, float], int] = {}
-    return np.array([known.setdefault(each, len(known)) for each in key], np.int64)
 
 
 Progress = Callable[[str], None]

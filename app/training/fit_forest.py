@@ -1,4 +1,10 @@
-"""Growing: decision trees from examples, as JSON, and what they are worth on scenes they never saw."""
+"""Fitting of random forests to examples, as JSON, and extension of a forest with a few new examples.
+
+A forest is extended by structure expansion: it keeps its splits, and each leaf that new examples reach is
+split further by them. The previous class shares of the leaf enter as PRIOR examples (Segev, Harel, Mannor,
+Crammer, El-Yaniv, "Learn on source, refine on target: a model transfer learning framework with random
+forests", 2017).
+"""
 
 from __future__ import annotations
 
@@ -8,31 +14,31 @@ from typing import Any
 
 import numpy as np
 
+from app.training.examples import POLE, TREE, UNKNOWN, UPRIGHT, Examples
 from pipeline.classification.features import NAMES, RAYS
 from pipeline.classification.forest import ALL_AROUND, CLASSES, FREE_END, ONE_WAY, ends_in_free_air
-from pipeline.types.records import Bool, Float, Int, Verdict
+from pipeline.types.records import Bool, Float, Float32, Int
 
-DOUBTFUL = -1
-TREE = CLASSES.index(Verdict.TREE)
-POLE = CLASSES.index(Verdict.POLE)
-UPRIGHT = (POLE, CLASSES.index(Verdict.PERSON))
+PRIOR = 3.0  # weight of the previous class shares of a leaf, in objects
+LEAST = 2.0  # least weight of a new leaf, in objects
+DEEPER = 4  # largest number of additional splits on a path
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """How trees are grown for a kind of sensor.
+class ForestSettings:
+    """Settings of the forest for a kind of sensor.
 
     Attributes:
-        method: "extra" cuts at random places, "best" at the best one of a random choice of figures.
-        trees, depth, least: Their number, their depth, and the least examples in a leaf.
-        leaves: Most leaves of a tree; cuts that tell most come first. None: as many as there are.
-        figures: Part of the figures that is tried at each cut.
-        same, other, simulated: What an example counts from a real scene of this kind of sensor, of the
-            other kind, and from a simulated scene.
-        tree: What a tree counts: by it the share of votes that parts trees from all else best is the
-            same for both kinds of sensor.
-        upright: How many times more poles and persons count: they are few and hard to tell.
-        rays: Whether figures that rays tell are asked for.
+        method: "extra" splits at random thresholds, "best" at the best threshold of some features.
+        trees, depth, least: Number of trees, their depth, and least examples of a leaf.
+        leaves: Largest number of leaves of a tree, None for no limit.
+        figures: Share of the features that is tried at each split.
+        same, other, simulated: Weight of an example of a real scene of this kind of sensor, of a real scene
+            of the other kind, and of a simulated scene.
+        tree: Weight of trees, chosen so that the same share of votes separates trees best for both kinds of
+            sensor.
+        upright: Weight of poles and persons, which are few and difficult.
+        rays: Whether the features of rays are used.
     """
 
     method: str
@@ -49,155 +55,127 @@ class Plan:
     rays: bool
 
 
-# A sensor that looks one way sees a trunk from one side and no higher than its field of view: trained on
-# simulated parks too, it finds fewer real ones, and four real parks are too few to learn from what rays
-# tell (docs/trunks.md has the figures).
-PLANS = {
-    ALL_AROUND: Plan(
+# A sensor that looks one way sees a trunk from one side and no higher than its field of view. Trained on
+# simulated # parks too, it finds fewer real trees, and four real parks are too few to learn from rays (see
+# docs/trunks.md).
+SETTINGS = {
+    ALL_AROUND: ForestSettings(
         "best", 40, 18, 6, 150, 0.3, same=5.0, other=1.0, simulated=1.0, tree=0.67, upright=2.0, rays=True
     ),
-    ONE_WAY: Plan(
+    ONE_WAY: ForestSettings(
         "extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.75, upright=1.0, rays=False
     ),
 }
-# What tells a pole that ends in free air from a tree that does. It learns from copies alone; in them all
-# poles together count so many times as much as all trees (see `grow_free_end`).
-FREE_END_PLAN = Plan(
+# The forest that separates poles from trees that end in free air. It is trained on augmented scans only;
+# there all # poles together have `upright` times the weight of all trees (see `fit_free_end`).
+FREE_END_SETTINGS = ForestSettings(
     "extra", 60, 8, 15, None, 0.3, same=0.0, other=0.0, simulated=1.0, tree=1.0, upright=1.5, rays=False
 )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Examples:
-    """Columns of one scene with what they really are.
-
-    Attributes:
-        scene: Its name; a scene is either trained on or judged, never both.
-        simulated: Whether it is no real one; all_around: whether its sensor sees all around.
-        axis: shape (N, 5), see `find_columns`.
-        figures: shape (N, figures).
-        label: int64, place in CLASSES, DOUBTFUL where nobody can tell.
-    """
-
-    scene: str
-    simulated: bool
-    all_around: bool
-    axis: Float
-    figures: Float
-    label: Int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Grown:
-    """Trees of scikit-learn, and for each the shares of the kinds in its nodes, shape (nodes, classes)."""
+class FittedForest:
+    """A forest of scikit-learn, and for each tree the class shares of its nodes, shape (nodes, classes)."""
 
     trees: Any
     share: list[Float]
 
 
-def grow(examples: list[Examples], kind: str, seed: int = 0) -> Grown:
-    """Many small trees agree better with new scenes than one does (Breiman 2001, Geurts 2006). They are
-    cut to tell trees from all else; the leaves then say what else.
+def fit(examples: list[Examples], kind: str, seed: int = 0) -> FittedForest:
+    """Fit a forest that separates trees from all else; its leaves hold the shares of all classes.
 
     Args:
-        examples: Of all scenes to learn from.
-        kind: Of the sensor, a key of PLANS.
-        seed: Of the choices made at random.
+        examples: Examples of all training scenes.
+        kind: Kind of the sensor, a key of SETTINGS.
+        seed: Random seed.
     """
-    from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
-
-    plan = PLANS[kind]
-    figures = np.concatenate([e.figures for e in examples]).astype(np.float32)
+    settings = SETTINGS[kind]
+    figures = np.concatenate([e.figures for e in examples])
     label = np.concatenate([e.label for e in examples])
-    weight = np.concatenate([np.full(len(e.label), float(_weight(e, kind, plan))) for e in examples])
-    weight[label == TREE] *= plan.tree
-    weight[np.isin(label, UPRIGHT)] *= plan.upright
-    used = (label != DOUBTFUL) & (weight > 0.0)
-    figures, label, weight = figures[used], label[used], weight[used]
-    if not plan.rays:
-        figures = figures[:, :RAYS]
-    method = ExtraTreesClassifier if plan.method == "extra" else RandomForestClassifier
-    trees = method(
-        plan.trees,
-        max_depth=plan.depth,
-        min_samples_leaf=plan.least,
-        max_leaf_nodes=plan.leaves,
-        max_features=plan.figures,
-        random_state=seed,
-    ).fit(figures, label == TREE, weight)
-    return Grown(trees, [_shares(tree, figures, label, weight) for tree in trees.estimators_])
+    weight = np.concatenate([np.full(len(e.label), float(_weight(e, kind))) for e in examples])
+    weight = _class_weight(weight, label, settings)
+    used = (label != UNKNOWN) & (weight > 0.0)
+    return _fitted(figures[used], label[used], weight[used], settings, seed)
 
 
-def grow_free_end(pasted: list[Examples], seed: int = 0) -> Grown | None:
-    """Trees and poles that end in free air, told from one another; None where there are not both.
+def fit_free_end(augmented: list[Examples], seed: int = 0) -> FittedForest | None:
+    """Fit a forest that separates trees from poles that end in free air; None unless there are both.
 
     Args:
-        pasted: Real scenes with poles and trees pasted into them, see `pasting`.
-        seed: Of the choices made at random.
+        augmented: Real scenes with inserted poles and trees, see `augmentation`.
+        seed: Random seed.
     """
-    from sklearn.ensemble import ExtraTreesClassifier
-
-    figures = np.concatenate([np.zeros((0, len(NAMES))), *(e.figures for e in pasted)])
-    label = np.concatenate([np.zeros(0, np.int64), *(e.label for e in pasted)])
+    figures = np.concatenate([np.zeros((0, len(NAMES))), *(e.figures for e in augmented)])
+    label = np.concatenate([np.zeros(0, np.int64), *(e.label for e in augmented)])
     used = of_free_end(figures, label)
-    figures, label = figures[used, :RAYS].astype(np.float32), label[used]
+    figures, label = figures[used], label[used]
     tree = label == TREE
     if not tree.any() or tree.all():
         return None
-    plan = FREE_END_PLAN
-    weight = np.where(tree, plan.tree, plan.upright * np.count_nonzero(tree) / np.count_nonzero(~tree))
-    trees = ExtraTreesClassifier(
-        plan.trees,
-        max_depth=plan.depth,
-        min_samples_leaf=plan.least,
-        max_features=plan.figures,
+    s = FREE_END_SETTINGS
+    weight = np.where(tree, s.tree, s.upright * np.count_nonzero(tree) / np.count_nonzero(~tree))
+    return _fitted(figures, label, weight, s, seed)
+
+
+def _fitted(figures: Float, label: Int, weight: Float, settings: ForestSettings, seed: int) -> FittedForest:
+    from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
+
+    known = (figures if settings.rays else figures[:, :RAYS]).astype(np.float32)
+    method = ExtraTreesClassifier if settings.method == "extra" else RandomForestClassifier
+    trees = method(
+        settings.trees,
+        max_depth=settings.depth,
+        min_samples_leaf=settings.least,
+        max_leaf_nodes=settings.leaves,
+        max_features=settings.figures,
         random_state=seed,
-    ).fit(figures, tree, weight)
-    return Grown(trees, [_shares(each, figures, label, weight) for each in trees.estimators_])
+    ).fit(known, label == TREE, weight)
+    return FittedForest(trees, [_shares(tree, known, label, weight) for tree in trees.estimators_])
+
+
+def _class_weight(weight: Float, label: Int, settings: ForestSettings) -> Float:
+    """Return weights (N,) multiplied by those of the classes."""
+    factor = np.where(label == TREE, settings.tree, 1.0)
+    factor[np.isin(label, UPRIGHT)] = settings.upright
+    return weight * factor
 
 
 def of_free_end(figures: Float, label: Int) -> Bool:
-    """Which examples tell a pole that ends in free air from a tree that does, shape (N,)."""
+    """Return which examples are poles or trees that end in free air, shape (N,)."""
     of: Bool = np.isin(label, (TREE, POLE)) & ends_in_free_air(figures)
     return of
 
 
-def grow_all(
-    examples: list[Examples], pasted: list[Examples], kinds: Iterable[str] = PLANS, seed: int = 0
-) -> dict[str, Grown]:
-    """All that can be grown for these kinds of sensors, by the key under which the JSON holds it."""
-    grown = {kind: grow(examples, kind, seed) for kind in kinds if can_grow(examples, kind)}
-    free_end = grow_free_end(pasted, seed) if ONE_WAY in grown else None
-    return grown if free_end is None else {**grown, FREE_END: free_end}
+def fit_all(
+    examples: list[Examples], augmented: list[Examples], kinds: Iterable[str] = SETTINGS, seed: int = 0
+) -> dict[str, FittedForest]:
+    """Fit all forests for some kinds of sensors, by their key in the JSON."""
+    fitted = {kind: fit(examples, kind, seed) for kind in kinds if can_fit(examples, kind)}
+    free_end = fit_free_end(augmented, seed) if ONE_WAY in fitted else None
+    return fitted if free_end is None else {**fitted, FREE_END: free_end}
 
 
-def can_grow(examples: list[Examples], kind: str) -> bool:
-    """Whether any of the scenes counts for this kind of sensor."""
-    return any(_weight(e, kind, PLANS[kind]) > 0.0 for e in examples)
+def can_fit(examples: list[Examples], kind: str) -> bool:
+    """Return whether any of the scenes has a weight for this kind of sensor."""
+    return any(_weight(e, kind) > 0.0 for e in examples)
 
 
-def _weight(examples: Examples, kind: str, plan: Plan) -> float:
+def _weight(examples: Examples, kind: str) -> float:
+    settings = SETTINGS[kind]
     if examples.simulated:
-        return plan.simulated
-    return plan.same if examples.all_around == (kind == ALL_AROUND) else plan.other
+        return settings.simulated
+    return settings.same if examples.all_around == (kind == ALL_AROUND) else settings.other
 
 
-def _shares(tree: Any, figures: Float, label: Int, weight: Float) -> Float:  # noqa: ANN401
+def _shares(tree: Any, figures: Float32, label: Int, weight: Float) -> Float:  # noqa: ANN401
     share = np.zeros((tree.tree_.node_count, len(CLASSES)))
     np.add.at(share, (tree.apply(figures), label), weight)
     rounded: Float = np.round(share / np.maximum(share.sum(axis=1, keepdims=True), 1e-12), 2)
     return rounded
 
 
-def shares(grown: Grown, figures: Float) -> Float:
-    """Votes in the order of CLASSES, shape (N, classes)."""
-    leaf = grown.trees.apply(figures[:, : grown.trees.n_features_in_].astype(np.float32))
-    votes: Float = np.mean([share[leaf[:, k]] for k, share in enumerate(grown.share)], axis=0)
-    return votes
-
-
-def as_json(grown: dict[str, Grown], scenes: list[str]) -> dict[str, Any]:
-    """What `pipeline.classification.forest.read_forest` reads."""
+def as_json(fitted: dict[str, FittedForest], scenes: list[str]) -> dict[str, Any]:
+    """Return the JSON that `pipeline.classification.forest.read_forest` reads."""
     return {
         "about": "Votes on what a column is, made by `stemmap train`; see docs/trunks.md.",
         "scenes": scenes,
@@ -205,15 +183,21 @@ def as_json(grown: dict[str, Grown], scenes: list[str]) -> dict[str, Any]:
         **{
             kind: [
                 node_of(tree.tree_, share, 0)
-                for tree, share in zip(g.trees.estimators_, g.share, strict=True)
+                for tree, share in zip(f.trees.estimators_, f.share, strict=True)
             ]
-            for kind, g in grown.items()
+            for kind, f in fitted.items()
         },
     }
 
 
 def node_of(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
-    """The JSON of a node of a tree of scikit-learn; `share`: of the kinds in each node, (nodes, classes)."""
+    """Return the JSON of a node of a tree of scikit-learn.
+
+    Args:
+        tree: The tree.
+        share: Class shares of all nodes, shape (nodes, classes).
+        row: The node.
+    """
     if tree.children_left[row] < 0:
         return {"share": [int(v) if v in (0.0, 1.0) else v for v in share[row].tolist()]}
     yes = node_of(tree, share, tree.children_left[row])
@@ -222,3 +206,77 @@ def node_of(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN40
         return yes
     threshold = round(float(tree.threshold[row]), 4)
     return {"figure": NAMES[tree.feature[row]], "at_most": threshold, "yes": yes, "no": no}
+
+
+def all_expanded(
+    base: dict[str, Any], kind: str, figures: Float, label: Int, thing: Int, seed: int
+) -> dict[str, list[dict[str, Any]]]:
+    """Return the extended trees for a kind of sensor, by their key in the JSON. For sensors that look one way
+    these include the trees for columns with a free upper end, which would overrule the others.
+
+    Args:
+        base: JSON of the forest.
+        kind: Kind of the sensor, a key of SETTINGS.
+        figures, label, thing, seed: See `expanded`.
+    """
+    grown = {kind: expanded(base[kind], SETTINGS[kind], figures, label, thing, seed)}
+    if kind == ONE_WAY and FREE_END in base:
+        of = of_free_end(figures, label)
+        grown[FREE_END] = expanded(base[FREE_END], FREE_END_SETTINGS, figures[of], label[of], thing[of], seed)
+    return grown
+
+
+def expanded(
+    trees: list[dict[str, Any]], settings: ForestSettings, figures: Float, label: Int, thing: Int, seed: int
+) -> list[dict[str, Any]]:
+    """Return the extended trees of a forest.
+
+    Args:
+        trees: Trees as in the JSON.
+        settings: Settings with which they were trained.
+        figures: Features, shape (N, features).
+        label: Index in CLASSES, shape (N,).
+        thing: Number of the object, shape (N,); each object has the same weight, for any number of examples.
+        seed: Random seed.
+    """
+    _, of, number = np.unique(thing, return_inverse=True, return_counts=True)
+    weight = _class_weight(1.0 / number[of], label, settings)
+    draws = np.random.default_rng(seed).integers(0, 2**31, len(trees))
+    return [
+        _expanded_node(tree, figures, label, weight, settings, draw)
+        for tree, draw in zip(trees, draws.tolist(), strict=True)
+    ]
+
+
+def _expanded_node(
+    node: dict[str, Any], figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
+) -> dict[str, Any]:
+    if not len(label):
+        return node
+    if "share" in node:
+        return _leaf(np.array(node["share"], np.float64), figures, label, weight, settings, draw)
+    yes = figures[:, NAMES.index(node["figure"])] <= node["at_most"]
+    return {
+        **node,
+        "yes": _expanded_node(node["yes"], figures[yes], label[yes], weight[yes], settings, draw),
+        "no": _expanded_node(node["no"], figures[~yes], label[~yes], weight[~yes], settings, draw),
+    }
+
+
+def _leaf(
+    share: Float, figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
+) -> dict[str, Any]:
+    from sklearn.tree import DecisionTreeClassifier
+
+    known = figures if settings.rays else figures[:, :RAYS]
+    tree = DecisionTreeClassifier(
+        max_depth=DEEPER,
+        min_weight_fraction_leaf=min(LEAST / weight.sum(), 0.5),
+        max_features=settings.figures,
+        random_state=draw,
+    ).fit(known.astype(np.float32), label == TREE, weight)
+    leaf = tree.apply(known.astype(np.float32))
+    said = np.zeros((tree.tree_.node_count, len(CLASSES)))
+    np.add.at(said, (leaf, label), weight)
+    mixed = (PRIOR * share + said) / (PRIOR * share.sum() + said.sum(axis=1, keepdims=True))
+    return node_of(tree.tree_, np.round(mixed, 2), 0)

@@ -12,10 +12,10 @@ import numpy as np
 
 from app.common.text import count
 from app.common.version import version
-from app.training.annotated_runs import AnnotatedRun, Progress, examples_of, object_numbers
-from app.training.expanding import all_expanded
-from app.training.fit_forest import Examples
-from app.training.validating import Rates, Validation, groups_of, validate
+from app.training.annotated_runs import AnnotatedRun, Progress, examples_of
+from app.training.examples import Examples, object_numbers
+from app.training.fit_forest import all_expanded
+from app.training.validation import Rates, Validation, groups_of, validate
 from pipeline.classification.forest import (
     ALL_AROUND,
     CLASSES,
@@ -25,7 +25,7 @@ from pipeline.classification.forest import (
     ForestOf,
     read_forests,
 )
-from pipeline.config.stages import Classification as GatheringParameters
+from pipeline.config.stages import Classification
 from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import Rate
 
@@ -48,7 +48,7 @@ class LearningOptions:
         progress: Called with progress messages.
     """
 
-    in_force: GatheringParameters
+    in_force: Classification
     forests: ForestOf
     seen: tuple[str, ...]
     seed: int

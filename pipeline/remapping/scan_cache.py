@@ -27,7 +27,7 @@ import pipeline
 from pipeline.config import Parameters
 from pipeline.front_end import SegmentedScan
 from pipeline.io.atomic_files import hold, is_held
-from pipeline.remapping.packing import HEAD, TooLargeError, pack, unpack
+from pipeline.remapping.packing import TooLargeError, pack, unpack
 from pipeline.types.records import Step
 
 MOST_BYTES = 4 << 30  # of one file
@@ -36,8 +36,8 @@ MOST_OPEN = 3  # files of one source
 SPARE_BYTES = 2 << 30  # of the disk are left to recordings and to other programs
 SCANS_BETWEEN_CHECKS = 50  # of the free space of the disk
 SUFFIX = ".scans"
-MAGIC = b"stemmap scans 3\n"
-ROW = np.dtype([("length", "<i8"), ("block_crc", "<u4"), ("head", HEAD), ("row_crc", "<u4")])
+MAGIC = b"stemmap scans 4\n"
+ROW = np.dtype([("index", "<i8"), ("length", "<i8"), ("block_crc", "<u4"), ("row_crc", "<u4")])
 
 SEGMENTATION_STAGES = ("acquisition", "filters", "ground", "clustering", "shape")
 SEGMENTATION_CLASSIFICATION = ("method", "every")  # they decide which scans have input for the columns
@@ -103,14 +103,14 @@ class ScanCache:
         if self._file is None or step.index in self._rows:
             return
         try:
-            head, block = pack(step, scan)
+            block = pack(step, scan)
             if self._end + ROW.itemsize + len(block) > self._most:
                 self._refuse(step.index, f"the cache is limited to {self._most / 1e9:.1f} GB")
                 return
             if step.index % SCANS_BETWEEN_CHECKS == 0 and free_space(self._folder) < SPARE_BYTES + len(block):
                 self._refuse(step.index, f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
                 return
-            row = np.array((len(block), zlib.crc32(block), head, 0), ROW)
+            row = np.array((step.index, len(block), zlib.crc32(block), 0), ROW)
             row["row_crc"] = _checksum(row)
             _write(self._file, self._end, row.tobytes() + block)
         except TooLargeError as error:
@@ -138,7 +138,7 @@ class ScanCache:
         try:
             if _read(self._file, at, block) != int(row["block_crc"]):
                 raise ValueError("the checksum is wrong")
-            step, scan = unpack(row["head"], block)
+            step, scan = unpack(block)
         except (OSError, ValueError, KeyError, TypeError, RuntimeError):
             del self._rows[index]
             self.notice = DAMAGED.format(len(self._rows))
@@ -165,7 +165,7 @@ class ScanCache:
             length, at = int(row["length"]), self._end + ROW.itemsize
             if row["row_crc"] != _checksum(row) or length < 0 or at + length > size:
                 break
-            self._rows[int(row["head"]["index"])] = (at, row)
+            self._rows[int(row["index"])] = (at, row)
             self._end = at + length
         if self._end < size:
             self.notice = DAMAGED.format(len(self._rows))

@@ -1,5 +1,5 @@
-"""Simulated runs: a stand, a robot that drives through it, and what its sensors give.
+"""Simulated runs: scenes, a robot that drives through them, and the readings of its sensors.
 
-The same scenario and seed always give the same bytes. World and map are one frame: the first true
-pose of the robot is the origin, x ahead, y left, z against gravity.
+The same scenario and seed give the same bytes. World and map are the same frame: the first true pose of the
+robot is the origin, x points ahead, y to the left, z up.
 """

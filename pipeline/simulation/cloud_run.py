@@ -1,7 +1,7 @@
-"""Virtual scanning: a simulated robot drives through the real cloud of a plot, with exact truth of its pose.
+"""Virtual scanning: a simulated robot drives through the real cloud of a plot, and its true pose is known.
 
-Bark, branches and undergrowth are those that a scanner saw; the LiDAR, its noise, the wheels and the
-inertial unit are those of every simulated run.
+Bark, branches and undergrowth are those of the cloud. The LiDAR, its noise, the wheels and the IMU are those
+of all simulated runs.
 """
 
 from __future__ import annotations
@@ -17,40 +17,37 @@ from pipeline.inventory import find_ground
 from pipeline.inventory.cloud import Cloud
 from pipeline.inventory.terrain_raster import HeightMap
 from pipeline.simulation import run as simulated
-from pipeline.simulation.inertial import inertial_readings
-from pipeline.simulation.lidar import SpinningLidar, Sweep
-from pipeline.simulation.motion import lay_on_terrain
+from pipeline.simulation.lidar import SpinningLidar, Sweep, scan_of_returns
+from pipeline.simulation.motion_sensors import inertial_readings
 from pipeline.simulation.primitives import SolidsBuilder
-from pipeline.simulation.receiver import pack_returns
-from pipeline.simulation.route_planning import loop_through
-from pipeline.simulation.run import MOUNTING, SimulatedRun, odometry_of, stream
+from pipeline.simulation.robot_motion import drive_course, lap_time, lay_course, lay_on_terrain
+from pipeline.simulation.run import MOUNTING, SimulatedRun, odometry_of, random_stream
+from pipeline.simulation.scenarios import RunRequest
 from pipeline.simulation.scene import Scene
 from pipeline.simulation.surfels import Surfels, first_surfels, lay_surfels
 from pipeline.simulation.terrain import Terrain
-from pipeline.simulation.trajectory import drive_course, lap_time, lay_course
-from pipeline.simulation.uri import RunRequest
-from pipeline.types.records import Float, Float32, Scan, TruthTrees
+from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees
 
-# Raise it with every change that changes the bytes of runs through clouds and of no others.
+# Raise it with every change that only changes the bytes of runs through clouds.
 VERSION = 3
 SLOPE = 35.0  # degrees; of the terrain against the plane of the plot
 BAND = (-0.5, 40.0)  # m above the ground; noise below it is not scanned
 MOST = 1 << 20  # points after thinning
 SPEED = 0.6  # m/s
 SHORTEST, LONGEST = 10.0, 600.0  # s; of one loop, unless a duration is asked for
-SHADE = 60.0  # reflectance of all returns: clouds have none that means the same
+REFLECTANCE = 60.0  # of all returns: intensities of clouds have other scales
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlotGround:
-    """The ground of a plot in the frame of the robot's first pose (see `Terrain.evaluate`)."""
+    """The ground of a plot in the frame of the first pose of the robot (see `Terrain.evaluate`)."""
 
     height: HeightMap
     start: Float
     yaw: float
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Height, dz/dx and dz/dy at places of shape (N,) [m]; shape (N, 3)."""
+        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         there = self.height.evaluate(self.start[0] + c * x - s * y, self.start[1] + s * x + c * y)
         z, gx, gy = there.T
@@ -64,7 +61,7 @@ class CloudRun(SimulatedRun):
     Attributes:
         surfels: The cloud in the frame of the first pose.
         source_digest: SHA-256 of the cloud and of the table of its trees.
-        warnings: What a person should know.
+        warnings: Messages for the user.
     """
 
     surfels: Surfels
@@ -72,12 +69,9 @@ class CloudRun(SimulatedRun):
     warnings: tuple[str, ...]
 
     def sweep(self, k: int) -> Sweep:
-        """Scan k (from 0), the same whether or not others were made before it."""
+        """Simulate scan k (from 0); the result does not depend on other scans."""
         lidar = self.lidar
-        begin = k * lidar.period_ns
-        times = (begin + lidar.column_offsets_ns().astype(np.int64)) / 1e9
-        R, o = self.motion.sensor_at(times, self.T_base_lidar)
-        beams = lidar.beams()
+        _, R, o = self.sensor_poses(k)
         ranges = first_surfels(
             self.surfels.points,
             self.surfels.normals,
@@ -85,42 +79,39 @@ class CloudRun(SimulatedRun):
             self.surfels.blocks,
             R,
             o,
-            beams,
+            lidar.beams(),
             lidar.lowest,
             lidar.ring_step,
             lidar.range_max,
         )
-        noise = stream(simulated.SCAN, self.request, k).standard_normal(ranges.shape)
+        noise = random_stream(simulated.SCAN, self.request, k).standard_normal(ranges.shape)
         reported = ranges + lidar.range_sigma * noise
         reported[~((reported >= lidar.range_min) & (reported <= lidar.range_max))] = 0.0
-        shade, nobody = np.full(ranges.shape, SHADE), np.full(ranges.shape, -1, np.int32)
-        points, reflectance, ring, offset_ns, solid = pack_returns(
-            reported, shade, nobody, beams, lidar.column_offsets_ns()
-        )
-        return Sweep(Scan(simulated.START_NS + begin, points, reflectance, ring, offset_ns), solid)
+        reflectance, no_solid = np.full(ranges.shape, REFLECTANCE), np.full(ranges.shape, -1, np.int32)
+        stamp_ns = simulated.START_NS + k * lidar.period_ns
+        return scan_of_returns(lidar, stamp_ns, reported, reflectance, no_solid)
 
     def digest(self) -> str:
-        """SHA-256 (hex) of all that decides the run's bytes."""
-        mounting = [*self.T_base_lidar.R.ravel().tolist(), *self.T_base_lidar.t.tolist()]
-        asked = (self.request.seed, self.request.sigma, self.request.odometry, self.request.duration_s)
+        """Return the SHA-256 (hex) of everything that decides the bytes of the run."""
+        request = (self.request.seed, self.request.sigma, self.request.odometry, self.request.duration_s)
         version = f"{simulated.VERSION}.{VERSION}"
-        text = f"stemmap cloud {version}; {asked}; {self.source_digest}; {mounting}"
+        text = f"stemmap cloud {version}; {request}; {self.source_digest}; {self._mounting()}"
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def open_cloud_run(
     request: RunRequest, cloud: Cloud, trees: TruthTrees | None, T_base_lidar: Pose3 | None = None
 ) -> CloudRun:
-    """Lay a way through a cloud and drive it; no scan is made yet.
+    """Plan a path through a cloud and drive it; no scan is simulated yet.
 
     Args:
-        request: What was asked for; a duration of 0 means one loop.
-        cloud: Of the plot.
-        trees: That stand in it, in the coordinates of the cloud.
-        T_base_lidar: Mounting; None means that of every simulated robot.
+        request: Requested options; a duration of 0 means one loop.
+        cloud: Cloud of the plot.
+        trees: Trees of the plot in the coordinates of the cloud.
+        T_base_lidar: Extrinsics of the LiDAR; None uses those of simulated robots.
 
     Raises:
-        SourceError: It cannot be read, or leaves no way for a robot.
+        SourceError: The cloud cannot be read, or has no path for a robot.
     """
     ground, near, _ = find_ground(cloud, SLOPE, band=BAND, most=MOST)
     points = near.points
@@ -134,7 +125,7 @@ def open_cloud_run(
     duration = request.duration_s or min(max(lap, SHORTEST), LONGEST)
     asked = RunRequest(request.name, request.seed, request.sigma, request.odometry, duration, 0)
     drive = drive_course(course, SPEED, duration)
-    motion = lay_on_terrain(drive, PlotGround(ground, start, heading), stream(simulated.SHAKE, asked))
+    motion = lay_on_terrain(drive, PlotGround(ground, start, heading), random_stream(simulated.SHAKE, asked))
     return CloudRun(
         request=asked,
         T_base_lidar=MOUNTING if T_base_lidar is None else T_base_lidar,
@@ -142,7 +133,7 @@ def open_cloud_run(
         scene=_scene(trees, cloud.description.offset + start, heading),
         motion=motion,
         odometry=odometry_of(motion, asked),
-        inertial=inertial_readings(motion, stream(simulated.INERTIAL, asked)),
+        inertial=inertial_readings(motion, random_stream(simulated.INERTIAL, asked)),
         scans=round(duration * 1e9) // SpinningLidar().period_ns,
         surfels=lay_surfels(_from(points[:, :3], start, heading)),
         source_digest=cloud.description.digest,
@@ -156,7 +147,7 @@ def _cut_short(way: float, lap: float) -> tuple[str]:
 
 
 def _heading(way: Float) -> float:
-    """Direction in which the smooth line through a closed row of waypoints leaves the first [rad]."""
+    """Return the heading of the smooth line through a closed row of waypoints at the first one [rad]."""
     from scipy.interpolate import CubicSpline
 
     knots = np.vstack([way, way[:1]])
@@ -173,7 +164,7 @@ def _from(points: Float32, start: Float, yaw: float) -> Float32:
 
 
 def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> Scene:
-    """Nothing but the truth: what stands there is in the surfels."""
+    """Return a scene that only has a ground truth: its objects are the surfels."""
     none = np.zeros(0)
     truth = TruthTrees(none, none, none, ())
     if trees is not None:
@@ -184,7 +175,149 @@ def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> Scene:
         terrain=Terrain(np.zeros((1, 4))),
         still=SolidsBuilder().build(),
         persons=(),
-        trees=(),
         truth=truth,
         kinds=(),
     )
+
+
+CELL = 0.1  # m
+LOW, HIGH = 0.25, 1.6  # m above the ground; points in this band are obstacles
+# Number of points that makes a cell an obstacle, as a share of that of the densest cells. Stems are dense;
+# through # sparse leaves a robot can push where there is no other path.
+DENSITIES = (0.02, 0.1, 0.25, 0.5)
+DENSE = 98  # percentile
+REACHES = 0.5  # share of the plot, along both axes, that the path must cover
+CLEARANCES = (0.6, 0.45, 0.35, 0.25)  # m; the widest with which there is a loop
+STATIONS = 16
+PART = 0.6  # share of the distance from the middle to the border
+SIDE = 0.2  # m; cells of the path search
+SPACING = 0.8  # m; between waypoints
+
+
+def loop_through(points: Float32, ground: HeightMap, where: str) -> Float:
+    """Return waypoints of a closed loop, shape (N, 2) [m]; the same cloud gives the same loop.
+
+    Args:
+        points: shape (N, 4): x, y, z, height above the ground [m].
+        ground: Ground of the plot; the loop stays where ground was seen.
+        where: Name of the cloud, for the error.
+
+    Raises:
+        SourceError: Stems and undergrowth leave no path.
+    """
+    count = _obstacles(points, ground)
+    densest = float(np.percentile(count[count > 0], DENSE)) if (count > 0).any() else 1.0
+    for density in DENSITIES:
+        clearance = _clearance(count < max(density * densest, 1.0), ground)
+        for least in CLEARANCES:
+            loop = _loop(clearance, least)
+            if loop is not None:
+                return ground.low + (loop + 0.5) * SIDE
+    raise SourceError("there is no free way for a robot through the plot", where=where)
+
+
+def _obstacles(points: Float32, ground: HeightMap) -> Int:
+    """Return the number of points that are obstacles in each cell of CELL."""
+    times = round(ground.cell / CELL)
+    shape = (ground.seen.shape[0] * times, ground.seen.shape[1] * times)
+    way = points[(points[:, 3] > LOW) & (points[:, 3] < HIGH)]
+    cell = np.floor((way[:, :2] - ground.low) / CELL).astype(np.int64)
+    inside = ((cell >= 0) & (cell < shape)).all(axis=1)
+    count = np.zeros(shape, np.int64)
+    np.add.at(count, tuple(cell[inside].T), 1)
+    return count
+
+
+def _clearance(free: Bool, ground: HeightMap) -> Float:
+    """Return the distance to obstacles of cells of SIDE [m]; cells without visible ground are obstacles."""
+    from scipy.ndimage import binary_dilation, distance_transform_edt
+
+    seen = binary_dilation(ground.seen, iterations=1)
+    times = round(ground.cell / CELL)
+    free = free & np.kron(seen, np.ones((times, times), np.bool_))
+    distance = distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * CELL
+    both = round(SIDE / CELL)
+    columns, rows = (n - n % both for n in distance.shape)
+    coarse: Float = (
+        distance[:columns, :rows].reshape(columns // both, both, rows // both, both).min(axis=(1, 3))
+    )
+    return coarse
+
+
+def _loop(clearance: Float, least: float) -> Float | None:
+    """Return a closed path over cells with at least this clearance, None when there is none."""
+    from scipy.ndimage import label
+
+    region, regions = label(clearance >= least)
+    if regions == 0:
+        return None
+    largest = region == 1 + int(np.argmax(np.bincount(region.ravel())[1:]))
+    stations = _stations(clearance, largest)
+    if len(stations) < 5 or (np.ptp(stations, axis=0) < REACHES * np.array(region.shape)).any():
+        return None
+    way = _joined(clearance, largest, stations)
+    every = max(int(SPACING / SIDE), 1)
+    loop: Float = way[::every].astype(np.float64)
+    return loop if len(loop) >= 6 else None
+
+
+def _stations(clearance: Float, region: Bool) -> Int:
+    """Return cells around the middle with the most clearance, one in each direction that has any."""
+    cells = np.argwhere(region)
+    middle = cells.mean(axis=0)
+    off = cells - middle
+    angle = np.arctan2(off[:, 1], off[:, 0])
+    away = np.hypot(*off.T)
+    chosen = []
+    for k in range(STATIONS):
+        there = (
+            np.abs((angle - 2.0 * np.pi * k / STATIONS + np.pi) % (2.0 * np.pi) - np.pi) < np.pi / STATIONS
+        )
+        if not there.any():
+            continue
+        ideal = PART * away[there].max()
+        width = clearance[tuple(cells[there].T)]
+        cost = np.abs(away[there] - ideal) * SIDE - 1.5 * np.minimum(width, 1.0)
+        chosen.append(cells[there][int(np.argmin(cost))])
+    return np.array(chosen).reshape(-1, 2)
+
+
+def _joined(clearance: Float, region: Bool, stations: Int) -> Int:
+    """Return the cheapest path from station to station and back; narrow cells are expensive."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import dijkstra
+
+    number = np.full(region.shape, -1)
+    number[region] = np.arange(int(region.sum()))
+    starts, ends, costs = [], [], []
+    for step in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        a = np.argwhere(region)
+        b = a + step
+        good = ((b >= 0) & (b < region.shape)).all(axis=1)
+        a, b = a[good], b[good]
+        good = region[tuple(b.T)]
+        a, b = a[good], b[good]
+        narrow = 1.0 / np.minimum(clearance[tuple(a.T)], clearance[tuple(b.T)])
+        starts.append(number[tuple(a.T)])
+        ends.append(number[tuple(b.T)])
+        costs.append(np.hypot(*step) * (1.0 + narrow**2))
+    n = int(region.sum())
+    graph = coo_array((np.concatenate(costs), (np.concatenate(starts), np.concatenate(ends))), shape=(n, n))
+    at = number[tuple(stations.T)]
+    before = dijkstra(graph.tocsr(), directed=False, indices=at, return_predecessors=True)[1]
+    cells = np.argwhere(region)
+    way = []
+    for k in range(len(at)):
+        part, here = [], int(at[(k + 1) % len(at)])
+        while here != at[k]:
+            part.append(here)
+            here = int(before[k, here])
+        way += part[::-1]
+    # Remove detours into a corner and back along the same cells.
+    kept: list[int] = []
+    for cell in way:
+        if len(kept) >= 2 and kept[-2] == cell:
+            kept.pop()
+        else:
+            kept.append(cell)
+    return cells[kept]

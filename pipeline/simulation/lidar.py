@@ -1,9 +1,9 @@
-"""The simulated LiDAR: a VLP-16 that spins while the robot drives, so each scan is distorted by motion.
+"""Simulated LiDARs: their beams, and the receiver with mixed echoes at edges, lost weak echoes, and noise.
 
-One sweep has 1,800 columns of 16 rays. It begins behind the robot and turns clockwise seen from above,
-as the real sensor does: column c looks along the azimuth pi - c * 0.2 degrees at c * 100 ms / 1800
-after the stamp of the scan, which is the sweep's start. All 16 lasers of a column fire at once. Points
-are in the sensor's frame at their own time; that is what a driver gives.
+A sweep of the default sensor, a VLP-16, has 1,800 columns of 16 rays. It begins behind the robot and turns
+clockwise seen from above, like the real sensor: column c has the azimuth pi - c * 0.2 degrees at c * 100 ms /
+1800 after the stamp of the scan, which is the start of the sweep. All lasers of a column fire at once. Points
+are in the sensor frame at their own time, as a driver gives them, so motion distorts the scan.
 """
 
 from __future__ import annotations
@@ -13,11 +13,184 @@ from functools import lru_cache
 
 import numpy as np
 
+from pipeline.jit import compiled
 from pipeline.simulation.primitives import Solids
-from pipeline.simulation.ray_casting import first_returns, ray_directions
-from pipeline.simulation.receiver import measure, pack_returns
+from pipeline.simulation.ray_casting import (
+    GROUND,
+    NOTHING,
+    first_returns,
+    ground_incidence,
+    meet_solid,
+    random_unit,
+    ray_directions,
+    solid_incidence,
+)
 from pipeline.simulation.terrain import Terrain
-from pipeline.types.records import Float, Int32, Scan, Sensor
+from pipeline.types.records import Bool, Float, Float32, Int32, Scan, Sensor
+
+
+@compiled
+def count_echoes(
+    kind: int, shape: Float, o: Float, d: Float, d_next: Float, divergence: float
+) -> tuple[int, float]:
+    """Divide a beam into eight rays; return how many meet a shape, and the sum of their ranges.
+
+    Args:
+        kind, shape, o, d: As in `meet_solid`.
+        d_next: Direction of the ray in the next column.
+        divergence: Full width of the beam [rad] times the number of columns.
+    """
+    ray = np.empty(3)
+    count, total = 0, 0.0
+    for m in range(8):
+        share = divergence * ((m + 0.5) / 8.0 - 0.5) / (2.0 * np.pi)
+        for i in range(3):
+            ray[i] = d[i] + share * (d_next[i] - d[i])
+        met = meet_solid(kind, shape, o, ray, 0.5)
+        if met < np.inf:
+            count += 1
+            total += met
+    return count, total
+
+
+@compiled
+def echo(
+    c: int,
+    k: int,
+    ranges: Float,
+    hit: Int32,
+    kind: Int32,
+    shape: Float,
+    surface: Float,
+    o: Float,
+    directions: Float,
+    divergence: float,
+    pulse: float,
+) -> tuple[float, int]:
+    """Return range and shape that the receiver reports for a beam of width `divergence` [rad].
+
+    At the edge of a shape a part of the beam passes and meets the shape behind. Echoes nearer to one another
+    than `pulse` [m] are reported as one range in between; else the stronger one is reported.
+    """
+    columns = ranges.shape[0]
+    before, after = max(c - 1, 0), min(c + 1, columns - 1)
+    t, n = ranges[c, k], hit[c, k]
+    # The comparison is false for two misses, whose difference is NaN.
+    if not (abs(ranges[before, k] - t) >= 0.05 or abs(ranges[after, k] - t) >= 0.05):
+        return t, n
+    front = c
+    if ranges[before, k] < ranges[front, k]:
+        front = before
+    if ranges[after, k] < ranges[front, k]:
+        front = after
+    edge = hit[front, k]
+    if edge < 0 or (kind[edge] == 1 and shape[edge, 8] > 0.0):
+        return t, n
+    behind, behind_hit = t, n
+    if n == edge:
+        back = before if hit[before, k] != edge else after
+        behind, behind_hit = ranges[back, k], hit[back, k]
+    if behind_hit == edge or behind - ranges[front, k] < 0.05:
+        return t, n
+    neighbour = after if after != c else before
+    count, total = count_echoes(
+        kind[edge], shape[edge], o[c], directions[c, k], directions[neighbour, k], divergence * columns
+    )
+    if count == 0 or count == 8:
+        return t, n
+    near, part = total / count, count / 8.0
+    strong = part * surface[edge, 0] / (near * near)
+    weak = 0.0
+    if behind < np.inf:
+        weak = (1.0 - part) * (surface[behind_hit, 0] if behind_hit >= 0 else 0.25) / (behind * behind)
+    if behind - near < pulse:
+        return (strong * near + weak * behind) / (strong + weak), edge
+    if strong >= weak:
+        return near, edge
+    return behind, behind_hit
+
+
+@compiled
+def measure(
+    ranges: Float,
+    hit: Int32,
+    kind: Int32,
+    shape: Float,
+    surface: Float,
+    terrain: Float,
+    o: Float,
+    directions: Float,
+    divergence: float,
+    pulse: float,
+    ground_reflectivity: float,
+    strength: float,
+    range_min: float,
+    range_max: float,
+    noise: Float,
+    key: int,
+) -> tuple[Float, Float, Int32]:
+    """Return what the receiver reports: range [m] (0 without a return), reflectance 0..255 and shape, (C, K)
+    each.
+
+    Args:
+        noise: Error of each range [m], shape (C, K).
+        strength: Range [m] at which a perpendicular surface of reflectivity 1 gives a return in 63 % of the
+            shots.
+    """
+    columns, rings = ranges.shape
+    reported = np.zeros((columns, rings))
+    reflectance = np.zeros((columns, rings))
+    source = np.full((columns, rings), NOTHING, dtype=np.int32)
+    for c in range(columns):
+        for k in range(rings):
+            t, n = echo(c, k, ranges, hit, kind, shape, surface, o, directions, divergence, pulse)
+            if n == NOTHING or t > range_max:
+                continue
+            if n == GROUND:
+                reflectivity = ground_reflectivity
+                incidence = ground_incidence(terrain, o[c], directions[c, k], t)
+            else:
+                reflectivity = surface[n, 0]
+                incidence = 0.7
+                if shape[n, 8] == 0.0 or kind[n] == 0:
+                    incidence = solid_incidence(kind[n], shape[n], o[c], directions[c, k], t)
+                    incidence = max(incidence, 0.05)
+                if surface[n, 1] > 0.0:
+                    t += surface[n, 1] * (2.0 * random_unit(n, c // 2, k) - 1.0)
+            power = reflectivity * incidence * (strength / t) ** 2
+            if power < 10.0 and random_unit(key, c * rings + k, -2) > 1.0 - np.exp(-power):
+                continue
+            t += noise[c, k]
+            if t < range_min or t > range_max:
+                continue
+            reported[c, k] = t
+            shade = 100.0 * reflectivity * (0.4 + 0.6 * incidence)
+            shade += 6.0 * (random_unit(key, c * rings + k, -3) - 0.5)
+            reflectance[c, k] = min(max(np.floor(shade + 0.5), 0.0), 255.0)
+            source[c, k] = n
+    return reported, reflectance, source
+
+
+def scan_of_returns(
+    lidar: SpinningLidar, stamp_ns: int, reported: Float, reflectance: Float, source: Int32
+) -> Sweep:
+    """Make a scan of the returns of a sweep, in the order of time, then ring.
+
+    Args:
+        lidar: The sensor.
+        stamp_ns: Start of the sweep.
+        reported: Range of each beam [m], 0 without a return; reflectance, source: See `measure`; (C, K) each.
+    """
+    column, ring = np.nonzero(reported > 0.0)
+    points = lidar.beams()[column, ring] * reported[column, ring, None]
+    scan = Scan(
+        stamp_ns,
+        points.astype(np.float32),
+        reflectance[column, ring].astype(np.float32),
+        ring.astype(np.int32),
+        lidar.column_offsets_ns()[column],
+    )
+    return Sweep(scan, source[column, ring])
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,15 +199,16 @@ class SpinningLidar:
 
     Attributes:
         columns: Shots per turn.
-        rings: Lasers.
+        rings: Number of lasers.
         lowest: Elevation of ring 0 [rad].
-        ring_step: Between neighbouring rings [rad].
-        period_ns: Of one turn.
-        range_min, range_max: [m].
+        ring_step: Angle between neighbouring rings [rad].
+        period_ns: Duration of a turn.
+        range_min, range_max: Measured ranges [m].
         range_sigma: Standard deviation of a range [m].
         divergence: Full width of a beam [rad].
-        pulse: Echoes nearer to one another than this melt into one [m].
-        strength: Reflectivity 1 seen head-on at this range returns with 63 % [m].
+        pulse: Echoes nearer to one another than this are reported as one [m].
+        strength: Range at which a perpendicular surface of reflectivity 1 gives a return in 63 % of the shots
+            [m].
     """
 
     columns: int = 1800
@@ -51,24 +225,31 @@ class SpinningLidar:
 
     @property
     def sensor(self) -> Sensor:
-        """What the pipeline is told of it."""
+        """The sensor as the pipeline describes it."""
         return Sensor(
             name="VLP-16 (simulated)",
             rings=self.rings,
             ring_step=self.ring_step,
             azimuth_step=2.0 * np.pi / self.columns,
-            # No sensor is perfect, and the pipeline divides by it.
+            # The pipeline divides by it, so it is not 0.
             range_sigma=max(self.range_sigma, 0.001),
             range_max=self.range_max,
         )
 
     def column_offsets_ns(self) -> Int32:
-        """Time of each column after the start of the sweep [ns], shape (C,)."""
+        """Return the time of each column after the start of the sweep [ns], shape (C,)."""
         offsets = np.arange(self.columns, dtype=np.int64) * self.period_ns // self.columns
         return offsets.astype(np.int32)
 
     def beams(self) -> Float:
-        """Unit directions of all rays in the sensor's frame, shape (C, K, 3)."""
+        """Return the unit directions of all rays in the sensor frame, shape (C, K, 3)."""
+        return _beams(self)
+
+    def sees(self, points: Float32) -> Bool:
+        """Return which points (N, 3) are in the field of view, shape (N,)."""
+        return np.ones(len(points), np.bool_)
+
+    def _directions(self) -> Float:
         azimuth = np.pi - np.arange(self.columns) * (2.0 * np.pi / self.columns)
         elevation = self.lowest + np.arange(self.rings) * self.ring_step
         out = np.empty((self.columns, self.rings, 3))
@@ -78,13 +259,56 @@ class SpinningLidar:
         return out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sweep:
-    """One sweep and what each of its points belongs to.
+@lru_cache(maxsize=4)
+def _beams(lidar: SpinningLidar) -> Float:
+    return lidar._directions()
+
+
+CONE = float(np.radians(35.0))  # half the opening angle of a solid-state sensor
+
+
+@dataclass(frozen=True, slots=True)
+class SolidStateLidar(SpinningLidar):
+    """A LiDAR that looks in one direction, in a cone, with a pattern that does not repeat.
 
     Attributes:
-        scan: As the driver gives it.
-        solid: int32, shape (N,): row in the solids that were cast, -2 for the ground.
+        pattern: Random seed of the pattern.
+    """
+
+    columns: int = 1028
+    rings: int = 200
+    lowest: float = -CONE
+    ring_step: float = 2.0 * CONE / 199
+    divergence: float = 0.004
+    pattern: int = 0
+
+    @property
+    def sensor(self) -> Sensor:
+        """The sensor as the pipeline describes it, without rings."""
+        return Sensor("solid state (simulated)", azimuth_step=0.0035, range_sigma=self.range_sigma)
+
+    def sees(self, points: Float32) -> Bool:
+        """Return which points (N, 3) are in the cone, shape (N,)."""
+        ahead: Bool = points[:, 0] > np.cos(CONE) * np.linalg.norm(points, axis=1)
+        return ahead
+
+    def _directions(self) -> Float:
+        """A grid of rays, each moved at random by less than half a step, shape (C, K, 3)."""
+        rng = np.random.default_rng(self.pattern)
+        step, shape = 2.0 * np.pi / self.columns, (self.columns, self.rings)
+        azimuth = np.pi - step * (np.arange(self.columns)[:, None] + rng.uniform(-0.45, 0.45, shape))
+        elevation = self.lowest + self.ring_step * (np.arange(self.rings) + rng.uniform(-0.45, 0.45, shape))
+        level = np.cos(elevation)
+        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """A sweep, and the solid of each of its points.
+
+    Attributes:
+        scan: The scan as a driver gives it.
+        solid: Row in the solids, -2 for the ground, int32, shape (N,).
     """
 
     scan: Scan
@@ -100,20 +324,19 @@ def sweep_scene(
     stamp_ns: int,
     rng: np.random.Generator,
 ) -> Sweep:
-    """One sweep.
+    """Simulate a sweep.
 
     Args:
         lidar: The sensor.
-        solids: What stands there at this time.
+        solids: All solids at this time.
         terrain: The ground.
         R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
         stamp_ns: Start of the sweep.
-        rng: Of this sweep alone.
+        rng: Random generator of this sweep.
     """
     key = int(rng.integers(0, 2**62))
     noise = lidar.range_sigma * rng.standard_normal((lidar.columns, lidar.rings))
-    beams = _beams(lidar)
-    directions = ray_directions(R, beams)
+    directions = ray_directions(R, lidar.beams())
     away = np.hypot(*(solids.capsule[:, :2] - o[lidar.columns // 2, :2]).T)
     ranges, hit = first_returns(
         solids.kind,
@@ -147,12 +370,4 @@ def sweep_scene(
         noise,
         key,
     )
-    points, shade, ring, offset_ns, solid = pack_returns(
-        reported, reflectance, source, beams, lidar.column_offsets_ns()
-    )
-    return Sweep(Scan(stamp_ns, points, shade, ring, offset_ns), solid)
-
-
-@lru_cache(maxsize=4)
-def _beams(lidar: SpinningLidar) -> Float:
-    return lidar.beams()
+    return scan_of_returns(lidar, stamp_ns, reported, reflectance, source)

@@ -1,12 +1,12 @@
-"""The shapes of which everything in a scene is made, kept as columns.
+"""Shapes of which the objects of a scene are built, as columns.
 
-A tapered cylinder (trunk, branch, pole, limb), an ellipsoid that is solid (head, torso) or lets part of
-the light through (foliage), and an upright box. Each row also has a capsule that encloses it.
+There are tapered cylinders (trunks, branches, poles, limbs), ellipsoids that are solid (head, torso) or
+porous (foliage), and upright boxes. Each row also has a capsule that encloses the shape.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,9 +25,9 @@ class Solids:
         shape: float64, shape (N, 9). CONE: start (3), unit axis (3), length, radius at the start,
             change of radius per metre. ELLIPSOID and BOX: centre (3), half sizes (3), cosine and sine
             of the yaw, and for the ellipsoid the mean free path of light in it [m], 0 if solid.
-        capsule: float64, shape (N, 7): two ends (3 + 3) and the radius of what encloses it.
+        capsule: float64, shape (N, 7): two ends (3 + 3) and the radius of the enclosing capsule.
         surface: float64, shape (N, 2): reflectivity 0..1, roughness of the surface [m].
-        owner: int32: number of the thing in the scene that it belongs to.
+        owner: int32: number of the object in the scene.
     """
 
     kind: Int32
@@ -40,7 +40,7 @@ class Solids:
         return int(self.kind.shape[0])
 
     def join(self, other: Solids) -> Solids:
-        """These and those."""
+        """Return these shapes followed by others."""
         return Solids(
             np.concatenate([self.kind, other.kind]),
             np.concatenate([self.shape, other.shape]),
@@ -50,7 +50,7 @@ class Solids:
         )
 
     def placed(self, offset: Float, yaw: float) -> Solids:
-        """Turned by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]."""
+        """Return the shapes turned by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]."""
         c, s = np.cos(yaw), np.sin(yaw)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         shape, capsule = self.shape.copy(), self.capsule.copy()
@@ -64,15 +64,11 @@ class Solids:
         return Solids(self.kind, shape, capsule, self.surface, self.owner)
 
 
-@dataclass(slots=True)
 class SolidsBuilder:
-    """Collects shapes one by one."""
+    """Collects shapes one by one. `owner` is the number of the object of a shape."""
 
-    _kind: list[int] = field(default_factory=list)
-    _shape: list[list[float]] = field(default_factory=list)
-    _capsule: list[list[float]] = field(default_factory=list)
-    _surface: list[list[float]] = field(default_factory=list)
-    _owner: list[int] = field(default_factory=list)
+    def __init__(self) -> None:
+        self._rows: list[tuple[int, list[float], list[float], list[float], int]] = []
 
     def cone(
         self,
@@ -84,17 +80,11 @@ class SolidsBuilder:
         reflectivity: float = 0.35,
         roughness: float = 0.0,
     ) -> None:
-        """A tapered cylinder without caps from `start` to `end` (3,) [m] with its two radii [m]."""
+        """Add a tapered cylinder without caps from `start` to `end` (3,) [m] with its two radii [m]."""
         a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
         length = float(np.linalg.norm(b - a))
-        axis = (b - a) / length
-        self._add(
-            CONE,
-            [*a, *axis, length, radii[0], (radii[1] - radii[0]) / length],
-            [*a, *b, max(radii)],
-            [reflectivity, roughness],
-            owner,
-        )
+        shape = [*a, *((b - a) / length), length, radii[0], (radii[1] - radii[0]) / length]
+        self._rows.append((CONE, shape, [*a, *b, max(radii)], [reflectivity, roughness], owner))
 
     def ellipsoid(
         self,
@@ -106,44 +96,32 @@ class SolidsBuilder:
         free_path: float = 0.0,
         reflectivity: float = 0.3,
     ) -> None:
-        """An ellipsoid with half sizes (3,) [m], turned by `yaw` about z; porous if `free_path` > 0."""
+        """Add an ellipsoid with half sizes (3,) [m], turned by `yaw` about z; porous if `free_path` > 0."""
         c, h = np.asarray(centre, dtype=np.float64), np.asarray(half, dtype=np.float64)
-        self._add(
-            ELLIPSOID,
-            [*c, *h, np.cos(yaw), np.sin(yaw), free_path],
-            [*c, *c, float(h.max())],
-            [reflectivity, 0.0],
-            owner,
-        )
+        shape = [*c, *h, np.cos(yaw), np.sin(yaw), free_path]
+        self._rows.append((ELLIPSOID, shape, [*c, *c, float(h.max())], [reflectivity, 0.0], owner))
 
     def box(
         self, owner: int, centre: ArrayLike, half: ArrayLike, *, yaw: float = 0.0, reflectivity: float = 0.5
     ) -> None:
-        """An upright box with half sizes (3,) [m], turned by `yaw` about z."""
+        """Add an upright box with half sizes (3,) [m], turned by `yaw` about z."""
         c, h = np.asarray(centre, dtype=np.float64), np.asarray(half, dtype=np.float64)
-        self._add(
-            BOX,
-            [*c, *h, np.cos(yaw), np.sin(yaw), 0.0],
-            [*c, *c, float(np.linalg.norm(h))],
-            [reflectivity, 0.0],
-            owner,
-        )
+        shape = [*c, *h, np.cos(yaw), np.sin(yaw), 0.0]
+        self._rows.append((BOX, shape, [*c, *c, float(np.linalg.norm(h))], [reflectivity, 0.0], owner))
+
+    def extend(self, solids: Solids) -> None:
+        """Add all shapes of a table."""
+        s = solids
+        columns = (s.kind, s.shape, s.capsule, s.surface, s.owner)
+        self._rows += zip(*(column.tolist() for column in columns), strict=True)
 
     def build(self) -> Solids:
-        """All shapes so far as columns."""
+        """Return all shapes so far as columns."""
+        kind, shape, capsule, surface, owner = zip(*self._rows, strict=True) if self._rows else [()] * 5
         return Solids(
-            np.array(self._kind, dtype=np.int32),
-            np.array(self._shape, dtype=np.float64).reshape(-1, 9),
-            np.array(self._capsule, dtype=np.float64).reshape(-1, 7),
-            np.array(self._surface, dtype=np.float64).reshape(-1, 2),
-            np.array(self._owner, dtype=np.int32),
+            np.array(kind, dtype=np.int32),
+            np.array(shape, dtype=np.float64).reshape(-1, 9),
+            np.array(capsule, dtype=np.float64).reshape(-1, 7),
+            np.array(surface, dtype=np.float64).reshape(-1, 2),
+            np.array(owner, dtype=np.int32),
         )
-
-    def _add(
-        self, kind: int, shape: list[float], capsule: list[float], surface: list[float], owner: int
-    ) -> None:
-        self._kind.append(kind)
-        self._shape.append(shape)
-        self._capsule.append(capsule)
-        self._surface.append(surface)
-        self._owner.append(owner)

@@ -1,7 +1,7 @@
-"""One sweep of a spinning LiDAR through a scene, compiled.
+"""Ray casting: ranges at which rays meet shapes and the ground, in closed form, compiled.
 
-Each shape covers an interval of columns and rings as seen from where the sensor is when it looks that
-way; only those rays are tested (see `visible`). The intervals are wide enough to miss nothing.
+In a sweep each shape covers an interval of columns and rings, as seen from the pose of the sensor at that
+time. Only these rays are tested (see `window_of_capsule`); the intervals are wide enough to contain all hits.
 """
 
 from __future__ import annotations
@@ -9,16 +9,282 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.jit import compiled
-from pipeline.simulation.culling import window_of_capsule
-from pipeline.simulation.intersect import meet_box, meet_cone, meet_ellipsoid, meet_ground, stand_on
+from pipeline.simulation.terrain import gradient_at, sine_of_turns
 from pipeline.types.records import Float, Int, Int32
+
+MISS = np.inf
+
+
+@compiled
+def meet_cone(shape: Float, o: Float, d: Float) -> float:
+    """Return the range at which a ray (origin o, unit direction d) enters the mantle of a tapered
+    cylinder."""
+    wx, wy, wz = o[0] - shape[0], o[1] - shape[1], o[2] - shape[2]
+    along = wx * shape[3] + wy * shape[4] + wz * shape[5]
+    rate = d[0] * shape[3] + d[1] * shape[4] + d[2] * shape[5]
+    k = shape[8]
+    radius = shape[7] + k * along
+    a = d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - rate * rate * (1.0 + k * k)
+    b = wx * d[0] + wy * d[1] + wz * d[2] - along * rate - k * rate * radius
+    c = wx * wx + wy * wy + wz * wz - along * along - radius * radius
+    discriminant = b * b - a * c
+    if discriminant <= 0.0 or a <= 1e-12:
+        return MISS
+    t: float = (-b - np.sqrt(discriminant)) / a
+    h = along + t * rate
+    if t <= 0.0 or h < 0.0 or h > shape[6] or shape[7] + k * h <= 0.0:
+        return MISS
+    return t
+
+
+@compiled
+def meet_ellipsoid(shape: Float, o: Float, d: Float) -> tuple[float, float]:
+    """Return the ranges at which a ray enters and leaves an ellipsoid; both are infinite when it misses."""
+    cos, sin = shape[6], shape[7]
+    wx, wy, wz = o[0] - shape[0], o[1] - shape[1], o[2] - shape[2]
+    px, py, pz = (cos * wx + sin * wy) / shape[3], (cos * wy - sin * wx) / shape[4], wz / shape[5]
+    qx, qy = (cos * d[0] + sin * d[1]) / shape[3], (cos * d[1] - sin * d[0]) / shape[4]
+    qz = d[2] / shape[5]
+    a = qx * qx + qy * qy + qz * qz
+    b = px * qx + py * qy + pz * qz
+    discriminant = b * b - a * (px * px + py * py + pz * pz - 1.0)
+    if discriminant <= 0.0:
+        return MISS, MISS
+    root = np.sqrt(discriminant)
+    return (-b - root) / a, (-b + root) / a
+
+
+@compiled
+def meet_box(shape: Float, o: Float, d: Float) -> float:
+    """Return the range at which a ray enters an upright box from outside."""
+    cos, sin = shape[6], shape[7]
+    wx, wy = o[0] - shape[0], o[1] - shape[1]
+    enter, leave = -np.inf, np.inf
+    for axis in range(3):
+        if axis == 0:
+            p, q = cos * wx + sin * wy, cos * d[0] + sin * d[1]
+        elif axis == 1:
+            p, q = cos * wy - sin * wx, cos * d[1] - sin * d[0]
+        else:
+            p, q = o[2] - shape[2], d[2]
+        half = shape[3 + axis]
+        if abs(q) < 1e-12:
+            if abs(p) > half:
+                return MISS
+        else:
+            t1, t2 = (-half - p) / q, (half - p) / q
+            enter, leave = max(enter, min(t1, t2)), min(leave, max(t1, t2))
+    return enter if 0.0 < enter <= leave else MISS
+
+
+@compiled
+def waves_at(terrain: Float, o: Float, waves: Float) -> None:
+    """Fill `waves`, shape (W, 3), with what all rays from one origin share: for each row of the terrain its
+    phase in
+    turns, sine and cosine at the origin; in row 0 the height above the plane."""
+    waves[0, 0] = o[2] - terrain[0, 0] * o[0] - terrain[0, 1] * o[1] - terrain[0, 2]
+    for i in range(1, terrain.shape[0]):
+        turns = terrain[i, 1] * o[0] + terrain[i, 2] * o[1] + terrain[i, 3]
+        waves[i, 0] = turns
+        waves[i, 1] = sine_of_turns(turns)
+        waves[i, 2] = sine_of_turns(turns + 0.25)
+
+
+@compiled
+def meet_ground(terrain: Float, waves: Float, d: Float, farthest: float, rate: Float) -> float:
+    """Return the range at which a ray first goes below the terrain, infinite if not before `farthest`.
+
+    Along the ray the waves rise no faster than `steepest` and curve no more than `bend`. Both bound how far
+    it is safe to advance; near the ground the second converges as fast as Newton's method.
+
+    Args:
+        terrain: Packed, see `Terrain`.
+        waves: Waves at the origin of the ray, see `waves_at`.
+        d: Unit direction.
+        farthest: [m].
+        rate: Working space of shape (W,).
+    """
+    count = terrain.shape[0]
+    fall = terrain[0, 0] * d[0] + terrain[0, 1] * d[1] - d[2]
+    above_plane = waves[0, 0]
+    steepest, bend, crest = 0.0, 0.0, 0.0
+    clearance, change = above_plane, -fall
+    for i in range(1, count):
+        rate[i] = terrain[i, 1] * d[0] + terrain[i, 2] * d[1]
+        slope = 6.283185307179586 * rate[i]
+        steepest += terrain[i, 0] * abs(slope)
+        bend += terrain[i, 0] * slope * slope
+        crest += terrain[i, 0]
+        clearance -= terrain[i, 0] * waves[i, 1]
+        change -= terrain[i, 0] * slope * waves[i, 2]
+    closing = steepest + fall
+    if closing <= 1e-9 or clearance <= 0.0:
+        return MISS
+    if fall < 0.0:  # a rising ray meets nothing above the highest crest
+        farthest = min(farthest, (crest - above_plane) / -fall)
+    t: float = 0.0
+    for _ in range(400):
+        root = np.sqrt(change * change + 2.0 * bend * clearance)
+        if change <= 0.0:
+            jump = 2.0 * clearance / (root - change)
+        else:
+            jump = (change + root) / bend if bend > 0.0 else MISS
+        t += max(jump, clearance / closing)
+        if t > farthest:
+            return MISS
+        if bend * jump * jump < 2e-5:
+            return t
+        clearance, change = above_plane - t * fall, -fall
+        for i in range(1, count):
+            turns = waves[i, 0] + t * rate[i]
+            clearance -= terrain[i, 0] * sine_of_turns(turns)
+            change -= 6.283185307179586 * terrain[i, 0] * rate[i] * sine_of_turns(turns + 0.25)
+        if clearance < 1e-5:
+            return t
+    return t
+
+
+@compiled
+def ground_incidence(terrain: Float, o: Float, d: Float, t: float) -> float:
+    """Return the cosine of the angle between a ray and the normal of the ground at range t."""
+    gx, gy = gradient_at(terrain, o[0] + t * d[0], o[1] + t * d[1])
+    cosine: float = abs(gx * d[0] + gy * d[1] - d[2]) / np.sqrt(1.0 + gx * gx + gy * gy)
+    return cosine
+
+
+@compiled
+def solid_incidence(kind: int, shape: Float, o: Float, d: Float, t: float) -> float:
+    """Return the cosine of the angle between a ray and the normal of the shape that it meets at range t."""
+    x, y, z = o[0] + t * d[0] - shape[0], o[1] + t * d[1] - shape[1], o[2] + t * d[2] - shape[2]
+    if kind == 0:
+        h = x * shape[3] + y * shape[4] + z * shape[5]
+        nx, ny, nz = x - h * shape[3], y - h * shape[4], z - h * shape[5]
+    else:
+        cos, sin = shape[6], shape[7]
+        u, v = (cos * x + sin * y) / shape[3], (cos * y - sin * x) / shape[4]
+        w = z / shape[5]
+        if kind == 2:
+            # On a face the scaled coordinate is 1: that axis is the normal.
+            if abs(w) >= abs(u) and abs(w) >= abs(v):
+                u, v = 0.0, 0.0
+            elif abs(u) >= abs(v):
+                v, w = 0.0, 0.0
+            else:
+                u, w = 0.0, 0.0
+        u, v, w = u / shape[3], v / shape[4], w / shape[5]
+        nx, ny, nz = cos * u - sin * v, sin * u + cos * v, w
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    cosine: float = abs(nx * d[0] + ny * d[1] + nz * d[2]) / max(length, 1e-12)
+    return cosine
+
+
+@compiled
+def clip_to_view(a: Float, b: Float, r: float, lowest: float, highest: float) -> float:
+    """Clip the segment from a to b (3,) to the part between the lowest and highest beam, in place.
+
+    Return the largest distance of the segment from the axis of the sensor [m], or -1 when the segment,
+    thickened by r, is out of view.
+    """
+    reach = 0.0
+    for _ in range(2):
+        reach = max(np.sqrt(a[0] * a[0] + a[1] * a[1]), np.sqrt(b[0] * b[0] + b[1] * b[1])) + r
+        floor, ceiling = np.tan(lowest) * reach - r, np.tan(highest) * reach + r
+        rise = b[2] - a[2]
+        if max(a[2], b[2]) < floor or min(a[2], b[2]) > ceiling:
+            return -1.0
+        if abs(rise) > 1e-9:
+            s1, s2 = (floor - a[2]) / rise, (ceiling - a[2]) / rise
+            first, last = max(0.0, min(s1, s2)), min(1.0, max(s1, s2))
+            for i in range(3):
+                way = b[i] - a[i]
+                b[i] = a[i] + last * way
+                a[i] = a[i] + first * way
+    return reach
+
+
+@compiled
+def interval_of_capsule(
+    capsule: Float, R: Float, o: Float, lowest: float, highest: float
+) -> tuple[float, float, float, float, float]:
+    """Return the angles that a capsule covers as seen by the sensor with rotation R (3, 3) at o (3,).
+
+    Returns:
+        Azimuth of its middle, half its width in azimuth, lowest and highest elevation [rad], and the nearest
+        range at which it can be met [m]. The width is negative when it is out of view.
+    """
+    a, b = np.empty(3), np.empty(3)
+    for i in range(3):
+        a[i] = b[i] = 0.0
+        for j in range(3):
+            a[i] += R[j, i] * (capsule[j] - o[j])
+            b[i] += R[j, i] * (capsule[3 + j] - o[j])
+    r = capsule[6]
+    reach = clip_to_view(a, b, r, lowest, highest)
+    if reach < 0.0:
+        return 0.0, -1.0, 0.0, 0.0, 0.0
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    span = dx * dx + dy * dy
+    s = 0.0 if span < 1e-12 else min(max(-(a[0] * dx + a[1] * dy) / span, 0.0), 1.0)
+    distance = np.sqrt((a[0] + s * dx) ** 2 + (a[1] + s * dy) ** 2)
+    nearest = max(distance - r, 1e-3)
+    top, bottom = max(a[2], b[2]) + r, min(a[2], b[2]) - r
+    elevation_top = np.arctan2(top, nearest if top > 0.0 else reach)
+    elevation_bottom = np.arctan2(bottom, nearest if bottom < 0.0 else reach)
+    if distance <= r * 1.001:
+        return 0.0, np.pi, elevation_bottom, elevation_top, nearest
+    rho_a, rho_b = np.sqrt(a[0] * a[0] + a[1] * a[1]), np.sqrt(b[0] * b[0] + b[1] * b[1])
+    turn = np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])
+    wide_a, wide_b = np.arcsin(min(r / rho_a, 1.0)), np.arcsin(min(r / rho_b, 1.0))
+    low, high = min(-wide_a, turn - wide_b), max(wide_a, turn + wide_b)
+    middle = np.arctan2(a[1], a[0]) + 0.5 * (low + high)
+    return middle, 0.5 * (high - low), elevation_bottom, elevation_top, nearest
+
+
+@compiled
+def window_of_capsule(
+    capsule: Float, R: Float, o: Float, lowest: float, ring_step: float, rings: int
+) -> tuple[int, int, int, int, float]:
+    """Return the rays of a sweep that can meet a capsule, as seen from the poses R (C, 3, 3) and o (C, 3).
+
+    Returns:
+        First and last column (modulo C), first and last ring, and the nearest range at which it can be met
+        [m]. The columns are empty when it is out of view.
+    """
+    columns = R.shape[0]
+    step = 2.0 * np.pi / columns
+    highest = lowest + ring_step * (rings - 1)
+    c = columns // 2
+    turned, width, low, high, nearest = 0.0, -1.0, 0.0, 0.0, 0.0
+    for _ in range(2):  # the position in the sweep decides from which pose it is seen
+        middle, width, low, high, nearest = interval_of_capsule(
+            capsule, R[c], o[c], lowest - 0.03, highest + 0.03
+        )
+        turned = (np.pi - middle) / step
+        c = int(turned) % columns
+    if width < 0.0:
+        return 0, -1, 0, -1, nearest
+    # The robot moves 0.1 m, turns and tilts during a sweep; the margin covers its share while the beam
+    # passes.
+    tilt = 0.004 + 0.01 * width
+    width += 0.05 * width + 1.5 * step
+    if turned - width / step < 60.0 or turned + width / step > columns - 60.0:
+        tilt = 0.03
+        width += 0.1 + 0.15 / max(nearest, 0.15)
+    if width >= np.pi:
+        first, last = 0, columns - 1
+    else:
+        first, last = int(np.floor(turned - width / step)), int(np.ceil(turned + width / step))
+    ring_first = max(0, int(np.ceil((low - tilt - lowest) / ring_step)))
+    ring_last = min(rings - 1, int(np.floor((high + tilt - lowest) / ring_step)))
+    return first, min(last, first + columns - 1), ring_first, ring_last, nearest
+
 
 NOTHING, GROUND = -1, -2
 
 
 @compiled
 def random_unit(key: int, a: int, b: int) -> float:
-    """A number in (0, 1) that depends on the key and two counters only."""
+    """Return a number in (0, 1) that only depends on the key and two counters."""
     h = (
         np.uint64(key)
         ^ (np.uint64(a + 1) * np.uint64(0x9E3779B97F4A7C15))
@@ -32,7 +298,7 @@ def random_unit(key: int, a: int, b: int) -> float:
 
 @compiled
 def ray_directions(R: Float, beams: Float) -> Float:
-    """Directions in the world, shape (C, K, 3), of beams (C, K, 3) under rotations (C, 3, 3)."""
+    """Return the directions in the world, shape (C, K, 3), of beams (C, K, 3) under rotations (C, 3, 3)."""
     out = np.empty_like(beams)
     for c in range(beams.shape[0]):
         for k in range(beams.shape[1]):
@@ -45,7 +311,7 @@ def ray_directions(R: Float, beams: Float) -> Float:
 
 @compiled
 def meet_solid(kind: int, shape: Float, o: Float, d: Float, chance: float) -> float:
-    """Range of the first return from a shape; in foliage it lies at a random depth."""
+    """Return the range of the first return from a shape; in foliage it is at a random depth."""
     if kind == 0:
         return meet_cone(shape, o, d)
     if kind == 2:
@@ -74,9 +340,9 @@ def first_returns(
     key: int,
     order: Int,
 ) -> tuple[Float, Int32]:
-    """Range [m] and shape (or NOTHING, GROUND) of each ray of a sweep, shape (C, K) each.
+    """Return range [m] and shape (or NOTHING, GROUND) of each ray of a sweep, shape (C, K) each.
 
-    `order` names the shapes, best the near ones first: what they hide is not tested.
+    `order` lists the shapes; with near shapes first, rays that they stop are not tested again.
 
     Column c looks along the azimuth pi - c 2 pi / C from the pose R[c], o[c].
     """
@@ -103,10 +369,45 @@ def first_returns(
                     owner[c, k] = n
     waves, space = np.empty((terrain.shape[0], 3)), np.empty(terrain.shape[0])
     for c in range(columns):
-        stand_on(terrain, o[c], waves)
+        waves_at(terrain, o[c], waves)
         for k in range(rings):
             t = meet_ground(terrain, waves, directions[c, k], min(ranges[c, k], farthest), space)
             if t < ranges[c, k]:
                 ranges[c, k] = t
                 owner[c, k] = GROUND
     return ranges, owner
+
+
+@compiled
+def first_along(kind: Int32, shape: Float, capsule: Float, directions: Float, key: int) -> Float:
+    """Return the range [m] at which each ray from the origin first meets a shape, infinite without, shape
+    (N,).
+
+    Args:
+        kind, shape, capsule: See `Solids`; no shape contains the origin.
+        directions: Unit vectors, shape (N, 3).
+        key: Seed of the depths at which foliage stops light.
+    """
+    ranges = np.full(directions.shape[0], np.inf)
+    middle = np.zeros(3)
+    origin = np.zeros(3)
+    for n in range(kind.shape[0]):
+        # A ball around the shape: only rays within its cone are tested.
+        reach, away = capsule[n, 6], 0.0
+        half = 0.0
+        for i in range(3):
+            middle[i] = 0.5 * (capsule[n, i] + capsule[n, i + 3])
+            away += middle[i] ** 2
+            half += (0.5 * (capsule[n, i] - capsule[n, i + 3])) ** 2
+        reach, away = reach + np.sqrt(half), np.sqrt(away)
+        sine = reach / away if away > reach else 1.0
+        ahead = np.sqrt(1.0 - sine * sine) * away
+        for k in range(directions.shape[0]):
+            d = directions[k]
+            if away > reach and d[0] * middle[0] + d[1] * middle[1] + d[2] * middle[2] < ahead:
+                continue
+            chance = 0.5
+            if kind[n] == 1 and shape[n, 8] > 0.0:
+                chance = random_unit(key, k, n)
+            ranges[k] = min(ranges[k], meet_solid(kind[n], shape[n], origin, d, chance))
+    return ranges

@@ -1,17 +1,24 @@
-"""The scenarios, as one table to read and to extend."""
+"""Scenarios of simulated runs, and the URIs that select them: `sim:stand?seed=3&sigma=0.03`.
+
+This module needs no compiled kernel, so that a URI is parsed quickly.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass, field, replace
+from urllib.parse import parse_qsl
 
 import numpy as np
+
+from pipeline.errors import UsageError
 
 Waypoints = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """Something that stands at a given place: its kind, x, y [m] and diameter [m]."""
+    """An object at a given position: its kind, x, y [m] and diameter [m]."""
 
     kind: str
     x: float
@@ -21,28 +28,29 @@ class Placed:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What stands where, and how the robot drives through it.
+    """A scenario: terrain, objects, and the course of the robot.
 
     Attributes:
-        line: One line for the menu.
-        waypoints: Of the course [m]; it is moved and turned to begin at the origin, along x.
-        closed: Whether the course is a loop that is driven again and again.
-        speed: [m/s].
-        duration_s: Length of the run unless the user asks for another.
+        line: Description in one line.
+        waypoints: Waypoints of the course [m]; it is moved and turned to begin at the origin, along x.
+        closed: Whether the course is a loop that is driven repeatedly.
+        speed: Speed of the robot [m/s].
+        duration_s: Default duration of the run [s].
         half_side: Half the side of the square plot around the middle of the course [m].
-        slope: Of the terrain's plane along x [degrees].
-        waves: Amplitude of the terrain's longest wave [m]; shortest wavelength [m].
-        trees: How many.
-        dbh: Smallest and largest [m].
-        thin: Shape of the distribution of DBH; larger means more thin trees.
+        slope: Slope of the terrain along x [degrees].
+        waves: Amplitude of the longest wave of the terrain [m], and shortest wavelength [m].
+        trees: Number of trees.
+        dbh: Smallest and largest DBH [m].
+        thin: Shape of the distribution of DBH; a larger value means more thin trees.
         gap: Least distance between the surfaces of two trunks [m].
-        branchy: Part of the trees with branches below 3.5 m.
+        branchy: Share of the trees with branches below 3.5 m.
         crown_base: Lowest and highest start of a crown [m].
         lean: Standard deviation of the lean [degrees].
-        poles, bushes, standing, walking, boxes, undergrowth: How many.
-        placed: What stands at a given place, in the frame of the map.
+        poles, bushes, standing, walking, boxes, undergrowth: Numbers of objects; standing and walking
+            persons.
+        placed: Objects at given positions in the frame of the map.
         crossings: Persons who walk to and fro: from x, y to x, y [m], and their speed [m/s].
-        obeys: Whether the robot slows down and stops for what stands in its way.
+        obeys: Whether the robot slows down and stops for obstacles in its path.
     """
 
     line: str
@@ -72,13 +80,13 @@ class Scenario:
 
 
 def _ring(radius: float, wobble: float, lobes: int, points: int) -> Waypoints:
-    """A round course that swings in and out, so that it is not just a circle."""
+    """Return a round course that swings in and out."""
     angle = np.linspace(0.0, 2.0 * np.pi, points, endpoint=False)
     r = radius + wobble * np.cos(lobes * angle)
     return tuple((float(a), float(b)) for a, b in zip(r * np.cos(angle), r * np.sin(angle), strict=True))
 
 
-# The paper's table gives seven trees, but its positions carry misprints: these are our own.
+# The table of the paper has seven trees, but their positions have misprints; these are our own.
 _PAPER_PLOT = (
     Placed("tree", 3.6, 2.3, 0.30),
     Placed("tree", 6.2, -3.0, 0.42),
@@ -189,5 +197,183 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def scenarios() -> dict[str, str]:
-    """The scenarios for a menu: URI and one line."""
+    """Return the description of each scenario by its URI."""
     return {f"sim:{name}": scenario.line for name, scenario in SCENARIOS.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class WheelQuality:
+    """Errors of wheel odometry.
+
+    Attributes:
+        scale: Relative error of the distance; its sign is drawn.
+        slip: Share of the distance lost per unit of uphill slope.
+        turn_scale: Relative error of a turn; its sign is drawn.
+        turn_bias: False turn per metre [rad/m]; its sign is drawn.
+        distance_noise: Standard deviation of the distance [m] per square root of metre.
+        turn_noise: Standard deviation of the heading [rad] per square root of metre.
+    """
+
+    scale: float
+    slip: float
+    turn_scale: float
+    turn_bias: float
+    distance_noise: float
+    turn_noise: float
+
+
+QUALITIES = {
+    "good": WheelQuality(0.003, 0.01, 0.002, 2e-4, 0.005, 0.002),
+    "normal": WheelQuality(0.01, 0.04, 0.006, 6e-4, 0.01, 0.004),
+    "poor": WheelQuality(0.03, 0.10, 0.006, 2.8e-3, 0.03, 0.006),
+}
+
+
+SCHEME = "sim:"
+EXACT = "exact"
+CLOUD = "cloud"
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
+_COMMON_KEYS = {
+    "seed": "0 to 2^63 - 1",
+    "sigma": "range noise in metres, 0 to 0.2",
+    "odometry": f"one of {', '.join([*QUALITIES, EXACT])}",
+    "duration": "seconds, 1 to 3600",
+}
+_KEYS = {
+    **_COMMON_KEYS,
+    "trees": "how many, 0 to 2000",
+    "drive": "another drive through the same scene, 0 to 1000",
+}
+_CLOUD_KEYS = {
+    "file": "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd",
+    "truth": "a table (CSV) of its trees in the coordinates of the cloud",
+    **_COMMON_KEYS,
+}
+# Numbers of poles, standing persons, bushes, boxes and walking persons of stands with many objects that are
+# not trees.
+FURNISHED = {"stand": (24, 6, 12, 5, 2), "slope": (24, 6, 12, 5, 2), "dense": (12, 4, 12, 2, 1)}
+
+
+@dataclass(frozen=True, slots=True)
+class RunRequest:
+    """Request for a simulated run.
+
+    Attributes:
+        name: Name of the scenario.
+        seed: Random seed of the run.
+        sigma: Standard deviation of a range [m].
+        odometry: Quality of the wheels, or "exact".
+        duration_s: Duration [s].
+        trees: Number of trees.
+        drive: Number of the drive; other drives through the same scene have other noise.
+        file, truth: Cloud of a run through a real plot and table of its trees, or empty.
+        furnished: Whether a stand has more objects that are not trees, see FURNISHED.
+    """
+
+    name: str
+    seed: int
+    sigma: float
+    odometry: str
+    duration_s: float
+    trees: int
+    drive: int = field(default=0, repr=False)
+    file: str = ""
+    truth: str = ""
+    furnished: bool = field(default=False, repr=False)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario with the requested objects."""
+        scenario = replace(SCENARIOS[self.name], trees=self.trees)
+        if not self.furnished or self.name not in FURNISHED:
+            return scenario
+        poles, standing, bushes, boxes, walking = FURNISHED[self.name]
+        return replace(scenario, poles=poles, standing=standing, bushes=bushes, boxes=boxes, walking=walking)
+
+
+def parse_uri(uri: str, seed: int = 0) -> RunRequest:
+    """Parse `sim:NAME?key=value&...`; "sim:" may be omitted.
+
+    A duration of 0 in the request for a run through a cloud stands for one loop.
+
+    Args:
+        uri: As the user wrote it.
+        seed: Seed of a URI that names none.
+
+    Raises:
+        UsageError: No such scenario or key, a key twice, a value that is not a number or out of bounds.
+    """
+    name, _, query = uri.removeprefix(SCHEME).partition("?")
+    if name != CLOUD and name not in SCENARIOS:
+        known = ", ".join(SCHEME + scenario for scenario in SCENARIOS)
+        raise UsageError(f"there is no scenario {name!r}", where=uri, remedy=f"Scenarios: {known}")
+    values = _pairs(uri, query, _CLOUD_KEYS if name == CLOUD else _KEYS)
+    if name == CLOUD and not values.get("file"):
+        raise UsageError(
+            "the cloud to be driven through is not named", where=uri, remedy="sim:cloud?file=plot.laz"
+        )
+    odometry = values.get("odometry", "normal")
+    if odometry not in (*QUALITIES, EXACT):
+        raise _refusal(uri, "odometry", odometry)
+    scenario = None if name == CLOUD else SCENARIOS[name]
+    trees, most = (
+        (0, 0) if scenario is None else (scenario.trees, scenario.trees if scenario.placed else 2000)
+    )
+    duration_s = 0.0 if scenario is None else scenario.duration_s
+    if "duration" in values:
+        duration_s = _real(uri, "duration", values["duration"], 1.0, 3600.0)
+    return RunRequest(
+        name=name,
+        seed=_whole(uri, "seed", values.get("seed", str(seed)), 2**63 - 1),
+        sigma=_real(uri, "sigma", values.get("sigma", "0.02"), 0.0, 0.2),
+        odometry=odometry,
+        duration_s=duration_s,
+        trees=_whole(uri, "trees", values.get("trees", str(trees)), most),
+        drive=_whole(uri, "drive", values.get("drive", "0"), 1000),
+        file=values.get("file", ""),
+        truth=values.get("truth", ""),
+    )
+
+
+def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
+    except ValueError:
+        raise UsageError(
+            "the part after ? must be key=value, joined by &", where=uri, remedy=_allowed(keys)
+        ) from None
+    values: dict[str, str] = {}
+    for key, value in pairs:
+        if key not in keys:
+            raise UsageError(f"a simulated run has no option {key!r}", where=uri, remedy=_allowed(keys))
+        if key in values:
+            raise UsageError(f"option {key!r} is given twice", where=uri, remedy="Give it once")
+        values[key] = value
+    return values
+
+
+def _allowed(keys: dict[str, str]) -> str:
+    return "Options: " + "; ".join(f"{key} ({meaning})" for key, meaning in keys.items())
+
+
+def _refusal(uri: str, key: str, text: str) -> UsageError:
+    return UsageError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_KEYS[key]}")
+
+
+def _whole(uri: str, key: str, text: str, most: int) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
+        refusal = _refusal(uri, key, text)
+        if key == "trees" and most < 2000:
+            refusal = UsageError(refusal.what, where=uri, remedy=f"This scenario has at most {most} trees")
+        raise refusal
+    return int(text)
+
+
+def _real(uri: str, key: str, text: str, low: float, high: float) -> float:
+    # float() alone would also take 1_0, spaces and digits of other scripts.
+    if not (len(text) < 40 and _NUMBER.fullmatch(text)):
+        raise _refusal(uri, key, text)
+    value = float(text)
+    if not low <= value <= high:
+        raise _refusal(uri, key, text)
+    return value

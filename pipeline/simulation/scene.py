@@ -1,204 +1,283 @@
-"""A scene: the terrain and all that stands on it, built from a scenario and a seed."""
+"""Scenes of forest scenarios: the terrain and all objects on it, built from a scenario and a seed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from pipeline.simulation.persons import Person
-from pipeline.simulation.planting import Plot
-from pipeline.simulation.primitives import Solids, SolidsBuilder
+from pipeline.errors import SourceError
+from pipeline.simulation.primitives import Solids
+from pipeline.simulation.robot_motion import Course
 from pipeline.simulation.scenarios import Placed, Scenario
 from pipeline.simulation.scene_objects import (
+    SceneBuilder,
     TreeShape,
     add_box,
     add_bush,
     add_pole,
     add_tree,
     add_undergrowth,
+    person,
 )
 from pipeline.simulation.terrain import Terrain
-from pipeline.simulation.trajectory import Course
 from pipeline.types.records import Float, TruthTrees
+
+_STEP_HZ, _STRIDE = 0.9, 0.42  # of a walking person; [rad]
+# Positions are drawn in small batches while there is room, and in large ones when the plot becomes full.
+_BATCHES = (8, 16, 32, 64, 128, *[256] * 36)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Person:
+    """A person who stands and sways, or walks to and fro between two places.
+
+    Attributes:
+        owner: Number of the object in the scene.
+        start, end: Ends of the path, shape (2,) [m]; equal for a person who stands.
+        heading: Heading of a person who stands [rad].
+        speed: [m/s], 0 for a person who stands.
+        phase: Shift in time [s], so that no two persons move alike.
+    """
+
+    owner: int
+    start: Float
+    end: Float
+    heading: float
+    speed: float
+    phase: float
+
+    def place(self, t: float) -> tuple[Float, float]:
+        """Return the position (2,) [m] and the heading [rad] at time t [s]."""
+        if self.speed == 0.0:
+            sway = np.array([np.sin(0.9 * (t + self.phase)), np.cos(0.7 * (t - self.phase))])
+            return self.start + 0.012 * sway, self.heading + 0.03 * float(sway[0])
+        way = self.end - self.start
+        length = float(np.hypot(*way))
+        gone = (self.speed * (t + self.phase)) % (2.0 * length)
+        back = gone > length
+        position = self.start + way * ((2.0 * length - gone if back else gone) / length)
+        return position, float(np.arctan2(way[1], way[0])) + (np.pi if back else 0.0)
+
+    def solids(self, t: float, terrain: Terrain) -> Solids:
+        """Return the body in the world at time t [s]."""
+        at, heading = self.place(t)
+        ground = float(terrain.height(at[:1], at[1:])[0])
+        stride = _STRIDE * np.sin(2.0 * np.pi * _STEP_HZ * (t + self.phase)) if self.speed > 0.0 else 0.0
+        return person(self.owner, float(stride)).placed(np.array([at[0], at[1], ground]), heading)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What the robot drives through.
+    """A simulated scene.
 
     Attributes:
         terrain: The ground.
-        still: All solids that never move.
-        persons: Those that do, even a little.
-        trees: The trees' shapes, in the order of `truth`.
-        truth: Trees (x, y of the axis at 1.3 m above the tree's ground), poles, bushes, boxes
-            ("other") and standing persons. Who walks is nowhere and so is not in it; neither is
-            undergrowth, which is ground.
-        kinds: Kind of each thing by its number (`Solids.owner`), among them "walker" and "undergrowth".
+        still: All solids that do not move.
+        persons: All persons; even those who stand sway.
+        truth: Trees (x, y of the axis at 1.3 m above the ground), poles, bushes, boxes ("other") and
+            standing persons. Walking persons have no position, and undergrowth counts as ground.
+        kinds: Kind of each object by its number (`Solids.owner`), with "walker" and "undergrowth".
     """
 
     terrain: Terrain
     still: Solids
     persons: tuple[Person, ...]
-    trees: tuple[TreeShape, ...]
     truth: TruthTrees
     kinds: tuple[str, ...]
 
-    def person_solids(self, n: int, t: float) -> Solids:
-        """The body of person n at time t [s]."""
-        return self.persons[n].solids(t, self.terrain)
-
     def solids_at(self, times: Float, R: Float, o: Float) -> Solids:
-        """What stands there, each person as they stand when the beam of a sweep passes them.
+        """Return all solids, each person at the time when the beam of a sweep passes them.
 
         Args:
-            times: Of the sweep's columns, shape (C,) [s].
+            times: Times of the columns of the sweep, shape (C,) [s].
             R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
         """
         solids = self.still
         middle = times.size // 2
-        for n, person in enumerate(self.persons):
-            at, _ = person.place(float(times[middle]))
+        for each in self.persons:
+            at, _ = each.place(float(times[middle]))
             away = R[middle].T @ (np.array([at[0], at[1], o[middle, 2]]) - o[middle])
             turned = (np.pi - float(np.arctan2(away[1], away[0]))) / (2.0 * np.pi)
             column = min(int(turned * times.size), times.size - 1)
-            solids = solids.join(self.person_solids(n, float(times[column])))
+            solids = solids.join(each.solids(float(times[column]), self.terrain))
         return solids
 
 
+class Plot:
+    """A square plot with a course through it; finds free positions for objects.
+
+    Args:
+        course: Course of the robot.
+        half_side: Half the side of the plot around the middle of the course [m].
+    """
+
+    def __init__(self, course: Course, half_side: float) -> None:
+        line = np.stack([course.x, course.y], axis=1)[::5]
+        self.centre = 0.5 * (line.min(axis=0) + line.max(axis=0))
+        self.half_side = half_side
+        self._line = cKDTree(line)
+        self._taken = np.empty((0, 3))
+
+    def from_course(self, places: Float) -> Float:
+        """Return the distances of places (N, 2) from the middle of the course [m]."""
+        distance: Float = self._line.query(places)[0]
+        return distance
+
+    def from_objects(self, places: Float) -> Float:
+        """Return the distances of places (N, 2) from the nearest surface of an object [m]."""
+        if self._taken.shape[0] == 0:
+            return np.full(places.shape[0], np.inf)
+        away = np.hypot(places[:, :1] - self._taken[:, 0], places[:, 1:] - self._taken[:, 1])
+        free: Float = (away - self._taken[:, 2]).min(axis=1)
+        return free
+
+    def take(self, x: float, y: float, radius: float) -> None:
+        """Mark a disc as occupied."""
+        self._taken = np.vstack([self._taken, [x, y, radius]])
+
+    def find(
+        self, radius: float, gap: float, near: float, far: float, rng: np.random.Generator, what: str
+    ) -> tuple[float, float]:
+        """Find a free position and mark it as occupied.
+
+        Args:
+            radius: Radius of the object [m].
+            gap: Least distance between its surface and those of its neighbours [m].
+            near, far: Least and greatest distance of its surface from the course [m].
+            rng: Draws the positions.
+            what: Name of the object, for the error.
+
+        Raises:
+            SourceError: The plot is full.
+        """
+        for count in _BATCHES:
+            places = self.centre + self.half_side * rng.uniform(-1.0, 1.0, (count, 2))
+            off = self.from_course(places) - radius
+            good = (off >= near) & (off <= far)
+            good[good] = self.from_objects(places[good]) - radius >= gap
+            if good.any():
+                x, y = (float(value) for value in places[int(np.argmax(good))])
+                self.take(x, y, radius)
+                return x, y
+        raise self.full(what)
+
+    @staticmethod
+    def full(what: str) -> SourceError:
+        """Return the error for an object that does not fit."""
+        return SourceError(
+            f"no place is left for another {what} in the simulated stand",
+            remedy="Ask for fewer trees with trees=N",
+        )
+
+
 def build_scene(scenario: Scenario, course: Course, rng: np.random.Generator) -> Scene:
-    """Build the scene.
+    """Build the scene of a scenario.
 
     Raises:
-        SourceError: Not everything found a place.
+        SourceError: There is no position left for an object.
     """
     slope = float(np.tan(np.radians(scenario.slope)))
     terrain = Terrain.grow(slope, scenario.waves[0], scenario.waves[1], rng)
-    work = _Work(scenario, terrain, Plot(course, scenario.half_side), rng)
-    for placed in _placed(scenario):
-        work.put(placed)
-    work.plant(scenario.trees - sum(placed.kind == "tree" for placed in _placed(scenario)))
-    work.scatter()
-    return work.scene()
-
-
-def _placed(scenario: Scenario) -> list[Placed]:
-    """The placed things, and no more trees than were asked for."""
+    planter = _Planter(scenario, SceneBuilder(terrain, rng), Plot(course, scenario.half_side))
     trees = [placed for placed in scenario.placed if placed.kind == "tree"][: scenario.trees]
-    return trees + [placed for placed in scenario.placed if placed.kind != "tree"]
+    for placed in [*trees, *(placed for placed in scenario.placed if placed.kind != "tree")]:
+        planter.add_placed(placed)
+    planter.add_trees(scenario.trees - len(trees))
+    planter.add_others()
+    return planter.built()
 
 
-class _Work:
-    """The scene while it is being built."""
+class _Planter:
+    """Places the objects of a scenario."""
 
-    def __init__(self, scenario: Scenario, terrain: Terrain, plot: Plot, rng: np.random.Generator) -> None:
-        self.scenario, self.terrain, self.plot, self.rng = scenario, terrain, plot, rng
-        self.builder = SolidsBuilder()
-        self.kinds: list[str] = []
-        self.persons: list[Person] = []
-        self.trees: list[TreeShape] = []
-        self.truth: list[tuple[float, float, float, str]] = []
+    def __init__(self, scenario: Scenario, scene: SceneBuilder, plot: Plot) -> None:
+        self._scenario, self._scene, self._plot, self._rng = scenario, scene, plot, scene.rng
+        self._persons: list[Person] = []
 
-    def put(self, placed: Placed) -> None:
-        """Set one thing where it is told to stand."""
+    def add_placed(self, placed: Placed) -> None:
+        """Add an object at its given position."""
         x, y, radius = placed.x, placed.y, 0.5 * placed.diameter
-        self.plot.take(x, y, radius)
+        self._plot.take(x, y, radius)
         if placed.kind == "tree":
             self._add_tree(x, y, placed.diameter)
         elif placed.kind == "pole":
-            add_pole(self.builder, self._number("pole", x, y), x, y, radius, self._ground(x, y), self.rng)
+            add_pole(self._scene, x, y, radius)
         elif placed.kind == "bush":
-            add_bush(self.builder, self._number("bush", x, y), x, y, radius, self._ground(x, y), self.rng)
+            add_bush(self._scene, x, y, radius)
         else:
             self._add_standing(x, y)
 
-    def plant(self, count: int) -> None:
-        """Trees at free places, the thick ones first."""
-        low, high = self.scenario.dbh
-        sizes = low + (high - low) * self.rng.beta(1.3, self.scenario.thin, max(count, 0))
+    def add_trees(self, count: int) -> None:
+        """Add trees at free positions, the thick ones first."""
+        low, high = self._scenario.dbh
+        sizes = low + (high - low) * self._rng.beta(1.3, self._scenario.thin, max(count, 0))
         for dbh in np.sort(sizes)[::-1]:
-            x, y = self.plot.find(0.5 * dbh, self.scenario.gap, 0.8, np.inf, self.rng, "tree")
+            x, y = self._plot.find(0.5 * dbh, self._scenario.gap, 0.8, np.inf, self._rng, "tree")
             self._add_tree(x, y, float(dbh))
 
-    def scatter(self) -> None:
-        """All that is not a tree, near enough to the course to be seen."""
-        plan, rng, find = self.scenario, self.rng, self.plot.find
-        for _ in range(plan.boxes):
-            x, y = find(0.9, 0.5, 1.2, 9.0, rng, "box")
-            add_box(self.builder, self._number("other", x, y), x, y, self._ground(x, y), rng)
-        for _ in range(plan.poles):
-            radius = float(rng.uniform(0.03, 0.08))
-            x, y = find(radius, 0.7, 1.0, 7.0, rng, "pole")
-            add_pole(self.builder, self._number("pole", x, y), x, y, radius, self._ground(x, y), rng)
-        for _ in range(plan.standing):
+    def add_others(self) -> None:
+        """Add the objects that are not trees, near enough to the course to be seen."""
+        scenario, scene, rng, find = self._scenario, self._scene, self._rng, self._plot.find
+        for _ in range(scenario.boxes):
+            add_box(scene, *find(0.9, 0.5, 1.2, 9.0, rng, "box"))
+        for _ in range(scenario.poles):
+            radius = scene.uniform(0.03, 0.08)
+            add_pole(scene, *find(radius, 0.7, 1.0, 7.0, rng, "pole"), radius)
+        for _ in range(scenario.standing):
             self._add_standing(*find(0.35, 0.5, 1.2, 5.0, rng, "person"))
-        for _ in range(plan.bushes):
-            radius = float(rng.uniform(0.4, 0.8))
-            x, y = find(radius, 0.2, 0.8, 9.0, rng, "bush")
-            add_bush(self.builder, self._number("bush", x, y), x, y, radius, self._ground(x, y), rng)
-        for _ in range(plan.walking):
+        for _ in range(scenario.bushes):
+            radius = scene.uniform(0.4, 0.8)
+            add_bush(scene, *find(radius, 0.2, 0.8, 9.0, rng, "bush"), radius)
+        for _ in range(scenario.walking):
             self._add_walker()
-        for x, y, to_x, to_y, speed in plan.crossings:
-            self.kinds.append("walker")
+        for x, y, to_x, to_y, speed in scenario.crossings:
             ends = (np.array([x, y]), np.array([to_x, to_y]))
-            self.persons.append(Person(len(self.kinds) - 1, *ends, 0.0, speed, 0.0))
-        for _ in range(plan.undergrowth):
-            place = self.plot.centre + self.plot.half_side * rng.uniform(-1.0, 1.0, 2)
-            if self.plot.from_course(place[None])[0] > 1.0:
-                x, y = float(place[0]), float(place[1])
-                self.kinds.append("undergrowth")
-                add_undergrowth(self.builder, len(self.kinds) - 1, x, y, self._ground(x, y), rng)
+            self._persons.append(Person(scene.owner("walker"), *ends, 0.0, speed, 0.0))
+        for _ in range(scenario.undergrowth):
+            place = self._plot.centre + self._plot.half_side * rng.uniform(-1.0, 1.0, 2)
+            if self._plot.from_course(place[None])[0] > 1.0:
+                add_undergrowth(scene, float(place[0]), float(place[1]))
 
-    def scene(self) -> Scene:
-        """What was built."""
-        x, y, dbh, kind = zip(*self.truth, strict=True) if self.truth else ((), (), (), ())
+    def built(self) -> Scene:
+        """Return the scene."""
+        truth = self._scene.truth
+        x, y, dbh, kind = zip(*truth, strict=True) if truth else ((), (), (), ())
         return Scene(
-            terrain=self.terrain,
-            still=self.builder.build(),
-            persons=tuple(self.persons),
-            trees=tuple(self.trees),
+            terrain=self._scene.terrain,
+            still=self._scene.solids.build(),
+            persons=tuple(self._persons),
             truth=TruthTrees(np.array(x), np.array(y), np.array(dbh), tuple(kind)),
-            kinds=tuple(self.kinds),
+            kinds=tuple(self._scene.kinds),
         )
 
-    def _number(self, kind: str, x: float, y: float, dbh: float = np.nan) -> int:
-        self.kinds.append(kind)
-        self.truth.append((x, y, dbh, kind))
-        return len(self.kinds) - 1
-
-    def _ground(self, x: float, y: float) -> float:
-        return float(self.terrain.height(np.array([x]), np.array([y]))[0])
-
     def _add_tree(self, x: float, y: float, dbh: float) -> None:
-        rng, plan = self.rng, self.scenario
-        lean = np.clip(np.radians(plan.lean) * rng.standard_normal(2), -0.09, 0.09)
-        low, high = plan.crown_base
+        rng, scenario = self._rng, self._scenario
+        lean = np.clip(np.radians(scenario.lean) * rng.standard_normal(2), -0.09, 0.09)
+        low, high = scenario.crown_base
         crown = float(rng.uniform(low, high) if dbh > 0.12 else rng.uniform(low, low + 1.0))
         top = max(float(4.0 + 28.0 * dbh * rng.uniform(0.85, 1.15)), crown + 1.5)
-        branches = int(rng.integers(3, 9)) if rng.random() < plan.branchy else 0
-        tree = TreeShape(x, y, dbh, (float(lean[0]), float(lean[1])), top, crown, branches)
-        self.trees.append(tree)
-        add_tree(self.builder, self._number("tree", x, y, dbh), tree, self._ground(x, y), rng)
+        branches = int(rng.integers(3, 9)) if rng.random() < scenario.branchy else 0
+        add_tree(self._scene, TreeShape(x, y, dbh, (float(lean[0]), float(lean[1])), top, crown, branches))
 
     def _add_standing(self, x: float, y: float) -> None:
         at: Float = np.array([x, y])
-        heading, phase = self.rng.uniform(0.0, 6.0, 2)
-        self.persons.append(Person(self._number("person", x, y), at, at, float(heading), 0.0, float(phase)))
+        heading, phase = self._rng.uniform(0.0, 6.0, 2)
+        owner = self._scene.true_object("person", x, y)
+        self._persons.append(Person(owner, at, at, float(heading), 0.0, float(phase)))
 
     def _add_walker(self) -> None:
-        rng = self.rng
-        middle = self.plot.centre
+        rng, plot = self._rng, self._plot
         for _ in range(2000):
-            start = middle + self.plot.half_side * rng.uniform(-0.8, 0.8, 2)
+            start = plot.centre + plot.half_side * rng.uniform(-0.8, 0.8, 2)
             angle, length = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(5.0, 10.0)
             end = start + length * np.array([np.cos(angle), np.sin(angle)])
             line = start + np.linspace(0.0, 1.0, 25)[:, None] * (end - start)
-            off = self.plot.from_course(line)
-            if off.min() >= 1.0 and off.max() < 9.0 and self.plot.from_things(line).min() >= 0.4:
-                self.kinds.append("walker")
+            off = plot.from_course(line)
+            if off.min() >= 1.0 and off.max() < 9.0 and plot.from_objects(line).min() >= 0.4:
                 speed, phase = rng.uniform(0.8, 1.2), rng.uniform(0.0, 20.0)
-                number = len(self.kinds) - 1
-                self.persons.append(Person(number, start, end, 0.0, float(speed), float(phase)))
+                owner = self._scene.owner("walker")
+                self._persons.append(Person(owner, start, end, 0.0, float(speed), float(phase)))
                 return
-        raise self.plot.full("person who walks")
+        raise plot.full("person who walks")

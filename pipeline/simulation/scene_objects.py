@@ -1,29 +1,89 @@
-"""What stands in a scene, each built of solids: trees, poles, bushes, boxes, undergrowth, persons."""
+"""Objects of simulated scenes, each built of solids: trees, poles, bushes, persons, street furniture.
+
+Every function `add_*` adds one object at x, y [m] on the terrain of a `SceneBuilder` and draws its shape from
+the random generator of the builder. `KINDS` declares the objects that a layout places by name, with the
+distributions of their sizes. These distributions are wide on purpose: a classifier should learn what an
+object is, not how large it is in one town.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from pipeline.simulation.primitives import Solids, SolidsBuilder
+from pipeline.simulation.terrain import Terrain
 from pipeline.types.records import Float
 
-BREAST_HEIGHT = 1.3
-TAPER = 0.01  # of the diameter, per metre of height
-_FOOT = 0.4  # trunks begin under the ground, so that no gap shows on a slope
+BREAST_HEIGHT = 1.3  # m
+TAPER = 0.01  # decrease of the diameter per metre of height
+_FOOT = 0.4  # m; trunks begin below the ground, so that no gap is visible on a slope
+
+
+class SceneBuilder:
+    """Collects the objects of a scene.
+
+    Args:
+        terrain: The ground on which objects are placed.
+        rng: Draws their shapes.
+
+    Attributes:
+        solids: Solids of all objects so far.
+        kinds: Kind of each object or part of an object by its number (`Solids.owner`).
+        truth: x, y [m], DBH [m] (NaN if not a tree) and kind of the objects of the ground truth.
+        trunks: Number, x and y [m] of each trunk.
+    """
+
+    def __init__(self, terrain: Terrain, rng: np.random.Generator) -> None:
+        self.terrain, self.rng = terrain, rng
+        self.solids = SolidsBuilder()
+        self.kinds: list[str] = []
+        self.truth: list[tuple[float, float, float, str]] = []
+        self.trunks: list[tuple[int, float, float]] = []
+
+    def owner(self, kind: str) -> int:
+        """Return the number of a new object or part of a kind."""
+        self.kinds.append(kind)
+        return len(self.kinds) - 1
+
+    def true_object(self, kind: str, x: float, y: float, dbh: float = np.nan) -> int:
+        """Return the number of a new object that belongs to the ground truth."""
+        self.truth.append((x, y, dbh, kind))
+        return self.owner(kind)
+
+    def foot(self, x: float, y: float) -> Float:
+        """Return the point on the ground at x, y [m], shape (3,)."""
+        return np.array([x, y, self.terrain.height(np.array([x]), np.array([y]))[0]])
+
+    def uniform(self, low: float, high: float) -> float:
+        """Draw a number from a uniform distribution."""
+        return float(self.rng.uniform(low, high))
+
+
+def _up(height: float) -> Float:
+    return np.array([0.0, 0.0, height])
+
+
+def _ahead(angle: float, rise: float = 0.0) -> Float:
+    return np.array([np.cos(angle), np.sin(angle), rise])
+
+
+# --- forest ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class TreeShape:
-    """A tree: its trunk's axis at 1.3 m above its ground stands at x, y [m].
+    """Shape of a forest tree. The axis of its trunk is at x, y at breast height.
 
     Attributes:
         x, y: [m].
         dbh: Diameter at 1.3 m [m].
-        lean: Shift of the axis per metre of height along x and y [1].
-        top: Height of the trunk above its ground [m].
-        crown_base: Where the foliage begins [m]; above `top` for none.
+        lean: Shift of the axis per metre of height along x and y.
+        top: Height of the trunk above the ground [m].
+        crown_base: Lower end of the foliage [m]; a tree with a crown base above `top` has none.
         branches: Number of branches below the crown.
     """
 
@@ -36,52 +96,35 @@ class TreeShape:
     branches: int
 
     def axis(self, height: float) -> tuple[float, float]:
-        """Where the axis is at a height above the tree's ground [m]."""
+        """Return x, y [m] of the axis at a height above the ground [m]."""
         up = height - BREAST_HEIGHT
         return self.x + self.lean[0] * up, self.y + self.lean[1] * up
 
     def radius(self, height: float) -> float:
-        """Radius of the trunk at a height [m]."""
+        """Return the radius of the trunk at a height [m]."""
         return max(0.5 * (self.dbh - TAPER * (height - BREAST_HEIGHT)), 0.015)
 
 
-def add_tree(
-    builder: SolidsBuilder, owner: int, tree: TreeShape, ground: float, rng: np.random.Generator
-) -> None:
-    """A tapered, leaning trunk with rough bark, branches and a crown."""
+def add_tree(scene: SceneBuilder, tree: TreeShape) -> None:
+    """Add a tapered, leaning trunk with rough bark, branches and a crown."""
+    rng, owner = scene.rng, scene.true_object("tree", tree.x, tree.y, tree.dbh)
+    ground = float(scene.foot(tree.x, tree.y)[2])
     top = min(tree.top, BREAST_HEIGHT + (tree.dbh - 0.04) / TAPER)
     ends = [np.array([*tree.axis(h), ground + h]) for h in (-_FOOT, top)]
     bark = min(0.012 * tree.dbh, 0.004)
     shade = rng.uniform(0.25, 0.45)
     radii = (tree.radius(-_FOOT), tree.radius(top))
-    builder.cone(owner, ends[0], ends[1], radii, reflectivity=shade, roughness=bark)
+    scene.solids.cone(owner, ends[0], ends[1], radii, reflectivity=shade, roughness=bark)
     for _ in range(tree.branches):
-        _add_branch(builder, owner, tree, ground, shade, rng)
-    if tree.crown_base < tree.top:
-        _add_crown(builder, owner, tree, ground, rng)
-
-
-def _add_branch(
-    builder: SolidsBuilder,
-    owner: int,
-    tree: TreeShape,
-    ground: float,
-    shade: float,
-    rng: np.random.Generator,
-) -> None:
-    height = rng.uniform(0.6, min(3.5, tree.crown_base))
-    direction, rise = rng.uniform(0.0, 2.0 * np.pi), np.tan(rng.uniform(-0.2, 0.7))
-    length = rng.uniform(0.4, 1.3)
-    start = np.array([*tree.axis(height), ground + height])
-    way = np.array([np.cos(direction), np.sin(direction), rise])
-    radius = rng.uniform(0.006, 0.018)
-    end = start + (length + tree.radius(height)) * way
-    builder.cone(owner, start, end, (radius, 0.003), reflectivity=shade)
-
-
-def _add_crown(
-    builder: SolidsBuilder, owner: int, tree: TreeShape, ground: float, rng: np.random.Generator
-) -> None:
+        height = rng.uniform(0.6, min(3.5, tree.crown_base))
+        direction, rise = rng.uniform(0.0, 2.0 * np.pi), np.tan(rng.uniform(-0.2, 0.7))
+        length = rng.uniform(0.4, 1.3)
+        start = np.array([*tree.axis(height), ground + height])
+        radius = rng.uniform(0.006, 0.018)
+        end = start + (length + tree.radius(height)) * _ahead(direction, rise)
+        scene.solids.cone(owner, start, end, (radius, 0.003), reflectivity=shade)
+    if tree.crown_base >= tree.top:
+        return
     width = np.clip(0.9 + 3.0 * tree.dbh, 1.0, 2.4)
     depth = tree.top + 0.8 - tree.crown_base
     for n in range(3):
@@ -89,67 +132,48 @@ def _add_crown(
         half = np.array([width, width, depth / 5.0]) * rng.uniform(0.75, 1.1, 3) * (1.0 - 0.18 * n)
         shift = 0.2 * width * rng.standard_normal(2)
         x, y = tree.axis(middle)
-        centre = np.array([x + shift[0], y + shift[1], ground + max(middle, tree.crown_base + half[2])])
-        builder.ellipsoid(owner, centre, half, yaw=rng.uniform(0.0, np.pi), free_path=1.2, reflectivity=0.5)
+        centre = [x + shift[0], y + shift[1], ground + max(middle, tree.crown_base + half[2])]
+        _foliage(scene, owner, centre, half, 1.2)
 
 
-def add_pole(
-    builder: SolidsBuilder,
-    owner: int,
-    x: float,
-    y: float,
-    radius: float,
-    ground: float,
-    rng: np.random.Generator,
-) -> None:
-    """A straight, upright pole of 1.8 to 4 m."""
-    top = ground + rng.uniform(1.8, 4.0)
-    builder.cone(owner, [x, y, ground - 0.3], [x, y, top], (radius, radius), reflectivity=0.6)
+def add_pole(scene: SceneBuilder, x: float, y: float, radius: float) -> None:
+    """Add a straight, upright pole of 1.8 to 4 m."""
+    owner, foot = scene.true_object("pole", x, y), scene.foot(x, y)
+    top = foot + _up(scene.uniform(1.8, 4.0))
+    scene.solids.cone(owner, foot - _up(0.3), top, (radius, radius), reflectivity=0.6)
 
 
-def add_bush(
-    builder: SolidsBuilder,
-    owner: int,
-    x: float,
-    y: float,
-    radius: float,
-    ground: float,
-    rng: np.random.Generator,
-) -> None:
-    """Two or three porous blobs near the ground, with thin stems inside."""
+def add_bush(scene: SceneBuilder, x: float, y: float, radius: float) -> None:
+    """Add two or three porous blobs near the ground, with thin stems in them."""
+    rng, owner, foot = scene.rng, scene.true_object("bush", x, y), scene.foot(x, y)
     for _ in range(int(rng.integers(2, 4))):
         half = radius * rng.uniform(0.6, 0.9, 3) * np.array([1.0, 1.0, 0.9])
-        at = np.array([x, y]) + (radius - half[:2].max()) * rng.uniform(-0.8, 0.8, 2)
-        centre = [at[0], at[1], ground + 0.75 * half[2]]
-        builder.ellipsoid(owner, centre, half, yaw=rng.uniform(0.0, np.pi), free_path=0.22, reflectivity=0.5)
+        at = foot[:2] + (radius - half[:2].max()) * rng.uniform(-0.8, 0.8, 2)
+        _foliage(scene, owner, [*at, foot[2] + 0.75 * half[2]], half, 0.22)
     for _ in range(4):
         lean = rng.uniform(-0.35, 0.35, 2) * radius
-        end = [x + lean[0], y + lean[1], ground + radius]
-        builder.cone(owner, [x, y, ground - 0.05], end, (0.012, 0.004))
+        scene.solids.cone(owner, foot - _up(0.05), foot + np.array([*lean, radius]), (0.012, 0.004))
 
 
-def add_box(
-    builder: SolidsBuilder, owner: int, x: float, y: float, ground: float, rng: np.random.Generator
-) -> None:
-    """A piece of wall or a crate, 0.8 to 2.4 m long and 1 to 1.8 m high."""
-    half = np.array([rng.uniform(0.4, 1.2), rng.uniform(0.12, 0.4), rng.uniform(0.5, 0.9)])
-    builder.box(owner, [x, y, ground + half[2] - 0.2], half, yaw=rng.uniform(0.0, np.pi))
+def add_box(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a piece of wall or a crate, 0.8 to 2.4 m long and 1 to 1.8 m high."""
+    half = np.array([scene.uniform(0.4, 1.2), scene.uniform(0.12, 0.4), scene.uniform(0.5, 0.9)])
+    owner, centre = scene.true_object("other", x, y), scene.foot(x, y) + _up(half[2]) - _up(0.2)
+    scene.solids.box(owner, centre, half, yaw=scene.uniform(0.0, np.pi))
 
 
-def add_undergrowth(
-    builder: SolidsBuilder, owner: int, x: float, y: float, ground: float, rng: np.random.Generator
-) -> None:
-    """A tuft of ferns or grass, up to half a metre high."""
-    half = np.array([rng.uniform(0.2, 0.5), rng.uniform(0.2, 0.5), rng.uniform(0.15, 0.5)])
-    centre = [x, y, ground + 0.1 * half[2]]
-    builder.ellipsoid(owner, centre, half, yaw=rng.uniform(0.0, np.pi), free_path=0.35, reflectivity=0.45)
+def add_undergrowth(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a tuft of ferns or grass, up to half a metre high."""
+    half = np.array([scene.uniform(0.2, 0.5), scene.uniform(0.2, 0.5), scene.uniform(0.15, 0.5)])
+    centre = scene.foot(x, y) + _up(0.1 * half[2])
+    _foliage(scene, scene.owner("undergrowth"), centre, half, 0.35, reflectivity=0.45)
 
 
 def person(owner: int, stride: float = 0.0) -> Solids:
-    """A person of 1.74 m at the origin who looks along x.
+    """Return a person of 1.74 m at the origin who looks along x.
 
     Args:
-        owner: Number of the thing.
+        owner: Number of the object.
         stride: Swing of the legs and arms [rad], 0 when standing.
     """
     builder = SolidsBuilder()
@@ -164,3 +188,323 @@ def person(owner: int, stride: float = 0.0) -> Solids:
     builder.ellipsoid(owner, [0.0, 0.0, 1.14], [0.13, 0.22, 0.38], reflectivity=0.45)
     builder.ellipsoid(owner, [0.0, 0.0, 1.62], [0.10, 0.08, 0.12], reflectivity=0.5)
     return builder.build()
+
+
+# --- trees of streets and parks --------------------------------------------------------------------
+
+
+def add_street_tree(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a trunk, in most cases with a crown, in some with branches, more stems, ivy, shrubs or a stake."""
+    rng = scene.rng
+    radius = 0.5 * (scene.uniform(0.08, 0.2) if rng.random() < 0.35 else scene.uniform(0.15, 0.7))
+    height = float(np.clip(5.0 + 30.0 * radius, 3.0, 12.0)) * scene.uniform(0.8, 1.2)
+    lowest, highest = ((0.5, 1.5), (1.2, 3.0), (2.5, 5.0))[int(rng.integers(0, 3))]
+    base = min(scene.uniform(lowest, highest), 0.75 * height)
+    lean = np.tan(np.radians(rng.choice([1.5, 4.0, 9.0], p=[0.6, 0.3, 0.1]) * rng.standard_normal(2)))
+    foot = scene.foot(x, y)
+    start = foot - np.array([*(1.6 * lean), 0.3])
+    end = foot + np.array([*((height - 1.3) * lean), height])
+    owner = _trunk(scene, x, y, start, end, (1.1 * radius, 0.35 * radius))
+    for _ in range(int(rng.integers(0, 6)) if rng.random() < 0.5 else 0):
+        at = scene.uniform(0.8, base + 0.5)
+        _leafy_branch(scene, owner, start + (end - start) * (at / height))
+    if rng.random() < 0.93:
+        _crown(scene, start + (end - start) * (base / height), height - base, scene.uniform(0.8, 3.5))
+    if rng.random() < 0.12:
+        _further_stems(scene, owner, foot, radius, 0.7 * height)
+    if rng.random() < 0.12:
+        _ivy(scene, start, end, radius)
+    for _ in range(int(rng.integers(1, 4)) if rng.random() < 0.35 else 0):
+        side = scene.uniform(0.0, 0.9) * _ahead(scene.uniform(0.0, 2.0 * np.pi))
+        add_shrub(scene, x + side[0], y + side[1], (0.2, 0.8), (0.3, 1.6))
+    if rng.random() < 0.1:
+        side = 0.45 * _ahead(scene.uniform(0.0, 2.0 * np.pi))
+        add_post(scene, x + side[0], y + side[1], (0.04, 0.04), (1.2, 2.2))
+
+
+def add_young_tree(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a thin tree of up to 7 m whose upper end is in free air, like that of a pole.
+
+    Its crown is sparse, dense or narrow, or it only has branches; some have stakes or a second stem.
+    """
+    rng, solids = scene.rng, scene.solids
+    form = str(rng.choice(["sparse", "dense", "narrow", "bare"]))
+    height, radius = scene.uniform(2.2, 7.0), scene.uniform(0.02, 0.12)
+    base = scene.uniform(0.2, 0.75) * height
+    lean = np.tan(np.radians(3.0 * rng.standard_normal(2)))
+    foot = scene.foot(x, y)
+    start, end = foot - _up(0.3), foot + np.array([*(height * lean), 0.95 * height])
+    owner = _trunk(scene, x, y, start, end, (1.1 * radius, 0.3 * radius))
+    if rng.random() < 0.1:
+        second = start + np.array([*rng.uniform(-0.1, 0.1, 2), 0.0])
+        top = end + np.array([*rng.uniform(-0.6, 0.6, 2), -0.2 * height])
+        solids.cone(owner, second, top, (0.8 * radius, 0.2 * radius))
+    for part in rng.uniform(base / height, 0.95, int(rng.integers(3, 16 if form == "bare" else 7))):
+        at = start + (end - start) * part
+        way = _ahead(scene.uniform(0.0, 2.0 * np.pi), scene.uniform(0.2, 2.0))
+        length = max(0.35 * (height - base) * scene.uniform(0.3, 1.0), 0.15)
+        solids.cone(owner, at, at + length * way, (scene.uniform(0.006, 0.02), 0.003))
+    if form != "bare":
+        owner, depth = scene.owner("foliage"), height - base
+        width = scene.uniform(0.2, 0.5) if form == "narrow" else scene.uniform(0.4, 1.0 + 0.2 * height)
+        free_path = scene.uniform(0.8, 3.0) if form == "sparse" else scene.uniform(0.1, 0.8)
+        for _ in range(int(rng.integers(1, 8))):
+            half = np.array([width, width, 0.5 * depth]) * rng.uniform(0.4, 1.0, 3)
+            up = base + scene.uniform(half[2], max(depth - half[2], half[2]))
+            out = np.maximum(width - half[:2], 0.0) * rng.uniform(-1.0, 1.0, 2)
+            _foliage(scene, owner, foot + np.array([*(up * lean + out), up]), half, free_path)
+    if rng.random() < 0.3:
+        first = scene.uniform(0.0, 2.0 * np.pi)
+        for angle in first + np.arange(int(rng.integers(1, 4))) * 2.0 * np.pi / 3.0:
+            side = scene.uniform(0.15, 0.5) * _ahead(angle)
+            add_post(scene, x + side[0], y + side[1], (0.02, 0.05), (1.0, 2.4))
+
+
+def add_shrub(
+    scene: SceneBuilder,
+    x: float,
+    y: float,
+    radius: tuple[float, float] = (0.3, 1.4),
+    height: tuple[float, float] = (0.4, 3.2),
+) -> None:
+    """Add porous blobs and thin stems; radius and height [m] are uniform in their bounds."""
+    rng, owner, foot = scene.rng, scene.owner("foliage"), scene.foot(x, y)
+    wide, tall, free_path = scene.uniform(*radius), scene.uniform(*height), scene.uniform(0.1, 0.45)
+    for _ in range(int(rng.integers(2, 6))):
+        half = np.array([wide, wide, 0.5 * tall]) * rng.uniform(0.4, 0.8, 3)
+        shift = (wide - half[:2].max()) * rng.uniform(-1.0, 1.0, 2)
+        up = scene.uniform(0.6 * half[2], max(tall - half[2], 0.7 * half[2]))
+        _foliage(scene, owner, foot + np.array([*shift, up]), half, free_path, reflectivity=0.3)
+    for _ in range(int(rng.integers(0, 7))):
+        end = foot + np.array([*(0.6 * wide * rng.uniform(-1.0, 1.0, 2)), 0.8 * tall])
+        scene.solids.cone(owner, foot - _up(0.1), end, (scene.uniform(0.01, 0.03), 0.005))
+
+
+def add_crown(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add foliage that hangs over from a tree out of view."""
+    _crown(scene, scene.foot(x, y) + _up(scene.uniform(1.0, 3.5)), scene.uniform(2.0, 5.0), 2.0)
+
+
+def _trunk(
+    scene: SceneBuilder, x: float, y: float, start: Float, end: Float, radii: tuple[float, float]
+) -> int:
+    owner = scene.owner("trunk")
+    scene.solids.cone(owner, start, end, radii, roughness=0.018 * radii[0])
+    scene.trunks.append((owner, x, y))
+    return owner
+
+
+def _foliage(
+    scene: SceneBuilder,
+    owner: int,
+    centre: Float | list[float],
+    half: Float,
+    free_path: float,
+    reflectivity: float = 0.5,
+) -> None:
+    """Add a porous ellipsoid that is turned at random."""
+    yaw = scene.uniform(0.0, np.pi)
+    scene.solids.ellipsoid(owner, centre, half, yaw=yaw, free_path=free_path, reflectivity=reflectivity)
+
+
+def _crown(scene: SceneBuilder, base: Float, depth: float, width: float) -> None:
+    rng, owner = scene.rng, scene.owner("foliage")
+    free_path = float(rng.choice([rng.uniform(0.15, 0.5), rng.uniform(0.5, 1.5)]))
+    for _ in range(int(rng.integers(4, 12))):
+        half = np.array([width, width, 0.5 * depth]) * rng.uniform(0.25, 0.65, 3)
+        out = max(width - half[:2].max(), 0.0) * rng.uniform(-1.0, 1.0, 2)
+        up = scene.uniform(0.7 * half[2], max(depth - half[2], half[2]))
+        _foliage(scene, owner, base + np.array([*out, up]), half, free_path)
+
+
+def _further_stems(scene: SceneBuilder, owner: int, foot: Float, radius: float, height: float) -> None:
+    """Add one to three more stems that part from the trunk at its foot."""
+    for _ in range(int(scene.rng.integers(1, 4))):
+        way = _ahead(scene.uniform(0.0, 2.0 * np.pi))
+        lean = np.tan(np.radians(scene.uniform(3.0, 15.0)))
+        start = foot + scene.uniform(0.0, 1.5) * radius * way - _up(0.3)
+        thick = scene.uniform(0.5, 0.9) * radius
+        end = start + height * (lean * way + _up(1.0))
+        scene.solids.cone(owner, start, end, (thick, 0.35 * thick), roughness=0.02 * thick)
+
+
+def _ivy(scene: SceneBuilder, start: Float, end: Float, radius: float) -> None:
+    """Add leaves that climb a trunk to some height."""
+    owner = scene.owner("foliage")
+    thick, top = radius + scene.uniform(0.05, 0.2), scene.uniform(0.2, 0.6)
+    for part in np.arange(0.05, top, 0.08):
+        half = np.array([thick, thick, 0.45]) * scene.rng.uniform(0.8, 1.2, 3)
+        _foliage(
+            scene, owner, start + part * (end - start), half, scene.uniform(0.05, 0.25), reflectivity=0.3
+        )
+
+
+def _leafy_branch(scene: SceneBuilder, owner: int, start: Float) -> None:
+    rng = scene.rng
+    way = scene.uniform(0.4, 1.5) * _ahead(scene.uniform(0.0, 2.0 * np.pi), scene.uniform(-0.1, 1.0))
+    scene.solids.cone(owner, start, start + way, (scene.uniform(0.01, 0.03), 0.004))
+    if rng.random() < 0.5:
+        half = rng.uniform(0.1, 0.35, 3)
+        _foliage(scene, scene.owner("foliage"), start + way, half, 0.3, reflectivity=0.3)
+
+
+# --- street furniture ------------------------------------------------------------------------------
+
+
+def add_post(
+    scene: SceneBuilder, x: float, y: float, radius: tuple[float, float], height: tuple[float, float]
+) -> None:
+    """Add a bare upright post; radius and height [m] are uniform in their bounds."""
+    _post(scene, scene.owner("pole"), x, y, scene.uniform(*radius), scene.uniform(*height))
+
+
+def add_lamp(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a lamp post with a thicker base and an arm or a head."""
+    owner = scene.owner("pole")
+    radius, height = scene.uniform(0.04, 0.12), scene.uniform(3.0, 9.0)
+    _post(scene, owner, x, y, radius, height)
+    if scene.rng.random() < 0.6:
+        _post(scene, owner, x, y, 1.5 * radius, scene.uniform(0.3, 1.4))
+    top = scene.foot(x, y) + _up(height)
+    end = top + scene.uniform(0.3, 2.0) * _ahead(scene.uniform(0.0, 2.0 * np.pi), 0.1)
+    scene.solids.cone(owner, top, end, (0.04, 0.04), reflectivity=0.6)
+    scene.solids.ellipsoid(owner, end, scene.rng.uniform(0.1, 0.3, 3), reflectivity=0.6)
+
+
+def add_sign(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a thin post with one to three plates or boxes."""
+    owner, plate = scene.owner("pole"), scene.owner("sign")
+    height, yaw = scene.uniform(1.2, 4.0), scene.uniform(0.0, np.pi)
+    _post(scene, owner, x, y, scene.uniform(0.02, 0.06), height)
+    top = height
+    for _ in range(int(scene.rng.integers(1, 4))):
+        half = np.array([scene.uniform(0.1, 0.6), scene.uniform(0.01, 0.12), scene.uniform(0.1, 0.5)])
+        centre = scene.foot(x, y) + _up(max(top - half[2], 0.4 + half[2]))
+        scene.solids.box(plate, centre, half, yaw=yaw, reflectivity=0.8)
+        top -= 2.0 * half[2] + scene.uniform(0.0, 0.5)
+
+
+def add_car(scene: SceneBuilder, x: float, y: float, yaw: float) -> None:
+    """Add a parked car or van."""
+    owner, foot = scene.owner("vehicle"), scene.foot(x, y)
+    length, is_van = scene.uniform(1.8, 2.6), scene.rng.random() < 0.25
+    top = scene.uniform(1.8, 2.4) if is_van else scene.uniform(0.85, 1.05)
+    scene.solids.box(owner, foot + _up(0.5 * (top + 0.3)), [length, 0.88, 0.5 * (top - 0.3)], yaw=yaw)
+    if not is_van:
+        scene.solids.box(owner, foot + _up(top + 0.28), [0.55 * length, 0.75, 0.28], yaw=yaw)
+    for ahead in (-0.62 * length, 0.62 * length):
+        for side in (-0.85, 0.85):
+            wheel = foot + ahead * _ahead(yaw) + side * _ahead(yaw + 0.5 * np.pi) + _up(0.3)
+            scene.solids.ellipsoid(owner, wheel, [0.31, 0.1, 0.31], yaw=yaw)
+
+
+def add_motorcycle(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a motorcycle or a bicycle on its stand."""
+    owner, foot, solids = scene.owner("vehicle"), scene.foot(x, y), scene.solids
+    yaw, thick = scene.uniform(0.0, np.pi), scene.uniform(0.02, 0.2)
+    way, across = _ahead(yaw), 0.35 * _ahead(yaw + 0.5 * np.pi)
+    for ahead in (-0.65, 0.65):
+        solids.ellipsoid(owner, foot + ahead * way + _up(0.32), [0.32, 0.06, 0.32], yaw=yaw)
+    solids.ellipsoid(owner, foot + _up(0.65), [0.6, thick, 0.12 + thick], yaw=yaw)
+    bar = foot + 0.35 * way + _up(1.05)
+    solids.cone(owner, foot + 0.55 * way + _up(0.3), bar, (0.04, 0.04))
+    solids.cone(owner, bar - across, bar + across, (0.02, 0.02))
+    if scene.rng.random() < 0.5:
+        solids.box(owner, foot - 0.7 * way + _up(1.0), [0.22, 0.22, 0.2], yaw=yaw)
+
+
+def add_bin(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a bin or a switch box."""
+    half = np.array([scene.uniform(0.2, 0.6), scene.uniform(0.2, 0.4), scene.uniform(0.4, 0.8)])
+    centre = scene.foot(x, y) + _up(half[2])
+    scene.solids.box(scene.owner("vehicle"), centre, half, yaw=scene.uniform(0.0, np.pi))
+
+
+def add_drum(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a round object as wide as a trunk: a barrel, an advertising column, a thick bollard."""
+    owner, foot = scene.owner("vehicle"), scene.foot(x, y)
+    radius, top = scene.uniform(0.12, 0.6), foot + _up(scene.uniform(0.6, 2.8))
+    scene.solids.cone(owner, foot - _up(0.2), top, (radius, radius * scene.uniform(0.7, 1.1)))
+    scene.solids.ellipsoid(owner, top, [radius, radius, 0.1])
+
+
+def add_person(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a person who stands."""
+    body = person(scene.owner("person"), scene.uniform(-0.3, 0.3))
+    scene.solids.extend(body.placed(scene.foot(x, y), scene.uniform(0.0, 2.0 * np.pi)))
+
+
+def add_hedge(scene: SceneBuilder, start: Float, end: Float) -> None:
+    """Add a row of dense foliage between two places (2,) [m], with a rough or a flat top."""
+    rng, owner = scene.rng, scene.owner("foliage")
+    height, half = scene.uniform(0.6, 2.6), scene.uniform(0.25, 0.6)
+    free_path, rough = scene.uniform(0.05, 0.25), scene.uniform(0.02, 0.3)
+    for place in _stations(start, end, 0.7 * half):
+        x, y = place + 0.3 * rough * rng.standard_normal(2)
+        top = height * (1.0 + rough * scene.uniform(-1.0, 1.0))
+        size = np.array([*(half * rng.uniform(0.8, 1.2, 2)), 0.55 * top])
+        _foliage(scene, owner, scene.foot(x, y) + _up(0.5 * top), size, free_path, reflectivity=0.3)
+
+
+def add_fence(scene: SceneBuilder, start: Float, end: Float) -> None:
+    """Add posts between two places (2,) [m], with rails, with slats, or with neither between them."""
+    owner, form = scene.owner("fence"), int(scene.rng.integers(0, 3))
+    height, radius = scene.uniform(0.8, 1.9), scene.uniform(0.025, 0.07)
+    for x, y in _stations(start, end, scene.uniform(1.2, 3.0)):
+        _post(scene, owner, x, y, radius, height)
+    if form == 1:
+        for part in (0.4, 0.85):
+            rail = [scene.foot(*place) + _up(part * height) for place in (start, end)]
+            scene.solids.cone(owner, rail[0], rail[1], (0.03, 0.03))
+    elif form == 2:
+        for x, y in _stations(start, end, scene.uniform(0.12, 0.25)):
+            _post(scene, owner, x, y, 0.025, 0.95 * height)
+
+
+def add_wall(scene: SceneBuilder, start: Float, end: Float, height: float, thickness: float) -> None:
+    """Add a wall or the face of a house between two places (2,) [m]; a high one may have a pipe."""
+    way = end - start
+    half = [0.5 * float(np.hypot(*way)), 0.5 * thickness, 0.5 * height + 0.3]
+    centre = scene.foot(*(0.5 * (start + end))) + _up(0.5 * height)
+    scene.solids.box(scene.owner("building"), centre, half, yaw=float(np.arctan2(way[1], way[0])))
+    if height > 2.5 and scene.rng.random() < 0.5:
+        side = (0.5 * thickness + 0.08) * np.array([way[1], -way[0]]) / np.hypot(*way)
+        x, y = start + way * scene.rng.random() + side
+        _post(scene, scene.owner("pole"), x, y, 0.05, height)
+
+
+def _stations(start: Float, end: Float, spacing: float) -> Float:
+    """Places from `start` to `end` at a spacing [m], shape (N, 2)."""
+    length = float(np.hypot(*(end - start)))
+    along = np.arange(0.0, length, spacing)
+    return start + along[:, None] * (end - start) / max(length, 0.1)
+
+
+def _post(scene: SceneBuilder, owner: int, x: float, y: float, radius: float, height: float) -> None:
+    foot = scene.foot(float(x), float(y))
+    top = foot + np.array([*(0.01 * height * scene.rng.standard_normal(2)), height])
+    scene.solids.cone(owner, foot - _up(0.3), top, (radius, 0.8 * radius), reflectivity=0.6)
+
+
+def _free_hedge(scene: SceneBuilder, x: float, y: float) -> None:
+    start = np.array([x, y])
+    add_hedge(scene, start, start + scene.uniform(2.0, 10.0) * _ahead(scene.uniform(0.0, np.pi))[:2])
+
+
+#: Objects that a layout places at x, y [m] by their name.
+KINDS: dict[str, Callable[[SceneBuilder, float, float], None]] = {
+    "tree": add_street_tree,
+    "young tree": add_young_tree,
+    "shrub": add_shrub,
+    "crown": add_crown,
+    "hedge": _free_hedge,
+    "post": partial(add_post, radius=(0.02, 0.1), height=(0.6, 3.0)),
+    "bollard": partial(add_post, radius=(0.04, 0.12), height=(0.5, 1.3)),
+    "mast": partial(add_post, radius=(0.04, 0.16), height=(2.5, 9.0)),
+    "lamp": add_lamp,
+    "sign": add_sign,
+    "motorcycle": add_motorcycle,
+    "bin": add_bin,
+    "drum": add_drum,
+    "person": add_person,
+}

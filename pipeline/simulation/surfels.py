@@ -1,9 +1,9 @@
-"""A real cloud as something that beams meet: each point a small disc in the surface that its neighbours show.
+"""Surfels: a real cloud as small discs in the surface of the neighbouring points, which beams can meet.
 
-What is measured must be where points are: where the surface bends, as on a trunk, a disc is much smaller
-than the gaps between points, so that a trunk grows no thicker; only flat ground has discs as wide as its
-gaps. In foliage a point is a small ball. So that no beam sees through the gaps of a trunk to the bark on
-its far side, each point of a surface also blocks the beams around it: what lies well behind gives no return.
+Returns must be at the positions of points. Where the surface is curved, as on a trunk, a disc is much smaller
+than the gaps between points, so that a trunk does not get thicker; only on flat ground discs are as wide as
+the gaps. In foliage a point is a small ball. Each point of a surface also blocks the beams around it, so that
+no beam passes through the gaps of a trunk to the bark on its far side.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pipeline.jit import compiled
 from pipeline.types.records import Float, Float32, Int
 
 NEIGHBOURS = 10
-SURFACE, FLAT = 0.35, 0.03  # smallest against middle eigenvalue of the neighbours' covariance
-WIDE, SMALL = 1.0, 0.6  # radius as a part of the distance to its sixth neighbour
+SURFACE, FLAT = 0.35, 0.03  # ratio of smallest to middle eigenvalue of the covariance of the neighbours
+WIDE, SMALL = 1.0, 0.6  # radius as a share of the distance to the sixth neighbour
 LEAST, WIDEST, SMALLEST, BALL = 0.006, 0.10, 0.025, 0.008  # m; of all, of ground, of other discs, of balls
-UPRIGHT = 0.7  # vertical part of the normal from which on a flat surface is ground
-BEHIND = 0.06  # m; what lies farther behind a blocking point is hidden
-GRAZING = 0.15  # sine of the angle between beam and disc below which it is not met
-MELT = 0.04  # m; what a beam meets so close together it measures as one
+UPRIGHT = 0.7  # least vertical component of the normal of flat ground
+BEHIND = 0.06  # m; surfels farther behind a blocking point are hidden
+GRAZING = 0.15  # sine of the angle between beam and disc below which the disc is not met
+MELT = 0.04  # m; hits this close together are measured as one
 _PART = 1 << 17
 
 
@@ -32,7 +32,7 @@ class Surfels:
 
     Attributes:
         points: shape (N, 3) [m]; normals: shape (N, 3), zero for balls; radius: shape (N,) [m].
-        blocks: shape (N,) [m]: how far around it a point hides what lies behind, 0 in foliage.
+        blocks: Radius in which a point hides surfels behind it, 0 in foliage, shape (N,) [m].
     """
 
     points: Float32
@@ -42,7 +42,7 @@ class Surfels:
 
 
 def lay_surfels(points: Float32) -> Surfels:
-    """Surfels on the points of a cloud, shape (N, 3) [m]."""
+    """Return surfels at the points of a cloud, shape (N, 3) [m]."""
     from scipy.spatial import cKDTree
 
     n = len(points)
@@ -79,7 +79,8 @@ def _lay(
             normals[i, 0], normals[i, 1], normals[i, 2] = vectors[0, 0], vectors[1, 0], vectors[2, 0]
             radius[i] = min(max(SMALL * spacing, LEAST), SMALLEST)
             blocks[i] = min(max(WIDE * spacing, LEAST), WIDEST)
-            # The side of a sparsely sampled trunk looks as flat as ground, but wide discs would stand out.
+            # The side of a sparsely sampled trunk seems as flat as ground, but wide discs would protrude from
+            # it.
             if values[0] < FLAT * values[1] and abs(vectors[2, 0]) > UPRIGHT:
                 radius[i] = blocks[i]
 
@@ -97,11 +98,11 @@ def first_surfels(
     ring_step: float,
     farthest: float,
 ) -> Float:
-    """Range [m] of each beam of a sweep, inf where it meets nothing, shape (C, K).
+    """Return the range [m] of each beam of a sweep, infinite when it meets nothing, shape (C, K).
 
-    Each surfel is looked at from where the sensor is when it turns past it, and only the beams within
-    its angle are tested; of what a beam meets the nearest counts, and what lies within MELT behind it
-    is averaged with it, the middle of a disc more than its rim.
+    Each surfel is seen from the pose of the sensor when the beam passes it, and only the beams within its
+    angle are tested. The range is the mean of the nearest hit and of those within MELT behind it, weighted
+    towards the middle of the discs.
 
     Args:
         points, normals, radius, blocks: See `Surfels`.
@@ -117,7 +118,7 @@ def first_surfels(
     v, m = np.empty(3), np.empty(3)
     for i in range(points.shape[0]):
         c = middle
-        for _ in range(2):  # where it stands in the sweep decides from which pose it is seen
+        for _ in range(2):  # the position in the sweep decides from which pose it is seen
             _turn(points[i], R[c], o[c], v)
             c = int((np.pi - np.arctan2(v[1], v[0])) / step + 0.5) % columns
         _turn(points[i], R[c], o[c], v)

@@ -1,4 +1,4 @@
-"""The ground: a smooth analytic height z(x, y), a tilted plane with a few long waves on it."""
+"""Simulated ground: a smooth analytic height z(x, y), a tilted plane with a few long waves."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ TWO_PI = 2.0 * np.pi
 
 @compiled
 def sine_of_turns(turns: float) -> float:
-    """sin(2 pi turns) to 4e-6. Own polynomial without a branch: several times faster than the C
-    library, and the same bits on every machine."""
+    """Return sin(2 pi turns) with an error of 4e-6. The polynomial has no branch: it is several times faster
+    than
+    the C library and gives the same bits on every machine."""
     u = turns - np.floor(turns + 0.5)
     x = 6.283185307179586 * (0.25 - abs(abs(u) - 0.25))
     q = x * x
@@ -26,7 +27,7 @@ def sine_of_turns(turns: float) -> float:
 
 @compiled
 def height_at(terrain: Float, x: float, y: float) -> float:
-    """Height [m] of the packed terrain (see `Terrain.pack`) at one place."""
+    """Return the height [m] of the terrain (see `Terrain.packed`) at one position."""
     z: float = terrain[0, 0] * x + terrain[0, 1] * y + terrain[0, 2]
     for i in range(1, terrain.shape[0]):
         z += terrain[i, 0] * sine_of_turns(terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3])
@@ -35,7 +36,7 @@ def height_at(terrain: Float, x: float, y: float) -> float:
 
 @compiled
 def gradient_at(terrain: Float, x: float, y: float) -> tuple[float, float]:
-    """Slope dz/dx and dz/dy of the packed terrain at one place."""
+    """Return the slope dz/dx and dz/dy of the terrain at one position."""
     gx, gy = terrain[0, 0], terrain[0, 1]
     for i in range(1, terrain.shape[0]):
         turns = terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3]
@@ -67,11 +68,12 @@ class Terrain:
 
     @classmethod
     def grow(cls, slope: float, amplitude: float, shortest: float, rng: np.random.Generator) -> Terrain:
-        """A terrain with height 0 at the origin.
+        """Return a random terrain with height 0 at the origin.
 
         Args:
-            slope: Rise of the plane along x [1].
-            amplitude: Amplitude of the longest wave [m]; the shorter ones are lower in proportion.
+            slope: Slope of the plane along x.
+            amplitude: Amplitude of the longest wave [m]; those of the others are proportional to their
+                length.
             shortest: Shortest wavelength [m].
             rng: Draws directions and phases.
         """
@@ -89,10 +91,10 @@ class Terrain:
         return cls(packed)
 
     def height(self, x: Float, y: Float) -> Float:
-        """Heights [m] at places of shape (N,) [m]."""
+        """Return heights [m] at positions of shape (N,) [m]."""
         return self.evaluate(x, y)[:, 0]
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Height, dz/dx and dz/dy at places of shape (N,) [m]; shape (N, 3)."""
+        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
         result: Float = _evaluate(self.packed, np.ascontiguousarray(x), np.ascontiguousarray(y))
         return result

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.training.scenes import labelled_points, trunks
+from app.training.labelled_scenes import labelled_points, trunks
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.ground.scan_ground import find_terrain

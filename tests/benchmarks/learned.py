@@ -1,6 +1,6 @@
 """What annotations of simulated streets and parks change: `python -m tests.benchmarks.learned`.
 
-Every column of the scenes counts as annotated; scenes are left out as wholes, see `app.training.validating`.
+Every column of the scenes counts as annotated; scenes are left out as wholes, see `app.training.validation`.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from app.training.fit_forest import DOUBTFUL, Examples
-from app.training.scenes import street_examples
-from app.training.validating import Rates, validate
+from app.training.examples import UNKNOWN, Examples
+from app.training.labelled_scenes import street_examples
+from app.training.validation import Rates, validate
 from pipeline.classification.forest import ALL_AROUND, CLASSES, FILE, ONE_WAY, read_forests, standard_forest
 from pipeline.config import Parameters, preset
 from pipeline.types.records import Verdict
@@ -38,7 +38,7 @@ def main() -> None:
 
 def _annotated(place: int, seed: int, one_way: bool, parameters: Parameters) -> Examples:
     last = list(street_examples(seed, one_way, parameters, REACH))[-1]
-    sure = (last.label != DOUBTFUL) & (last.label != CLASSES.index(Verdict.OTHER))
+    sure = (last.label != UNKNOWN) & (last.label != CLASSES.index(Verdict.OTHER))
     axis = last.axis[sure].copy()
     axis[:, 0] += APART * place
     return replace(last, axis=axis, figures=last.figures[sure], label=last.label[sure])

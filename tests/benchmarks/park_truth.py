@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from sklearn.cluster import DBSCAN
 
-from app.training.scenes import LEAST_RETURNS, labelled_points, trunks
+from app.training.labelled_scenes import LEAST_RETURNS, labelled_points, trunks
 from pipeline.types.records import Float
 
 REACH = 25.0  # m

@@ -14,7 +14,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from app.training.streets import simulate_street
 from pipeline.config import Parameters, preset
 from pipeline.detection.cluster_shape import describe_stems
 from pipeline.detection.clustering import cluster
@@ -26,6 +25,7 @@ from pipeline.io.readers import open_source
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing import filters
 from pipeline.preprocessing.acquisition import acquire
+from pipeline.simulation.street_scenes import simulate_street
 from pipeline.types.records import Float, Float32, Sensor, Step
 
 EDGES = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
@@ -75,7 +75,7 @@ def _streets(*, one_way: bool) -> Iterator[Place]:
     for seed in range(200, 230):
         street = simulate_street(seed, one_way=one_way)
         if one_way or street.sensor.rings == 64:
-            yield street.steps[0], street.T_base_lidar, street.sensor, street.trunk[street.seen >= 10]
+            yield street.steps[0], street.T_base_lidar, street.sensor, street.trunk[street.returns >= 10]
 
 
 def _count(place: Place, parameters: Parameters) -> np.ndarray[tuple[int, int], np.dtype[np.int64]]:

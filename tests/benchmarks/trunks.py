@@ -21,9 +21,9 @@ import numpy as np
 
 from app.common.timers import Stopwatch
 from app.training.augmentation import FOLDER, copies, is_of
-from app.training.fit_forest import Examples, as_json, can_grow, grow_all
-from app.training.keeping import read_examples
-from app.training.scenes import labelled_points, trunks
+from app.training.examples import Examples, read_examples
+from app.training.fit_forest import as_json, can_fit, fit_all
+from app.training.labelled_scenes import labelled_points, trunks
 from pipeline.classification.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, package_alone
 from pipeline.config import preset
 from pipeline.evaluation import evaluate
@@ -172,10 +172,10 @@ def _grown_without(scene: Path, examples: list[Examples], pasted: list[Examples]
     if len(others) == len(examples):
         raise SystemExit(f"the examples know no scene {scene}: train with the same path")
     kind = ALL_AROUND if next(e for e in examples if e not in others).all_around else ONE_WAY
-    if not can_grow(others, kind):
+    if not can_fit(others, kind):
         raise SystemExit(f"no other scene teaches a sensor that looks {kind}")
     beside = [e for e in pasted if not is_of(e.scene, str(scene))]
-    return forest_of(as_json(grow_all(others, beside, (kind,), draw), []), kind)
+    return forest_of(as_json(fit_all(others, beside, (kind,), draw), []), kind)
 
 
 def _simulated(scene: str, seeds: list[int], every: int) -> None:

@@ -1,6 +1,6 @@
-"""Records to words, numbers and one block of arrays, and back by the types that the records declare.
+"""Records as JSON and one block of arrays; decoding follows the types that the records declare.
 
-Nothing in the file chooses what is built: the reader asks for a record and takes what its fields want.
+The file does not choose what is built: the reader names the type of the record, and its fields decide.
 """
 
 from __future__ import annotations
@@ -10,34 +10,57 @@ import types
 import typing
 from collections import Counter
 from dataclasses import fields, is_dataclass
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from functools import cache
+from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
 R = TypeVar("R")
-NOT_SAVED = "not saved"  # in the metadata of a field: it is left out, and begins by its default
+NOT_SAVED = "not saved"  # in the metadata of a field that is not saved and gets its default
 _ALIGN = 8
+_hints = cache(typing.get_type_hints)
+
+
+@cache
+def _saved(kind: type) -> tuple[str, ...]:
+    """The names of the fields of a record that are saved."""
+    return tuple(f.name for f in fields(kind) if not f.metadata.get(NOT_SAVED))
+
+
+@cache
+def _origin_and_args(kind: Any) -> tuple[Any, tuple[Any, ...]]:  # noqa: ANN401
+    return get_origin(kind), get_args(kind)
 
 
 class _Blob:
-    """Arrays behind one another, each at a multiple of eight bytes."""
+    """Bytes of arrays, each at a multiple of eight bytes; see `encode` for `planes`."""
 
-    def __init__(self) -> None:
+    def __init__(self, planes: bool) -> None:
         self.parts: list[bytes] = []
         self.length = 0
+        self._planes = planes
 
     def add(self, array: np.ndarray[Any, Any]) -> dict[str, Any]:
         data = np.ascontiguousarray(array)
         at = self.length
-        raw = data.tobytes()
+        raw = (
+            data.reshape(-1).view(np.uint8).reshape(-1, data.itemsize).T.tobytes()
+            if self._planes
+            else data.tobytes()
+        )
         self.parts.append(raw + b"\0" * (-len(raw) % _ALIGN))
         self.length += len(self.parts[-1])
         return {"dtype": data.dtype.newbyteorder("<").str, "shape": list(array.shape), "at": at}
 
 
-def encode(record: Any) -> tuple[Any, bytes]:  # noqa: ANN401 - any record
-    """A record of arrays, numbers, words, tuples and other records as JSON and the bytes of its arrays."""
-    blob = _Blob()
+def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: ANN401 - any record
+    """Return a record of arrays, numbers, texts, tuples and other records as JSON and the bytes of its
+    arrays.
+
+    With `planes` the first bytes of all numbers of an array come first, then the second ones, and so on,
+    because these compress better.
+    """
+    blob = _Blob(planes)
     tree = _encoded(record, blob)
     return tree, b"".join(blob.parts)
 
@@ -46,8 +69,7 @@ def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
     if isinstance(value, np.ndarray):
         return blob.add(value)
     if is_dataclass(value) and not isinstance(value, type):
-        saved = [f.name for f in fields(value) if not f.metadata.get(NOT_SAVED)]
-        return {name: _encoded(getattr(value, name), blob) for name in saved}
+        return {name: _encoded(getattr(value, name), blob) for name in _saved(type(value))}
     if isinstance(value, tuple | list):
         return [_encoded(part, blob) for part in value]
     if isinstance(value, dict):
@@ -61,19 +83,26 @@ def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
     raise TypeError(f"{type(value).__name__} cannot be saved")
 
 
-def decode(kind: type[R], tree: Any, blob: bytes) -> R:  # noqa: ANN401
-    """The record of a kind that was encoded.
+def decode(kind: type[R], tree: Any, blob: bytes, *, planes: bool = False) -> R:  # noqa: ANN401
+    """Return the record of a type that was encoded, see `encode`.
 
     Raises:
-        ValueError: A field is missing or too much, or has another type, or an array does not lie in the
+        ValueError: A field is missing or unknown, or has another type, or an array is not inside of the
             block.
     """
-    result: R = _decoded(kind, tree, blob, kind.__name__)
+    result: R = _decoded(kind, tree, _Block(blob, planes), kind.__name__)
     return result
 
 
-def _decoded(kind: Any, tree: Any, blob: bytes, name: str) -> Any:  # noqa: ANN401
-    origin, of = get_origin(kind), get_args(kind)
+class _Block(NamedTuple):
+    """Bytes of arrays, and whether they are arranged in planes."""
+
+    raw: bytes
+    planes: bool
+
+
+def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN401
+    origin, of = _origin_and_args(kind)
     if origin is np.ndarray:
         return _array(get_args(of[1])[0], tree, blob, name)
     if origin in (Union, types.UnionType):
@@ -88,35 +117,35 @@ def _decoded(kind: Any, tree: Any, blob: bytes, name: str) -> Any:  # noqa: ANN4
         return Counter(_decoded(dict[str, int], tree, blob, name))
     if origin is dict:
         if not isinstance(tree, dict):
-            raise ValueError(f"{name} is no table")
+            raise ValueError(f"{name} is not a table")
         return {str(k): _decoded(of[1], part, blob, f"{name}.{k}") for k, part in tree.items()}
     if origin is Literal:
         if tree not in of:
-            raise ValueError(f"{name} is none of {of}")
+            raise ValueError(f"{name} is not one of {of}")
         return tree
     if isinstance(kind, type) and issubclass(kind, tuple):  # a NamedTuple, saved as a row
-        hints = typing.get_type_hints(kind)
+        hints = _hints(kind)
         return kind(*_tuple(tuple(hints.values()), tree, blob, name))
     if is_dataclass(kind):
         return _record(kind, tree, blob, name)
     return _number(kind, tree, name)
 
 
-def _record(kind: Any, tree: Any, blob: bytes, name: str) -> Any:  # noqa: ANN401
-    wanted = [f.name for f in fields(kind) if not f.metadata.get(NOT_SAVED)]
+def _record(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN401
+    wanted = _saved(kind)
     if not isinstance(tree, dict) or set(tree) != set(wanted):
-        raise ValueError(f"{name} has not the parts that this version knows")
-    kinds = typing.get_type_hints(kind)
+        raise ValueError(f"{name} does not have the fields of this version")
+    kinds = _hints(kind)
     return kind(**{part: _decoded(kinds[part], tree[part], blob, f"{name}.{part}") for part in wanted})
 
 
-def _tuple(of: tuple[Any, ...], tree: Any, blob: bytes, name: str) -> tuple[Any, ...]:  # noqa: ANN401
+def _tuple(of: tuple[Any, ...], tree: Any, blob: _Block, name: str) -> tuple[Any, ...]:  # noqa: ANN401
     if not isinstance(tree, list):
-        raise ValueError(f"{name} is no row")
+        raise ValueError(f"{name} is not a list")
     if len(of) == 2 and of[1] is Ellipsis:
         return tuple(_decoded(of[0], part, blob, name) for part in tree)
     if len(tree) != len(of):
-        raise ValueError(f"{name} has {len(tree)} parts, not {len(of)}")
+        raise ValueError(f"{name} has {len(tree)} elements, not {len(of)}")
     return tuple(_decoded(k, part, blob, name) for k, part in zip(of, tree, strict=True))
 
 
@@ -129,19 +158,24 @@ def _number(kind: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
         return tree
     if kind in (bool, str) and isinstance(tree, kind):
         return tree
-    raise ValueError(f"{name} = {str(tree)[:40]!r} is no {getattr(kind, '__name__', kind)}")
+    raise ValueError(f"{name} = {str(tree)[:40]!r} is not of type {getattr(kind, '__name__', kind)}")
 
 
-def _array(scalar: Any, tree: Any, blob: bytes, name: str) -> np.ndarray[Any, Any]:  # noqa: ANN401
+def _array(scalar: Any, tree: Any, blob: _Block, name: str) -> np.ndarray[Any, Any]:  # noqa: ANN401
     dtype = np.dtype(scalar)
     if not isinstance(tree, dict) or tree.get("dtype") != dtype.newbyteorder("<").str:
-        raise ValueError(f"{name} is no array of {dtype}")
+        raise ValueError(f"{name} is not an array of {dtype}")
     shape: Any = tree.get("shape")
     at: Any = tree.get("at")
     if not isinstance(shape, list) or not shape or not all(type(n) is int and n >= 0 for n in (*shape, at)):
-        raise ValueError(f"{name} has no shape")
+        raise ValueError(f"{name} has no valid shape")
     count = math.prod(shape)
-    if len(shape) > 8 or at + count * dtype.itemsize > len(blob):
-        raise ValueError(f"{name} does not lie in the block of arrays")
-    flat = np.frombuffer(blob, dtype.newbyteorder("<"), count, at)
+    if len(shape) > 8 or at + count * dtype.itemsize > len(blob.raw):
+        raise ValueError(f"{name} is not inside of the block of arrays")
+    flat: np.ndarray[Any, Any]
+    if blob.planes:
+        raw = np.frombuffer(blob.raw, np.uint8, count * dtype.itemsize, at).reshape(dtype.itemsize, count)
+        flat = np.ascontiguousarray(raw.T).view(dtype.newbyteorder("<"))
+    else:
+        flat = np.frombuffer(blob.raw, dtype.newbyteorder("<"), count, at)
     return flat.reshape(shape).astype(dtype)

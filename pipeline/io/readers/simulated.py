@@ -8,11 +8,9 @@ from urllib.parse import urlencode
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceDescription, SourceOptions
-from pipeline.simulation.inertial import IMU_HZ
+from pipeline.simulation.motion_sensors import IMU_HZ, ODOMETRY_HZ
 from pipeline.simulation.run import START_NS, SimulatedRun, open_run
-from pipeline.simulation.scenarios import scenarios
-from pipeline.simulation.uri import CLOUD, SCHEME, RunRequest, parse_uri
-from pipeline.simulation.wheels import ODOMETRY_HZ
+from pipeline.simulation.scenarios import CLOUD, SCHEME, RunRequest, parse_uri, scenarios
 from pipeline.types.records import Record, Truth
 
 __all__ = ["SimulatedSource", "open_simulated", "scenarios"]

@@ -10,13 +10,15 @@ import pytest
 
 from app.training import augmentation
 from app.training.augmentation import _seen_with, digest_of, is_of, name_of_copy, paste, pasted_examples
-from app.training.fit_forest import POLE as POLE_CLASS
-from app.training.fit_forest import TREE, Examples
-from app.training.scene_objects import POLE
-from app.training.streets import simulate_street
+from app.training.examples import POLE as POLE_CLASS
+from app.training.examples import TREE, Examples
+from app.training.labelled_scenes import LABELS
 from pipeline.classification.features import COUNT
 from pipeline.config import preset
 from pipeline.simulation.primitives import SolidsBuilder
+from pipeline.simulation.street_scenes import simulate_street
+
+POLE = LABELS["pole"]
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +31,7 @@ def park(tmp_path_factory):
     first = 0
     for k, step in enumerate(street.steps):
         points = step.scan.points
-        label = street.label[first : first + len(points)].astype("<u4")
+        label = np.array([LABELS[kind] for kind in street.kind[first : first + len(points)]], "<u4")
         first += len(points)
         np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(
             folder / "velodyne" / f"{k:06d}.bin"

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from app.cli import main
-from app.training.fit_forest import Examples
-from app.training.keeping import read_examples, stored_or_computed
+from app.training.examples import Examples, read_examples, stored_or_computed
 from pipeline.errors import StemmapError
 
 

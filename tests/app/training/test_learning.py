@@ -16,12 +16,12 @@ from app.cli import main
 from app.dashboard.parameters import ParameterState
 from app.store.records import Author, Content
 from app.store.store import Store
-from app.training.annotated_runs import CLASS_OF_KIND, SEEN, ExampleCollector, object_numbers
-from app.training.expanding import PRIOR, all_expanded, expanded
-from app.training.fit_forest import PLANS, TREE, Examples
+from app.training.annotated_runs import CLASS_OF_KIND, SEEN, ExampleCollector
+from app.training.examples import TREE, Examples, object_numbers
+from app.training.fit_forest import PRIOR, SETTINGS, all_expanded, expanded
 from app.training.learned_forests import FOLDER, Forests, name_of
 from app.training.learning import LEAST_OTHERS, LEAST_TREES, seen_by, what_lacks
-from app.training.validating import SAME_PLACE, Rates, fold_of, groups_of, validate
+from app.training.validation import SAME_PLACE, Rates, fold_of, groups_of, validate
 from pipeline.classification import no_columns
 from pipeline.classification.features import COUNT, NAMES
 from pipeline.classification.forest import ALL_AROUND, CLASSES, FILE, FREE_END, ONE_WAY, forest_of, vote
@@ -87,19 +87,21 @@ def test_two_annotations_never_share_a_column():
 # --- what is learned ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", PLANS)
+@pytest.mark.parametrize("kind", SETTINGS)
 def test_a_leaf_says_what_it_said_and_what_is_new_by_their_weights(kind):
     n, share = 4, np.array(LEAF["share"])
     label = np.full(n, POLE)
-    (leaf,) = expanded([LEAF], PLANS[kind], np.zeros((n, COUNT)), label, np.arange(n), seed=0)
-    said = n * PLANS[kind].upright * np.eye(len(CLASSES))[POLE]
+    (leaf,) = expanded([LEAF], SETTINGS[kind], np.zeros((n, COUNT)), label, np.arange(n), seed=0)
+    said = n * SETTINGS[kind].upright * np.eye(len(CLASSES))[POLE]
     assert leaf["share"] == pytest.approx((PRIOR * share + said) / (PRIOR + said.sum()), abs=0.006)
 
 
 def test_a_thing_counts_once_however_many_examples_it_gave():
     figures, label = np.zeros((6, COUNT)), np.array([POLE] * 5 + [TREE])
-    once = expanded([LEAF], PLANS[ALL_AROUND], figures[4:], label[4:], np.array([0, 1]), seed=0)
-    assert expanded([LEAF], PLANS[ALL_AROUND], figures, label, np.array([0, 0, 0, 0, 0, 1]), seed=0) == once
+    once = expanded([LEAF], SETTINGS[ALL_AROUND], figures[4:], label[4:], np.array([0, 1]), seed=0)
+    assert (
+        expanded([LEAF], SETTINGS[ALL_AROUND], figures, label, np.array([0, 0, 0, 0, 0, 1]), seed=0) == once
+    )
 
 
 def test_what_nothing_new_is_known_of_stays_and_what_contradicts_is_told_apart():
@@ -109,12 +111,12 @@ def test_what_nothing_new_is_known_of_stays_and_what_contradicts_is_told_apart()
     figures = np.zeros((40, COUNT))
     figures[:, tilt] = rng.uniform(0.0, 5.0, 40)
     label = np.where(figures[:, tilt] > 2.5, POLE, TREE)
-    trees = expanded([tree] * 60, PLANS[ALL_AROUND], figures, label, np.arange(40), seed=0)
+    trees = expanded([tree] * 60, SETTINGS[ALL_AROUND], figures, label, np.arange(40), seed=0)
     assert all(each["no"] == LEAF for each in trees)
     forest = forest_of(data(**{ALL_AROUND: trees}), ALL_AROUND)
     votes = vote(figures, forest)[:, 0]
     assert votes[label == TREE].min() > votes[label == POLE].max()
-    assert trees == expanded([tree] * 60, PLANS[ALL_AROUND], figures, label, np.arange(40), seed=0)
+    assert trees == expanded([tree] * 60, SETTINGS[ALL_AROUND], figures, label, np.arange(40), seed=0)
 
 
 def ending_in_free_air(n: int):
@@ -316,4 +318,4 @@ def true_things(uri: str) -> tuple[str, list[Content]]:
 def test_the_package_forest_is_one_that_can_be_kept(tmp_path):
     package = json.loads(FILE.read_text())
     forests = Forests(tmp_path)
-    assert len(forests(forests.keep(package), False).root) == PLANS[ONE_WAY].trees
+    assert len(forests(forests.keep(package), False).root) == SETTINGS[ONE_WAY].trees

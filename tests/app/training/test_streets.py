@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.training.fit_forest import DOUBTFUL, TREE
-from app.training.scene_objects import FOLIAGE, GROUND, POLE, TRUNK, Furniture
-from app.training.scenes import street_examples
-from app.training.streets import CONE, simulate_street
+from app.training.examples import TREE, UNKNOWN
+from app.training.labelled_scenes import street_examples
 from pipeline.config import preset
+from pipeline.simulation.lidar import CONE
+from pipeline.simulation.scene_objects import SceneBuilder, add_sign
+from pipeline.simulation.street_scenes import simulate_street
 from pipeline.simulation.terrain import Terrain
 
 
@@ -22,15 +23,15 @@ def test_the_same_seed_gives_the_same_street(street):
     one_way, first = street
     again = simulate_street(204, one_way=one_way)
     np.testing.assert_array_equal(first.points, again.points)
-    np.testing.assert_array_equal(first.label, again.label)
+    np.testing.assert_array_equal(first.kind, again.kind)
     assert len(simulate_street(205, one_way=one_way).points) != len(first.points)
 
 
 def test_every_return_has_a_label(street):
     _, scene = street
-    assert sum(len(step.scan.points) for step in scene.steps) == len(scene.points) == len(scene.label)
-    assert {GROUND, FOLIAGE} <= set(scene.label.tolist())
-    assert scene.seen.sum() == np.count_nonzero(scene.label == TRUNK)
+    assert sum(len(step.scan.points) for step in scene.steps) == len(scene.points) == len(scene.kind)
+    assert {"ground", "foliage"} <= set(scene.kind.tolist())
+    assert scene.returns.sum() == np.count_nonzero(scene.kind == "trunk")
 
 
 def test_a_sensor_that_looks_one_way_sees_a_cone(street):
@@ -43,25 +44,25 @@ def test_a_sensor_that_looks_one_way_sees_a_cone(street):
 
 def test_trunks_stand_where_their_returns_are():
     scene = simulate_street(204, one_way=False)
-    sure = scene.trunk[scene.seen >= 30]
-    returns = scene.points[scene.label == TRUNK][:, :2]
+    sure = scene.trunk[scene.returns >= 30]
+    returns = scene.points[scene.kind == "trunk"][:, :2]
     assert len(sure)
     for place in sure:
         assert np.count_nonzero(np.hypot(*(returns - place).T) < 1.5) >= 30
 
 
 def test_a_sign_is_a_pole_and_its_plate():
-    furniture = Furniture(Terrain.grow(0.0, 0.0, 9.0, np.random.default_rng(0)), np.random.default_rng(1))
-    furniture.sign(3.0, 1.0)
-    solids = furniture.solids()
-    assert furniture.classes[solids.owner[0]] == POLE
+    scene = SceneBuilder(Terrain(np.zeros((1, 4))), np.random.default_rng(1))
+    add_sign(scene, 3.0, 1.0)
+    solids = scene.solids.build()
+    assert scene.kinds[solids.owner[0]] == "pole"
     assert len(solids) >= 2
-    assert not furniture.trunks
+    assert not scene.trunks
 
 
 def test_examples_of_a_street_know_trees_and_other_things():
     examples = list(street_examples(204, False, preset("forest"), 25.0))
     label = examples[-1].label
     assert np.count_nonzero(label == TREE) > 0
-    assert np.count_nonzero((label != TREE) & (label != DOUBTFUL)) > 0
+    assert np.count_nonzero((label != TREE) & (label != UNKNOWN)) > 0
     assert np.hypot(*examples[-1].axis[:, :2].T).max() < 25.0

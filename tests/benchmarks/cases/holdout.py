@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from tests.benchmarks.table import Cell, Table
 
 if TYPE_CHECKING:
-    from app.training.fit_forest import Examples
+    from app.training.examples import Examples
     from pipeline.classification.forest import Forest
     from pipeline.types.records import Float
 
@@ -127,7 +127,7 @@ def _outcome(scene: Path, forest: Forest) -> Outcome:
     """One scene mapped by the whole mapper."""
     import numpy as np
 
-    from app.training.scenes import labelled_points, trunks
+    from app.training.labelled_scenes import labelled_points, trunks
     from pipeline.evaluation.matching import match
     from tests.benchmarks.classes import ByClass
     from tests.benchmarks.trunks import mapped
@@ -152,8 +152,8 @@ def _training_examples() -> tuple[list[Examples], list[Examples]]:
     from functools import partial
 
     from app.training.augmentation import FOLDER, copies
-    from app.training.keeping import stored_or_computed
-    from app.training.scenes import labelled_examples, stand_examples, stand_name, street_examples
+    from app.training.examples import stored_or_computed
+    from app.training.labelled_scenes import labelled_examples, stand_examples, stand_name, street_examples
     from pipeline.config import preset
 
     kept = examples_folder()
@@ -197,14 +197,14 @@ def _fitted_without(
 ) -> Forest:
     """The classifier fitted to all scenes but these."""
     from app.training.augmentation import is_of
-    from app.training.fit_forest import as_json, grow_all
+    from app.training.fit_forest import as_json, fit_all
     from pipeline.classification.forest import ALL_AROUND, ONE_WAY, forest_of
 
     left_out = {str(scene) for scene in scenes}
     others = [e for e in examples if e.scene not in left_out]
     copies = [e for e in pasted if not any(is_of(e.scene, scene) for scene in left_out)]
     kind = ALL_AROUND if scenes[0] == STREET else ONE_WAY
-    return forest_of(as_json(grow_all(others, copies, (kind,), seed), []), kind)
+    return forest_of(as_json(fit_all(others, copies, (kind,), seed), []), kind)
 
 
 def _whole_clouds() -> Table:

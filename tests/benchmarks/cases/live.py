@@ -42,7 +42,7 @@ def record_drive(place: Path) -> int:
     from pipeline.io.recording import write_recording
     from pipeline.simulation.lidar import SpinningLidar
     from pipeline.simulation.run import open_run
-    from pipeline.simulation.uri import parse_uri
+    from pipeline.simulation.scenarios import parse_uri
     from pipeline.types.records import Scan
 
     uri = f"sim:stand?duration={SECONDS:g}"

@@ -7,7 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from app.training.fit_forest import DOUBTFUL, PLANS, Examples, as_json, grow, grow_free_end, shares
+from app.training.examples import UNKNOWN, Examples
+from app.training.fit_forest import SETTINGS, FittedForest, as_json, fit, fit_free_end
 from pipeline.classification.features import COUNT, NAMES
 from pipeline.classification.forest import (
     ALL_AROUND,
@@ -72,6 +73,12 @@ def test_a_file_that_is_missing_too_large_or_no_json_is_refused(tmp_path):
         read_forest(file, ONE_WAY)
 
 
+def shares(fitted: FittedForest, figures):
+    """Votes of a fitted forest in the order of CLASSES, shape (N, classes)."""
+    leaf = fitted.trees.apply(figures[:, : fitted.trees.n_features_in_].astype(np.float32))
+    return np.mean([share[leaf[:, k]] for k, share in enumerate(fitted.share)], axis=0)
+
+
 def test_the_forest_of_the_package_votes_in_shares():
     figures = np.random.default_rng(0).uniform(-1.0, 5.0, (50, COUNT))
     for all_around in (True, False):
@@ -85,17 +92,17 @@ def test_what_was_grown_votes_the_same_as_json():
     rng = np.random.default_rng(1)
     figures = rng.uniform(0.0, 1.0, (300, COUNT))
     label = np.where(figures[:, 3] > 0.5, 0, 1 + (figures[:, 5] > 0.5))
-    label[:20] = DOUBTFUL
+    label[:20] = UNKNOWN
     examples = [
-        Examples("a", False, kind == ALL_AROUND, np.zeros((300, 5)), figures, label) for kind in PLANS
+        Examples("a", False, kind == ALL_AROUND, np.zeros((300, 5)), figures, label) for kind in SETTINGS
     ]
-    for kind in PLANS:
-        grown = grow(examples, kind)
+    for kind in SETTINGS:
+        grown = fit(examples, kind)
         forest = forest_of(as_json({kind: grown}, []), kind)
         ours, theirs = vote(figures.astype(np.float32).astype(np.float64), forest), shares(grown, figures)
         # Thresholds are rounded to four digits: a figure that lies within the rounding may turn.
         assert np.mean(np.abs(ours - theirs).max(axis=1) < 0.02) > 0.95
-        sure = label != DOUBTFUL
+        sure = label != UNKNOWN
         assert np.mean((ours[sure, 0] >= 0.5) == (label[sure] == 0)) > 0.95
 
 
@@ -105,7 +112,7 @@ def test_the_same_examples_grow_the_same_trees():
     examples = [
         Examples("a", False, True, np.zeros((100, 5)), figures, (figures[:, 0] > 0.5).astype(np.int64))
     ]
-    assert as_json({"k": grow(examples, ALL_AROUND)}, []) == as_json({"k": grow(examples, ALL_AROUND)}, [])
+    assert as_json({"k": fit(examples, ALL_AROUND)}, []) == as_json({"k": fit(examples, ALL_AROUND)}, [])
 
 
 def ending(top: float, free: float):
@@ -147,9 +154,9 @@ def test_poles_that_end_in_free_air_are_told_by_what_was_pasted():
     figures[:, NAMES.index("thick")] = rng.uniform(0.0, 0.2, 200)
     label = (figures[:, NAMES.index("thick")] < 0.1).astype(np.int64)
     pasted = Examples("a with poles 0", True, False, np.zeros((200, 5)), figures, label)
-    grown = grow_free_end([pasted])
+    grown = fit_free_end([pasted])
     assert grown is not None
     assert np.mean((shares(grown, figures)[:, 0] >= 0.5) == (label == 0)) > 0.95
-    assert grow_free_end([]) is None
+    assert fit_free_end([]) is None
     low = Examples("a with poles 1", True, False, np.zeros((200, 5)), np.zeros((200, COUNT)), label)
-    assert grow_free_end([low]) is None
+    assert fit_free_end([low]) is None

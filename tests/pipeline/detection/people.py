@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.simulation.persons import Person
 from pipeline.simulation.run import SimulatedRun, open_run
-from pipeline.simulation.scenarios import Scenario
+from pipeline.simulation.scenarios import EXACT, RunRequest, Scenario
+from pipeline.simulation.scene import Person
 from pipeline.simulation.scene_objects import person
 from pipeline.simulation.terrain import Terrain
-from pipeline.simulation.uri import EXACT, RunRequest
 from pipeline.types.records import Float
 
 STRIDE, STEP_HZ = 0.42, 0.9

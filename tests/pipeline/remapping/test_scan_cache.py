@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
 from pipeline.front_end import SegmentedScan
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import encode
 from pipeline.remapping import Rerun, ScanCache, ScanCaches, scan_cache
-from pipeline.remapping.packing import HIGHEST
+from pipeline.remapping.packing import HIGHEST, unpack
 from pipeline.remapping.scan_cache import SUFFIX
 from pipeline.types.records import PoseMeasurement, Scan, Step, Turn
 from tests.pipeline.remapping.mapped import BASE, fill, frames, mapper, run
@@ -80,7 +81,7 @@ def test_a_scan_comes_back_whole(cache):
         assert encode(found) == encode(wanted)
         wanted_step = replace(
             step, index=k, scan=Scan(step.scan.stamp_ns, nothing), T_odom_base=again.T_odom_base,
-            roll=0.0, pitch=0.0, tilt_known=False, twist=(0.0, 0.0, 0.0), turn_rate=None, learnt=again.learnt,
+            learnt=again.learnt,
         )  # fmt: skip
         assert encode(again) == encode(wanted_step)
         assert (again.T_odom_base is None) == (k == 4)
@@ -228,3 +229,11 @@ def test_the_files_opened_longest_ago_go_when_the_folder_is_full(folder, monkeyp
     with closing(held), closing(ScanCaches(folder, "source")) as caches:
         assert len(caches.of(BASE)) == SCANS
         assert [path.exists() for path in older] == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    "block", [b"", b"no Zstandard at all", zstandard.compress(b"\xff"), zstandard.compress(b"\xff" * 9)]
+)
+def test_a_block_that_is_damaged_is_a_value_error(block):
+    with pytest.raises(ValueError, match=r"[Zz]standard|frame|content|size|cut|JSON"):
+        unpack(block)

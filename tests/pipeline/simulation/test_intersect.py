@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.simulation.intersect import (
+from pipeline.simulation.primitives import BOX, CONE, ELLIPSOID, SolidsBuilder
+from pipeline.simulation.ray_casting import (
     ground_incidence,
     meet_box,
     meet_cone,
     meet_ellipsoid,
     meet_ground,
     solid_incidence,
-    stand_on,
+    waves_at,
 )
-from pipeline.simulation.primitives import BOX, CONE, ELLIPSOID, SolidsBuilder
 from pipeline.simulation.terrain import Terrain
 from pipeline.types.records import Float
 from tests.pipeline.simulation import oracle
@@ -33,7 +33,7 @@ def random_rays(rng: np.random.Generator, count: int = 400) -> tuple[Float, Floa
 
 def ground_range(terrain: Terrain, o: Float, d: Float, farthest: float = 100.0) -> float:
     waves, space = np.empty((terrain.packed.shape[0], 3)), np.empty(terrain.packed.shape[0])
-    stand_on(terrain.packed, o, waves)
+    waves_at(terrain.packed, o, waves)
     return meet_ground(terrain.packed, waves, d, farthest, space)
 
 

@@ -7,13 +7,18 @@ import pytest
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.simulated import open_simulated
-from pipeline.simulation.inertial import GRAVITY, inertial_readings
-from pipeline.simulation.motion import lay_on_terrain, rotations
-from pipeline.simulation.odometry_quality import QUALITIES
-from pipeline.simulation.scenarios import SCENARIOS, Scenario
+from pipeline.simulation.motion_sensors import GRAVITY, inertial_readings, wheel_odometry
+from pipeline.simulation.robot_motion import (
+    RATE_HZ,
+    Course,
+    drive_course,
+    lap_time,
+    lay_course,
+    lay_on_terrain,
+    rotations,
+)
+from pipeline.simulation.scenarios import QUALITIES, SCENARIOS, Scenario
 from pipeline.simulation.terrain import Terrain
-from pipeline.simulation.trajectory import RATE_HZ, Course, drive_course, lap_time, lay_course
-from pipeline.simulation.wheels import wheel_odometry
 from pipeline.types.records import Float
 
 FLAT = Terrain(np.zeros((1, 4)))

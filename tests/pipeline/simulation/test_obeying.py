@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from pipeline.config import Parameters
-from pipeline.errors import UsageError
 from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose2
-from pipeline.simulation.obstacle_aware_driver import SPEED, ObeyingDrive
+from pipeline.simulation.obstacle_aware_driver import obstacle_aware_drive
+from pipeline.simulation.robot_motion import RATE_HZ, lay_course, speed_limit
 from pipeline.simulation.run import MOUNTING, SimulatedRun, open_run
-from pipeline.simulation.trajectory import RATE_HZ, lay_course
-from pipeline.simulation.uri import parse_uri
+from pipeline.simulation.scenarios import parse_uri
 from pipeline.types.clearance import Zone
 from pipeline.types.records import Step
 
@@ -67,30 +66,19 @@ def test_the_pipeline_tells_the_same_of_the_standing_robot():
     assert clearance.zone is Zone.STOP
 
 
-def test_the_same_request_drives_the_same_way_and_can_be_told_to_ignore():
+def test_the_same_request_drives_the_same_path():
     request = parse_uri("sim:crossing?duration=3")
     first, second = open_run(request).motion.drive, open_run(request).motion.drive
     np.testing.assert_array_equal(first.x, second.x)
-    ignoring = parse_uri("sim:crossing?obstacles=ignore&duration=30")
-    assert open_run(ignoring).motion.drive.x[-1] > 18.0
-    assert (
-        open_run(request).digest() != open_run(parse_uri("sim:crossing?duration=3&obstacles=ignore")).digest()
-    )
-    assert parse_uri("sim:stand?obstacles=obey").obeys
-    with pytest.raises(UsageError, match="obstacles"):
-        parse_uri("sim:stand?obstacles=perhaps")
 
 
-def test_a_loop_goes_round_and_a_blind_robot_stands():
+def test_on_a_loop_the_robot_keeps_to_the_course_and_to_its_speed():
     angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
     course = lay_course(np.stack([2.0 * np.cos(angle), 2.0 * np.sin(angle)], axis=1), closed=True)
-    robot = ObeyingDrive(course, 0.9, crossing().scene, MOUNTING, 1)
-    for _ in range(250):
-        robot._advance(SPEED[Zone.CLEAR])
-    drive = robot._drive(0)
+    drive, clearances = obstacle_aware_drive(course, 0.9, crossing().scene, MOUNTING, 1, 20.0)
     assert drive.yaw[-1] > 2.0 * np.pi
+    assert drive.speed.max() <= speed_limit(course, 0.9).max() + 1e-9
+    assert {clearance.zone for clearance in clearances} <= set(Zone)
     np.testing.assert_allclose(
         np.hypot(np.diff(drive.x), np.diff(drive.y)) * RATE_HZ, drive.speed[1:], atol=0.02
     )
-    robot._advance(SPEED[Zone.UNKNOWN])
-    assert robot._speeds[-1] < drive.speed[-1]

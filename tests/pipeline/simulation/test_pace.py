@@ -7,15 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.simulation.speed_profile import (
+from pipeline.simulation.robot_motion import (
     ACCELERATION,
+    RATE_HZ,
     YAW_GAIN,
     YAW_RATE,
     Spin,
+    drive_course,
+    lap_time,
+    lay_course,
     sharp_cells,
     within_gains,
 )
-from pipeline.simulation.trajectory import RATE_HZ, drive_course, lap_time, lay_course
 from tests.pipeline.strategies import FEW, LAW
 
 SPEED = 0.6

@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.simulated import open_simulated
-from pipeline.simulation.persons import Person
 from pipeline.simulation.primitives import CONE
 from pipeline.simulation.scenarios import SCENARIOS, scenarios
+from pipeline.simulation.scene import Person
 from pipeline.simulation.terrain import Terrain
 
 

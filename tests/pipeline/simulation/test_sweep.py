@@ -39,9 +39,8 @@ def only(solids: Solids, keep: Bool) -> Solids:
 def test_every_ray_of_a_moving_sweep_agrees_with_testing_all_shapes(uri, k):
     run = open_simulated(uri).run
     lidar, terrain = run.lidar, run.scene.terrain
-    times = (k * lidar.period_ns + lidar.column_offsets_ns().astype(np.int64)) / 1e9
-    R, o = run.motion.sensor_at(times, run.T_base_lidar)
-    bodies = [run.scene.person_solids(n, float(times[0])) for n in range(len(run.scene.persons))]
+    times, R, o = run.sensor_poses(k)
+    bodies = [person.solids(float(times[0]), terrain) for person in run.scene.persons]
     solids = run.scene.still
     for body in bodies:
         solids = solids.join(body)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.errors import SourceError
-from pipeline.simulation.uri import parse_uri
+from pipeline.simulation.scenarios import parse_uri
 
 
 def test_defaults_are_those_of_the_scenario():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from app.training.augmentation import name_of_copy
-from app.training.fit_forest import POLE, TREE, Examples
-from app.training.leave_one_out import leave_one_out
+from app.training.examples import POLE, TREE, Examples
+from app.training.validation import leave_one_out
 from pipeline.classification.features import COUNT, NAMES
 
 N = 40  # examples of each

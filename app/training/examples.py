@@ -1,18 +1,58 @@
-"""Stores training examples on disk, because simulating many scenes takes minutes."""
+"""Training examples: voxel columns with their true class, and their storage on disk."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from app.training.fit_forest import Examples
+from pipeline.classification.forest import CLASSES
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
+from pipeline.types.records import Float, Int, Verdict
+
+UNKNOWN = -1
+TREE = CLASSES.index(Verdict.TREE)
+POLE = CLASSES.index(Verdict.POLE)
+UPRIGHT = (POLE, CLASSES.index(Verdict.PERSON))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Examples:
+    """Columns of one scene with their true class.
+
+    Attributes:
+        scene: Name of the scene. All examples of a scene are used for training, or all for validation.
+        simulated: Whether the scene is simulated.
+        all_around: Whether its sensor sees all around.
+        axis: Axes of the columns, shape (N, 5), see `find_columns`.
+        figures: Features, shape (N, features).
+        label: Index in CLASSES, UNKNOWN where the class cannot be decided, int64, shape (N,).
+    """
+
+    scene: str
+    simulated: bool
+    all_around: bool
+    axis: Float
+    figures: Float
+    label: Int
+
+
+def object_numbers(examples: Sequence[Examples]) -> Int:
+    """Return a number for each example, equal for all examples of one object, that is of one position in a
+    scene."""
+    key = [
+        (scene, float(x), float(y))
+        for scene, each in enumerate(examples)
+        for x, y in each.axis[:, :2].tolist()
+    ]
+    known: dict[tuple[int, float, float], int] = {}
+    return np.array([known.setdefault(each, len(known)) for each in key], np.int64)
 
 
 def stored_or_computed(

@@ -1,4 +1,8 @@
-"""The inertial unit: turn rates, specific force, and an attitude whose yaw drifts."""
+"""Simulated wheel odometry and IMU, with the errors of real ones.
+
+Wheels have a wrong radius and track width, slip on slopes, and noise. The IMU measures turn rates, specific
+force, and an attitude whose yaw drifts.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,43 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.poses import Pose3
-from pipeline.simulation.motion import Motion
-from pipeline.simulation.trajectory import RATE_HZ
+from pipeline.simulation.robot_motion import RATE_HZ, Motion
+from pipeline.simulation.scenarios import WheelQuality
 from pipeline.types.records import Float
+
+ODOMETRY_HZ = 50
+
+
+def wheel_odometry(motion: Motion, quality: WheelQuality, rng: np.random.Generator) -> Float:
+    """Return x, y [m] and yaw [rad] by the wheels at 50 Hz, shape (N, 3); the first row is zero.
+
+    The distance is measured along the ground. On a slope it is longer than its projection on the map, so
+    planar odometry is wrong there even without noise.
+    """
+    step = RATE_HZ // ODOMETRY_HZ
+    d = motion.drive
+    x, y, z, yaw, pitch = (column[::step] for column in (d.x, d.y, motion.z, d.yaw, motion.pitch))
+    distance = np.sqrt(np.diff(x) ** 2 + np.diff(y) ** 2 + np.diff(z) ** 2)
+    turn = np.diff(yaw)
+    # Each error is within 15 % of its nominal size, so that "poor" is never good by chance.
+    signs = rng.choice([-1.0, 1.0], 3) * rng.uniform(0.85, 1.15, 3)
+    uphill = -np.sin(0.5 * (pitch[1:] + pitch[:-1]))
+    root = np.sqrt(distance)
+    measured = distance * (1.0 + signs[0] * quality.scale + quality.slip * uphill)
+    measured += quality.distance_noise * root * rng.standard_normal(distance.size)
+    turned = turn * (1.0 + signs[1] * quality.turn_scale) + signs[2] * quality.turn_bias * distance
+    turned += quality.turn_noise * root * rng.standard_normal(distance.size)
+    heading = np.concatenate([[0.0], np.cumsum(turned)])
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    return np.stack(
+        [
+            np.concatenate([[0.0], np.cumsum(measured * np.cos(middle))]),
+            np.concatenate([[0.0], np.cumsum(measured * np.sin(middle))]),
+            heading,
+        ],
+        axis=1,
+    )
+
 
 IMU_HZ = 100
 GRAVITY = 9.81
@@ -25,7 +63,7 @@ class Inertial:
 
     Attributes:
         angular_velocity: shape (N, 3) [rad/s].
-        linear_acceleration: shape (N, 3) [m/s^2], +9.81 along z when it stands level.
+        linear_acceleration: shape (N, 3) [m/s^2], +9.81 along z at rest on level ground.
         attitude: Roll, pitch and yaw, shape (N, 3) [rad]; yaw starts at 0 and drifts.
     """
 
@@ -34,13 +72,13 @@ class Inertial:
     attitude: Float
 
     def orientation(self, n: int) -> Float:
-        """Quaternion w, x, y, z of reading n."""
+        """Return the quaternion w, x, y, z of reading n."""
         roll, pitch, yaw = self.attitude[n]
         return Pose3.from_euler(np.zeros(3), roll, pitch, yaw).quaternion()
 
 
 def inertial_readings(motion: Motion, rng: np.random.Generator) -> Inertial:
-    """What the unit tells of a motion."""
+    """Return the readings of the IMU for a motion."""
     step, dt = RATE_HZ // IMU_HZ, 1.0 / RATE_HZ
     d = motion.drive
     roll, pitch = motion.roll, motion.pitch
@@ -56,7 +94,7 @@ def inertial_readings(motion: Motion, rng: np.random.Generator) -> Inertial:
     )[::step]
     ahead, left = np.gradient(d.speed, dt), d.speed * d.yaw_rate
     up = GRAVITY + np.gradient(np.gradient(motion.z, dt), dt)
-    # Rx(roll)^T Ry(pitch)^T of the force in the level frame that looks ahead.
+    # Rx(roll)^T Ry(pitch)^T of the force in the level frame with x ahead.
     low = ahead * sp + up * cp
     force = np.stack([ahead * cp - up * sp, left * cr + low * sr, low * cr - left * sr], axis=1)[::step]
     count = turn_rate.shape[0]
@@ -73,7 +111,7 @@ def inertial_readings(motion: Motion, rng: np.random.Generator) -> Inertial:
 
 
 def _wander(count: int, rng: np.random.Generator) -> Float:
-    """A slow error of roll and pitch, shape (count, 2) [rad]: random knots, smoothly joined."""
+    """Return a slow error of roll and pitch, shape (count, 2) [rad]: random knots, smoothly interpolated."""
     knots = int(count / IMU_HZ / _WANDER_S) + 3
     values = _TILT_WANDER * rng.standard_normal((knots, 2))
     at = np.arange(count) / IMU_HZ / _WANDER_S

@@ -1,16 +1,16 @@
-"""Scenes to learn from: simulated ones, whose truth is exact, and folders of scans with a label a point."""
+"""Training examples of simulated scenes with their ground truth, and of folders of scans with a label per
+point."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from app.training.fit_forest import DOUBTFUL, Examples
-from app.training.stands import furnished_stand
-from app.training.streets import simulate_street
+from app.training.examples import UNKNOWN, Examples
 from pipeline.classification import Gathering, View, depth_image, steepest_by_direction
 from pipeline.classification.forest import CLASSES, Forest
 from pipeline.config import Parameters
@@ -23,20 +23,23 @@ from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing.acquisition import acquire
 from pipeline.simulation.run import open_run
-from pipeline.simulation.uri import parse_uri
+from pipeline.simulation.scenarios import parse_uri
+from pipeline.simulation.street_scenes import simulate_street
 from pipeline.types.records import Columns, Float, Float32, Int, Sensor, Step, TruthTrees, Verdict
 
-MARKS = (
-    1,
-    2,
-    3,
-    8,
-    40,
-    100,
-)  # scans after which examples are taken too: a map is judged from its first scan on
-LEAST_RETURNS = 30  # of a trunk that counts as one
-SAME, DOUBT = 0.3, 0.6  # m: a column so near to a trunk is it; up to there nobody can tell
-KIND_OF_LABEL = {71: Verdict.TREE, 80: Verdict.POLE, 81: Verdict.POLE, 30: Verdict.PERSON, 70: Verdict.BUSH,
+# Numbers of scans after which examples are taken, besides the end: trees are classified from the first scan
+# on.
+MARKS = (1, 2, 3, 8, 40, 100)
+LEAST_RETURNS = 30  # of a trunk that counts as a tree
+SAME, DOUBT = 0.3, 0.6  # m; a column within SAME of a trunk is a tree, its class is unknown up to DOUBT
+# Classes of SemanticKITTI by the kind of the parts of simulated objects.
+LABELS = {
+    "vehicle": 10, "person": 30, "building": 50, "fence": 51, "foliage": 70, "trunk": 71, "ground": 72,
+    "pole": 80, "sign": 81,
+}  # fmt: skip
+TRUNK = LABELS["trunk"]
+KIND_OF_LABEL = {TRUNK: Verdict.TREE, 80: Verdict.POLE, 81: Verdict.POLE, 30: Verdict.PERSON, 70:
+Verdict.BUSH,
                  50: Verdict.WALL, 51: Verdict.WALL, 52: Verdict.WALL}  # fmt: skip
 REACH_OF_KIND = {"pole": 0.35, "person": 0.5, "bush": 0.9, "other": 1.3}
 _VERDICT_OF_KIND = {
@@ -44,10 +47,11 @@ _VERDICT_OF_KIND = {
 }  # fmt: skip
 
 
-def gathered(
+def columns_of(
     run: Iterable[Step], sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters
 ) -> Iterator[Columns]:
-    """The columns of a run mapped with the poses it tells, after each of MARKS scans and at the end."""
+    """Yield the columns of a run that is mapped with its own poses, after each of MARKS scans and at the
+    end."""
     taken = 0
     gathering = Gathering(parameters.classification, all_around=sensor.rings > 0, forests=_no_forest)
     before = b""
@@ -71,44 +75,48 @@ def gathered(
         yield gathering.columns
 
 
-def _gathered_from_place(folder: Path, parameters: Parameters) -> Iterator[Columns]:
+def _columns_from_place(folder: Path, parameters: Parameters) -> Iterator[Columns]:
     with closing(open_source(str(folder))) as source:
         about = source.description
         run = steps(source.records(), odometry="static")
-        yield from gathered(run, about.sensor, about.T_base_lidar, parameters)
+        yield from columns_of(run, about.sensor, about.T_base_lidar, parameters)
 
 
 def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: float) -> Iterator[Examples]:
-    """Of a simulated street or park; see `simulate_street`."""
+    """Yield the examples of a simulated street or park; see `simulate_street`."""
     street = simulate_street(seed, one_way=one_way)
     name = f"{'park' if one_way else 'street'} {seed}"
-    sure, any_trunk = street.trunk[street.seen >= LEAST_RETURNS], street.trunk[street.seen > 0]
-    for columns in gathered(street.steps, street.sensor, street.T_base_lidar, parameters):
+    points, kinds = street.points, np.unique(street.kind)
+    label = np.array([LABELS[kind] for kind in kinds.tolist()])[np.searchsorted(kinds, street.kind)]
+    sure, any_trunk = street.trunk[street.returns >= LEAST_RETURNS], street.trunk[street.returns > 0]
+    for columns in columns_of(street.steps, street.sensor, street.T_base_lidar, parameters):
         near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
-        label = label_by_points(axis, street.points, street.label, sure, any_trunk)
-        yield Examples(name, True, not one_way, axis, figures, label)
+        kind = label_by_points(axis, points, label, sure, any_trunk)
+        yield Examples(name, True, not one_way, axis, figures, kind)
 
 
 def stand_examples(
     uri: str, parameters: Parameters, every: int, *, furnished: bool = False
 ) -> Iterator[Examples]:
-    """Of a simulated run, as it is or with more of what is no tree; of so many scans one is made."""
-    source = SimulatedSource(uri, open_run(furnished_stand(uri) if furnished else parse_uri(uri)))
+    """Yield the examples of a simulated run; `furnished` adds objects that are not trees, and only every n-th
+    scan
+    is simulated."""
+    source = SimulatedSource(uri, open_run(replace(parse_uri(uri), furnished=furnished)))
     about, truth = source.description, source.run.scene.truth
     run = steps(source.records(every=every))
-    for columns in gathered(run, about.sensor, about.T_base_lidar, parameters):
+    for columns in columns_of(run, about.sensor, about.T_base_lidar, parameters):
         label = label_by_truth(columns.axis, truth)
         yield Examples(stand_name(uri, furnished), True, True, columns.axis, columns.figures, label)
 
 
 def stand_name(uri: str, furnished: bool) -> str:
-    """Of the scene of a simulated run."""
+    """Return the name of the scene of a simulated run."""
     return f"furnished {uri}" if furnished else uri
 
 
 def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
-    """What stands at each column, as places in CLASSES."""
+    """Return the class of each column by the ground truth, as indices in CLASSES."""
     label = np.full(len(axis), CLASSES.index(Verdict.OTHER), np.int64)
     place = np.stack([truth.x, truth.y], axis=1)
     kind = np.array(truth.kind)
@@ -116,17 +124,18 @@ def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
         near = _distance(axis, place[kind == name]) < reach
         label[near] = CLASSES.index(_VERDICT_OF_KIND[name])
     to_tree = _distance(axis, place[kind == "tree"])
-    label[(to_tree >= SAME) & (to_tree < DOUBT)] = DOUBTFUL
+    label[(to_tree >= SAME) & (to_tree < DOUBT)] = UNKNOWN
     label[to_tree < SAME] = CLASSES.index(Verdict.TREE)
     return label
 
 
 def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Iterator[Examples]:
-    """Of a folder of scans from one place (`velodyne/*.bin`, `labels/*.label`), or one such pair of files."""
+    """Yield the examples of scans from one place (`velodyne/*.bin`, `labels/*.label`), or of one pair of
+    files."""
     points, label = labelled_points(folder)
     all_around = looks_all_around(folder)
     sure, any_trunk = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
-    for columns in _gathered_from_place(folder, parameters):
+    for columns in _columns_from_place(folder, parameters):
         near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
         kind = label_by_points(axis, points, label, sure, any_trunk)
@@ -134,20 +143,20 @@ def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Ite
 
 
 def looks_all_around(folder: Path) -> bool:
-    """Whether the sensor of labelled scans does."""
+    """Return whether the sensor of labelled scans sees all around."""
     with closing(open_source(str(folder))) as source:
         return source.description.sensor.rings > 0
 
 
 def labelled_points(folder: Path) -> tuple[Float, Int]:
-    """All points (N, 3) [m] of a place and their classes; returns at the origin are left out."""
+    """Return all points (N, 3) [m] of a place and their labels; returns at the origin are left out."""
     scans = labelled_scans(folder)
     cloud = np.concatenate([points for points, _ in scans]).astype(np.float64)
     return cloud, np.concatenate([label for _, label in scans])
 
 
 def labelled_scans(folder: Path) -> list[tuple[Float32, Int]]:
-    """The points (N, 3) [m] of each scan of a place, and their classes, as `labelled_points`."""
+    """Return the points (N, 3) [m] of each scan of a place and their labels, as `labelled_points`."""
     if folder.is_file():
         files = [(folder, folder.with_suffix(".label"))]
     else:
@@ -164,10 +173,10 @@ def labelled_scans(folder: Path) -> list[tuple[Float32, Int]]:
 
 
 def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
-    """Middles (N, 2) [m] of the labelled trunks: points of class 71, linked at 0.3 m."""
+    """Return the middles (N, 2) [m] of the labelled trunks: points of TRUNK, linked at 0.3 m."""
     from sklearn.cluster import DBSCAN
 
-    cloud = points[label == 71]
+    cloud = points[label == TRUNK]
     if len(cloud) == 0:
         return np.zeros((0, 2))
     group = DBSCAN(eps=0.3, min_samples=1).fit(cloud).labels_
@@ -177,11 +186,12 @@ def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
 
 
 def label_by_points(axis: Float, points: Float, label: Int, sure: Float, any_trunk: Float) -> Int:
-    """What stands at each column, as places in CLASSES: a trunk, or what most points around it are.
+    """Return the class of each column, as indices in CLASSES: a trunk, or the most frequent class around it.
 
     Args:
-        axis: Columns; points, label: see `labelled_points`.
-        sure, any_trunk: Places (T, 2) [m] of trunks of LEAST_RETURNS returns, and of all.
+        axis: Axes of the columns, shape (K, 5).
+        points, label: See `labelled_points`.
+        sure, any_trunk: Positions (T, 2) [m] of trunks with LEAST_RETURNS returns, and of all trunks.
     """
     from scipy.spatial import cKDTree
 
@@ -190,18 +200,18 @@ def label_by_points(axis: Float, points: Float, label: Int, sure: Float, any_tru
     for k, rows in enumerate(tree.query_ball_point(axis[:, :2], 0.35)):
         names, counts = np.unique(label[rows], return_counts=True)
         order = [int(names[i]) for i in np.argsort(-counts, kind="stable") if names[i] in KIND_OF_LABEL]
-        order = [name for name in order if name != 71]
+        order = [name for name in order if name != TRUNK]
         if order:
             kind[k] = CLASSES.index(KIND_OF_LABEL[order[0]])
     to_tree, to_any = _distance(axis, sure), _distance(axis, any_trunk)
-    kind[(to_tree >= SAME) & (to_any < 0.5)] = DOUBTFUL
-    kind[(to_tree >= SAME) & (to_tree < DOUBT)] = DOUBTFUL
+    kind[(to_tree >= SAME) & (to_any < 0.5)] = UNKNOWN
+    kind[(to_tree >= SAME) & (to_tree < DOUBT)] = UNKNOWN
     kind[to_tree < SAME] = CLASSES.index(Verdict.TREE)
     return kind
 
 
 def _distance(axis: Float, place: Float) -> Float:
-    """Of each column from the nearest place [m]."""
+    """Return the distance of each column from the nearest position [m]."""
     if len(place) == 0:
         return np.full(len(axis), np.inf)
     from scipy.spatial import cKDTree
@@ -211,7 +221,7 @@ def _distance(axis: Float, place: Float) -> Float:
 
 
 def _no_forest(_name: str, _all_around: bool) -> Forest:
-    """One leaf that knows nothing: the trees are what is being made."""
+    """Return a forest of one leaf with equal shares, because features do not depend on the forest."""
     none = np.full(1, -1, np.int32)
     zero = np.zeros(1, np.int32)
     return Forest(

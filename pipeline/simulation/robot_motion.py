@@ -1,0 +1,350 @@
+"""True motion of the robot: a smooth course through waypoints, driven with limits on speed, turn rate and
+their
+changes, and the pose of the base on the terrain with a little vibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+
+from pipeline.geometry.poses import Pose3
+from pipeline.types.records import Bool, Float, Int
+
+ACCELERATION = 0.5  # m/s^2
+YAW_RATE = 0.5  # rad/s
+YAW_GAIN = 1.0  # rad/s^2, largest change of the turn rate
+CREEP = 0.1  # m/s; where even this speed is too fast for a turn, the robot turns on the spot
+_APART = 5  # samples; turns on the spot that are nearer to one another, or to an end, are joined
+
+
+def sharp_cells(s: Float, yaw: Float) -> Bool:
+    """Return where a line turns too sharply to be driven, between each of N samples and the next, shape (N -
+    1,).
+
+    The yaw decides, because a cusp between two samples has no curvature at them."""
+    sharp = np.abs(np.diff(yaw)) > YAW_RATE / CREEP * np.diff(s)
+    if sharp.any():
+        rows = np.concatenate([[-1], np.flatnonzero(sharp), [sharp.size]])
+        for before, after in pairwise(rows):
+            sharp[before + 1 : after] |= after - before <= _APART
+    return sharp
+
+
+def curvature_beside(sharp: Bool, s: Float, yaw: Float, closed: bool) -> Float:
+    """Return the curvature at each sample by the yaw of its neighbouring cells that are not sharp, else 0
+    [1/m]."""
+    slope = np.where(sharp, np.nan, np.diff(yaw) / np.diff(s))
+    before = np.concatenate([slope[-1:] if closed else slope[:1], slope])
+    after = np.concatenate([slope, slope[:1] if closed else slope[-1:]])
+    before, after = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)
+    beside: Float = np.nan_to_num(0.5 * (before + after))
+    return beside
+
+
+def runs_of(sharp: Bool) -> Int:
+    """Return the first and last sample of each run of sharp cells, shape (K, 2)."""
+    edges = np.diff(np.concatenate([[0], sharp.astype(np.int8), [0]]))
+    return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
+
+
+def within_gains(v: Float, s: Float, curvature: Float) -> Float:
+    """Return the highest speeds not above `v` that the robot can reach one after the other: for all samples i
+
+        v_i^2 <= v_(i -+ 1)^2 + 2 a ds  with  a = min(ACCELERATION, YAW_GAIN / (2 |k|))
+        v_i^2 |dk / ds| <= YAW_GAIN / 2
+
+    so that the turn rate k v changes by no more than a |k| + v^2 |dk / ds| <= YAW_GAIN.
+
+    Args:
+        v: Limit at each sample, shape (N,) [m/s].
+        s: Distance along the line at each sample [m].
+        curvature: k at each sample, linear between two [1/m].
+    """
+    ds, k = np.diff(s), np.abs(curvature)
+    bend = np.abs(np.diff(curvature)) / ds
+    bend = np.maximum(np.append(bend, 0.0), np.append(0.0, bend))
+    limit = np.minimum(v, np.sqrt(0.5 * YAW_GAIN / np.maximum(bend, 1e-9)))
+    gain = np.minimum(ACCELERATION, 0.5 * YAW_GAIN / np.maximum(np.maximum(k[1:], k[:-1]), 1e-9))
+    far = np.append(0.0, np.cumsum(2.0 * gain * ds))
+    square = limit * limit
+    forth = np.minimum.accumulate(square - far) + far
+    back = (np.minimum.accumulate((square + far)[::-1]))[::-1] - far
+    reached = np.maximum(np.minimum(forth, back), 0.0)
+    # Speeds that need no change keep their bits.
+    bounded: Float = np.where(reached < square * (1.0 - 1e-9), np.sqrt(reached), limit)
+    return bounded
+
+
+class Spin(NamedTuple):
+    """A turn on the spot from rest to rest, as a share f of the distance and of the turn with f'' = gain, 0,
+    -gain.
+
+    Attributes:
+        begin, takes: Begin and duration [s].
+        gain, ramp: Second derivative of f [1/s^2] and the duration of the acceleration [s].
+        first, way: Begin and length along the line [m].
+        yaw, turn: Begin and angle of the turn [rad].
+    """
+
+    begin: float
+    takes: float
+    gain: float
+    ramp: float
+    first: float
+    way: float
+    yaw: float
+    turn: float
+
+    @classmethod
+    def over(cls, first: float, way: float, yaw: float, turn: float) -> Spin:
+        """Return the fastest turn within the limits; it begins at time 0."""
+        rate = min(YAW_RATE / max(abs(turn), 1e-9), CREEP / way)
+        gain = min(YAW_GAIN / max(abs(turn), 1e-9), ACCELERATION / way)
+        ramp = min(rate / gain, gain**-0.5)  # a short turn decelerates before it reaches the rate
+        return cls(0.0, 1.0 / (gain * ramp) + ramp, gain, ramp, first, way, yaw, turn)
+
+    def at(self, t: Float) -> tuple[Float, Float]:
+        """Return f and f' [1/s] at times of shape (N,) [s]."""
+        up = np.clip(t - self.begin, 0.0, self.takes)
+        left = self.takes - up
+        even = self.gain * self.ramp * (up - 0.5 * self.ramp)
+        part = np.where(up < self.ramp, 0.5 * self.gain * up * up, even)
+        part = np.where(left < self.ramp, 1.0 - 0.5 * self.gain * left * left, part)
+        return part, self.gain * np.minimum(np.minimum(up, left), self.ramp)
+
+
+RATE_HZ = 200
+_DS = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """Planar motion at 200 Hz, as columns of length T.
+
+    Attributes:
+        t: Time since the start [s].
+        x, y: [m]; the first pose is the origin.
+        yaw: [rad], continuous, 0 at the start.
+        speed: [m/s] in the plane.
+        yaw_rate: [rad/s].
+    """
+
+    t: Float
+    x: Float
+    y: Float
+    yaw: Float
+    speed: Float
+    yaw_rate: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """The course in the plane, sampled every 2 cm. It begins at the origin along x; `yaw` is continuous,
+    `curvature` is in 1/m."""
+
+    s: Float
+    x: Float
+    y: Float
+    yaw: Float
+    curvature: Float
+    closed: bool
+
+
+def lay_course(waypoints: Float, closed: bool) -> Course:
+    """Return a smooth course through waypoints of shape (N, 2) [m], moved and turned to begin at the origin
+    along x."""
+    knots = np.vstack([waypoints, waypoints[:1]]) if closed else waypoints
+    chord = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(knots, axis=0).T))])
+    spline = CubicSpline(chord, knots, bc_type="periodic" if closed else "natural")
+    u = np.linspace(0.0, chord[-1], max(int(chord[-1] / (0.25 * _DS)), 100))
+    fine = spline(u)
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(fine, axis=0).T))])
+    s = np.linspace(0.0, length[-1], round(length[-1] / _DS) + 1)
+    at = np.interp(s, length, u)
+    xy, first, second = spline(at), spline(at, 1), spline(at, 2)
+    norm = np.hypot(first[:, 0], first[:, 1])
+    yaw = np.unwrap(np.arctan2(first[:, 1], first[:, 0]))
+    curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / norm**3
+    c, sn = np.cos(yaw[0]), np.sin(yaw[0])
+    x, y = (xy - xy[0]).T
+    return Course(s, c * x + sn * y, c * y - sn * x, yaw - yaw[0], curvature, closed)
+
+
+def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
+    """Drive a course from rest for `duration_s`: repeatedly when it is closed, else to its end.
+
+    Args:
+        course: The course.
+        speed: Speed on the straight [m/s]. Turns are driven at 0.5 rad/s at most; where the course reverses,
+            the robot stops and turns on the spot.
+        duration_s: Duration of the run [s]; the result is a little longer.
+    """
+    until = duration_s + 0.5
+    laps = max(1, int(np.ceil(until * speed / course.s[-1])) + 1) if course.closed else 1
+    table = _timetable(course, speed, laps)
+    s, course = table.s, table.course
+    t = np.arange(int(np.ceil(until * RATE_HZ)) + 1) / RATE_HZ
+    along = np.interp(t, table.time, s)
+    v = np.where(along < s[-1], np.interp(along, s, table.v), 0.0)
+    during = [(t >= spin.begin) & (t < spin.begin + spin.takes) for spin in table.spins]
+    for rows, spin in zip(during, table.spins, strict=True):
+        part, pace = spin.at(t[rows])
+        along[rows], v[rows] = spin.first + part * spin.way, pace * spin.way
+    drive = on_course(course, t, along, v)
+    for rows, spin in zip(during, table.spins, strict=True):
+        part, pace = spin.at(t[rows])
+        drive.yaw[rows], drive.yaw_rate[rows] = spin.yaw + part * spin.turn, pace * spin.turn
+    return drive
+
+
+def on_course(course: Course, t: Float, along: Float, speed: Float) -> Drive:
+    """Return the motion along a course: distance [m] and speed [m/s] at times t [s], shape (T,) each."""
+    lap, rest = np.divmod(along, course.s[-1]) if course.closed else (np.zeros_like(along), along)
+    x, y, yaw, curvature = (
+        np.asarray(np.interp(rest, course.s, column))
+        for column in (course.x, course.y, course.yaw, course.curvature)
+    )
+    yaw = yaw + lap * (course.yaw[-1] - course.yaw[0])
+    return Drive(t=t, x=x, y=y, yaw=yaw, speed=speed, yaw_rate=speed * curvature)
+
+
+def lap_time(course: Course, speed: float) -> float:
+    """Return the time to drive a course once from rest [s], see `drive_course`."""
+    return float(_timetable(course, speed, 1).time[-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Timetable:
+    """Distance [m], speed [m/s] and time [s] between turns on the spot, these turns, and the course without
+    their
+    curvature."""
+
+    s: Float
+    v: Float
+    time: Float
+    spins: list[Spin]
+    course: Course
+
+
+def _timetable(course: Course, speed: float, laps: int) -> _Timetable:
+    sharp = sharp_cells(course.s, course.yaw)
+    if sharp.any():
+        beside = curvature_beside(sharp, course.s, course.yaw, course.closed)
+        course = replace(course, curvature=beside)
+    limit, curvature = speed_limit(course, speed), course.curvature
+    # All laps in a row, so that the joint between two laps needs no special case.
+    v, k = (
+        np.concatenate([np.tile(c[:-1], laps), c[:1] if course.closed else c[-1:]])
+        for c in (limit, curvature)
+    )
+    s = np.arange(v.size) * (course.s[1] - course.s[0])
+    yaw = np.append(0.0, np.cumsum(np.tile(np.diff(course.yaw), laps)))
+    runs = runs_of(np.tile(sharp, laps))
+    v[runs] = 0.0
+    v = np.minimum(v, np.sqrt(2.0 * ACCELERATION * s))
+    if not course.closed:
+        v = np.minimum(v, np.sqrt(2.0 * ACCELERATION * (s[-1] - s)))
+    v = within_gains(v, s, k)
+    spins = [Spin.over(s[i], s[j] - s[i], yaw[i], yaw[j] - yaw[i]) for i, j in runs]
+    takes = np.zeros(v.size - 1)
+    driven = np.ones(v.size, np.bool_)
+    for (i, j), spin in zip(runs, spins, strict=True):
+        takes[i] = spin.takes
+        driven[i + 1 : j] = False
+    cells = ~np.tile(sharp, laps)
+    takes[cells] = (2.0 * np.diff(s))[cells] / (v[1:] + v[:-1])[cells]
+    time = np.concatenate([[0.0], np.cumsum(takes)])
+    spins = [spin._replace(begin=time[i]) for (i, _), spin in zip(runs, spins, strict=True)]
+    return _Timetable(s[driven], v[driven], time[driven], spins, course)
+
+
+def speed_limit(course: Course, speed: float) -> Float:
+    """Return the highest speed at each sample of a course [m/s]: turns are driven at 0.5 rad/s at most."""
+    mode = "wrap" if course.closed else "nearest"
+    limit = np.minimum(speed, YAW_RATE / np.maximum(np.abs(course.curvature), 1e-6))
+    window = int(0.6 / _DS)
+    slowest: Float = minimum_filter1d(limit, 2 * window + 1, mode=mode)
+    smooth: Float = gaussian_filter1d(slowest, window / 3.0, mode=mode)
+    return smooth
+
+
+_VIBRATION_HZ = np.array([1.3, 2.9, 5.3, 8.7])
+_VIBRATION_ANGLE = np.radians(np.array([0.20, 0.10, 0.06, 0.03]))
+
+
+class Ground(Protocol):
+    """The ground below the robot."""
+
+    def evaluate(self, x: Float, y: Float) -> Float:
+        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """True pose of the base at 200 Hz, as columns of length T. The base is on the ground.
+
+    Attributes:
+        drive: Planar part.
+        z: Height [m] in the world.
+        roll, pitch: Tilt of the base [rad], R = Rz(yaw) Ry(pitch) Rx(roll).
+    """
+
+    drive: Drive
+    z: Float
+    roll: Float
+    pitch: Float
+
+    def at(self, t: Float) -> tuple[Float, Float]:
+        """Return rotations (N, 3, 3) and positions (N, 3) [m] of the base in the world at times (N,) [s]."""
+        first = max(int(t[0] * RATE_HZ) - 1, 0)
+        part = slice(first, int(np.ceil(t[-1] * RATE_HZ)) + 2)
+        d = self.drive
+        grid = d.t[part]
+        x, y, z, roll, pitch, yaw = (
+            np.interp(t, grid, column[part]) for column in (d.x, d.y, self.z, self.roll, self.pitch, d.yaw)
+        )
+        return rotations(roll, pitch, yaw), np.stack([x, y, z], axis=1)
+
+    def sensor_at(self, t: Float, T_base_lidar: Pose3) -> tuple[Float, Float]:
+        """Return the same for a sensor on the base."""
+        R, p = self.at(t)
+        return np.ascontiguousarray(R @ T_base_lidar.R), p + R @ T_base_lidar.t
+
+
+def lay_on_terrain(drive: Drive, terrain: Ground, rng: np.random.Generator) -> Motion:
+    """Place the base on the ground, perpendicular to it, with vibration while it moves."""
+    z, gx, gy = terrain.evaluate(drive.x, drive.y).T
+    c, s = np.cos(drive.yaw), np.sin(drive.yaw)
+    ahead, left = gx * c + gy * s, gy * c - gx * s
+    moving = np.clip(drive.speed / 0.5, 0.0, 1.0)
+    shake = [_vibration(drive.t, rng) * moving for _ in range(2)]
+    return Motion(
+        drive=drive,
+        z=z,
+        roll=np.arcsin(left / np.sqrt(1.0 + ahead**2 + left**2)) + shake[0],
+        pitch=-np.arctan(ahead) + shake[1],
+    )
+
+
+def rotations(roll: Float, pitch: Float, yaw: Float) -> Float:
+    """Return R = Rz(yaw) Ry(pitch) Rx(roll), shape (N, 3, 3), of angles (N,) [rad]."""
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    cy, sy = np.cos(yaw), np.sin(yaw)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _vibration(t: Float, rng: np.random.Generator) -> Float:
+    phase = rng.uniform(0.0, 2.0 * np.pi, _VIBRATION_HZ.size)
+    waves = np.sin(2.0 * np.pi * np.outer(t, _VIBRATION_HZ) + phase)
+    shaken: Float = waves @ _VIBRATION_ANGLE / np.sqrt(2.0)
+    return shaken
