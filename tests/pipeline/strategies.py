@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from hypothesis import settings
+import pytest
 from hypothesis import strategies as st
 
 from pipeline.detection.free_space import BINS
@@ -22,10 +23,6 @@ from pipeline.types.records import (
     TruthTrees,
     Verdict,
 )
-
-# Compiled kernels are slow at their first call, so no example has a deadline.
-LAW = settings(max_examples=50, deadline=None)
-FEW = settings(max_examples=20, deadline=None)
 
 SENSOR = Sensor("VLP-16", rings=16, ring_step=np.radians(2.0), azimuth_step=np.radians(0.2), range_sigma=0.02)
 NOTHING_SEEN = np.zeros(BINS)
@@ -44,6 +41,12 @@ poses3 = st.builds(
     st.floats(-1.5, 1.5),
     st.floats(-3.1, 3.1),
 )
+
+
+def first_of(values: Iterable[Any]) -> list[Any]:
+    """Return the values of a parameter of a test: the first for the default run, the others marked slow."""
+    first, *others = (value if isinstance(value, tuple) else (value,) for value in values)
+    return [pytest.param(*first), *(pytest.param(*other, marks=pytest.mark.slow) for other in others)]
 
 
 def arc(radius, half_angle, *, distance=4.0, bearing=0.0, rows=6, n=60, height=1.0, lean=(0.0, 0.0)):

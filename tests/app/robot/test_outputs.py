@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -25,7 +25,6 @@ def decoded(topic: str, payload: bytes) -> Any:
     return store.deserialize_cdr(payload, outputs.TYPES[topic])
 
 
-@settings(deadline=None, max_examples=20)
 @given(st.floats(-100, 100), st.floats(-100, 100), st.floats(-3, 3))
 def test_the_pose_and_its_covariance_arrive(x: float, y: float, yaw: float):
     seen = frame(0, START_NS)

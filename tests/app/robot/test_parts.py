@@ -7,7 +7,7 @@ import threading
 from contextlib import closing
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.robot.address import VelodyneAddress, ZenohAddress, is_live, parse_address
@@ -65,7 +65,6 @@ def test_what_is_no_address_is_refused(uri: str):
         parse_address(uri)
 
 
-@settings(deadline=None)  # the other library takes a second to load
 @given(NAMES, NAMES, NAMES, st.integers(0, 200))
 def test_tokens_and_keys_are_those_of_another_library(robot: str, node: str, topic: str, domain: int):
     entity = pytest.importorskip("zenoh_ros2_sdk.entity", reason="zenoh-ros2-sdk is not installed")

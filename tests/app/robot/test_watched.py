@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.cli import serve
@@ -62,7 +62,6 @@ def test_what_was_published_is_what_is_shown():
     assert (told.silence_s, results.losses) == (0.5, {})
 
 
-@settings(deadline=None, max_examples=50)
 @given(st.sampled_from(TOPICS), st.binary(max_size=200), st.integers(0, 400))
 def test_damaged_messages_are_counted_and_harm_nothing(topic: str, extra: bytes, cut: int):
     results, whole = Results(), messages()

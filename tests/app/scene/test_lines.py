@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene import Scene, colours
@@ -20,7 +20,6 @@ def drawn(line: Line) -> np.ndarray:
 
 
 async def test_a_line_is_what_was_shown_last(scene: Scene):
-    @settings(max_examples=15, deadline=None)
     @given(st.lists(st.integers(0, 3 * CHUNK + 5), min_size=1, max_size=6), st.booleans())
     def law(lengths: list[int], bent: bool):
         line = Line(scene._server.scene, "/law", (1, 2, 3), 0.0)

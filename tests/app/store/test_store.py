@@ -134,7 +134,7 @@ class Edits(RuleBasedStateMachine):
 
 
 TestEdits = Edits.TestCase
-TestEdits.settings = settings(max_examples=20, stateful_step_count=25, deadline=None)
+TestEdits.settings = settings(stateful_step_count=25)
 
 
 def test_all_is_undone_and_done_again_in_order():

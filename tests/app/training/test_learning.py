@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.cli import main
@@ -166,7 +166,6 @@ def test_what_is_validated_asks_the_expanded_trees_too():
 # --- what it is worth -----------------------------------------------------------------------------
 
 
-@settings(max_examples=30)
 @given(
     st.lists(
         st.lists(st.tuples(st.floats(0, 20), st.floats(0, 20)), min_size=1, max_size=12),

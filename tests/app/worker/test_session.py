@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from app.worker.protocol import Status
@@ -157,7 +157,6 @@ commands = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
 @given(commands)
 def test_whatever_is_done_the_picture_is_that_of_a_plain_run(done: list[tuple[str, float]]) -> None:
     session, model = opened(), Model()
@@ -202,7 +201,6 @@ impatient = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
 @given(impatient)
 def test_however_commands_overtake_one_another_a_scan_is_mapped_the_same(
     done: list[tuple[tuple[str, int], int]],
@@ -224,7 +222,6 @@ def test_however_commands_overtake_one_another_a_scan_is_mapped_the_same(
         assert checksum(session) == played({}, session.status().scan_index)
 
 
-@settings(max_examples=30, deadline=None)
 @given(start=st.integers(0, 128), target=st.integers(0, 128), after=st.integers(0, 140), known=st.booleans())
 def test_a_change_on_the_way_acts_from_the_sought_scan_on(
     start: int, target: int, after: int, known: bool

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.classification.feature_attribution import what_told
@@ -42,7 +42,6 @@ def test_the_effect_of_each_figure_by_hand():
     assert leaning[NAMES.index("crown")] == 0.0  # was not asked on the way
 
 
-@settings(deadline=None)  # compiles
 @given(st.integers(0, 2**32 - 1))
 def test_no_figure_tells_more_than_the_vote_holds(seed: int):
     forest = standard_forest(all_around=True)

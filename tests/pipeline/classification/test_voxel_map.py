@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.classification.voxel_map import FIRST_SCANS, MOST_TILES, SIDE, SLICE, SLICES, TILE, Memory
@@ -22,7 +22,6 @@ def remembered(points):
     return points[(points[:, 2] >= 0.0) & (np.floor(points[:, 2] / SLICE) < SLICES)]
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**16), n=st.integers(0, 400), scans=st.integers(1, 4))
 def test_every_return_is_counted_once_and_the_means_are_theirs(seed, n, scans):
     memory = Memory.empty(1 << 4, 1 << 1)  # so small that it must grow

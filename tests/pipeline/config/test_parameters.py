@@ -21,7 +21,6 @@ from pipeline.config import (
     to_toml,
 )
 from pipeline.errors import ParameterError
-from tests.pipeline.strategies import LAW
 
 SPECS = field_specs()
 NUMBERS = [spec for spec in SPECS if spec.kind in ("float", "int")]
@@ -197,7 +196,6 @@ def test_toml_brings_every_preset_back(name):
     assert from_toml(to_toml(preset(name)), preset("forest"), "x.toml") == preset(name)
 
 
-@LAW
 @given(st.data())
 def test_toml_brings_any_values_back(data):
     spec = data.draw(st.sampled_from(NUMBERS))

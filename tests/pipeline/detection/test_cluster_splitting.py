@@ -13,7 +13,7 @@ from pipeline.config import preset
 from pipeline.detection.cluster_shape import describe, describe_stems
 from pipeline.detection.verdicts import classify_clusters
 from pipeline.types.records import Clusters, Labels, Verdict
-from tests.pipeline.strategies import LAW, SENSOR, one_cluster
+from tests.pipeline.strategies import SENSOR, one_cluster
 
 FOREST = preset("forest").shape.model_copy(update={"split_slices": 4})
 DETECTION = preset("forest").detection
@@ -110,7 +110,6 @@ def test_other_clusters_keep_their_numbers_and_figures():
     assert_same(clusters, describe(points, labels, SHARP, FOREST))
 
 
-@LAW
 @given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.floats(0.001, 1.0))
 def test_no_return_is_lost_whatever_the_points(seed, slices, spread):
     rng = np.random.default_rng(seed)

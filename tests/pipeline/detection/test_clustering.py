@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
 from pipeline.detection.clustering import ENGINES, cluster, dbscan_grid, in_order_of_first_point, weigh
-from tests.pipeline.strategies import FEW, LAW, SENSOR, simulated_cloud
+from tests.pipeline.strategies import SENSOR, simulated_cloud
 
 FOREST = preset("forest").clustering
 EPS = 0.25
@@ -69,7 +69,6 @@ def assert_numbered_by_first_point(label):
 @pytest.mark.parametrize("dimensions", [2, 3])
 @pytest.mark.parametrize("elements", [lattice, anywhere], ids=["lattice", "anywhere"])
 def test_the_grid_is_dbscan(dimensions, elements):
-    @LAW
     @given(clouds(dimensions, elements), st.integers(1, 9))
     def law(points, min_points):
         label, core = dbscan_grid(points.astype(np.float64), EPS, min_points)
@@ -83,7 +82,6 @@ def test_the_grid_is_dbscan(dimensions, elements):
 @pytest.mark.parametrize("engine", ["sklearn", "open3d"])
 @pytest.mark.parametrize("elements", [lattice, anywhere], ids=["lattice", "anywhere"])
 def test_every_engine_is_dbscan(engine, elements):
-    @FEW
     @given(clouds(3, elements), st.integers(1, 9))
     def law(points, min_points):
         told = ENGINES[engine](points, EPS, min_points)
@@ -160,7 +158,6 @@ def test_engines_agree_on_a_scan(dimensions, eps, min_points, other):
     assert len(pairs) == ours.label.max() + 1 == theirs.label.max() + 1
 
 
-@LAW
 @given(arrays.arrays(np.int32, st.integers(0, 30), elements=st.integers(-1, 6)))
 @example(np.array([], np.int32))
 @example(np.array([-1, -1], np.int32))
@@ -187,7 +184,6 @@ def test_an_empty_scan_has_no_clusters(method):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_weight_is_a_repeated_point(engine):
-    @FEW
     @given(clouds(2, lattice), st.integers(1, 9), st.data())
     def law(points, min_points, data):
         weight = data.draw(arrays.arrays(np.int32, len(points), elements=st.integers(1, 3)))

@@ -16,7 +16,6 @@ from pipeline.detection.external_stems import external_clusters
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.mapper import Mapper
 from pipeline.types.records import Scan, Sensor, Stems, Step, Verdict
-from tests.pipeline.strategies import LAW
 
 NAN = float("nan")
 LEVEL = Acquisition(range_min=0.0)
@@ -42,7 +41,6 @@ def stand(seed: int, count: int = 12) -> NDArray[np.float64]:
     return np.column_stack([rng.uniform(-12.0, 12.0, (count, 2)), np.full(count, -3.0)])
 
 
-@LAW
 @given(tilts, tilts, st.integers(0, 100))
 def test_stems_are_levelled_by_the_pose(roll: float, pitch: float, seed: int):
     tilt = Pose3.from_euler(np.zeros(3), roll, pitch, 0.0)
@@ -53,7 +51,6 @@ def test_stems_are_levelled_by_the_pose(roll: float, pitch: float, seed: int):
     np.testing.assert_allclose(clusters.centre, level[:, :2], atol=1e-5)
 
 
-@LAW
 @given(tilts, tilts, st.integers(0, 100))
 def test_without_a_tilt_they_are_levelled_by_their_axes(roll: float, pitch: float, seed: int):
     tilt = Pose3.from_euler(np.zeros(3), roll, pitch, 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.detection.cylinder_fit import arc_start, fit_one
@@ -20,7 +20,6 @@ def leaning_arc(centre, lean, radius, half=1.2):
     return np.column_stack([x.ravel(), y.ravel(), height.ravel()])
 
 
-@settings(deadline=None)  # compiles
 @given(st.floats(-3.0, 3.0), st.floats(0.08, 0.3), st.floats(-0.04, 0.04), st.floats(-0.04, 0.04))
 def test_a_leaning_cylinder_has_no_residuals(bearing, radius, lean_x, lean_y):
     centre = 5.0 * np.array([np.cos(bearing), np.sin(bearing)])

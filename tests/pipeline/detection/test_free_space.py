@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.detection.free_space import BINS, FIELD, clear_range, in_free_view
 from pipeline.geometry.azimuth_bins import direction_bin
-from tests.pipeline.strategies import LAW, seeds
+from tests.pipeline.strategies import seeds
 
 AROUND = np.linspace(-np.pi, np.pi, 1440, endpoint=False)
 POSE = np.array([1.0, 2.0, 0.5])
@@ -65,7 +65,6 @@ def test_distances_count_from_the_base_and_not_from_the_sensor():
     assert np.min(free) == pytest.approx(7.0, abs=0.01)
 
 
-@LAW
 @given(st.floats(-np.pi, np.pi), st.floats(0.01, 100.0), st.integers(1, 400))
 def test_bins_of_direction_cover_the_circle_whatever_the_length(angle, length, bins):
     x, y = np.cos(angle), np.sin(angle)
@@ -91,7 +90,6 @@ def test_the_origin_has_a_direction_too():
     assert direction_bin(-0.0, -0.0, 360) == 180
 
 
-@LAW
 @given(seeds, st.floats(0.0, 40.0))
 def test_the_free_distance_is_that_of_the_nearest_point_by_direction(seed, spread):
     random = np.random.default_rng(seed)

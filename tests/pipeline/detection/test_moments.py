@@ -14,7 +14,7 @@ from pipeline.config import preset
 from pipeline.detection.cluster_shape import describe, eccentricity, moments
 from pipeline.detection.clustering import group_rows
 from pipeline.types.records import Labels
-from tests.pipeline.strategies import LAW, SENSOR, arc, one_cluster
+from tests.pipeline.strategies import SENSOR, arc, one_cluster
 
 PAPER = preset("paper").shape
 FOREST = preset("forest").shape
@@ -67,7 +67,6 @@ def test_eccentricity_of_a_half_circle_with_noise_along_the_ray(radius, sigma):
 clouds = arrays.arrays(np.float64, st.tuples(st.integers(3, 40), st.just(3)), elements=st.floats(-2, 2))
 
 
-@LAW
 @given(clouds, st.sampled_from([2, 3]))
 def test_eigenvalues_are_those_of_numpy(points, plane):
     points = points.astype(np.float32)
@@ -80,7 +79,6 @@ def test_eigenvalues_are_those_of_numpy(points, plane):
     np.testing.assert_allclose(told.centroid[0], points.astype(np.float64).mean(axis=0), atol=1e-12)
 
 
-@LAW
 @given(st.integers(0, 999), st.floats(-3, 3), st.floats(-5, 5), st.floats(-5, 5))
 def test_turning_moving_and_shuffling_do_not_change_the_eccentricity(seed, turn, dx, dy):
     rng = np.random.default_rng(seed)
@@ -90,7 +88,6 @@ def test_turning_moving_and_shuffling_do_not_change_the_eccentricity(seed, turn,
     assert e_of(moved) == pytest.approx(e_of(points), rel=1e-3)
 
 
-@LAW
 @given(st.floats(0.1, 10.0))
 def test_size_does_not_change_the_eccentricity(scale):
     points = np.random.default_rng(0).normal(size=(50, 3)) * [0.3, 0.1, 0.4]
@@ -126,7 +123,6 @@ def test_eccentricity_is_at_least_one():
     np.testing.assert_array_equal(eccentricity(values), [1.0, 3.0, np.inf, 1.0])
 
 
-@LAW
 @given(arrays.arrays(np.int32, st.integers(0, 40), elements=st.integers(-1, 4)))
 def test_gathering_puts_the_rows_of_each_cluster_side_by_side(label):
     order, bounds = group_rows(label, 5)

@@ -12,12 +12,13 @@ from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Float
 from tests.benchmarks.trunks import EXACT_POSES
 from tests.pipeline.detection.people import run_with
+from tests.pipeline.strategies import first_of
 
 EVERY = 2  # scans are made, and as many gathered as in a whole run
 LOOK = 5  # of these the map is looked at
 BEHIND_S = 6.0  # who left a place so long ago has left it behind
 MATCH, PERSON = 0.5, 0.7  # m
-SEEDS = [0, pytest.param(1, marks=pytest.mark.slow), 2]
+SEEDS = first_of(range(3))
 
 
 def looks(seed, kinds):

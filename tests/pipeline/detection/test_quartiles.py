@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.detection.cylinder_fit import quantile
-from tests.pipeline.strategies import LAW
 
 
 def of_sorted(numbers, part):
@@ -19,7 +18,6 @@ def of_sorted(numbers, part):
     return ordered[k] + (at - k) * (ordered[after] - ordered[k])
 
 
-@LAW
 @given(
     arrays.arrays(
         np.float64,

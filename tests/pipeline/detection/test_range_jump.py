@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.detection.clustering import range_jump
-from tests.pipeline.strategies import LAW
 
 STEP = np.radians(0.5)
 BEAMS = np.arange(-180, 181) * STEP
@@ -53,7 +52,6 @@ def test_a_run_beside_free_beams_is_not_hidden():
     assert hidden.tolist() == [False]
 
 
-@LAW
 @given(
     st.lists(st.one_of(st.none(), st.floats(1.0, 30.0)), max_size=60),
     st.floats(0.1, 3.0),

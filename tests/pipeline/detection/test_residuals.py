@@ -14,7 +14,6 @@ from pipeline.detection.cylinder_fit import (
     RAY,
     normal_equations,
 )
-from tests.pipeline.strategies import LAW
 
 SIGMA = 1e-6  # m; what the error of a range is expected to add is nothing then
 FAR = 1e3  # m; every return keeps its weight
@@ -42,7 +41,6 @@ def seen_part(across, reach, radius):
     return 0.5 * (low + high) if low <= high else abs(across) - BEAM * reach
 
 
-@LAW
 @given(st.floats(0.02, 0.4), st.floats(3.0, 120.0), st.floats(-1.2, 1.2), st.floats(-1.5, -0.2))
 def test_the_residual_is_that_of_the_middle_of_the_part_that_meets_the_trunk(radius, distance, side, front):
     across, behind = side * radius, front * radius
@@ -67,7 +65,6 @@ def test_a_beam_wider_than_the_trunk_does_not_turn_its_normal_round(distance):
         assert mirrored[0] == pytest.approx(g[0], rel=1e-6)
 
 
-@LAW
 @given(st.floats(0.05, 0.5), st.floats(2.0, 30.0))
 def test_a_return_on_the_circle_asks_for_nothing(radius, distance):
     _, g, _, _ = one_return(0.0, -radius, distance, radius)

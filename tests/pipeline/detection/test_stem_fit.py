@@ -14,7 +14,7 @@ from pipeline.config import preset
 from pipeline.detection.cluster_shape import describe
 from pipeline.detection.cylinder_fit import BEAM, fit_stems
 from pipeline.types.records import Labels, Sensor
-from tests.pipeline.strategies import FEW, LAW, SENSOR, arc, one_cluster
+from tests.pipeline.strategies import SENSOR, arc, one_cluster
 
 FOREST = preset("forest").shape
 PAPER = preset("paper").shape
@@ -26,7 +26,6 @@ def fit(points, sensor=SENSOR):
     return describe(points.astype(np.float32), one_cluster(points), sensor, FOREST)
 
 
-@LAW
 @given(
     st.floats(0.05, 0.5),
     st.floats(1.0, 1.5),
@@ -168,7 +167,6 @@ def test_neighbours_do_not_disturb_one_another():
         np.testing.assert_allclose(together.centre[k], fit(part).centre[0], atol=1e-4)
 
 
-@FEW
 @given(st.floats(-3.1, 3.1))
 def test_turning_the_scan_turns_the_answer(turn):
     points = arc(0.18, 1.1, distance=6.0)
@@ -235,7 +233,6 @@ def test_where_no_circle_was_fitted_there_is_no_radius():
     assert np.isfinite(fit(arc(0.1, 0.8, rows=1, n=5)).radius[0])
 
 
-@LAW
 @given(arrays.arrays(np.float64, st.tuples(st.integers(1, 12), st.just(3)), elements=st.floats(-50, 50)))
 def test_no_cluster_at_all_breaks_the_fit(points):
     told = fit(points)

@@ -14,7 +14,6 @@ from pipeline.front_end import detect, segment
 from pipeline.geometry.azimuth_bins import bin_direction, direction_bin
 from pipeline.geometry.poses import Pose3
 from pipeline.types.records import Scan, Sensor, Step, Verdict
-from tests.pipeline.strategies import LAW
 
 FOREST = preset("forest")
 STEP = float(np.radians(0.2))
@@ -109,7 +108,6 @@ def test_a_trunk_alone_in_the_view_is_no_border_of_it():
     assert verdict_at(lone, TRUNK[:2]) is not Verdict.AT_BORDER
 
 
-@LAW
 @given(st.integers(0, 5 * BINS))
 def test_a_sector_is_found_again_by_its_middle(k):
     x, y = bin_direction(k, BINS)
@@ -117,7 +115,6 @@ def test_a_sector_is_found_again_by_its_middle(k):
     assert np.hypot(x, y) == pytest.approx(1.0)
 
 
-@LAW
 @given(st.floats(-np.pi, np.pi), st.floats(0.2, 2.2))
 def test_the_view_is_told_by_where_returns_end(heading, half):
     turn = heading + np.linspace(-half, half, 800)

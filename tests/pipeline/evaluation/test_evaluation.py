@@ -24,7 +24,7 @@ from pipeline.evaluation import (
 from pipeline.evaluation.trajectory import fit_rigid
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Path, TruthPath
-from tests.pipeline.strategies import LAW, poses2, seeds, trees, truth_trees
+from tests.pipeline.strategies import poses2, seeds, trees, truth_trees
 
 FOREST = preset("forest").evaluation
 KINDS = ("tree", "pole", "person", "bush", "other")
@@ -44,7 +44,6 @@ def _best(found, truth, reach):
     return best
 
 
-@LAW
 @given(seeds, st.integers(0, 4), st.integers(0, 4))
 def test_the_matching_is_the_best_of_all(seed, n, m):
     rng = np.random.default_rng(seed)
@@ -92,7 +91,6 @@ def test_a_truth_that_few_trees_match_is_doubted(right, elsewhere, missed, doubt
         assert f"warning: {told}" in evaluation_lines(score)
 
 
-@LAW
 @given(seeds, st.integers(0, 12), st.integers(0, 12), st.booleans())
 def test_counts_sum_to_their_wholes(seed, n, m, with_path):
     rng = np.random.default_rng(seed)
@@ -173,7 +171,6 @@ def test_matched_rows_are_of_confirmed_trees_and_true_trees():
 # --- pairs ----------------------------------------------------------------------------------------
 
 
-@LAW
 @given(seeds, st.integers(0, 8), poses2)
 def test_moving_and_turning_a_map_changes_no_distance(seed, n, motion):
     rng = np.random.default_rng(seed)
@@ -186,7 +183,6 @@ def test_moving_and_turning_a_map_changes_no_distance(seed, n, motion):
     assert np.isnan(one.mean) == (n < 2)
 
 
-@LAW
 @given(st.floats(0.5, 2.0))
 def test_a_map_that_is_too_large_errs_by_its_scale(scale):
     truth = np.random.default_rng(0).uniform(-10, 10, (6, 2))
@@ -223,7 +219,6 @@ def truth_of(x, y, stamp=T, same_frame=True):
     return TruthPath(stamp, x, y, np.full(len(x), np.nan), same_frame)
 
 
-@LAW
 @given(poses2)
 def test_a_path_in_another_frame_is_aligned_to_nothing(motion):
     moved = motion.apply(np.stack([X, Y], axis=1))
@@ -239,7 +234,6 @@ def test_a_path_in_another_frame_is_aligned_to_nothing(motion):
     assert not inside.aligned
 
 
-@LAW
 @given(seeds, poses2)
 def test_the_fit_is_the_motion_that_was_made_and_no_nudge_betters_it(seed, motion):
     rng = np.random.default_rng(seed)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
@@ -23,7 +23,6 @@ def whole(found: Float, truth: Float) -> tuple[int, float]:
     return int(good.sum()), float(distance[rows, columns][good].sum())
 
 
-@settings(deadline=None)  # the library loads at the first example
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 40), SIDES)
 def test_groups_that_share_no_pair_give_what_the_whole_gives(seed: int, n: int, m: int, side: float):
     rng = np.random.default_rng(seed)

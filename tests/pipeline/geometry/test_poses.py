@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.poses import Pose2, Pose3, interpolate, mean_angle, wrap_angle
-from tests.pipeline.strategies import LAW, angles, poses2, poses3
+from tests.pipeline.strategies import angles, poses2, poses3
 
 
 def _same2(a: Pose2, b: Pose2) -> None:
@@ -21,7 +21,6 @@ def _same3(a: Pose3, b: Pose3) -> None:
     np.testing.assert_allclose(a.t, b.t, atol=1e-9)
 
 
-@LAW
 @given(poses2, poses2, poses2)
 def test_poses_in_the_plane_form_a_group(a, b, c):
     _same2((a @ b) @ c, a @ (b @ c))
@@ -31,7 +30,6 @@ def test_poses_in_the_plane_form_a_group(a, b, c):
     _same2((a @ b).inverse(), b.inverse() @ a.inverse())
 
 
-@LAW
 @given(poses3, poses3, poses3)
 def test_poses_in_space_form_a_group(a, b, c):
     _same3((a @ b) @ c, a @ (b @ c))
@@ -40,7 +38,6 @@ def test_poses_in_space_form_a_group(a, b, c):
     _same3(a @ Pose3.identity(), a)
 
 
-@LAW
 @given(poses2, poses2)
 def test_composing_poses_is_applying_them_in_turn(a, b):
     points = np.array([[0.0, 0.0], [1.0, 2.0], [-3.0, 0.5]])
@@ -48,14 +45,12 @@ def test_composing_poses_is_applying_them_in_turn(a, b):
     np.testing.assert_allclose(a.inverse().apply(a.apply(points)), points, atol=1e-9)
 
 
-@LAW
 @given(poses3, poses3)
 def test_composing_poses_in_space_is_applying_them_in_turn(a, b):
     points = np.array([[0.0, 0.0, 1.0], [1.0, 2.0, -4.0]])
     np.testing.assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-9)
 
 
-@LAW
 @given(angles)
 def test_a_wrapped_angle_is_the_same_direction_in_one_turn(angle):
     wrapped = float(wrap_angle(angle))
@@ -70,7 +65,6 @@ def test_the_turn_is_half_open_to_the_last_bit():
     assert np.all((wrapped >= -np.pi) & (wrapped < np.pi)), wrapped
 
 
-@LAW
 @given(poses3)
 def test_a_rotation_comes_back_from_its_quaternion_and_its_angles(pose):
     q = pose.quaternion()
@@ -105,7 +99,6 @@ def test_angles_are_those_of_rotations_about_the_axes():
     np.testing.assert_allclose(yaw, [[np.cos(0.1), np.sin(0.1), 0.0]])
 
 
-@LAW
 @given(poses2, poses2, st.floats(0.0, 1.0))
 def test_interpolation_meets_its_ends_and_turns_the_shorter_way(a, b, fraction):
     _same2(interpolate(a, b, 0.0), a)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.ground.scan_ground import find_terrain, in_band
 from pipeline.ground.terrain import SECTORS, Terrain, height_above, heights_of_places, shows_ground
-from tests.pipeline.strategies import FEW, LAW, seeds
+from tests.pipeline.strategies import seeds
 
 FOREST = preset("forest").ground
 SENSOR_HEIGHT = 0.8
@@ -30,7 +30,6 @@ def _rings(slope_deg, uphill, *, field=np.pi):
     return (ray[ok] * reach[ok, None]).astype(np.float32)
 
 
-@FEW
 @given(st.floats(0.0, 34.0), st.floats(-3.1, 3.1))
 def test_the_ground_of_any_plane_stays_out_of_the_band(slope, uphill):
     points = _rings(slope, uphill)
@@ -53,7 +52,6 @@ def test_a_point_over_a_plane_has_its_height(slope, height):
     assert np.abs(error).max() < 0.25 + np.tan(np.radians(slope))
 
 
-@FEW
 @given(st.floats(0.0, 20.0), st.floats(-3.1, 3.1))
 def test_ground_is_known_for_ground_and_places_have_the_heights_of_points(slope, uphill):
     points = _rings(slope, uphill)
@@ -158,7 +156,6 @@ def test_an_echo_far_below_the_ground_is_a_ghost():
     assert np.abs(above[np.hypot(points[:, 0], points[:, 1]) < 10.0]).max() < 0.3
 
 
-@LAW
 @given(seeds, st.integers(1, 48))
 def test_heights_of_many_points_are_those_of_each(seed, rings):
     random = np.random.default_rng(seed)

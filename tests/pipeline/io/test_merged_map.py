@@ -1,4 +1,4 @@
-"""A merged map: what is known of the second map's frame is known of its landmarks."""
+"""Merged maps: the second map is moved into the frame of the first one with its uncertainty."""
 
 from __future__ import annotations
 
@@ -9,54 +9,85 @@ import numpy as np
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.merged_map import merge_maps
 from pipeline.io.checkpoints.saved_map import SavedMap
+from pipeline.tracking.observation import SECTORS
 from pipeline.types.records import Columns
 from tests.pipeline.test_mapper import fed, mapper, run
 
+T = Pose2(1000.0, -300.0, 0.7)
+# Of T, with correlations; the lever arms in the map are a few metres.
+COVARIANCE = np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 4e-4]])
 
-def test_an_unsure_heading_makes_far_landmarks_unsure_across():
-    """sigma^2 d^2 is added across the line to the frame's origin: no sum of variances of x and y alone."""
+
+def expected(covariance, mean):
+    """Covariances of places of the second map in the first one, by a numerical Jacobian.
+
+    Args:
+        covariance: In the frame of the second map, shape (N, 2, 2).
+        mean: In the same frame, shape (N, 2) [m].
+    """
+    h = 1e-4
+    shifted = [Pose2(T.x + dx, T.y + dy, T.yaw + dyaw) for dx, dy, dyaw in h * np.eye(3)]
+    J = np.stack([(pose.apply(mean) - T.apply(mean)) / h for pose in shifted], axis=-1)
+    c, s = np.cos(T.yaw), np.sin(T.yaw)
+    C = np.array([[c, -s], [s, c]])
+    return C @ covariance @ C.T + J @ COVARIANCE @ J.transpose(0, 2, 1)
+
+
+def full(flat):
+    """Matrices of rows xx, xy, yy."""
+    return flat[:, [[0, 1], [1, 2]]]
+
+
+def test_landmarks_and_tracks_of_the_second_map_are_moved_with_their_full_covariances():
     m = mapper()
     fed(m, run()[0][:4])
     state = SavedMap.of(m)
-    T, sigma = Pose2(1000.0, -300.0, 0.7), 0.01
-    merged = merge_maps(state, state, T, np.diag([0.0, 0.0, sigma]) ** 2, 10**12, m.parameters)
+    merged = merge_maps(state, state, T, COVARIANCE, 10**12, m.parameters)
     before = state.slam.map_of(state.slam.best)
     after = merged.map.slam.map_of(merged.map.slam.best)
     n = len(before.hits)
     assert n >= 3
     np.testing.assert_allclose(after.mean[n:], T.apply(before.mean))
-    d2 = np.sum(before.mean**2, axis=1)
-    gained = after.covariance[n:][:, [0, 2]].sum(axis=1) - before.covariance[:, [0, 2]].sum(axis=1)
-    np.testing.assert_allclose(gained, sigma**2 * d2, rtol=1e-9)
-    track = merged.map.tracks.take(np.arange(len(merged.map.tracks)) >= len(state.tracks))
-    own = np.sum(state.tracks.x[:, :2] ** 2, axis=1)
-    grown = np.trace(track.P[:, :2, :2], axis1=1, axis2=2)
-    was = np.trace(state.tracks.P[:, :2, :2], axis1=1, axis2=2)
-    np.testing.assert_allclose(grown - was, sigma**2 * own, rtol=1e-9)
+    wanted = expected(full(before.covariance), before.mean)
+    np.testing.assert_allclose(full(after.covariance)[n:], wanted, rtol=1e-2, atol=1e-5)
+    was = state.tracks
+    track = merged.map.tracks.take(np.arange(len(merged.map.tracks)) >= len(was))
+    np.testing.assert_allclose(track.x[:, :2], T.apply(was.x[:, :2]))
+    np.testing.assert_allclose(
+        track.P[:, :2, :2], expected(was.P[:, :2, :2], was.x[:, :2]), rtol=1e-2, atol=1e-5
+    )
+    np.testing.assert_allclose(track.shared, expected(was.shared, was.x[:, :2]), rtol=1e-2, atol=1e-5)
 
 
-def test_the_marks_of_both_frames_are_kept_and_the_second_s_are_as_sure_as_its_place():
+def test_the_sides_from_which_a_tree_was_seen_turn_with_the_second_map():
+    m = mapper()
+    fed(m, run()[0][:4])
+    state = SavedMap.of(m)
+    state.tracks.sides[:] = 0b11  # the first two sectors from the x axis of the map on
+    quarter = Pose2(500.0, 0.0, np.pi / 2.0)
+    merged = merge_maps(state, state, quarter, COVARIANCE, 10**12, m.parameters).map.tracks
+    assert set(merged.sides[len(state.tracks) :].tolist()) == {0b11 << (SECTORS // 4)}
+
+
+def test_keyframes_of_both_maps_are_kept_and_those_of_the_second_have_the_covariance_of_its_place():
     m = mapper()
     fed(m, run()[0][:6])
     state = SavedMap.of(m)
     assert len(state.slam.frame.serial)
-    T, sigma = Pose2(50.0, -30.0, 0.7), 0.01
-    covariance = np.diag([0.2, 0.3, sigma]) ** 2
-    merged = merge_maps(state, state, T, covariance, 10**12, m.parameters).map
-    merged.state()  # it can be gone on from
-    assert merged.placed == len(state.stamp_ns), "no odometry leads from one run to the other"
+    state.slam.frame.covariance[:] = COVARIANCE
+    merged = merge_maps(state, state, T, COVARIANCE, 10**12, m.parameters).map
+    merged.state()  # mapping can continue from it
+    assert merged.placed == len(state.stamp_ns), "no odometry connects the two runs"
     assert len(merged.motion) == 2 * len(state.stamp_ns)
     was, now = state.slam.frame, merged.slam.frame
     n = len(was.serial)
     assert now.serial.tolist() == [*was.serial, *(was.serial + state.slam.detections)]
     np.testing.assert_allclose(now.pose[n:, :2], T.apply(was.pose[:, :2]))
-    grown = np.trace(now.covariance[n:, :2, :2], axis1=1, axis2=2)
-    before = np.trace(was.covariance[:, :2, :2], axis1=1, axis2=2)
-    lever = np.sum(was.pose[:, :2] ** 2, axis=1)
-    np.testing.assert_allclose(grown - before, 0.13 + sigma**2 * lever, rtol=1e-9)
+    wanted = expected(was.covariance[:, :2, :2], was.pose[:, :2])
+    np.testing.assert_allclose(now.covariance[n:, :2, :2], wanted, rtol=1e-2, atol=1e-5)
 
 
-def test_all_that_is_known_of_the_columns_of_both_is_kept():
+def test_all_fields_of_the_columns_of_both_maps_are_kept():
     m = mapper()
     fed(m, run()[0][:12])
     state = SavedMap.of(m)

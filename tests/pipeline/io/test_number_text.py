@@ -6,13 +6,12 @@ import io
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.io.readers.number_text import parse_numbers, parse_table, read_rows
 
 
-@settings(max_examples=100, deadline=None)
 @given(
     st.lists(st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3), max_size=20),
     st.sampled_from([" ", "\t", "   "]),
@@ -29,7 +28,6 @@ def test_numbers_are_those_that_python_reads(
     assert damaged == 0
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=200))
 def test_arbitrary_bytes_never_raise(text: bytes) -> None:
     table, damaged = parse_table(text, 2)

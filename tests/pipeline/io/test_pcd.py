@@ -87,7 +87,7 @@ def pcd(rows: list[tuple[float, float, float, int]], data: str, **changes: str) 
     return head.encode() + struct.pack("<II", len(packed), len(raw)) + packed
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(COORDINATES)
 def test_ascii_binary_and_compressed_hold_the_same(
     tmp_path: Path, rows: list[tuple[float, float, float, int]]
@@ -104,7 +104,6 @@ def test_ascii_binary_and_compressed_hold_the_same(
             np.testing.assert_array_equal(columns[name].astype(np.float32), column.astype(np.float32))
 
 
-@settings(max_examples=150, deadline=None)
 @given(
     st.binary(max_size=600)
     | st.builds(lambda b, n: b * n, st.binary(min_size=1, max_size=9), st.integers(1, 400))
@@ -113,7 +112,6 @@ def test_lzf_gives_back_what_was_packed(content: bytes):
     assert lzf_decompress(lzf_compress(content), len(content)).tobytes() == content
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.binary(max_size=200), st.integers(0, 2**32 - 1))
 def test_lzf_refuses_damage_without_harm(block: bytes, size: int):
     with suppress(ScanFileError):

@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -77,7 +77,6 @@ def layouts(draw: st.DrawFn) -> np.dtype[np.void]:
     return np.dtype({"names": list(names), "formats": formats, "offsets": offsets, "itemsize": step})
 
 
-@settings(max_examples=150, deadline=None)
 @given(layouts(), st.integers(1, 6), st.integers(1, 8), st.integers(0, 7), st.integers(0, 2**32 - 1))
 def test_any_layout_gives_back_what_was_put_in(
     dtype: np.dtype[np.void], height: int, width: int, padding: int, seed: int

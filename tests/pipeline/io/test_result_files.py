@@ -28,7 +28,7 @@ from pipeline.io.result_files import (
 )
 from pipeline.mapper import Mapper
 from pipeline.types.records import HeightMap, Path
-from tests.pipeline.strategies import LAW, SENSOR, arc, step, trees
+from tests.pipeline.strategies import SENSOR, arc, step, trees
 
 NAMES = {"trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json", "state.zip"}
 START = 1_700_000_000_000_000_000
@@ -52,7 +52,6 @@ def a_frame():
 # --- numbers --------------------------------------------------------------------------------------
 
 
-@LAW
 @given(st.floats(-1e9, 1e9), st.integers(0, 6))
 def test_a_number_is_plain_and_as_near_as_its_digits(value, digits):
     text = _number(value, digits)

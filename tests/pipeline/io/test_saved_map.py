@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.classification import PackedMemory
@@ -225,7 +225,6 @@ class Outer:
     many: list[float]
 
 
-@settings(deadline=None, max_examples=50)
 @given(
     st.lists(st.floats(width=64), max_size=5),
     st.lists(st.tuples(st.integers(-(2**62), 2**62), st.floats(), st.text()), max_size=3),
@@ -242,7 +241,6 @@ def test_every_record_comes_back_bit_by_bit(numbers, parts, flag):
     assert back.y.shape == outer.y.shape
 
 
-@settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6))
 def test_a_memory_comes_back_bit_by_bit(seed, scans):
     rng = np.random.default_rng(seed)

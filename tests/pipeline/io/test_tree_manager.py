@@ -16,7 +16,6 @@ from pipeline.io.readers.tree_manager import _numbers
 from pipeline.io.tree_manager_writer import COLUMNS, state_name, state_text, trajectory_text
 from pipeline.types.records import Odometry, Record, Scan, Stems
 from tests.pipeline.io.conftest import Opened
-from tests.pipeline.strategies import LAW
 
 NAN = float("nan")
 
@@ -174,7 +173,6 @@ def test_an_axis_that_is_none_is_not_known_and_one_upside_down_is_turned(tmp_pat
     )
 
 
-@LAW
 @given(st.lists(st.lists(st.floats(-1e3, 1e3) | st.just(NAN), min_size=17, max_size=17), max_size=5))
 def test_what_is_written_is_read(rows: list[list[float | bool]]):
     _, _, body = state_text(rows).encode().partition(b"\n")
@@ -183,7 +181,6 @@ def test_what_is_written_is_read(rows: list[list[float | bool]]):
     np.testing.assert_allclose(table, np.array(rows, float).reshape(-1, 17), rtol=1e-8, atol=1e-12)
 
 
-@LAW
 @given(st.binary(max_size=300))
 def test_whatever_the_bytes_are_rows_are_whole_or_counted(body: bytes):
     table, damaged = _numbers(body, 3)

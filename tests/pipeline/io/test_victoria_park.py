@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SourceError
@@ -55,7 +55,6 @@ def test_beams_go_from_right_to_left(tmp_path: Path, opened: Opened):
     assert scan.dropped == 358
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(-5, 5), st.floats(-0.6, 0.6), st.integers(1, 400))
 def test_steady_steering_drives_an_arc_of_one_centre(speed: float, steering: float, steps: int):
     car = Car()

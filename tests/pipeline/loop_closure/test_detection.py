@@ -28,7 +28,7 @@ from pipeline.slam.poses import composed, inverse
 from pipeline.tracking.map_correction import bent as bent_tracks
 from pipeline.tracking.track_table import TrackTable
 from tests.benchmarks.wide_ring import REACH, SENSOR, WideRing, mapped
-from tests.pipeline.strategies import FEW, NOTHING_SEEN, detections, seeds
+from tests.pipeline.strategies import NOTHING_SEEN, detections, first_of, seeds
 from tests.pipeline.test_mapper import as_bytes
 
 NOISE = Noise(0.05, 0.01, 0.03)
@@ -61,7 +61,6 @@ def loop(path, at, first=0, ties=NO_TIES, sigma=SURE, motion=None):
 # --- the path -------------------------------------------------------------------------------------
 
 
-@FEW
 @given(st.floats(-1e-3, 1e-3), st.floats(0.97, 1.03), st.integers(0, 100))
 def test_a_path_with_a_steady_error_is_bent_back_onto_the_truth(turn, longer, first):
     truth, told = circle(), circle(turn=turn, longer=longer)
@@ -97,7 +96,6 @@ def test_a_scan_that_known_trees_held_stays_where_it_is():
     assert abs(bent[50, 1]) < 0.15 < abs(free[50, 1])
 
 
-@FEW
 @given(seeds, st.integers(0, 20))
 def test_the_drift_is_that_of_the_steps_one_after_another(seed, first):
     random = np.random.default_rng(seed)
@@ -127,7 +125,6 @@ def shifted(dx=0.0, dy=0.0, first=-1, scans=60):
     return Bend(before, after, first, scans - 1)
 
 
-@FEW
 @given(seeds)
 def test_what_stands_in_one_tile_moves_as_one_piece_and_what_was_known_stays(seed):
     random = np.random.default_rng(seed)
@@ -157,7 +154,6 @@ def test_of_two_trees_that_were_one_the_older_number_stays_and_two_beside_it_sta
     assert table.number.tolist() == [3, 4, 8, 9, 12], "the state itself is left alone"
 
 
-@FEW
 @given(seeds)
 def test_voxels_move_and_no_return_is_lost(seed):
     random = np.random.default_rng(seed)
@@ -222,7 +218,7 @@ def ring(seed, method="constellation"):
     return mapped(WideRing(), seed, STEMS.replace({"relocalisation.method": method}))
 
 
-@pytest.mark.parametrize("seed", [0, 5])
+@pytest.mark.parametrize("seed", first_of([0, 5]))
 def test_back_after_a_long_way_path_and_map_are_bent(seed):
     bent, left = ring(seed), ring(seed, "none")
     assert bent.closed()
@@ -232,7 +228,7 @@ def test_back_after_a_long_way_path_and_map_are_bent(seed):
     assert bent.told()[bent.closed()[0]] < 0.5
 
 
-@pytest.mark.parametrize("seed", [0, 5])
+@pytest.mark.parametrize("seed", first_of([0, 5]))
 def test_every_tree_that_was_seen_stands_once_when_the_loop_is_closed(seed):
     run = ring(seed)
     assert len(run.closed()) == 1, "what is closed is not closed again"
@@ -273,7 +269,7 @@ def test_a_snapshot_taken_before_the_loop_goes_on_to_the_same_bytes():
     assert once == [as_bytes(frame) for frame in run.frames[at - 2 : at + 6]]
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", first_of(range(2)))
 def test_who_has_not_come_back_closes_no_loop(seed):
     run = mapped(WideRing(laps=0.9), seed, STEMS)
     assert not run.closed()

@@ -1,4 +1,4 @@
-"""A kidnapped robot: it says that it is lost, finds itself again, and leaves no false tree behind."""
+"""A kidnapped robot: it reports that it is lost, finds itself again, and leaves no false tree behind."""
 
 from __future__ import annotations
 
@@ -64,11 +64,25 @@ def confirmed(frame):
 
 
 @cache
+def mapped_before():
+    """A mapper that mapped the drive up to the jump, its snapshot and its frames."""
+    m = mapper()
+    frames = [m.process(step) for step in kidnapped()[0]]
+    return m, m.snapshot(), frames
+
+
+def at_the_jump():
+    """The mapper, restored to the scan of the jump."""
+    m, state, _ = mapped_before()
+    m.restore(state)
+    return m
+
+
+@cache
 def mapped():
     """The frames before and after the jump."""
-    m = mapper()
-    before, after = kidnapped()
-    return [m.process(step) for step in before], [m.process(step) for step in after]
+    m = at_the_jump()
+    return mapped_before()[2], [m.process(step) for step in kidnapped()[1]]
 
 
 def test_a_drive_without_a_jump_is_never_lost():
@@ -87,10 +101,7 @@ def test_a_kidnapped_robot_says_so_and_is_good_again_within_fifty_scans():
 
 
 def test_no_loop_bends_what_was_driven_before_it_was_put_in_place():
-    m = mapper()
-    before, after = kidnapped()
-    for step in before:
-        m.process(step)
+    m, (_, after) = at_the_jump(), kidnapped()
     state = m.snapshot()
     assert state.placed == 0
     told = iter(m.process(step).warnings for step in after)
@@ -133,10 +144,7 @@ def test_without_relocalisation_it_maps_on():
 
 
 def test_a_snapshot_taken_while_lost_goes_on_to_the_same_bytes():
-    m = mapper()
-    before, after = kidnapped()
-    for step in before:
-        m.process(step)
+    m, (_, after) = at_the_jump(), kidnapped()
     lost = [m.process(step) for step in after[:5]]
     assert lost[-1].health.state == "lost"
     state = m.snapshot()
@@ -147,19 +155,13 @@ def test_a_snapshot_taken_while_lost_goes_on_to_the_same_bytes():
 
 @pytest.mark.parametrize("landing", [0, 90])
 def test_wherever_it_lands(landing):
-    m = mapper()
-    before, after = kidnapped(landing)
-    for step in before:
-        m.process(step)
+    m, (_, after) = at_the_jump(), kidnapped(landing)
     states = [m.process(step).health.state for step in after]
     assert states[-1] != "lost"
 
 
 def test_a_map_saved_while_lost_goes_on_to_the_same_bytes():
-    m = mapper()
-    before, after = kidnapped()
-    for step in before:
-        m.process(step)
+    m, (_, after) = at_the_jump(), kidnapped()
     for step in after[:5]:
         m.process(step)
     saved = SavedMap.of(m)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
@@ -15,7 +15,6 @@ from pipeline.loop_closure.stem_matching.alignment import aligned, alignment_cov
 from pipeline.loop_closure.stem_matching.hypotheses import pairs_within
 from pipeline.loop_closure.stem_matching.stem_constellation import worst_sigma
 
-LAW = settings(deadline=None, max_examples=25)
 P = Relocalisation()
 seeds = st.integers(0, 2**32 - 1)
 SIDE = 60.0
@@ -43,7 +42,6 @@ def is_right(match, T, local):
     return off < 1.0 and abs(float(wrap_angle(match.pose.yaw - T.yaw))) < 0.05
 
 
-@LAW
 @given(seeds, st.floats(0.0, 0.35), st.floats(0.0, 0.35))
 def test_no_loop_is_false_in_a_forest(seed, missing, false):
     rng = np.random.default_rng(seed)
@@ -66,7 +64,6 @@ def test_most_views_of_a_forest_are_found():
     assert found >= 28
 
 
-@LAW
 @given(seeds)
 def test_a_forest_that_is_not_in_the_map_is_not_found_there(seed):
     rng = np.random.default_rng(seed)
@@ -76,7 +73,6 @@ def test_a_forest_that_is_not_in_the_map_is_not_found_there(seed):
     assert match.reason in ("could be chance", "no agreement", "too few stems", "ambiguous")
 
 
-@LAW
 @given(seeds, st.floats(1.5, 5.0), st.floats(1.0, 1.6), st.floats(0.0, 0.1), st.floats(0.0, 0.2))
 def test_a_plantation_is_refused(seed, spacing, ratio, jitter, missing):
     rng = np.random.default_rng(seed)
@@ -105,7 +101,6 @@ def test_diameters_can_tell_the_rows_of_a_plantation_apart():
     assert blind.reason == "ambiguous"
 
 
-@LAW
 @given(seeds, st.floats(-3.1, 3.1), st.floats(-500, 500), st.floats(-500, 500))
 def test_the_pose_turns_with_the_local_frame(seed, yaw, x, y):
     rng = np.random.default_rng(seed)
@@ -174,7 +169,6 @@ def test_the_same_stems_give_the_same_bytes():
 # --- closed forms ---------------------------------------------------------------------------------
 
 
-@LAW
 @given(seeds, st.integers(2, 30))
 def test_the_alignment_is_that_of_scipy(seed, n):
     from scipy.spatial.transform import Rotation
@@ -206,7 +200,6 @@ def test_the_covariance_of_stems_on_a_circle():
     np.testing.assert_allclose(told, wanted, atol=1e-12)
 
 
-@LAW
 @given(seeds, st.integers(0, 60))
 def test_the_pairs_are_those_of_a_tree(seed, n):
     from scipy.spatial import cKDTree
@@ -219,7 +212,6 @@ def test_the_pairs_are_those_of_a_tree(seed, n):
     assert np.all(np.diff(length) >= 0)
 
 
-@LAW
 @given(seeds)
 def test_the_worst_sigma_is_the_larger_eigenvalue(seed):
     A = np.random.default_rng(seed).normal(size=(5, 2, 2))

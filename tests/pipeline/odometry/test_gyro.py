@@ -19,7 +19,7 @@ from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing.acquisition import acquire
 from pipeline.slam.motion import Motion, accumulated
 from pipeline.types.records import Imu, Odometry, Scan, Sensor, Step, Turn
-from tests.pipeline.strategies import LAW, scan, seeds
+from tests.pipeline.strategies import scan, seeds
 
 MS = 1_000_000
 START = 1_700_000_000_000_000_000
@@ -46,7 +46,6 @@ def told(rate_at, until_ms, *, standing=False, tilt=(0.0, 0.0)):
     return gyro
 
 
-@LAW
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.integers(5, 180), st.integers(50, 200))
 def test_a_turn_is_the_integral_of_its_rate(a, b, first, span):
     gyro = told(lambda t: a + b * t, 500)
@@ -57,7 +56,6 @@ def test_a_turn_is_the_integral_of_its_rate(a, b, first, span):
     assert turn.sigma > 0.0
 
 
-@LAW
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-1.0, 1.0))
 def test_only_the_turn_about_the_vertical_counts(roll, pitch, rate):
     rate_told = told(lambda _: rate, 200, tilt=(roll, pitch)).rate(START + 100 * MS)
@@ -121,7 +119,6 @@ def test_holes_and_dead_units_tell_nothing():
 # --- wheels and gyroscope -------------------------------------------------------------------------
 
 
-@LAW
 @given(seeds, st.floats(1e-4, 0.1), st.floats(1e-4, 0.1))
 def test_turns_that_agree_are_weighed_by_their_variances(seed, a, b):
     rng = np.random.default_rng(seed)
@@ -134,7 +131,6 @@ def test_turns_that_agree_are_weighed_by_their_variances(seed, a, b):
     assert (slack, doubt) == ((0.1, 0.0), "")
 
 
-@LAW
 @given(st.floats(-0.5, 0.5), st.floats(0.01, 0.5), st.floats(-0.3, 0.3))
 def test_a_sure_gyroscope_puts_the_robot_on_its_true_arc(turn, way, wrong):
     def chord(angle):

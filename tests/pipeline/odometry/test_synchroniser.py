@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.poses import Pose2, Pose3, wrap_angle
 from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Imu, Odometry, Step
-from tests.pipeline.strategies import LAW, scan
+from tests.pipeline.strategies import scan
 
 MS = 1_000_000
 START = 1_700_000_000_000_000_000  # nanoseconds do not fit a float: only their differences may become one
@@ -41,7 +41,6 @@ def at(ms):
     return scan(START + round(ms * MS))
 
 
-@LAW
 @given(st.floats(0.1, 200.0), st.floats(-2, 2), st.floats(-3, 3))
 def test_the_pose_is_interpolated_to_the_time_of_the_scan(ms, speed, turn):
     readings = [odometry(t, speed * t * 1e-3, 0.0, turn * t * 1e-3) for t in range(0, 220, 20)]
@@ -55,7 +54,6 @@ def test_the_pose_is_interpolated_to_the_time_of_the_scan(ms, speed, turn):
     assert step.warnings == ()
 
 
-@LAW
 @given(st.floats(0.0, 40.0), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_the_tilt_of_the_pose_is_that_of_the_time_of_the_scan(ms, roll, pitch):
     records = [odometry(0, roll=0.1), at(ms), odometry(40, 0.02, roll=roll, pitch=pitch)]

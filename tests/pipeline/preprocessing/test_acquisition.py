@@ -11,7 +11,7 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose3
 from pipeline.preprocessing.acquisition import HOUSING, acquire, acquire_near
 from pipeline.types.records import Step
-from tests.pipeline.strategies import LAW, scan
+from tests.pipeline.strategies import scan
 
 FOREST = preset("forest").acquisition
 MOUNTING = Pose3.from_euler(np.array([0.3, -0.1, 0.8]), 0.02, -0.05, 0.4)
@@ -30,7 +30,6 @@ def _seen(world, T_world_base):
     )
 
 
-@LAW
 @given(st.integers(0, 999), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_a_tilted_robot_gives_the_upright_world(seed, roll, pitch):
     world = _world(seed)
@@ -53,7 +52,6 @@ def test_without_a_known_tilt_or_the_wish_nothing_is_turned():
     np.testing.assert_array_equal(unknown, unwanted)
 
 
-@LAW
 @given(st.integers(0, 999), st.floats(-3.0, 3.0), st.floats(-0.5, 0.5))
 def test_driving_straight_leaves_no_trace_in_the_scan(seed, forward, left):
     world = _world(seed)
@@ -64,7 +62,6 @@ def test_driving_straight_leaves_no_trace_in_the_scan(seed, forward, left):
     np.testing.assert_allclose(points + offset, world, atol=1e-5)
 
 
-@LAW
 @given(st.integers(0, 999), st.floats(-2.0, 2.0))
 def test_turning_on_the_spot_leaves_no_trace_in_the_scan(seed, turn):
     world = _world(seed)
@@ -103,7 +100,6 @@ def test_both_ends_of_the_range_belong_to_it_and_nan_to_nothing():
     np.testing.assert_array_equal(points, np.array([[0.5, 0, 0], [0, 40, 0]], np.float32))
 
 
-@LAW
 @given(st.integers(0, 999), st.floats(0.0, 3.0))
 def test_each_return_is_near_or_taken_or_out_of_reach(seed, nearest):
     rng = np.random.default_rng(seed)

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
 from pipeline.preprocessing.filters import pass_through, voxel_grid
-from tests.pipeline.strategies import LAW, simulated_cloud
+from tests.pipeline.strategies import simulated_cloud
 
 FOREST = preset("forest").filters
 clouds = arrays.arrays(
@@ -26,14 +26,12 @@ def _means_of_cubes(points, size):
     return np.array([points[rows].astype(np.float64).mean(axis=0) for rows in cubes.values()]).reshape(-1, 3)
 
 
-@LAW
 @given(clouds, st.sampled_from([0.01, 0.05, 0.25, 1.0]))
 def test_voxels_are_the_means_of_cubes(points, size):
     p = FOREST.model_copy(update={"voxel_size": size})
     np.testing.assert_allclose(voxel_grid(points, p), _means_of_cubes(points, size), atol=1e-6)
 
 
-@LAW
 @given(clouds, st.randoms(use_true_random=False))
 def test_the_order_of_points_does_not_matter(points, random):
     p = FOREST.model_copy(update={"voxel_size": 0.5})
@@ -78,7 +76,6 @@ def test_a_thousand_equal_points_are_one():
     np.testing.assert_allclose(voxel_grid(points, FOREST), points[:1], atol=1e-6)
 
 
-@LAW
 @given(clouds)
 def test_the_box_keeps_what_numpy_keeps_in_its_order(points):
     p = FOREST.model_copy(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.simulation.primitives import BOX, CONE, ELLIPSOID, SolidsBuilder
@@ -56,7 +56,6 @@ def test_beam_at_the_tangent_of_a_cylinder():
     assert meet_cone(shape, np.zeros(3), np.array([np.cos(outside), np.sin(outside), 0.0])) == np.inf
 
 
-@settings(deadline=None)
 @given(SEEDS)
 def test_cones_agree_with_the_oracle(seed):
     rng = np.random.default_rng(seed)
@@ -75,7 +74,6 @@ def test_cones_agree_with_the_oracle(seed):
     assert np.sum(np.isfinite(ours) != np.isfinite(slow)) <= 1
 
 
-@settings(deadline=None)
 @given(SEEDS)
 def test_ellipsoids_and_boxes_agree_with_the_oracle(seed):
     rng = np.random.default_rng(seed)

@@ -19,7 +19,6 @@ from pipeline.simulation.robot_motion import (
     sharp_cells,
     within_gains,
 )
-from tests.pipeline.strategies import FEW, LAW
 
 SPEED = 0.6
 WAYS = {
@@ -85,7 +84,6 @@ def test_a_way_without_sharp_turns_has_no_turns_on_the_spot():
     assert (drive.speed[drive.t > 2.0] > 0.2).all()
 
 
-@LAW
 @given(
     st.lists(st.tuples(st.floats(0.0, 2.0), st.floats(-8.0, 8.0)), min_size=2, max_size=40),
     st.floats(0.01, 0.5),
@@ -109,7 +107,6 @@ def test_speeds_are_the_fastest_between_which_a_robot_can_change(samples, ds):
     np.testing.assert_allclose(told, slow, atol=1e-6)
 
 
-@FEW
 @given(st.floats(0.01, 0.3), st.floats(-7.0, 7.0))
 def test_a_turn_on_the_spot_goes_from_rest_to_rest(way, turn):
     spin = Spin.over(0.0, way, 0.0, turn)

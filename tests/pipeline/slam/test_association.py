@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.slam.association import associate
-from tests.pipeline.strategies import LAW, seeds
+from tests.pipeline.strategies import seeds
 
 SMALL = np.array([[1e-3, 0.0, 1e-3]])
 
@@ -24,7 +24,6 @@ def join(centre, mean, *, R=SMALL, P=SMALL, gate=3.0, distance_max=1.0):
     )
 
 
-@LAW
 @given(seeds, st.integers(0, 8), st.integers(0, 8))
 def test_pairs_are_one_to_one_and_within_gate_and_reach(seed, detections, landmarks):
     rng = np.random.default_rng(seed)
@@ -41,7 +40,6 @@ def test_pairs_are_one_to_one_and_within_gate_and_reach(seed, detections, landma
         assert np.hypot(*y) <= 0.7
 
 
-@LAW
 @given(seeds, st.integers(1, 5))
 def test_clear_cases_are_joined_as_the_best_of_all_assignments(seed, n):
     rng = np.random.default_rng(seed)
@@ -55,7 +53,6 @@ def test_clear_cases_are_joined_as_the_best_of_all_assignments(seed, n):
     np.testing.assert_array_equal(row, best)
 
 
-@LAW
 @given(seeds, st.integers(0, 40), st.integers(0, 40), st.floats(0.05, 10.0), st.floats(0.3, 5.0))
 def test_every_pair_within_reach_is_weighed(seed, detections, landmarks, distance_max, gate):
     """Against all pairs by brute force, ties by the landmark and then by the detection that comes first."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.gaussian import Pose, expected_spread, pose_of
@@ -15,7 +15,6 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 @given(SEEDS, st.sampled_from([0.05, 1.0, 4.0, 20.0]))
-@settings(max_examples=40, deadline=None)
 def test_cells_find_who_stands_near(seed: int, radius: float) -> None:
     random = np.random.default_rng(seed)
     mean = random.uniform(-60.0, 60.0, (80, 2))
@@ -32,7 +31,6 @@ def test_cells_find_who_stands_near(seed: int, radius: float) -> None:
 
 @pytest.mark.parametrize("distance_max", [0.5, 1.0, 4.0])
 @given(seed=SEEDS)
-@settings(max_examples=25, deadline=None)
 def test_pairs_are_all_within_the_gate_and_sorted(seed: int, distance_max: float) -> None:
     random = np.random.default_rng(seed)
     mean = random.uniform(-12.0, 12.0, (60, 2))

@@ -13,7 +13,7 @@ from pipeline.tracking import Tracker
 from pipeline.tracking.split_covariance_intersection import split, weight
 from tests.benchmarks.cases.consistency import Errors, one_run
 from tests.benchmarks.stands import STRAIGHT
-from tests.pipeline.strategies import LAW, NOTHING_SEEN, detections, seeds
+from tests.pipeline.strategies import NOTHING_SEEN, detections, seeds
 
 POSE = np.diag([0.1, 0.1, 0.0]) ** 2
 MANY = 1e12  # particles, of which no sampling noise is left
@@ -37,7 +37,6 @@ def joined(own, shared, R, B, x, z):
     return x + K @ (z - x), (np.eye(2) - K) @ P[0, :2, :2], part[0], K
 
 
-@LAW
 @given(seeds, st.floats(-1.0, 1.0))
 def test_the_told_covariance_bounds_the_true_one_whatever_the_correlation(seed, r):
     rng = np.random.default_rng(seed)
@@ -51,7 +50,6 @@ def test_the_told_covariance_bounds_the_true_one_whatever_the_correlation(seed, 
     np.testing.assert_allclose(told, own_after + part, atol=1e-9)
 
 
-@LAW
 @given(seeds)
 def test_without_a_shared_part_it_is_the_kalman_filter(seed):
     rng = np.random.default_rng(seed)
@@ -64,7 +62,6 @@ def test_without_a_shared_part_it_is_the_kalman_filter(seed):
     np.testing.assert_array_equal(part, 0.0)
 
 
-@LAW
 @given(*[st.floats(1e-4, 1.0)] * 4)
 def test_the_weight_makes_the_variance_least(own, shared, R, B):
     def variance(w):
@@ -96,7 +93,6 @@ def test_a_view_from_a_sure_pose_takes_over_from_doubtful_ones():
 # --- a pose ---------------------------------------------------------------------------------------
 
 
-@LAW
 @given(seeds)
 def test_the_larger_of_two_covariances_is_as_large_as_both(seed):
     rng = np.random.default_rng(seed)
@@ -128,7 +124,6 @@ def test_what_the_particles_forgot_is_remembered_where_the_landmarks_stand():
     np.testing.assert_allclose(told, thin)
 
 
-@LAW
 @given(seeds, st.sampled_from([1.0, 30.0, 1000.0]))
 def test_what_is_larger_by_sampling_noise_alone_counts_for_nothing_and_by_much_for_all(seed, n_eff):
     rng = np.random.default_rng(seed)

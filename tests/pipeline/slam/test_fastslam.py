@@ -18,7 +18,7 @@ from pipeline.slam.motion import compound, moved_poses, noise_of, step_variances
 from pipeline.slam.particle_maps import ROOM, own_block, take_ancestors, with_room
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.state import SlamState
-from tests.pipeline.strategies import ALL_FREE, FEW, LAW, NOTHING_SEEN, detections, seeds
+from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam
 TREES = np.array([[5.0, 2.0], [6.0, -2.0], [2.0, 4.0], [-3.0, 3.0], [1.0, -4.0], [8.0, 1.0]])
@@ -96,7 +96,6 @@ def test_the_covariance_of_a_motion_is_the_scatter_of_drawn_motions():
     np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.05 * covariance.max())
 
 
-@LAW
 @given(st.floats(-3, 3), st.floats(-2, 2), st.floats(-2, 2), st.floats(-1, 1))
 def test_the_motion_is_the_composition_of_poses(yaw, x, y, turn):
     start, step = Pose2(1.0, -2.0, yaw), Pose2(x, y, turn)
@@ -124,7 +123,6 @@ def _full(c):
     return np.array([[c[0], c[1]], [c[1], c[2]]])
 
 
-@LAW
 @given(seeds, covariances, covariances)
 def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
     from filterpy.kalman import update
@@ -143,7 +141,6 @@ def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
     np.testing.assert_allclose(wanted_P, precision, atol=1e-9)
 
 
-@LAW
 @given(covariances, covariances, st.integers(1, 400))
 def test_a_landmark_s_covariance_stays_positive(Sigma, R, times):
     m, rows = np.zeros((1, 2)), Sigma[None].copy()
@@ -318,7 +315,6 @@ def test_what_particles_share_changes_nothing_of_what_they_learn():
         assert frozen(shared.state) == frozen(apart.state)
 
 
-@FEW
 @given(seeds)
 def test_resampling_gives_each_particle_its_ancestor_s_map_and_loses_no_row(seed):
     rng = np.random.default_rng(seed)
@@ -356,7 +352,6 @@ def test_a_copy_and_its_original_share_nothing():
     assert frozen(copy) == before
 
 
-@FEW
 @given(st.integers(1, 300), st.integers(1, 300))
 def test_another_number_of_particles_keeps_the_belief(before, after):
     rng = np.random.default_rng(before)

@@ -14,7 +14,7 @@ from pipeline.geometry.gaussian import pose_of
 from pipeline.geometry.poses import Pose2
 from pipeline.slam import FastSlam
 from pipeline.slam.joint_association import CHOICES, MOST, choose_jointly, doubts_for
-from tests.pipeline.strategies import FEW, NOTHING_SEEN, detections, seeds
+from tests.pipeline.strategies import NOTHING_SEEN, detections, seeds
 
 GATE2 = 12.25
 WELL = 3  # hits
@@ -86,7 +86,6 @@ def searched(scene_, n, doubts, gate2=GATE2):
 
 
 @pytest.mark.parametrize(("n", "choices"), [(1, 4), (3, 2), (4, 3)])
-@FEW
 @given(seed=seeds)
 def test_the_choice_is_the_likeliest_of_all(n, choices, seed):
     given_ = scene(seed, n)
@@ -99,7 +98,6 @@ def test_the_choice_is_the_likeliest_of_all(n, choices, seed):
     assert cost_of(chosen, *given_[:7]) == pytest.approx(cost, abs=1e-6)
 
 
-@FEW
 @given(seeds)
 def test_pair_by_pair_is_the_likelihood_of_all_pairs_together(seed):
     """One Gaussian of all innovations, which share the error of the pose, linearised at one place."""
@@ -125,7 +123,6 @@ def test_pair_by_pair_is_the_likelihood_of_all_pairs_together(seed):
     assert cost == pytest.approx(y @ np.linalg.solve(S, y) + np.linalg.slogdet(S)[1], rel=0.02, abs=0.2)
 
 
-@FEW
 @given(seeds)
 def test_many_doubts_end_and_are_never_worse_than_no_landmark_at_all(seed):
     given_ = scene(seed, MOST, trees=MOST)

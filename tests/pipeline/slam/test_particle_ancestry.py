@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.slam.particle_ancestry import BLOCK, RECENT_POSES, Genealogy
-from tests.pipeline.strategies import FEW, seeds
+from tests.pipeline.strategies import seeds
 
 
 def grown(rng, particles, scans):
@@ -22,7 +22,6 @@ def grown(rng, particles, scans):
     return genealogy, pasts
 
 
-@FEW
 @given(seeds, st.integers(1, 9), st.integers(1, 40))
 def test_a_path_is_the_past_of_its_particle(seed, particles, scans):
     genealogy, pasts = grown(np.random.default_rng(seed), particles, scans)
@@ -30,7 +29,6 @@ def test_a_path_is_the_past_of_its_particle(seed, particles, scans):
         np.testing.assert_allclose(genealogy.path(leaf), pasts[leaf], atol=1e-6)
 
 
-@FEW
 @given(seeds, st.integers(1, 9))
 def test_particles_drawn_anew_keep_their_past(seed, particles):
     rng = np.random.default_rng(seed)

@@ -24,7 +24,7 @@ from pipeline.slam.pose_quality import (
 from pipeline.slam.rigid_shift_test import MANY
 from pipeline.slam.running_statistics import LED, LED_MOST, STRANGE_LOST, Doubted, Recent, remembered
 from pipeline.slam.scan_statistics import INNOVATION, RECOGNISED, SHIFT, TOLD, ScanTold, scan_told
-from tests.pipeline.strategies import ALL_FREE, FEW, NOTHING_SEEN, detections, seeds
+from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam
 WORLD = np.stack(np.meshgrid(np.arange(-12.0, 13.0, 4.0), [-3.0, 3.0]), axis=-1).reshape(-1, 2)
@@ -126,7 +126,6 @@ def test_the_word_and_its_reason(recent, sigma, doubt, state):
     assert bool(health.reason) == (state != "good")
 
 
-@FEW
 @given(seeds)
 def test_what_the_particles_tell_is_weighted(seed):
     rng = np.random.default_rng(seed)

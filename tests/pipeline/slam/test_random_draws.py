@@ -7,10 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.slam.random_draws import draws
-from tests.pipeline.strategies import LAW
 
 
-@LAW
 @given(st.integers(0, 2**70), st.integers(0, 2**40))
 def test_seed_and_scan_decide(seed: int, index: int) -> None:
     noise, offset = draws(seed, index, 20)

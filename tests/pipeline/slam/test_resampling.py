@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.slam.resampling import low_variance_ancestors, normalised
-from tests.pipeline.strategies import LAW, seeds
+from tests.pipeline.strategies import seeds
 
 offsets = st.floats(0.0, 1.0, exclude_max=True)
 
@@ -25,7 +25,6 @@ def test_weights_on_three_of_a_hundred_particles_give_those_three():
         assert drawn[99] in (49, 50)
 
 
-@LAW
 @given(seeds, st.integers(1, 200), offsets, st.floats(0.1, 20.0))
 def test_each_particle_is_drawn_as_often_as_its_weight_says(seed, particles, offset, contrast):
     weights = normalised(np.random.default_rng(seed).normal(0, contrast, particles))
@@ -37,7 +36,6 @@ def test_each_particle_is_drawn_as_often_as_its_weight_says(seed, particles, off
     assert np.all(drawn <= np.ceil(due + 1e-9))
 
 
-@LAW
 @given(seeds, offsets)
 def test_survivors_keep_their_slot(seed, offset):
     weights = normalised(np.random.default_rng(seed).normal(0, 2, 40))
@@ -62,7 +60,6 @@ def test_equal_weights_with_any_offset_keep_all_but_the_rounded(offset):
     assert low_variance_ancestors(np.ones(1), offset).tolist() == [0]
 
 
-@LAW
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=50))
 def test_weights_sum_to_one_and_keep_their_ratios(logs):
     weights = normalised(np.array(logs))

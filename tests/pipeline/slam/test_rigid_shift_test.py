@@ -11,7 +11,7 @@ from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam.motion import Noise, Wheels
 from pipeline.slam.rigid_shift_test import AGREE, FEWEST, MANY, SEVERAL, moved_together
 from pipeline.slam.slip_detection import SLIPPED, STUCK, UNSURE, motion_by_trees, why
-from tests.pipeline.strategies import LAW, seeds
+from tests.pipeline.strategies import seeds
 
 SIGMA = 0.03
 SURE = Noise(0.03, np.radians(0.4), np.radians(2.0))
@@ -44,7 +44,6 @@ def asked(
     return moved, place, C
 
 
-@LAW
 @given(seeds, st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.02, 0.02), st.floats(-3.0, 3.0))
 def test_a_small_motion_of_all_is_recovered(seed, x, y, turn, yaw):
     known, _ = scene(seed)
@@ -63,14 +62,12 @@ def test_a_small_motion_of_all_is_recovered(seed, x, y, turn, yaw):
     assert np.all(np.linalg.eigvalsh(C) > 0.0)
 
 
-@LAW
 @given(seeds)
 def test_trees_that_stand_where_they_should_tell_nothing(seed):
     known, rng = scene(seed)
     assert not asked(known, known + rng.normal(0.0, SIGMA, known.shape))[0]
 
 
-@LAW
 @given(seeds, st.integers(1, 3))
 def test_some_that_do_not_agree_are_left_out(seed, others):
     known, rng = scene(seed)

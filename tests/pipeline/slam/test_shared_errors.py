@@ -14,7 +14,7 @@ from pipeline.slam.shared_errors import Measured, SharedErrors, corrected_by, le
 from pipeline.slam.state import SlamState
 from pipeline.types.sensor_data import SHARED, SOURCES, PoseMeasurement
 from tests.benchmarks.stands import RING
-from tests.pipeline.strategies import LAW, NOTHING_SEEN, detections, seeds
+from tests.pipeline.strategies import NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam
 STEPS, STRIDE = 160, 0.5
@@ -116,7 +116,6 @@ def test_a_scan_without_trees_leaves_the_place_as_well_known_as_the_way_since():
         assert sigma[k] < 1.3 * max(sigma[k - 1], sigma[k + 1])
 
 
-@LAW
 @given(seeds)
 def test_a_particle_learns_what_the_joint_gaussian_of_pose_and_errors_says(seed):
     rng = np.random.default_rng(seed)
@@ -142,7 +141,6 @@ def test_a_particle_learns_what_the_joint_gaussian_of_pose_and_errors_says(seed)
     np.testing.assert_allclose(measured.covariance[0], after[3:, 3:] - gain @ after[:3, 3:], atol=1e-6)
 
 
-@LAW
 @given(seeds)
 def test_an_inverse_by_cofactors_is_the_inverse(seed):
     S = spd(np.random.default_rng(seed), 3)

@@ -19,6 +19,7 @@ from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Frame, Record, Truth
 from tests.benchmarks.troubled import AFTER, KNOWN, PLACES, SENSOR, TROUBLES, Drive, drive, parameters
+from tests.pipeline.strategies import first_of
 
 WITHIN = 50  # scans
 NO_WORSE = 0.2  # m beyond the error before
@@ -121,18 +122,18 @@ def assert_survived(name: str, day: Day, slower: int = 1, *, enough: bool = True
 
 
 @pytest.mark.parametrize("name", TROUBLES)
-@pytest.mark.parametrize(("place", "seed"), [("stand", 1), ("a circle", 2)])
+@pytest.mark.parametrize(("place", "seed"), first_of([("stand", 1), ("a circle", 2)]))
 def test_a_bad_day(name: str, place: str, seed: int) -> None:
     assert_survived(name, lived(place, seed, name))
 
 
 @pytest.mark.parametrize("name", ["stuck", "odometry ends", "jump of 0.5 m", "kidnapped"])
-@pytest.mark.parametrize(("place", "seed"), [("at 3 m/s", 3), ("few trees", 4), ("dense", 5)])
+@pytest.mark.parametrize(("place", "seed"), first_of([("few trees", 4), ("at 3 m/s", 3), ("dense", 5)]))
 def test_elsewhere(name: str, place: str, seed: int) -> None:
     assert_survived(name, lived(place, seed, name), enough=(name, place) != ("stuck", "few trees"))
 
 
-@pytest.mark.parametrize(("place", "seed"), [("at 3 m/s", 3), ("dense", 5)])
+@pytest.mark.parametrize(("place", "seed"), first_of([("dense", 5), ("at 3 m/s", 3)]))
 def test_stuck_from_the_start_where_more_trees_stand_than_people_walk(place: str, seed: int) -> None:
     assert_survived("stuck from the start", lived(place, seed, "stuck from the start"))
 

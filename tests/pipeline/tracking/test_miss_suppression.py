@@ -19,7 +19,7 @@ from pipeline.tracking.map_correction import held
 from pipeline.tracking.miss_suppression import beyond_doubt
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import Landmarks, Verdict
-from tests.pipeline.strategies import ALL_FREE, FEW, detections, seeds
+from tests.pipeline.strategies import ALL_FREE, detections, seeds
 
 STEMS = preset("stems").tracking
 MAX = STEMS.distance_max
@@ -41,7 +41,6 @@ def pose_known(sigma, yaw=0.0):
     return np.diag(np.square([sigma, sigma, yaw]))
 
 
-@FEW
 @given(seeds, st.floats(0.0, 5.0), st.floats(0.0, 0.2))
 def test_who_knows_the_trees_no_better_than_the_robot_its_place_spares_none(seed, sigma, yaw):
     random = np.random.default_rng(seed)
@@ -114,7 +113,6 @@ def test_a_tree_that_was_given_up_is_taken_back_with_a_number_of_its_own():
 # --- one hypothesis -------------------------------------------------------------------------------
 
 
-@FEW
 @given(seeds, st.floats(0.1, 3.0))
 def test_where_particles_lie_apart_one_is_followed_until_it_dies(seed, power):
     random = np.random.default_rng(seed)

@@ -12,7 +12,6 @@ from pipeline.tracking import Tracker
 from pipeline.tracking.track_classification import REACH
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import Verdict
-from tests.pipeline.strategies import LAW
 from tests.pipeline.tracking.test_round_fit_override import PLACE, column
 
 FOREST = preset("forest")
@@ -47,7 +46,6 @@ def test_what_stands_alone_within_reach_is_it_however_far():
     assert told((REACH + 0.01, 3))[1:] == [Verdict.TREE], "the column begins a track of its own"
 
 
-@LAW
 @given(st.lists(st.tuples(st.floats(0.0, 0.44), st.integers(0, 600)), min_size=1, max_size=6))
 def test_none_that_is_both_nearer_and_seen_more_often_is_left_for_another(tracks):
     verdicts = told(*tracks)

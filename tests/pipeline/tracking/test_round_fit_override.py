@@ -18,7 +18,6 @@ from pipeline.tracking import Tracker
 from pipeline.tracking.round_fit_override import FITS, REACH, SIDES
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import Verdict
-from tests.pipeline.strategies import LAW
 
 FOREST = preset("forest")
 PLACE = np.array([3.0, -2.0])
@@ -103,7 +102,6 @@ def test_what_the_votes_alone_decide_is_not_asked_how_high_it_is(votes, kind):
     assert verdict(rays(column(**votes), 0, 50), track()) is Verdict[kind.upper()]
 
 
-@LAW
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.05, 1.0))
 def test_no_tree_is_lost_and_more_votes_for_a_tree_never_harm(tree, more, needed):
     low, high = sorted((tree, more))

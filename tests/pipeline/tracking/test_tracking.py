@@ -15,7 +15,7 @@ from pipeline.tracking import Tracker
 from pipeline.tracking.kalman import ENGINES, process_noise, transition
 from pipeline.tracking.merge import fuse
 from pipeline.tracking.observation import SECTORS, seen_sides
-from tests.pipeline.strategies import ALL_FREE, FEW, LAW, NOTHING_SEEN, detections, seeds
+from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").tracking
 PAPER = preset("paper").tracking
@@ -36,7 +36,6 @@ def show(t, k, centre, *, pose=None, free=NOTHING_SEEN, view_range=15.0, pose_co
 # --- the Kalman filter ----------------------------------------------------------------------------
 
 
-@LAW
 @given(seeds, st.floats(0.0, 30.0), st.floats(0.0, 1.0), st.integers(1, 6))
 def test_both_engines_give_the_same_numbers(seed, dt, acceleration, trees):
     rng = np.random.default_rng(seed)
@@ -77,7 +76,6 @@ def test_a_still_tree_is_the_mean_of_its_views():
     assert 0.005 < np.sqrt(trees.covariance[0, 0, 0]) < 0.02
 
 
-@FEW
 @given(seeds)
 def test_a_whole_run_is_the_same_with_both_engines(seed):
     rng = np.random.default_rng(seed)
@@ -98,7 +96,6 @@ def test_a_whole_run_is_the_same_with_both_engines(seed):
 # --- numbers --------------------------------------------------------------------------------------
 
 
-@FEW
 @given(seeds)
 def test_numbers_never_change_and_are_never_used_twice(seed):
     rng = np.random.default_rng(seed)
@@ -175,7 +172,6 @@ def test_no_radius_no_merging():
     assert show(t, 0, [[5.0, 0.0], [5.0, 0.0]]).number.tolist() == [1, 2]
 
 
-@LAW
 @given(seeds)
 def test_fusing_is_the_best_of_two_independent_positions(seed):
     rng = np.random.default_rng(seed)
@@ -307,7 +303,6 @@ def test_sectors_that_were_wholly_seen_are_kept():
     assert len(sectors(0.0, 2 * np.pi)) == SECTORS
 
 
-@LAW
 @given(st.floats(-10, 10), st.floats(0, 2 * np.pi))
 def test_coverage_is_never_more_than_the_arc_and_at_most_two_sectors_less(bearing, arc):
     seen = sectors(bearing, arc)
@@ -315,7 +310,6 @@ def test_coverage_is_never_more_than_the_arc_and_at_most_two_sectors_less(bearin
     assert arc - 2 * STEP - 1e-6 <= len(seen) * STEP <= arc + 1e-6
 
 
-@LAW
 @given(st.floats(-10, 10), st.floats(0, 3 * np.pi))
 def test_each_sector_is_seen_that_lies_within_the_arc(bearing, arc):
     first = int(np.ceil((bearing - arc / 2) / STEP - 1e-9))
@@ -333,7 +327,6 @@ def test_walking_around_a_tree_covers_it():
     assert trees.coverage[0] == pytest.approx(2 * np.pi)
 
 
-@LAW
 @given(
     st.floats(1.0, 40.0),
     st.floats(-3.1, 3.1),
