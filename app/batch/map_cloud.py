@@ -18,8 +18,7 @@ import numpy as np
 from app.batch.map_run import Outcome
 from app.batch.run_folder import as_written
 from app.batch.summary import evaluation_lines
-from app.common.text import changed_values, count, preset_words
-from app.common.version import version
+from app.common.text import changed_values, count, preset_words, version
 from app.training.learned_forests import kept_forests
 from pipeline.config import Parameters
 from pipeline.evaluation import Evaluation, evaluate

@@ -23,9 +23,8 @@ from app.batch.run_folder import as_written
 from app.batch.summary import breaks_of, driven, start_lines, summary_lines
 from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
-from app.common.text import changed_values, count, preset_words
+from app.common.text import changed_values, count, preset_words, version
 from app.common.timers import Stopwatch
-from app.common.version import version
 from app.sources.opening import Chosen, with_odometry
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters

@@ -14,10 +14,8 @@ import numpy as np
 
 from app.batch.continue_map import PAUSE_NS, SavedRun, read_saved_run
 from app.batch.run_folder import check_folder, read_run_record
-from app.batch.run_health import RunHealth
-from app.batch.summary import RunTotals, breaks_of, driven
-from app.common.text import changed_values
-from app.common.version import version
+from app.batch.summary import RunHealth, RunTotals, breaks_of, driven
+from app.common.text import changed_values, version
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2

@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Iterator
 from typing import NoReturn
 
-from app.common.version import version
+from app.common.text import version
 from pipeline.errors import ParameterError, StemmapError, UsageError
 
 COMMANDS = (

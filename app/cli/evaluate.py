@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli.flags import (
+    add_dbh_unit_flag,
     add_parameter_flags,
     add_run_flags,
     add_source_flags,
@@ -59,9 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="true trees (CSV) in the frame of the map, one FILE for all runs or one each "
         "(default: those of the source)",
     )
-    parser.add_argument(
-        "--dbh-unit", choices=("m", "cm", "mm"), help="unit of a diameter column without unit"
-    )
+    add_dbh_unit_flag(parser)
     parser.add_argument(
         "--match-distance", metavar="M", help="largest distance between a tree and its ground truth [m]"
     )

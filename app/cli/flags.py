@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,13 +47,20 @@ def add_parameter_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config", metavar="FILE", type=Path, help="TOML file whose values replace those of the preset"
     )
+    add_set_flag(parser, "value of one parameter; may be repeated; `stemmap params` lists all")
+
+
+def add_set_flag(parser: argparse.ArgumentParser, help_text: str) -> None:
+    """--set."""
     parser.add_argument(
-        "--set",
-        metavar="STAGE.NAME=VALUE",
-        dest="assignments",
-        action="append",
-        default=[],
-        help="value of one parameter; may be repeated; `stemmap params` lists all",
+        "--set", metavar="STAGE.NAME=VALUE", dest="assignments", action="append", default=[], help=help_text
+    )
+
+
+def add_dbh_unit_flag(parser: argparse.ArgumentParser) -> None:
+    """--dbh-unit."""
+    parser.add_argument(
+        "--dbh-unit", choices=("m", "cm", "mm"), help="unit of a diameter column without unit"
     )
 
 
@@ -287,14 +295,10 @@ def compilation_notice() -> Iterator[None]:
 
     from pipeline.jit import on_compiling
 
-    reported = False
-
+    @cache
     def report() -> None:
-        nonlocal reported
-        if not reported:
-            reported = True
-            tqdm.write(COMPILING, file=sys.stderr)
-            sys.stderr.flush()
+        tqdm.write(COMPILING, file=sys.stderr)
+        sys.stderr.flush()
 
     with on_compiling(report):
         yield

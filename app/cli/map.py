@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import argparse
 import math
+import signal
 import sys
-from contextlib import closing
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.cli.flags import (
     SOURCE_HELP,
+    add_dbh_unit_flag,
     add_force_flag,
     add_live_flags,
     add_parameter_flags,
@@ -19,15 +23,19 @@ from app.cli.flags import (
     cannot_write,
     chosen_parameters,
     compilation_notice,
+    recording_place,
     says_parameters,
     source,
     source_options,
     whole_number,
 )
-from pipeline.errors import ParameterError
+from pipeline.errors import ParameterError, SourceError
 
 if TYPE_CHECKING:
     from app.batch.continue_map import Start
+    from app.robot.source import LiveSource
+    from pipeline.io.readers import Source
+
 
 NOT_TIMED = "not timed: the only scan loads the compiled code"
 HELP = "map a run without a browser and write its files"
@@ -43,9 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_source_flags(parser)
     add_live_flags(parser)
     parser.add_argument("--truth", metavar="FILE", type=Path, help="ground truth trees (CSV) for the scores")
-    parser.add_argument(
-        "--dbh-unit", choices=("m", "cm", "mm"), help="unit of a diameter column without unit"
-    )
+    add_dbh_unit_flag(parser)
     parser.add_argument(
         "--continue",
         dest="continued",
@@ -128,10 +134,10 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     from app.batch.continue_map import ContinuedMap, read_saved_run
     from app.batch.map_run import OfflineRun, map_run
     from app.batch.run_folder import check_folder
-    from app.cli.live_commands import begin_recording, heard, recording_of, told_of_frames
+    from app.robot.source import LiveSource
     from app.sources.opening import open_any
     from app.worker.numba_warmup import compile_ahead
-    from app.worker.run_factory import recorded_parameters
+    from app.worker.run import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
@@ -140,7 +146,12 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         arguments.seed = saved.seed if saved else 0
     with (
         closing(open_any(arguments.source, source_options(arguments))) as opened,
-        heard(opened, recording_of(arguments), publish=arguments.publish, pictures=arguments.out),
+        _listening(
+            opened,
+            recording_place(arguments, arguments.source),
+            publish=arguments.publish,
+            pictures=arguments.out,
+        ),
     ):
         revisions = () if saved or says_parameters(arguments) else recorded_parameters(opened.description)
         preset_name, parameters = chosen_parameters(
@@ -148,7 +159,9 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             saved.preset if saved else opened.description.preset,
             saved.chosen_parameters() if saved else revisions[0][1] if revisions else None,
         )
-        begin_recording(opened, parameters)
+        live = opened if isinstance(opened, LiveSource) else None
+        if live is not None:
+            live.use_parameters(0, 0, parameters)
         compile_ahead()
         plan = OfflineRun(
             source=opened,
@@ -160,7 +173,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             continued=ContinuedMap(saved, _in_the_map(arguments.start)) if saved else None,
             stop_after=arguments.stop_after,
             revisions=revisions,
-            on_frame=told_of_frames(opened),
+            on_frame=None if live is None else lambda frame, mapper: live.mapped(frame, mapper.path),
             chosen=_choices(arguments),
         )
         first = saved.sources[0].digest if saved else opened.description.digest
@@ -245,3 +258,80 @@ class _Bar:
     def close(self) -> None:
         """End the bar."""
         self._bar.close()
+
+
+# --- live sources ------------------------------------------------------------------------------------
+
+_NOTICE_S = 5.0
+
+
+@contextmanager
+def _listening(
+    source: Source | LiveSource, recording: str, *, publish: bool, pictures: Path
+) -> Iterator[None]:
+    """Wait until a live source sends scans. Inside, Ctrl-C and SIGTERM end its records and not the command.
+    Other sources are ready at once.
+
+    Args:
+        source: Live or not.
+        recording: File to which the messages are recorded; "" for none.
+        publish: Whether results are published on the network of the robot.
+        pictures: Folder on whose disk pictures for the trees are stored.
+
+    Raises:
+        SourceError: It was stopped before a scan arrived, a message cannot be read, or no recording can be
+            created.
+    """
+    from app.robot.recorder import Recorder
+    from app.robot.source import LiveSource
+    from app.worker.numba_warmup import warm_up
+
+    if not isinstance(source, LiveSource):
+        yield
+        return
+    try:
+        source.keep_pictures(pictures)
+    except OSError as error:
+        print(f"stemmap: there will be no pictures of trees: {error.strerror}", file=sys.stderr)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda *_: source.stop()) for number in numbers}
+    try:
+        source.start(Recorder(Path(recording)) if recording else None, publish=publish)
+        warm_up()
+        with _notices(source):
+            if not source.wait():
+                raise SourceError("nothing was heard", where=source.uri, remedy=source.waiting_for())
+            print(
+                f"{source.uri} is heard; Ctrl-C ends the run and writes its files",
+                file=sys.stderr,
+                flush=True,
+            )
+            yield
+    finally:
+        if source.recording:
+            print(f"stemmap: {source.recording}", file=sys.stderr, flush=True)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _notices(source: LiveSource) -> Iterator[None]:
+    """Inside, a thread prints every five seconds why no scans arrive, and whether a robot was lost."""
+    ended = threading.Event()
+
+    def show(*lines: str) -> None:
+        for line in filter(None, lines):
+            print(f"stemmap: {line}", file=sys.stderr, flush=True)
+
+    def watch() -> None:
+        while not ended.wait(_NOTICE_S):
+            show(*source.notices(), source.waiting_for())
+
+    thread = threading.Thread(target=watch, name="notices", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        show(*source.notices())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from app.cli.flags import add_force_flag, cannot_write, compilation_notice
+from app.cli.flags import add_force_flag, add_set_flag, cannot_write, compilation_notice
 
 HELP = "merge two mapped runs of one stand into one map"
 
@@ -16,13 +16,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("b", metavar="DIR_B", type=Path, help="the run that is merged into it")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the files")
     add_force_flag(parser)
-    parser.add_argument(
-        "--set",
-        metavar="STAGE.NAME=VALUE",
-        dest="assignments",
-        action="append",
-        default=[],
-        help="value that replaces a parameter of DIR_A, e.g. relocalisation.slack=0.3 for distorted maps",
+    add_set_flag(
+        parser, "value that replaces a parameter of DIR_A, e.g. relocalisation.slack=0.3 for distorted maps"
     )
     parser.epilog = (
         "The maps are aligned by the distances between their stems; without a certain match nothing is\n"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli.flags import (
+    add_dbh_unit_flag,
     add_parameter_flags,
     add_run_flags,
     cannot_write,
@@ -42,9 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="true trees (CSV) of a run, in the frame of its map; repeated for each run, in their order "
         "or with RUN= in front (default: those of the source)",
     )
-    parser.add_argument(
-        "--dbh-unit", choices=("m", "cm", "mm"), help="unit of a diameter column without unit"
-    )
+    add_dbh_unit_flag(parser)
     parser.add_argument(
         "--held-out",
         metavar="RUN",

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from pipeline.config import Parameters
     from pipeline.config.model import Value
 
+
 COMPILING = "compiling for this machine; it takes some minutes the first time, less for a new kind of source"
 
 
@@ -45,3 +46,10 @@ def preset_words(name: str, parameters: Parameters) -> str:
     told = [f"{key} = {value}" for key, value in changed.items()]
     rest = f" and {len(told) - MOST} more" if len(told) > MOST else ""
     return f"preset {name} with {', '.join(told[:MOST])}{rest}"
+
+
+def version() -> str:
+    """Return the version, for example "0.1.0"."""
+    from importlib.metadata import version as of
+
+    return of("stemmap")

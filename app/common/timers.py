@@ -1,16 +1,18 @@
-"""Timers: limit how often a function is called, and measure the stages of the pipeline."""
+"""Limits of how often a function is called, the end of tasks, and times of the stages of the pipeline."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from statistics import median
-from typing import Generic, ParamSpec
+from typing import Any, Generic, ParamSpec
 
 P = ParamSpec("P")
+_log = logging.getLogger(__name__)
 
 
 class Throttle(Generic[P]):
@@ -58,6 +60,19 @@ class Throttle(Generic[P]):
         finally:
             end = loop.time()
             self._free_at = max(start + self._pause_s, end + (end - start) * (1 / self._share - 1))
+
+
+async def cancel(task: asyncio.Task[Any] | None) -> None:
+    """Cancel a task and wait for its end. An error of the task is logged."""
+    if task is None:
+        return
+    task.cancel()
+    try:
+        await task
+    except asyncio.CancelledError:
+        pass
+    except Exception:
+        _log.exception("%s had ended with a fault", task.get_name())
 
 
 class Stopwatch:

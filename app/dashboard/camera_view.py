@@ -8,10 +8,14 @@ import time
 from collections import OrderedDict
 from typing import Any
 
+import numpy as np
+
 from app.common.draw_picture import Drawing, draw_safely
-from app.dashboard.camera_marks import marks_of, motion
+from app.dashboard.payload import clusters_payload
 from app.explain.client import NoStoryError, WorkerClient
-from pipeline.types.records import Frame, Path
+from pipeline.geometry.poses import Pose2, interpolate
+from pipeline.io.readers.camera import Camera
+from pipeline.types.records import Float, Frame, Path
 
 #: All browsers together get so many pictures a second at most.
 _PAUSE_S = 0.3
@@ -85,3 +89,122 @@ class CameraDesk:
         """Raises: NoStoryError: Another run was opened since."""
         if of != self._of:
             raise NoStoryError("another run was opened", remedy="Its picture comes with its first scan")
+
+
+#: Trees farther away are a few pixels; so much of a stem is marked [m]; its width where no diameter is known.
+FARTHEST, NEAREST, FROM_Z, TO_Z, THIN = 25.0, 0.5, 0.0, 2.0, 0.2
+MOST = 150
+
+
+def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
+    """Boxes of clusters and of trees that are in view, the farthest of each first; the MOST nearest at most.
+
+    The robot's tilt is not known here, so on a slope the boxes of trees stand a little high or low.
+
+    Args:
+        frame: Of the scan.
+        camera: Of the picture.
+        moved: T_scan_picture of the base, where the picture was taken at another time.
+    """
+    found = [*_trees(frame, camera, moved), *_clusters(frame, camera, moved)]
+    nearest = sorted(found, key=lambda mark: float(mark["distance_m"]))[:MOST]
+    # What comes later lies on top and takes the click.
+    return sorted(nearest, key=lambda mark: (mark["kind"] == "tree", -float(mark["distance_m"])))
+
+
+def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
+    trees = frame.trees
+    marks = []
+    places = (frame.estimate.T_map_base @ moved).inverse().apply(trees.position)
+    for row in np.flatnonzero(trees.confirmed):
+        x, y = places[row]
+        reach = float(np.hypot(x, y))
+        if not NEAREST < reach < FARTHEST:
+            continue
+        half = 0.5 * (float(trees.dbh[row]) if np.isfinite(trees.dbh[row]) else THIN)
+        across = np.array([-y, x, 0.0]) * half / reach
+        corners = np.array([[x, y, z] + side * across for z in (FROM_Z, TO_Z) for side in (-1.0, 1.0)])
+        box = _box(camera, corners)
+        if box is not None:
+            number = int(trees.number[row])
+            marks.append({"kind": "tree", "number": number, "verdict": "tree", "distance_m": reach, **box})
+    return marks
+
+
+def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
+    verdicts = clusters_payload(frame)["verdict"]
+    points = frame.filtered.astype(np.float64) + frame.sensor_offset
+    points[:, :2] = moved.inverse().apply(points[:, :2])
+    order = np.argsort(frame.labels, kind="stable")
+    labels = frame.labels[order]
+    marks = []
+    for number, verdict in enumerate(verdicts):
+        first, last = np.searchsorted(labels, [number, number + 1])
+        members = points[order[first:last]]
+        box = _box(camera, members) if len(members) else None
+        if box is not None:
+            reach = float(np.hypot(*members[:, :2].mean(axis=0)))
+            marks.append(
+                {"kind": "cluster", "number": number, "verdict": verdict, "distance_m": reach, **box}
+            )
+    return marks
+
+
+def _box(camera: Camera, points: Float) -> dict[str, float] | None:
+    """The box around points of the base frame, None where it is not in view."""
+    pixels, depth = camera.project(points)
+    if not (depth > NEAREST).all():
+        return None
+    size = np.array([camera.width, camera.height])
+    low, high = pixels.min(axis=0) / size, pixels.max(axis=0) / size
+    if (high <= 0.0).any() or (low >= 1.0).any():
+        return None
+    low, high = np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)
+    left, top, width, height = (round(float(v), 4) for v in (*low, *(high - low)))
+    return {"left": left, "top": top, "width": width, "height": height}
+
+
+#: Beyond the ends of a path the robot goes on as it did so long before [ns]: corrections of single poses
+#: would be taken for speed over a shorter time.
+_STEADY_NS = 500_000_000
+
+
+def motion(path: Path | None, from_ns: int, to_ns: int) -> Pose2:
+    """`T_from_to` of the base between two times, none where the path has fewer than two poses.
+
+    Within the path it is interpolated; before and after it the robot's velocities are held.
+    """
+    if path is None or len(path.stamp_ns) < 2:
+        return Pose2()
+    return _pose_at(path, from_ns).inverse() @ _pose_at(path, to_ns)
+
+
+def _pose_at(path: Path, stamp_ns: int) -> Pose2:
+    """`T_map_base` at a time."""
+    stamps = path.stamp_ns
+    first, last = 0, len(stamps) - 1
+    if stamp_ns <= stamps[first]:
+        last = max(1, int(np.searchsorted(stamps, stamps[first] + _STEADY_NS, side="right")) - 1)
+    elif stamp_ns >= stamps[last]:
+        first = min(last - 1, int(np.searchsorted(stamps, stamps[last] - _STEADY_NS)))
+    else:
+        last = int(np.searchsorted(stamps, stamp_ns))
+        first = last - 1
+    begin, end = (Pose2(*(float(axis[k]) for axis in (path.x, path.y, path.yaw))) for k in (first, last))
+    part = float(stamp_ns - stamps[first]) / float(max(1, stamps[last] - stamps[first]))
+    if part < 0.0 or part > 1.0:
+        return _held(begin, end, part)
+    return interpolate(begin, end, part)
+
+
+def _held(begin: Pose2, end: Pose2, part: float) -> Pose2:
+    """Before `begin` (part < 0) or beyond `end` (part > 1) with the motion between them held."""
+    moved = begin.inverse() @ end
+    rest = part if part < 0.0 else part - 1.0
+    turn = rest * moved.yaw
+    start = begin if part < 0.0 else end
+    # Half the turn is made halfway: the chord of the arc of constant velocities (midpoint rule).
+    along = Pose2(0.0, 0.0, 0.5 * turn - 0.5 * moved.yaw).apply(np.array([[rest * moved.x, rest * moved.y]]))[
+        0
+    ]
+    return start @ Pose2(float(along[0]), float(along[1]), turn)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -21,7 +21,6 @@ from app.dashboard.annotations import Annotating
 from app.dashboard.broadcast import Live
 from app.dashboard.camera_view import CameraDesk
 from app.dashboard.events import Events
-from app.dashboard.loop_playback import Loop
 from app.dashboard.map_changes import MapChanges
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, Counts, counts_of, map_payload, truth_payload
@@ -33,19 +32,24 @@ from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
 from app.tuning.sweep.sensitivity import Sensitivity, question_of
-from app.worker.internal_protocol import (
+from app.worker.outbox import joined
+from app.worker.protocol import (
     Answer,
     Begin,
     FromWorker,
+    Open,
     Opened,
+    Play,
     Remapped,
     Report,
     Rough,
+    Seek,
+    SetParameters,
     Shown,
+    Status,
     ToWorker,
+    WorkerBusyError,
 )
-from app.worker.outbox import joined
-from app.worker.protocol import Open, Play, SetParameters, Status, WorkerBusyError
 from pipeline.config import Parameters, preset
 from pipeline.config.model import Value
 from pipeline.types.records import Frame, Path, Trees, TruthTrees
@@ -463,3 +467,40 @@ def _open_command(request: SourceRequest) -> Open:
     if isinstance(request, Open):
         return request
     return Open(**{name: getattr(request, name) for name in SourceRequest.__struct_fields__})
+
+
+Span = tuple[float, float]
+
+
+class Loop:
+    """From where to where, and when to turn.
+
+    Args:
+        live: Where the browsers are told.
+        send: Sends a command to the worker.
+
+    Attributes:
+        span: First and last time [s since the first scan], None for no loop.
+    """
+
+    def __init__(self, live: Live, send: Callable[[ToWorker], Awaitable[None]]) -> None:
+        self.span: Span | None = None
+        self._live, self._send = live, send
+        self._turning = False
+
+    def choose(self, span: Span | None) -> None:
+        """Play this part; None plays on at its end."""
+        self.span, self._turning = span, False
+        self._live.tell("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
+
+    async def shown(self, time_s: float, status: Status) -> None:
+        """At the end of the part go to its beginning, while the run plays."""
+        if self.span is None:
+            return
+        if time_s < self.span[1]:
+            self._turning = False
+        elif not self._turning and status.state in ("playing", "finished"):
+            self._turning = True  # pictures that are under way must not turn it once more
+            await self._send(Seek(self.span[0]))
+            if status.state == "finished":
+                await self._send(Play())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from app.common.child_process import ChildProcess, python_module
+from app.common.timers import cancel
 from app.store.async_store import AsyncStore
 from app.store.store import AnnotatedSource
 from app.training.learned_forests import Forests
@@ -89,10 +89,7 @@ class Learning:
     async def close(self) -> None:
         """End the process."""
         task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+        await cancel(task)
 
     def as_plain(self) -> dict[str, Any]:
         """For the browsers."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.explain.history import half_axes
-from app.worker.internal_protocol import Shown
+from app.worker.protocol import Shown
 from pipeline.classification.forest import CLASSES
 from pipeline.types.clearance import Clearance
 from pipeline.types.pose_health import Health
@@ -40,7 +40,7 @@ def map_payload(shown: Shown) -> dict[str, Any]:
         "sigma_xy": round(float(np.sqrt(np.mean(np.diagonal(estimate.covariance)[:2]))), _DIGITS),
         "n_eff": round(estimate.n_eff, 1),
         "health": health_payload(frame.health),
-        "trees": trees_payload(frame, start_ns=frame.stamp_ns - round(shown.time_s * _NS)),
+        "trees": trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * _NS)),
         "verdicts": verdict_counts(frame.clusters.verdict),
         "clusters": clusters_payload(frame),
         "counts": dict(frame.counts),
@@ -116,12 +116,7 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
     }
 
 
-def trees_payload(frame: Frame, start_ns: int) -> list[dict[str, Any]]:
-    """Return the confirmed trees, one dict each; unknown values are None."""
-    return tree_rows(frame.trees, start_ns)
-
-
-def tree_rows(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
+def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
     """Return the confirmed trees of a table, one dict each; unknown values are None."""
     keep = np.flatnonzero(trees.confirmed)
     columns: dict[str, Sequence[Any]] = {

@@ -18,7 +18,7 @@ from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.store.book import Change, NewRun, RunFigures
 from app.store.store import Store
-from app.worker.internal_protocol import Opened, Shown
+from app.worker.protocol import Opened, Shown
 from pipeline.config.model import Value
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
@@ -223,7 +223,7 @@ async def _quietly(work: Any) -> None:  # noqa: ANN401 - any coroutine
 def _standing(glance: Glance, all_scans: int | None) -> RunFigures:
     shown = glance.shown
     frame = shown.frame
-    trees = trees_payload(frame, start_ns=frame.stamp_ns - round(shown.time_s * 1e9))
+    trees = trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * 1e9))
     truth = truth_payload(glance.truth)
     return RunFigures(
         scans=frame.index + 1,

@@ -8,8 +8,7 @@ from collections.abc import Awaitable, Callable
 
 from app.explain.records import ClusterStory, TreeStory
 from app.worker.camera import CameraPicture
-from app.worker.internal_protocol import Answer, AskCamera, AskCluster, AskCompare, AskTree, Question
-from app.worker.protocol import WorkerBusyError
+from app.worker.protocol import Answer, AskCamera, AskCluster, AskCompare, AskTree, Question, WorkerBusyError
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame

@@ -11,9 +11,9 @@ from typing import Any
 import msgspec
 
 from app.common.child_process import ChildProcess, python_module
-from app.fleet.fleet import Fleet, end
+from app.common.timers import cancel
+from app.fleet.fleet import NAMELESS, Fleet
 from app.fleet.hearing import Report, RobotReport
-from app.fleet.robots import NAMELESS
 from pipeline.errors import StemmapError
 
 _log = logging.getLogger(__name__)
@@ -45,7 +45,7 @@ class RemoteRobots:
 
     async def close(self) -> None:
         """End the process."""
-        await end(self._task)
+        await cancel(self._task)
 
     async def _keep(self) -> None:
         while True:

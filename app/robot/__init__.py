@@ -1,1 +1,1 @@
-"""A robot that is heard live: what it sends, over which link, and whether it is still there."""
+"""Live robots and sensors: addresses, connections, topics, recording and publishing."""

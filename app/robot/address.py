@@ -13,9 +13,9 @@ from urllib.parse import parse_qsl
 
 from pipeline.errors import SourceError
 
-#: As `?robot=`: not one robot, but all of them, a dashboard each.
+#: Value of `?robot=` for all robots, each with a dashboard.
 ALL_ROBOTS = "*"
-#: As `?robot=`: the robot without a namespace, which is ROS's root namespace.
+#: Value of `?robot=` for the robot without a namespace (ROS's root namespace).
 ROOT = "/"
 SCHEME, VELODYNE, DDS = "zenoh:", "velodyne:", "dds:"
 _ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):([0-9]{1,5})")
@@ -23,7 +23,7 @@ _FILES = ("ca", "cert", "key")
 _TOPICS = ("scan", "odometry", "imu", "gnss", "pose", "camera")
 _OPTIONS = ("robot", "domain", "mapped", *_TOPICS, *_FILES)
 _DDS_OPTIONS = ("domain", "interface", "peer", "robot", *_TOPICS)
-#: An IPv4 address or name of a network interface, and hosts: nothing that could say more in a configuration.
+#: Network interfaces (IPv4 address or name) and hosts, without characters that could change a configuration.
 _INTERFACE = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,14}|[0-9]{1,3}(\.[0-9]{1,3}){3}")
 _HOST = re.compile(r"[A-Za-z0-9][A-Za-z0-9.-]{0,252}")
 _DDS_REMEDY = "An address looks like dds:?domain=0&interface=192.168.1.10, with &peer=HOST where needed."
@@ -33,67 +33,64 @@ _VELODYNE_REMEDY = (
 _REMEDY = "An address looks like zenoh:tcp/192.168.1.5:7447, with ?robot=NAME or &domain=0 where needed."
 
 
-@dataclass(frozen=True, slots=True)
-class ZenohAddress:
-    """Where a robot is to be heard.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Address:
+    """Address of a live source.
 
     Attributes:
         uri: As the user wrote it.
-        endpoint: The one that is connected, e.g. "tcp/192.168.1.5:7447".
         domain: ROS_DOMAIN_ID.
-        robot: Its namespace, ROOT for none, "" for the first one that sends scans.
+        robot: Namespace whose topics are read, ROOT for none; "" for all topics, or for the first robot that
+            sends scans.
         topics: Topic by role where the user names it.
-        mapped_there: Whether the robots map by themselves, and their results alone are heard.
-        files: Of a connection with certificates: "ca" of the router's authority, "cert" and "key" our own.
     """
 
     uri: str
-    endpoint: str
     domain: int = 0
     robot: str = ""
     topics: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZenohAddress(Address):
+    """Address of a robot behind a Zenoh router.
+
+    Attributes:
+        endpoint: Router that is connected, e.g. "tcp/192.168.1.5:7447".
+        mapped_there: Whether the robots map by themselves; only their results are received then.
+        files: Certificates: "ca" of the authority of the router, "cert" and "key" of this machine.
+    """
+
+    endpoint: str
     files: dict[str, str] = field(default_factory=dict)
     mapped_there: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class DdsAddress:
-    """Where a robot without a router is to be heard.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DdsAddress(Address):
+    """Address of a robot on plain DDS, without a router.
 
     Attributes:
-        uri: As the user wrote it.
-        domain: ROS_DOMAIN_ID.
-        interface: Own network interface, by name or address; "" stays on this machine.
-        peers: Hosts that are asked though the network passes no multicast on.
-        robot: Topics below `/robot/` are read, "" for all.
-        topics: Topic by role where the user names it.
+        interface: Network interface of this machine, by name or address; "" for loopback.
+        peers: Hosts that are contacted where the network has no multicast.
     """
 
-    uri: str
-    domain: int = 0
     interface: str = ""
     peers: tuple[str, ...] = ()
-    robot: str = ""
-    topics: dict[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class VelodyneAddress:
-    """Where a sensor's packets come in.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VelodyneAddress(Address):
+    """Address at which the packets of a sensor arrive.
 
     Attributes:
-        uri: As the user wrote it.
         host, port: To listen on.
-        sender: The sensor's address; "" takes this machine's own packets alone.
+        sender: Address of the sensor; "" accepts only packets of this machine.
     """
 
-    uri: str
     host: str
     port: int
     sender: str
-    robot: str = ""
-    domain: int = 0
-    topics: dict[str, str] = field(default_factory=dict)
 
 
 def is_live(uri: str) -> bool:
@@ -101,11 +98,11 @@ def is_live(uri: str) -> bool:
     return uri.lower().startswith((SCHEME, VELODYNE, DDS))
 
 
-def parse_address(uri: str) -> ZenohAddress | VelodyneAddress | DdsAddress:
+def parse_address(uri: str) -> Address:
     """Read an address.
 
     Raises:
-        SourceError: It is none, or has an option that does not exist.
+        SourceError: The address is invalid or has an unknown option.
     """
     if uri.lower().startswith(DDS):
         return _dds(uri)
@@ -120,12 +117,18 @@ def _dds(uri: str) -> DdsAddress:
     interface = options.get("interface", "")
     peers = tuple(peer for peer in options.get("peer", "").split(",") if peer)
     if (interface and not _INTERFACE.fullmatch(interface)) or not all(map(_HOST.fullmatch, peers)):
-        raise SourceError("this is no interface or peer", where=uri, remedy=_DDS_REMEDY)
+        raise SourceError("the interface or a peer is invalid", where=uri, remedy=_DDS_REMEDY)
     if find_spec("cyclonedds") is None:
         remedy = "Install it with: uv sync --extra dds"
         raise SourceError("plain DDS needs cyclonedds", where=uri, remedy=remedy)
-    robot = options.get("robot", "").strip("/")
-    return DdsAddress(uri, _domain(uri, options), interface, peers, robot, _topics(options))
+    return DdsAddress(
+        uri=uri,
+        domain=_domain(uri, options),
+        robot=options.get("robot", "").strip("/"),
+        topics=_topics(options),
+        interface=interface,
+        peers=peers,
+    )
 
 
 def _velodyne(uri: str) -> VelodyneAddress:
@@ -141,32 +144,43 @@ def _velodyne(uri: str) -> VelodyneAddress:
             raise ValueError
     except ValueError:
         raise SourceError(
-            "this is no address of a Velodyne sensor", where=uri, remedy=_VELODYNE_REMEDY
+            "this is not the address of a Velodyne sensor", where=uri, remedy=_VELODYNE_REMEDY
         ) from None
     if not sender and not own.is_loopback:
-        raise SourceError("anybody could send there", where=uri, remedy=_VELODYNE_REMEDY)
-    return VelodyneAddress(uri, host, int(port), sender)
+        raise SourceError(
+            "the address of the sensor is missing: other hosts could send packets",
+            where=uri,
+            remedy=_VELODYNE_REMEDY,
+        )
+    return VelodyneAddress(uri=uri, host=host, port=int(port), sender=sender)
 
 
 def _zenoh(uri: str) -> ZenohAddress:
     endpoint, _, query = uri[len(SCHEME) :].partition("?")
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None or not 0 < int(found.group(3)) < 1 << 16:
-        raise SourceError("this is no address of a Zenoh router", where=uri, remedy=_REMEDY)
+        raise SourceError("this is not the address of a Zenoh router", where=uri, remedy=_REMEDY)
     options = _known(uri, query, _OPTIONS)
-    domain, topics = _domain(uri, options), _topics(options)
     mapped = options.get("mapped", "here")
     if mapped not in ("here", "robot"):
-        remedy = "mapped=robot shows what robots publish of their own maps; mapped=here is usual."
-        raise SourceError(f"{mapped!r} is no place where maps are made", where=uri, remedy=remedy)
+        remedy = "Use mapped=robot for robots that map themselves, or mapped=here."
+        raise SourceError(f"mapped={mapped!r} is unknown", where=uri, remedy=remedy)
     files = _files(uri, endpoint, {name: options[name] for name in _FILES if options.get(name)})
     asked = options.get("robot", "")
     robot = asked.strip("/") or (ROOT if asked else "")
-    return ZenohAddress(uri, endpoint, domain, robot, topics, files, mapped == "robot")
+    return ZenohAddress(
+        uri=uri,
+        domain=_domain(uri, options),
+        robot=robot,
+        topics=_topics(options),
+        endpoint=endpoint,
+        files=files,
+        mapped_there=mapped == "robot",
+    )
 
 
 def _known(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
-    """The options of an address, all of them known ones."""
+    """Parse the options of an address, which must be known."""
     options = dict(parse_qsl(query, keep_blank_values=True))
     unknown = sorted(options.keys() - set(names))
     if unknown:
@@ -178,7 +192,7 @@ def _known(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
 def _domain(uri: str, options: dict[str, str]) -> int:
     domain = options.get("domain", "0")
     if not (domain.isascii() and domain.isdigit() and int(domain) <= 232):
-        raise SourceError(f"{domain!r} is no ROS domain", where=uri, remedy="Give a number from 0 to 232.")
+        raise SourceError(f"{domain!r} is not a ROS domain", where=uri, remedy="Give a number from 0 to 232.")
     return int(domain)
 
 
@@ -188,7 +202,7 @@ def _topics(options: dict[str, str]) -> dict[str, str]:
 
 
 def _files(uri: str, endpoint: str, named: dict[str, str]) -> dict[str, str]:
-    """The files of certificates by what they are, with their whole paths."""
+    """Return the absolute paths of the certificates by role."""
     if named and endpoint.startswith("tcp/"):
         raise SourceError(
             "certificates need an encrypted connection", where=uri, remedy="Write tls/ in place of tcp/"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -13,11 +11,11 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 
 from app.robot.address import DdsAddress
-from app.robot.inbox import ArrivalTimes, Inbox
+from app.robot.inbox import Inbox
+from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, TOO_MANY, Link, first_line
 from app.robot.topics import MAX_ENDPOINTS, NAME, PICTURE_TYPES, SCAN_TYPES, TYPE, Publisher
-from app.robot.zenoh import LOST_SCANS, MESSAGE_LIMIT, TOO_MANY, first_line
 from pipeline.io.readers.base import count_loss
-from pipeline.io.readers.container import Channel, Message
+from pipeline.io.readers.container import Channel
 from pipeline.io.readers.ros_messages import standard_types
 
 _STRING = "string"
@@ -61,12 +59,12 @@ _PREFIX, _LONGEST = "rt/", 256
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """What a writer says of itself.
+    """A writer as it announces itself.
 
     Attributes:
         topic, msgtype: In the ROS 2 spelling.
-        reliable: Whether it sends again what got lost.
-        latched: Whether it keeps what it said for who comes late.
+        reliable: Whether it repeats lost messages.
+        latched: Whether it repeats its last messages for late subscribers.
     """
 
     topic: str
@@ -76,7 +74,7 @@ class Offer:
 
     @classmethod
     def of(cls, topic: str, type_name: str, *, reliable: bool, latched: bool) -> Offer | None:
-        """A writer by the names that it announces; None where it writes no topic of ROS."""
+        """Return the offer of a writer; None where its topic is not one of ROS."""
         if len(topic) > _LONGEST or len(type_name) > _LONGEST or not topic.startswith(_PREFIX):
             return None
         name, kind = topic[len(_PREFIX) - 1 :], TYPE.fullmatch(type_name)
@@ -89,7 +87,7 @@ class DdsGraph:
     """The writers that are alive now.
 
     Args:
-        robot: Its topics alone count, those below `/robot/`; "" takes all as those of one robot.
+        robot: Only topics below `/robot/` count; "" for all topics, as those of one robot.
     """
 
     def __init__(self, robot: str) -> None:
@@ -97,7 +95,7 @@ class DdsGraph:
         self._alive: dict[str, Offer] = {}
 
     def add(self, key: str, offer: Offer | None, losses: dict[str, int]) -> bool:
-        """A writer was announced; whether that changes anything."""
+        """Add a writer that was announced; return whether that changes anything."""
         if offer is None or self._alive.get(key) == offer:
             return False
         if len(self._alive) >= MAX_ENDPOINTS:
@@ -107,16 +105,16 @@ class DdsGraph:
         return True
 
     def remove(self, key: str) -> bool:
-        """A writer is gone; whether it was known."""
+        """Remove a writer; return whether it was known."""
         return self._alive.pop(key, None) is not None
 
     def publishers(self) -> list[Publisher]:
-        """All topics that are written, each once, by name."""
+        """Return all topics that are written, each once, sorted by name."""
         found = {(self._owner(offer.topic), offer.topic, offer.msgtype) for offer in self._alive.values()}
         return [Publisher(*each) for each in sorted(found)]
 
     def common(self, topic: str, msgtype: str) -> Offer | None:
-        """What all writers of a topic offer, None where there is none."""
+        """Return what all writers of a topic offer, None where there is none."""
         there = [o for o in self._alive.values() if (o.topic, o.msgtype) == (topic, msgtype)]
         if not there:
             return None
@@ -127,10 +125,9 @@ class DdsGraph:
         return self._robot if self._robot and topic.startswith(f"/{self._robot}/") else ""
 
 
-_RETRY_S = 1.0
 _WAIT_NS = 50_000_000
-#: So many samples wait in CycloneDDS while Python is busy: two seconds of scans, few of the large pictures
-#: (most of them are not wanted anyway), of the rest far more.
+#: Samples that wait in CycloneDDS while Python is busy: two seconds of scans, few of the large pictures (the
+#: rate limit drops most of them), and far more of other messages.
 _SCAN_DEPTH, _PICTURE_DEPTH, _DEPTH = 20, 4, 5000
 OVERRUN = "times that more messages came at once than CycloneDDS keeps"
 PICTURE_OVERRUN = "times that more pictures came at once than CycloneDDS keeps"
@@ -138,7 +135,7 @@ OWN_CONFIGURATION = "CYCLONEDDS_URI"
 
 
 def configuration(address: DdsAddress) -> str:
-    """CycloneDDS's configuration: one interface, this machine's own unless another was named."""
+    """Return the configuration of CycloneDDS: one interface, by default the loopback of this machine."""
     named = address.interface or "127.0.0.1"
     by = "address" if named[0].isdigit() else "name"
     peers = address.peers or (() if address.interface else ("127.0.0.1",))
@@ -155,79 +152,50 @@ def configuration(address: DdsAddress) -> str:
     )
 
 
-class DdsLink:
-    """Takes part in a DDS domain, in a thread of its own; tried again until it works.
+class DdsLink(Link):
+    """Participant in a DDS domain.
 
     Args:
         address: Of the domain.
-        inbox: For what comes.
-
-    Attributes:
-        problem, losses, scans, version: As of `ZenohLink`.
+        inbox: Gets the messages.
     """
 
-    session = None
-
     def __init__(self, address: DdsAddress, inbox: Inbox) -> None:
-        self.problem = "not connected yet"
-        self.losses: dict[str, int] = {}
-        self.scans = self.version = 0
-        self._address, self._inbox = address, inbox
+        super().__init__(inbox, "dds")
+        self._address = address
         self._graph = DdsGraph(address.robot)
-        self._times = ArrivalTimes()
-        self._lock = threading.Lock()
-        self._closing = threading.Event()
-        self._heard_s: float | None = None
         self._channels: Sequence[Channel] = ()
-        self._thread = threading.Thread(target=self._listen, name="dds", daemon=True)
-        self._thread.start()
+        self.thread.start()
 
     @property
     def place(self) -> str:
-        """Where it listens, in words."""
+        """Where it listens, as text for the user."""
         return f"in DDS domain {self._address.domain} on {self._address.interface or 'this machine'}"
 
     @property
     def nothing(self) -> str:
-        """Why there is nothing, in words."""
+        """Why no scan topic is chosen, as text for the user."""
         wanted = f" below /{self._address.robot}" if self._address.robot else ""
         others = sorted({p.topic for p in self.publishers()})[:10]
         there = f" (there are: {', '.join(others)})" if others else ""
         elsewhere = "" if self._address.interface else "; interface=ADDRESS listens on a network"
         return f"no scans{wanted} are announced{there}{elsewhere}"
 
-    @property
-    def silence_s(self) -> float | None:
-        """Seconds since the last scan came, None before the first."""
-        return None if self._heard_s is None else time.monotonic() - self._heard_s
-
     def publishers(self) -> list[Publisher]:
-        """All topics that somebody writes now."""
-        with self._lock:
+        """All topics that are written now."""
+        with self.lock:
             return self._graph.publishers()
 
-    def robots(self) -> list[str]:
-        """The robot, while it sends scans: DDS names topics, not robots."""
-        return sorted({p.robot for p in self.publishers() if p.msgtype in SCAN_TYPES})
-
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Listen to these topics from now on."""
+        """Receive the messages of these topics."""
         self._channels = tuple(channels)
 
-    def close(self) -> None:
-        """Leave the domain."""
-        self._closing.set()
-        self._thread.join(timeout=5.0)
+    def failure(self, error: Exception) -> str:
+        """Why it takes no part in the domain."""
+        return f"cannot take part in DDS domain {self._address.domain}: {first_line(error)}"
 
-    def _listen(self) -> None:
-        while not self._closing.is_set():
-            try:
-                self._take_part()
-            except Exception as error:  # whatever CycloneDDS says of networks, interfaces and itself
-                self.problem = f"cannot take part in DDS domain {self._address.domain}: {first_line(error)}"
-                self._closing.wait(_RETRY_S)
-
-    def _take_part(self) -> None:
+    def receive(self) -> None:
+        """Take part in the domain until `close`."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
         from cyclonedds.core import WaitSet
         from cyclonedds.domain import Domain, DomainParticipant
@@ -239,11 +207,11 @@ class DdsLink:
         announced = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
         waiting = WaitSet(participant)
         readers: dict[int, _Reader] = {}
-        with self._lock:  # what was announced to an earlier participant may be long gone
+        with self.lock:  # writers of an earlier participant may have ended
             self._graph = DdsGraph(self._address.robot)
             self.version += 1
         self.problem = ""
-        while not self._closing.is_set():
+        while not self.closing.is_set():
             self._note(announced)
             self._adjust(participant, waiting, readers)
             waiting.wait(_WAIT_NS)
@@ -253,12 +221,12 @@ class DdsLink:
         del waiting, announced, participant, domain  # in this order; that leaves the network
 
     def _note(self, announced: Any) -> None:  # noqa: ANN401
-        """What was announced and withdrawn since."""
+        """Take the announcements and withdrawals since the last call."""
         from cyclonedds.core import InstanceState
 
         for found in announced.take(100):
             alive = found.sample_info.instance_state == InstanceState.Alive
-            with self._lock:
+            with self.lock:
                 if alive:
                     changed = self._graph.add(str(found.key), _offer(found), self.losses)
                 else:
@@ -266,9 +234,9 @@ class DdsLink:
                 self.version += changed
 
     def _adjust(self, participant: Any, waiting: Any, readers: dict[int, _Reader]) -> None:  # noqa: ANN401
-        """A reader a channel, that asks for no more than all writers of its topic offer."""
+        """Keep a reader for each channel that requests no more than all writers of its topic offer."""
         for channel in self._channels:
-            with self._lock:
+            with self.lock:
                 asked = self._graph.common(channel.topic, channel.msgtype)
             known = readers.get(channel.number)
             if asked is None or (known is not None and known.asked == asked):
@@ -281,28 +249,21 @@ class DdsLink:
 
     def _note_lost(self, channel: Channel, number: int) -> None:
         if channel.msgtype in SCAN_TYPES:
-            with self._lock:
+            with self.lock:
                 count_loss(self.losses, LOST_SCANS, number)
 
     def _take(self, reader: _Reader) -> None:
         payloads = reader.take()
-        is_scan, is_picture = (reader.channel.msgtype in types for types in (SCAN_TYPES, PICTURE_TYPES))
-        with self._lock:
-            if len(payloads) >= reader.depth:
+        if len(payloads) >= reader.depth:
+            with self.lock:
+                is_picture = reader.channel.msgtype in PICTURE_TYPES
                 count_loss(self.losses, PICTURE_OVERRUN if is_picture else OVERRUN)
-            if payloads and is_scan:
-                self._heard_s = time.monotonic()
-                self.scans += len(payloads)
         for payload in payloads:
-            message = Message(reader.channel.number, self._times.next_ns(), payload)
-            if not is_picture:
-                self._inbox.put(message, is_scan=is_scan)
-            elif self._inbox.wants_picture(message.log_ns, len(payload)):
-                self._inbox.put_picture(message)
+            self.take(reader.channel, payload, len(payload))
 
 
 def _offer(found: Any) -> Offer | None:  # noqa: ANN401
-    """An announced writer of cyclonedds in our words."""
+    """Convert an announced writer of cyclonedds."""
     from cyclonedds.core import Policy
 
     reliable = isinstance(found.qos[Policy.Reliability], Policy.Reliability.Reliable)
@@ -311,7 +272,7 @@ def _offer(found: Any) -> Offer | None:  # noqa: ANN401
 
 
 class _Sample:
-    """Stands in for a message's class: the bytes stay as they came."""
+    """Replaces the class of a message, so that its bytes are not decoded."""
 
     def __init__(self, payload: bytes) -> None:
         self.payload = payload
@@ -328,7 +289,7 @@ class _Sample:
 
 
 class _Reader:
-    """A DataReader of one channel. Asks for a topic's past where its writers keep it (as /tf_static)."""
+    """A DataReader of one channel; it requests earlier messages where the writers keep them (/tf_static)."""
 
     def __init__(self, participant: Any, channel: Channel, asked: Offer, lost: Any) -> None:  # noqa: ANN401
         from cyclonedds.core import (
@@ -368,6 +329,6 @@ class _Reader:
         self.ready = ReadCondition(self._reader, SampleState.Any | ViewState.Any | InstanceState.Any)
 
     def take(self) -> list[bytes]:
-        """What came since, each in CDR."""
+        """Return the messages since the last call, in CDR."""
         found = self._reader.take(self.depth)
         return [sample.payload for sample in found if isinstance(sample, _Sample)]

@@ -171,7 +171,7 @@ class Inbox:
 
 @dataclass(slots=True)
 class Heard:
-    """Of one topic: how many messages came, and when the first and the last one [ns]."""
+    """Number of messages of a topic, and times of the first and the last one [ns]."""
 
     messages: int = 0
     first_ns: int = 0
@@ -179,13 +179,13 @@ class Heard:
 
     @property
     def rate_hz(self) -> float | None:
-        """From the first to the last message; None where that is not known."""
+        """Mean rate from the first to the last message; None with fewer than two."""
         seconds = 1e-9 * (self.last_ns - self.first_ns)
         return round((self.messages - 1) / seconds, 1) if self.messages > 1 and seconds > 0.0 else None
 
 
 class CountingInbox(Inbox):
-    """Counts what comes by the number of its channel, and keeps none of it."""
+    """Counts messages by channel and keeps none of them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -193,22 +193,22 @@ class CountingInbox(Inbox):
         self._heard: dict[int, Heard] = {}
 
     def heard(self, number: int) -> Heard:
-        """Of a channel so far."""
+        """Return the count of a channel so far."""
         with self._guard:
             known = self._heard.get(number, Heard())
             return Heard(known.messages, known.first_ns, known.last_ns)
 
     def wants_picture(self, arrival_ns: int, size: int) -> bool:
-        """All count."""
+        """Accept all pictures."""
         del arrival_ns, size
         return True
 
     def put_picture(self, message: Message) -> None:
-        """Count it."""
+        """Count the message."""
         self.put(message, is_scan=False)
 
     def put(self, message: Message, *, is_scan: bool) -> None:
-        """Count it."""
+        """Count the message."""
         del is_scan
         with self._guard:
             known = self._heard.setdefault(message.channel, Heard(0, message.log_ns))

@@ -1,4 +1,4 @@
-"""Pictures of a live run put aside for its trees: which tree is where is only known when the run is over."""
+"""Pictures of a live run, stored until its end, when the positions of the trees are known."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from pipeline.io.readers.camera import Picture
 from pipeline.remapping.scan_cache import SPARE_BYTES, free_space
 from pipeline.types.records import Path
 
-#: A picture each metre or a quarter of a turn shows every tree from near; the disk that they may take.
+#: Motion between two stored pictures, which shows every tree from near, and limits of the disk space.
 STEP_M, TURN_RAD = 1.0, math.radians(22.5)
 MOST_BYTES, MOST_PICTURES = 1 << 30, 20_000
-FULL = "pictures not put aside for trees: 1 GB of them is there"
-REFUSED = "pictures not put aside for trees: the disk refuses"
-SPARED = f"pictures not put aside for trees: less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left"
+FULL = "pictures not stored for trees: the limit of 1 GB is reached"
+REFUSED = "pictures not stored for trees: the disk cannot be written"
+SPARED = f"pictures not stored for trees: less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left"
 
 
 class _Kept(NamedTuple):
-    """A picture without its bytes, and where these begin in the file and how many they are."""
+    """A picture without its bytes, and their position and length in the file."""
 
     picture: Picture
     begin: int
@@ -30,21 +30,21 @@ class _Kept(NamedTuple):
 
 
 class PictureStore:
-    """A file without a name, which goes with the process.
+    """Temporary file without a name, which the system deletes when the process ends.
 
     Args:
-        folder: On whose disk it is, or on that of the next folder above that is there.
+        folder: Selects the disk; the nearest existing parent is used.
 
     Attributes:
-        losses: What was not kept, by reason.
+        losses: Number of pictures that were not stored, by reason.
 
     Raises:
-        OSError: The file cannot be made.
+        OSError: The file cannot be created.
     """
 
     def __init__(self, folder: FilePath) -> None:
         there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.is_dir())
-        # Without a buffer: what a full disk refused would wait there, for who reads or closes to be refused.
+        # Without a buffer: bytes that a full disk refused would raise an error at a later read or at the end.
         self._file = tempfile.TemporaryFile(dir=there, buffering=0)  # noqa: SIM115 - open until `close`
         self._folder = there
         self._kept: dict[int, _Kept] = {}
@@ -53,7 +53,7 @@ class PictureStore:
         self.losses: dict[str, int] = {}
 
     def is_due(self, path: Path) -> bool:
-        """Whether the robot is far enough from where the last picture was put aside."""
+        """Whether the robot has moved far enough since the last stored picture."""
         if not len(path.x):
             return False
         here = float(path.x[-1]), float(path.y[-1]), float(path.yaw[-1])
@@ -64,7 +64,7 @@ class PictureStore:
         return math.hypot(here[0] - x, here[1] - y) >= STEP_M or turned >= TURN_RAD
 
     def add(self, picture: Picture, path: Path) -> None:
-        """Put a picture aside that was taken at the end of a path."""
+        """Store a picture that was taken at the end of a path."""
         self._last = float(path.x[-1]), float(path.y[-1]), float(path.yaw[-1])
         if picture.stamp_ns in self._kept:
             return
@@ -88,11 +88,11 @@ class PictureStore:
         self._length += size
 
     def stamps(self) -> list[int]:
-        """When they were taken, ascending [ns]."""
+        """Return the times of the pictures, ascending [ns]."""
         return sorted(self._kept)
 
     def at(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Those that were taken at some of `stamps`, each once."""
+        """Yield the pictures of some of `stamps`, each once."""
         for stamp_ns in sorted(set(wanted_ns) & self._kept.keys()):
             told, begin, length = self._kept[stamp_ns]
             self._file.seek(begin)
@@ -100,5 +100,5 @@ class PictureStore:
             yield Picture(stamp_ns, told.encoding, told.width, told.height, told.step, data)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close and delete the file."""
         self._file.close()

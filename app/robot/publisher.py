@@ -1,4 +1,4 @@
-"""Our results on the robot's network, declared as rmw_zenoh declares a node's topics."""
+"""Publishes the results on the network of the robot, declared as rmw_zenoh declares the topics of a node."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from app.robot.zenoh import ADMIN, PUBLISHER, data_key
 from pipeline.io.recording import outputs
 
 NODE = "stemmap"
-# Reliability, durability (1 keeps the last message for who comes late), history and depth; the rest is usual.
+# Reliability, durability (1 repeats the last message for late subscribers), history and depth.
 _VOLATILE, _LATCHED = "::,10:,:,:,,", ":1:,1:,:,:,,"
 
 
@@ -56,7 +56,7 @@ class RosPublisher:
 
 
 class _Topic:
-    """One topic; its messages carry a number, a time and who sent them, as rmw_zenoh's do."""
+    """One topic; its messages have a number, a time and a publisher id, as those of rmw_zenoh."""
 
     def __init__(self, session: Any, key: str, token: str, *, latched: bool) -> None:  # noqa: ANN401
         import zenoh
@@ -68,7 +68,7 @@ class _Topic:
             session,
             key,
             encoding="application/cdr",
-            # A listener that is too slow must not hold up the map.
+            # A slow subscriber must not delay the map.
             congestion_control=zenoh.CongestionControl.DROP,
             cache=ext.CacheConfig(1) if latched else None,
             publisher_detection=latched,

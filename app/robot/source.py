@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path as FilePath
-from typing import Any, Protocol
+from typing import Any
 
-from app.robot.address import ALL_ROBOTS, DdsAddress, VelodyneAddress, ZenohAddress, parse_address
+from app.robot.address import ALL_ROBOTS, Address, DdsAddress, VelodyneAddress, ZenohAddress, parse_address
 from app.robot.dds import DdsLink
 from app.robot.inbox import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox
+from app.robot.link import Link
 from app.robot.picture_store import PictureStore
 from app.robot.publisher import RosPublisher
 from app.robot.recorder import Recorder
@@ -22,7 +23,6 @@ from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
-from pipeline.io.readers.container import Channel
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
 from pipeline.io.recording import outputs
 from pipeline.types.records import Frame, Path, Record, Truth
@@ -30,39 +30,17 @@ from pipeline.types.records import Frame, Path, Record, Truth
 KIND, VELODYNE_KIND, DDS_KIND = "ROS 2 over Zenoh", "Velodyne sensor", "ROS 2 over DDS"
 
 
-class Link(Protocol):
-    """What a source needs of `ZenohLink`."""
-
-    problem: str
-    losses: dict[str, int]
-    scans: int
-    version: int
-
-    @property
-    def session(self) -> Any: ...  # noqa: ANN401
-    @property
-    def place(self) -> str: ...
-    @property
-    def nothing(self) -> str: ...
-    @property
-    def silence_s(self) -> float | None: ...
-    def publishers(self) -> list[Publisher]: ...
-    def robots(self) -> list[str]: ...
-    def subscribe(self, channels: Sequence[Channel]) -> None: ...
-    def close(self) -> None: ...
-
-
 MakeLink = Callable[[Any, Inbox], Link]
 
 
-def link_for(address: ZenohAddress | VelodyneAddress | DdsAddress) -> tuple[MakeLink, str]:
-    """What connects to an address, given it and an inbox; and the kind of such a source for people."""
+def link_for(address: Address) -> tuple[MakeLink, str]:
+    """Return the class of the connection for an address, and the kind of such a source for the user."""
     if isinstance(address, VelodyneAddress):
         return VelodyneLink, VELODYNE_KIND
     return (DdsLink, DDS_KIND) if isinstance(address, DdsAddress) else (ZenohLink, KIND)
 
 
-#: A robot's nodes start one after another: its topics are chosen this long after the first scan topic [s].
+#: The nodes of a robot start one after another: topics are chosen this long after the first scan topic [s].
 _SETTLE_S = 1.0
 _POLL_S = 0.005
 #: A longer silence is reported [s]; a LiDAR of 5 Hz pauses for 0.2 s.
@@ -72,21 +50,21 @@ _MAP_PAUSE_S = 1.0
 
 
 class LiveSource:
-    """Records of what a robot sends from now on. They cannot be read again; a recording of them can.
+    """Records of the messages that a robot sends from now on. They cannot be read again; a recording can.
 
     A thread of the source watches the robot: it chooses the topics, starts the recorder and subscribes,
     whatever the mapping does meanwhile.
 
     Args:
         address: Of the robot.
-        options: Topics and mounting, where the user knows better.
+        options: Topics and mounting that the user chose.
         make_link: Makes the connection from the address and the inbox.
         kind: Of the source, for the user.
     """
 
     def __init__(
         self,
-        address: ZenohAddress | VelodyneAddress | DdsAddress,
+        address: Address,
         options: SourceOptions,
         make_link: Callable[[Any, Inbox], Link] = ZenohLink,
         kind: str = KIND,
@@ -129,15 +107,15 @@ class LiveSource:
 
     @property
     def description(self) -> SourceDescription:
-        """What is known; `ready` says whether it is.
+        """The description of the source; see `ready`.
 
         Raises:
             SourceError: Nothing was heard yet.
         """
         known = None if self._reader is None else self._reader.description
         if known is None or self._choice is None:
-            raise SourceError("nothing was heard yet", where=self.uri, remedy="Look whether the robot sends.")
-        digest = f"live:{self.uri}:{self._began_ns}"  # no other run is this one
+            raise SourceError("nothing was heard yet", where=self.uri, remedy="Check that the robot sends.")
+        digest = f"live:{self.uri}:{self._began_ns}"  # differs for every run
         topics = (*known.topics, *camera_topics(self._choice.camera))
         return replace(
             known, digest=digest, topics=topics, warnings=(*known.warnings, *self._choice.warnings)
@@ -156,7 +134,7 @@ class LiveSource:
         """Yield records as they come, until `stop`; waits for them.
 
         Raises:
-            SourceError: What comes cannot be read, or all of it again is asked for.
+            SourceError: A message cannot be read, or the run is to be read again.
         """
         if start_ns is not None:
             raise SourceError("a live run cannot be read again", where=self.uri, remedy="Open its recording.")
@@ -170,7 +148,7 @@ class LiveSource:
             yield from self._reader.finish()
 
     def truth(self) -> Truth | None:
-        """Nobody knows."""
+        """A live run has no ground truth."""
         return None
 
     def close(self) -> None:
@@ -189,27 +167,27 @@ class LiveSource:
         if self._recorder is not None:
             self._recorder.close()
 
-    # --- its camera ------------------------------------------------------------------------------
+    # --- camera ------------------------------------------------------------------------------
 
     def camera(self) -> tuple[Camera | None, str]:
-        """How the camera stands; None and why where nobody tells, or there is none ("")."""
+        """Return the camera model; None with the reason where it is unknown, or with "" without a camera."""
         return (None, "") if self._camera is None else self._camera.camera(self._base)
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """The picture of the last seconds nearest to a time, None where it is farther than `within_ns`."""
+        """Return the recent picture nearest to a time, None where it differs by more than `within_ns`."""
         return None if self._camera is None else self._camera.near(stamp_ns, self._offset_ns, within_ns)
 
     def picture_stamps(self) -> list[int]:
-        """When the pictures were taken that were put aside, ascending [ns]."""
+        """Return the times of the stored pictures, ascending [ns]."""
         return [] if self._kept is None else self._kept.stamps()
 
     def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """The pictures that were taken at some of `picture_stamps`, each once."""
+        """Yield the pictures of some of `picture_stamps`, each once."""
         return iter(()) if self._kept is None else self._kept.at(wanted_ns)
 
     @property
     def pictures_told(self) -> str:
-        """How many pictures came and were taken in, in words; "" where there is no camera."""
+        """Numbers of pictures that arrived and were accepted, as text; "" where there is no camera."""
         if self._camera is None:
             return ""
         lost = sum(self._inbox.losses.get(reason, 0) for reason in (PICTURES_SKIPPED, PICTURES_TOO_LARGE))
@@ -219,14 +197,14 @@ class LiveSource:
         )
 
     def keep_pictures(self, folder: FilePath) -> None:
-        """Put pictures aside, from which those of trees are made at the end; on the disk of a folder.
+        """Store pictures on the disk of a folder, for the pictures of trees at the end of the run.
 
         Raises:
-            OSError: The file for them cannot be made.
+            OSError: The file for them cannot be created.
         """
         self._kept = PictureStore(folder)
 
-    # --- as something live -----------------------------------------------------------------------
+    # --- live -----------------------------------------------------------------------
 
     @property
     def ready(self) -> bool:
@@ -235,7 +213,7 @@ class LiveSource:
 
     @property
     def robot(self) -> str:
-        """The robot's namespace, "" for none, or before it is known."""
+        """Namespace of the robot, "" for none, or before it is known."""
         return "" if self._choice is None else self._choice.robot
 
     @property
@@ -244,18 +222,13 @@ class LiveSource:
         return self._link.robots()
 
     def publishers(self) -> list[Publisher]:
-        """All topics that are published where it is heard, each once."""
+        """All topics that are published on the network of the robot, each once."""
         return self._link.publishers()
 
     @property
     def scans_waiting(self) -> int:
-        """Scans that came and are not mapped yet."""
+        """Number of scans that wait to be mapped."""
         return self._inbox.scans_waiting
-
-    @property
-    def scans_come(self) -> int:
-        """Scans that came so far."""
-        return self._link.scans
 
     @property
     def recording(self) -> str:
@@ -286,14 +259,14 @@ class LiveSource:
             self._recorder.add_parameters(revision, from_scan, parameters.model_dump())
 
     def stop(self) -> None:
-        """End `records`; safe in a signal's handler."""
+        """End `records`; may be called in a signal handler."""
         self._ending.set()
 
     def listen(self) -> bool:
-        """Take what came before the description was known; whether it is known now.
+        """Take the messages that arrived before the description was known; return whether it is known now.
 
         Raises:
-            SourceError: What comes cannot be read.
+            SourceError: A message cannot be read.
         """
         if not self.ready:
             self._early = self.take()
@@ -305,20 +278,20 @@ class LiveSource:
         return self.ready
 
     def wait(self) -> bool:
-        """Listen until the description is known, or until `stop`; whether it is known.
+        """Listen until the description is known or `stop` is called; return whether it is known.
 
         Raises:
-            SourceError: What comes cannot be read.
+            SourceError: A message cannot be read.
         """
         while not self.listen() and not self._ending.is_set():
             self._ending.wait(_POLL_S)
         return self.ready
 
     def take(self) -> list[Record]:
-        """The records of the next message that gives any; [] when nothing is there.
+        """Return the records of the next message that has any; [] when none waits.
 
         Raises:
-            SourceError: What comes cannot be read.
+            SourceError: A message cannot be read.
         """
         if self._failure is not None:
             raise self._failure
@@ -336,12 +309,12 @@ class LiveSource:
         return []
 
     def notices(self) -> list[str]:
-        """What happened since this was asked last: the robot lost, or back."""
+        """Return notices since the last call, such as a lost robot."""
         told, self._notices = self._notices, []
         return told
 
     def waiting_for(self) -> str:
-        """Why nothing comes, in words; "" while scans come."""
+        """Why no scans arrive, as text; "" while they arrive."""
         silence_s = self._link.silence_s
         if self._choice is not None and silence_s is not None and silence_s < SILENT_S:
             return ""
@@ -356,7 +329,7 @@ class LiveSource:
             reason = f"{self._choice.channels[0].topic} is announced and silent"
         return f"{since}: {reason}" if since else f"Waiting: {reason}"
 
-    # --- inside ----------------------------------------------------------------------------------
+    # --- private --------------------------------------------------------------------------------
 
     @property
     def _base(self) -> str:
@@ -384,7 +357,7 @@ class LiveSource:
             )
 
     def _note_presence(self, choice: Choice) -> None:
-        """Look whether the robot's scans are still announced."""
+        """Note whether the scans of the robot are still announced."""
         self._version = self._link.version
         publishers = self._link.publishers()
         scan = choice.channels[0].topic
@@ -427,7 +400,7 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
     """Begin to listen; returns at once.
 
     Raises:
-        SourceError: The address is none.
+        SourceError: The address is invalid.
     """
     address, chosen = parse_address(uri), options or SourceOptions()
     make_link, kind = link_for(address)
@@ -435,13 +408,13 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
         return LiveSource(address, chosen, make_link, kind)
     if address.mapped_there:
         raise SourceError(
-            "a map that a robot makes is watched, not made again",
+            "a robot that maps itself is shown and not mapped again",
             where=uri,
             remedy="Use `stemmap serve`, or leave out mapped=robot",
         )
     if address.robot == ALL_ROBOTS:
         raise SourceError(
-            "one robot at a time is mapped",
+            "only one robot can be mapped at a time",
             where=uri,
             remedy="Name it, or show all of them with `stemmap serve`",
         )

@@ -32,7 +32,7 @@ MAX_ENDPOINTS = 5000
 
 @dataclass(frozen=True, slots=True)
 class Publisher:
-    """A topic that somebody publishes.
+    """A published topic.
 
     Attributes:
         robot: The publisher's namespace without slashes at its ends, "" for none.
@@ -46,25 +46,25 @@ class Publisher:
 
 
 SCAN_TYPES, PICTURE_TYPES = TYPES_BY_ROLE["scan"], TYPES_BY_ROLE["camera"]
-#: As `?camera=`: pictures stay on the robot, where the radio link is thin.
+#: Value of `?camera=` that receives no pictures, for a slow radio link.
 NO_CAMERA = "none"
-#: What we publish ourselves is nobody's LiDAR and nobody's odometry.
+#: Namespace of the topics that this program publishes, which are not read.
 OWN = "stemmap"
-#: Pictures that show no scene to a person.
+#: Words of topics whose pictures do not show the scene.
 _NO_SCENE = ("depth", "disparity", "confidence", "mask", "label")
 _DERIVED = ("camera", "depth", "image", "map", "ground", "cluster", "filtered", "voxel")
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What is read of a robot.
+    """The topics of a robot that are read.
 
     Attributes:
         robot: Its namespace, "" for none.
         channels: To subscribe to; their numbers count from 1.
-        warnings: What else there was.
-        camera: The channel of pictures and that of their CameraInfo, as far as they are there; numbered after
-            the others, of which the map is made.
+        warnings: Other topics and robots that could have been chosen.
+        camera: The channels of the pictures and of their CameraInfo where they exist, numbered after the
+            others.
     """
 
     robot: str
@@ -114,14 +114,14 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
 
 
 def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publisher | None:
-    """The poses of another SLAM, where they were named."""
+    """Return the topic of the poses of another SLAM, where the user named it."""
     if "pose" not in topics:
         return None
     return _of_role(there, topics, "pose", TYPES_BY_ROLE["pose"], lambda p: (p.topic,), where)
 
 
 def _camera(there: list[Publisher], topics: dict[str, str], where: str) -> list[Publisher]:
-    """The pictures that are shown, and what tells where things stand in them; [] for none."""
+    """Return the topics of the pictures and of their CameraInfo; [] for none."""
     if topics.get("camera") == NO_CAMERA:
         return []
     seen = there if "camera" in topics else [p for p in there if not _has_word(p, _NO_SCENE)]
@@ -164,7 +164,7 @@ def _refuse_wrong_type(
 
 
 def _derived(publisher: Publisher) -> bool:
-    """Whether the name says that a cloud is no raw sweep of a LiDAR."""
+    """Whether the name suggests that a cloud is not a raw sweep of a LiDAR."""
     return _has_word(publisher, _DERIVED)
 
 
@@ -173,7 +173,7 @@ def _has_word(publisher: Publisher, words: tuple[str, ...]) -> bool:
 
 
 def _scan_rank(publisher: Publisher) -> tuple[object, ...]:
-    """A laser that sees in one plane is the robot's bumper where there is a LiDAR too."""
+    """A planar laser comes last, because it is a safety sensor where there is a LiDAR too."""
     kind = publisher.msgtype
     return kind == LASER_SCAN, _derived(publisher), kind == VELODYNE_SCAN, publisher.robot, publisher.topic
 
@@ -184,11 +184,11 @@ def _odometry_rank(publisher: Publisher) -> tuple[object, ...]:
 
 
 def _imu_rank(publisher: Publisher) -> tuple[object, ...]:
-    return "raw" in publisher.topic.lower(), publisher.topic  # raw ones come without an orientation
+    return "raw" in publisher.topic.lower(), publisher.topic  # raw ones have no orientation
 
 
 def _picture_rank(publisher: Publisher) -> tuple[object, ...]:
-    """Compressed ones are a tenth of the others."""
+    """Compressed pictures come first; they have a tenth of the size."""
     return publisher.msgtype != COMPRESSED_IMAGE, publisher.topic
 
 
@@ -210,8 +210,8 @@ def _warnings(scans: list[Publisher], scan: Publisher, robot: str, named: str | 
 
 
 def countable(publishers: Sequence[Publisher], most: int) -> list[Channel]:
-    """A channel for each topic that something can be made of, by the number of its publisher. The others may
-    be of any size, and are not listened to."""
+    """Return a channel for each readable topic, numbered as its publisher. The others may be of any size and
+    are not received."""
     return [
         Channel(k, each.topic, each.msgtype, "cdr", "", "", 0)
         for k, each in enumerate(publishers[:most])

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import socket
-import threading
 import time
 from collections.abc import Sequence
 from typing import Any
 
 from app.robot.address import VelodyneAddress
-from app.robot.inbox import ArrivalTimes, Inbox
+from app.robot.inbox import Inbox
+from app.robot.link import Link
 from app.robot.topics import Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
@@ -86,40 +86,28 @@ _RECEIVE_BUFFER = 8 << 20
 _WAIT_S = 0.05
 #: After this silence the sensor counts as gone [s].
 _LOST_S = 3.0
-_RETRY_S = 1.0
 
 OTHERS = "packets of other senders"
 NO_DATA = "packets that are no data packets of a known sensor"
 OTHER_SENSOR = "packets of other sensors"
 
 
-class VelodyneLink:
-    """Receiver of a sensor's packets, in a thread of its own. It looks like a robot with one topic.
+class VelodyneLink(Link):
+    """Receiver of a sensor's packets. It looks like a robot with one topic.
 
     Args:
         address: Where to listen, and to which sender.
         inbox: Gets the sweeps.
-
-    Attributes:
-        problem, losses, scans, version: As of `ZenohLink`.
     """
 
-    session = None
-
     def __init__(self, address: VelodyneAddress, inbox: Inbox) -> None:
-        self.problem = "not listening yet"
-        self.losses: dict[str, int] = {}
-        self.scans = self.version = 0
-        self._address, self._inbox = address, inbox
-        self._times = ArrivalTimes()
+        super().__init__(inbox, "velodyne")
+        self._address = address
         self._sweeps = Sweeps()
         self._product: int | None = None
-        self._heard_s: float | None = None
         self._there = False
         self._number: int | None = None
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._listen, name="velodyne", daemon=True)
-        self._thread.start()
+        self.thread.start()
 
     @property
     def place(self) -> str:
@@ -134,39 +122,30 @@ class VelodyneLink:
         others = f"; {refused} packets of other senders were refused" if refused else ""
         return f"no data packet of a known sensor came{others}"
 
-    @property
-    def silence_s(self) -> float | None:
-        """Seconds since the last packet arrived, None before the first."""
-        return None if self._heard_s is None else time.monotonic() - self._heard_s
-
     def publishers(self) -> list[Publisher]:
         """The sensor, while it sends."""
         return [Publisher("", TOPIC, VELODYNE_SCAN)] if self._there else []
-
-    def robots(self) -> list[str]:
-        """The sensor has no name."""
-        return [""] if self._there else []
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
         """Put sweeps into the inbox from now on."""
         self._number = channels[0].number
 
-    def close(self) -> None:
-        """Stop listening."""
-        self._closing.set()
-        self._thread.join(timeout=2.0)
+    def failure(self, error: Exception) -> str:
+        """Why it cannot listen."""
+        reason = (error.strerror if isinstance(error, OSError) else "") or repr(error)
+        return f"cannot listen on {self._address.host}:{self._address.port}: {reason}"
 
-    def _listen(self) -> None:
-        while not self._closing.is_set():
-            try:
-                with self._bound() as listening:
-                    self.problem = ""
-                    self._receive(listening)
-            except Exception as error:  # after any error it listens again: the thread must not end silently
-                where = f"{self._address.host}:{self._address.port}"
-                reason = (error.strerror if isinstance(error, OSError) else "") or repr(error)
-                self.problem = f"cannot listen on {where}: {reason}"
-                self._closing.wait(_RETRY_S)
+    def receive(self) -> None:
+        """Receive packets until `close`."""
+        with self._bound() as listening:
+            self.problem = ""
+            while not self.closing.is_set():
+                try:
+                    packet, (sender, _port) = listening.recvfrom(PACKET_BYTES + 1)
+                except TimeoutError:
+                    self._pause()
+                else:
+                    self._take(packet, sender)
 
     def _bound(self) -> socket.socket:
         listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -179,18 +158,9 @@ class VelodyneLink:
             raise
         return listening
 
-    def _receive(self, listening: socket.socket) -> None:
-        while not self._closing.is_set():
-            try:
-                packet, (sender, _port) = listening.recvfrom(PACKET_BYTES + 1)
-            except TimeoutError:
-                self._pause()
-                continue
-            self._take(packet, sender)
-
     def _pause(self) -> None:
         """Handle a silence: a short one ends the sweep, after a long one the sensor counts as gone."""
-        if self._sweeps.is_stale(self._times.now_ns()):
+        if self._sweeps.is_stale(self.times.now_ns()):
             self._hand_over(self._sweeps.end())
         silence_s = self.silence_s
         if self._there and silence_s is not None and silence_s > _LOST_S:
@@ -210,14 +180,14 @@ class VelodyneLink:
         if packet[PRODUCT] != self._product:
             count_loss(self.losses, OTHER_SENSOR)
             return
-        self._heard_s = time.monotonic()
+        self.heard_s = time.monotonic()
         if not self._there:
             self._there = True
             self.version += 1
-        self._hand_over(self._sweeps.add(self._times.now_ns(), packet))
+        self._hand_over(self._sweeps.add(self.times.now_ns(), packet))
 
     def _hand_over(self, sweep: bytes | None) -> None:
         if sweep is None or self._number is None:
             return
         self.scans += 1
-        self._inbox.put(Message(self._number, self._times.next_ns(), sweep), is_scan=True)
+        self.inbox.put(Message(self._number, self.times.next_ns(), sweep), is_scan=True)

@@ -5,16 +5,15 @@ from __future__ import annotations
 import contextlib
 import json
 import struct
-import threading
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from app.robot.address import ROOT, ZenohAddress
-from app.robot.inbox import ArrivalTimes, Inbox
-from app.robot.topics import MAX_ENDPOINTS, NAME, PICTURE_TYPES, SCAN_TYPES, TYPE, Publisher
+from app.robot.inbox import Inbox
+from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, TOO_MANY, Link, first_line
+from app.robot.topics import MAX_ENDPOINTS, NAME, SCAN_TYPES, TYPE, Publisher
 from pipeline.io.readers.base import count_loss
-from pipeline.io.readers.container import Channel, Message
+from pipeline.io.readers.container import Channel
 
 ADMIN = "@ros2_lv"
 PUBLISHER = "MP"
@@ -68,20 +67,10 @@ class RosGraph:
         """All publishers, each once, sorted by robot and topic."""
         return sorted(set(self._alive.values()), key=lambda p: (p.robot, p.topic, p.msgtype))
 
-    def robots(self, scan_types: tuple[str, ...]) -> list[str]:
-        """The namespaces that publish scans, sorted."""
-        return sorted({p.robot for p in self._alive.values() if p.msgtype in scan_types})
 
-
-#: Largest message that is assembled; a cloud of 2 million points is smaller.
-MESSAGE_LIMIT = 64 << 20
-_RETRY_S = 1.0
+_WATCH_S = 1.0
 _ATTACHMENT = struct.Struct("<QQB")
-
-LOST_SCANS, LOST_OTHERS = "scans lost on the network", "other messages lost on the network"
-TOO_LARGE = "messages larger than 64 MB"
-TOO_MANY = f"topics beyond the first {MAX_ENDPOINTS:,}"
-
+LOST_OTHERS = "other messages lost on the network"
 
 #: Zenoh's names of the certificate files.
 _TLS = {"ca": "root_ca_certificate", "cert": "connect_certificate", "key": "connect_private_key"}
@@ -112,37 +101,22 @@ def configuration(endpoint: str, files: Mapping[str, str] | None = None) -> str:
     )
 
 
-class ZenohLink:
-    """Connection to a router, in a thread of its own that tries again until `close`.
+class ZenohLink(Link):
+    """Connection to a router.
 
     Args:
         address: Of the router.
         inbox: Gets the messages.
-
-    Attributes:
-        problem: Why there is no connection, "" while there is one.
-        losses: Number of messages lost before the inbox, by reason.
-        scans: Number of scans that arrived.
-        version: Grows with every change among the publishers.
     """
 
     def __init__(self, address: ZenohAddress, inbox: Inbox) -> None:
-        self.problem = "not connected yet"
-        self.losses: dict[str, int] = {}
-        self.scans = 0
-        self.version = 0
-        self._address, self._inbox = address, inbox
+        super().__init__(inbox, "zenoh")
+        self._address = address
         self._graph = RosGraph()
-        self._lock = threading.Lock()
-        self._closing = threading.Event()
-        self._session: Any = None
         self._channels: Sequence[Channel] = ()
         self._subscriptions: list[Any] = []
         self._sequences: dict[int, tuple[bytes, int]] = {}
-        self._times = ArrivalTimes()
-        self._heard_s: float | None = None
-        self._thread = threading.Thread(target=self._run, name="zenoh", daemon=True)
-        self._thread.start()
+        self.thread.start()
 
     @property
     def place(self) -> str:
@@ -160,68 +134,49 @@ class ZenohLink:
         there = f" (there are: {', '.join(others[:10])})" if others else ""
         return f"no scans of {wanted} are announced in ROS domain {self._address.domain}{there}"
 
-    @property
-    def silence_s(self) -> float | None:
-        """Seconds since the last scan arrived, None before the first."""
-        return None if self._heard_s is None else time.monotonic() - self._heard_s
-
     def publishers(self) -> list[Publisher]:
         """All publishers that are alive."""
-        with self._lock:
+        with self.lock:
             return self._graph.publishers()
-
-    def robots(self) -> list[str]:
-        """The namespaces from which scans are published."""
-        with self._lock:
-            return self._graph.robots(SCAN_TYPES)
-
-    @property
-    def session(self) -> Any:  # noqa: ANN401 - zenoh is imported where it is used
-        """The Zenoh session, None while there is none."""
-        return self._session
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
         """Receive the messages of further topics; publishers of fixed transforms repeat their last ones."""
         self._channels = (*self._channels, *channels)
-        if self._session is not None:
+        if self.session is not None:
             self._subscriptions += [self._subscribe_to(channel) for channel in channels]
-
-    def close(self) -> None:
-        """Leave the router."""
-        self._closing.set()
-        self._thread.join(timeout=5.0)
 
     def _subscribe_to(self, channel: Channel) -> Any:  # noqa: ANN401 - zenoh is imported where it is used
         from zenoh import ext
 
         is_latched = channel.topic.endswith("tf_static")
         return ext.declare_advanced_subscriber(
-            self._session,
+            self.session,
             data_key(self._address.domain, channel.topic, channel.msgtype),
             lambda sample: self._take(sample, channel),
             history=ext.HistoryConfig(detect_late_publishers=True, max_samples=100) if is_latched else None,
         )
 
-    def _run(self) -> None:
-        """Connect, try again after any error, and watch the connection until `close`."""
-        while not self._closing.is_set():
-            try:
-                self._connect()
-                self._watch()
-            except Exception as error:  # zenoh has one class for all errors, and does not promise it
-                self.problem = f"no connection to {self._address.endpoint}: {first_line(error)}"
+    def receive(self) -> None:
+        """Connect, and watch the connection until `close`."""
+        try:
+            self._connect()
+            self._watch()
+        finally:
             self._disconnect()
-            self._closing.wait(_RETRY_S)
+
+    def failure(self, error: Exception) -> str:
+        """Why there is no connection."""
+        return f"no connection to {self._address.endpoint}: {first_line(error)}"
 
     def _connect(self) -> None:
         import zenoh
 
         config = configuration(self._address.endpoint, self._address.files)
         session: Any = zenoh.open(zenoh.Config.from_json5(config))
-        with self._lock:
-            self._session = session
+        with self.lock:
+            self.session = session
             self._graph = RosGraph()
-        if self._closing.is_set():
+        if self.closing.is_set():
             return
         key = f"{ADMIN}/{self._address.domain}/**"
         self._subscriptions = [
@@ -231,14 +186,14 @@ class ZenohLink:
 
     def _watch(self) -> None:
         """Report whether the router is there, until `close`; zenoh reconnects by itself."""
-        while not self._closing.is_set():
-            is_connected = bool(self._session.info.routers_zid())
+        while not self.closing.is_set():
+            is_connected = bool(self.session.info.routers_zid())
             self.problem = "" if is_connected else f"no connection to {self._address.endpoint}"
-            self._closing.wait(_RETRY_S)
+            self.closing.wait(_WATCH_S)
 
     def _disconnect(self) -> None:
-        with self._lock:
-            session, self._session = self._session, None
+        with self.lock:
+            session, self.session = self.session, None
         if session is not None:
             with contextlib.suppress(Exception):  # a session that is broken needs no closing
                 session.close()
@@ -246,7 +201,7 @@ class ZenohLink:
     def _note_token(self, sample: Any) -> None:  # noqa: ANN401
         import zenoh
 
-        with self._lock:
+        with self.lock:
             self.version += 1
             if sample.kind == zenoh.SampleKind.DELETE:
                 self._graph.remove(str(sample.key_expr))
@@ -254,23 +209,11 @@ class ZenohLink:
                 count_loss(self.losses, TOO_MANY)
 
     def _take(self, sample: Any, channel: Channel) -> None:  # noqa: ANN401
-        payload, attachment = sample.payload, sample.attachment
-        is_scan = channel.msgtype in SCAN_TYPES
-        size = len(payload)
-        with self._lock:
-            if is_scan:
-                self._heard_s = time.monotonic()
-                self.scans += 1
-            if attachment is not None:
-                self._count_gap(channel.number, attachment.to_bytes(), LOST_SCANS if is_scan else LOST_OTHERS)
-            if size > MESSAGE_LIMIT:
-                count_loss(self.losses, TOO_LARGE)
-                return
-            arrival_ns = self._times.next_ns()
-            if channel.msgtype not in PICTURE_TYPES:
-                self._inbox.put(Message(channel.number, arrival_ns, payload.to_bytes()), is_scan=is_scan)
-            elif self._inbox.wants_picture(arrival_ns, size):
-                self._inbox.put_picture(Message(channel.number, arrival_ns, payload.to_bytes()))
+        if sample.attachment is not None:
+            reason = LOST_SCANS if channel.msgtype in SCAN_TYPES else LOST_OTHERS
+            with self.lock:
+                self._count_gap(channel.number, bytes(sample.attachment), reason)
+        self.take(channel, sample.payload, len(sample.payload))
 
     def _count_gap(self, number: int, attachment: bytes, reason: str) -> None:
         """Count lost messages: rmw_zenoh numbers the messages of a publisher, so a gap is a loss."""
@@ -282,9 +225,3 @@ class ZenohLink:
         self._sequences[number] = (gid, sequence)
         if known is not None and known[0] == gid and sequence > known[1] + 1:
             count_loss(self.losses, reason, sequence - known[1] - 1)
-
-
-def first_line(error: Exception) -> str:
-    """The first line of a library's error, without places in its source code."""
-    first = str(error).partition("\n")[0].partition(" at ")[0].rstrip("!; ")
-    return first[:200] or type(error).__name__

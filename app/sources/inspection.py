@@ -104,13 +104,13 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
 
     from app.batch.run_folder import read_run, read_run_record
-    from app.dashboard.payload import tree_rows
+    from app.dashboard.payload import trees_payload
     from app.dashboard.run_recorder import thinned
 
     folder = Path(question["path"])
     run, record = read_run(folder), read_run_record(folder)
     path_xy = np.stack([run.path.x, run.path.y], axis=1)
-    trees = tree_rows(run.trees, 0)
+    trees = trees_payload(run.trees, 0)
     return {
         "uri": run.uri,
         "kind": str(record["source"].get("kind", ""))[:200],

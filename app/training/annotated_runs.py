@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.common.version import version
+from app.common.text import version
 from app.robot.source import LiveSource
 from app.sources.opening import open_any, with_odometry
 from app.sources.request import SourceRequest

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from app.common.text import count
-from app.common.version import version
+from app.common.text import count, version
 from app.training.annotated_runs import AnnotatedRun, Progress, examples_of
 from app.training.examples import Examples, object_numbers
 from app.training.fit_forest import all_expanded

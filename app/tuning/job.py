@@ -8,7 +8,6 @@ journal are removed when the run is left, another search begins or stemmap ends.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import shutil
 import weakref
 from collections.abc import Callable, Sequence
@@ -22,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from app.common.child_process import ChildProcess, ProtocolError, python_module
 from app.common.text import count
+from app.common.timers import cancel
 from app.robot.address import is_live
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.store import AnnotatedSource
@@ -124,10 +124,7 @@ class TuneSearch:
         """End the search and remove its result, because its run is left."""
         async with self._turn:
             task, self._task = self._task, None
-            if task is not None:
-                task.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await task
+            await cancel(task)
             self._forget()
         self.show()
 

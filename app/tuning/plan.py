@@ -12,7 +12,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from app.common.version import version
+from app.common.text import version
 from app.sources.request import SourceRequest
 from pipeline.config import FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value, validated

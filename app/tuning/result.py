@@ -4,15 +4,13 @@ the page."""
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import tomli_w
 
-from app.common.text import count
-from app.common.version import version
+from app.common.text import count, version
 from app.dashboard.parameters import file_of
 from app.tuning.plan import Goal, Plan, RunScore, Trial, pool
 from pipeline.config import Parameters
@@ -84,8 +82,8 @@ def result_of(search: Search) -> Result:
 
 
 def toml_of(plan: Plan, result: Result, date: str) -> str:
-    """Return the best set as a parameter file for `--config`. Comments at its top hold the provenance, as
-    TOML (see `provenance_in`)."""
+    """Return the best set as a parameter file for `--config`. Comments at its top hold the provenance as
+    TOML."""
     parameters = best_parameters(plan, result)
     head, _, rest = file_of(plan.preset, parameters).partition("\n")
     # Not splitlines: a name may contain U+2028, which does not end a line of TOML.
@@ -133,20 +131,6 @@ def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
             )
         ],
     }
-
-
-def provenance_in(text: str) -> dict[str, Any]:
-    """Return the provenance that the comments of a parameter file hold; empty for other files."""
-    lines = text.split("\n")[1:]
-    remarks = []
-    for line in lines:
-        if not line.startswith("#"):
-            break
-        remarks.append(line.removeprefix("#").removeprefix(" "))
-    try:
-        return tomllib.loads("\n".join(remarks))
-    except tomllib.TOMLDecodeError:
-        return {}
 
 
 def lines_of(plan: Plan, result: Result) -> list[str]:

@@ -25,12 +25,12 @@ from app.dashboard.parameters import ParameterState
 from app.store.async_store import AsyncStore, StoreBusyError
 from app.store.records import UnknownError
 from app.training.learned_forests import Forests
+from app.web import uploads as upload_routes
 from app.web.auth import Guard, viewer_token
-from app.web.connection_limits import Limits, TooManyRequestsError
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
 from app.web.routes import page, parameters, results, run, runs, sockets, tuning
-from app.web.routes import uploads as upload_routes
+from app.web.routes.access import Limits, TooManyRequestsError
 from app.web.routes.run import NotPermittedError
 from app.web.uploads import Uploads
 from app.worker.protocol import Open, WorkerBusyError

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, Generic, TypeVar, get_args
 import msgspec
 import numpy as np
 
-from app.worker.internal_protocol import FromWorker, ToWorker
+from app.worker.protocol import FromWorker, ToWorker
 
 M = TypeVar("M")
 

@@ -18,21 +18,35 @@ from typing import TypeVar
 import msgspec
 
 from app.common.text import COMPILING
+from app.explain.build import cluster_story, tree_story
 from app.explain.history import RecentScans
-from app.worker.internal_protocol import (
+from app.worker.camera import camera_picture
+from app.worker.outbox import for_comparison
+from app.worker.protocol import (
+    Advance,
+    Answer,
+    AskCamera,
+    AskCluster,
+    AskCompare,
+    AskTree,
     Begin,
+    Command,
     FromWorker,
+    Open,
     Opened,
+    Pause,
+    Play,
     Question,
     Remapped,
     Report,
     Rough,
+    Seek,
+    SetParameters,
+    SetSpeed,
     Shown,
+    Status,
     ToWorker,
 )
-from app.worker.protocol import Advance, Command, Open, Pause, Play, Seek, SetParameters, SetSpeed, Status
-from app.worker.queries import QueryAnswerer
-from app.worker.replay_clock import ReplayClock
 from app.worker.session import Session
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError
@@ -82,7 +96,6 @@ class WorkerLoop:
         self._put = put
         self._clock = clock
         self._recent = recent or RecentScans()
-        self._queries = QueryAnswerer(session, self._recent)
         self._taken: deque[ToWorker | None] = deque()
         self._replay = ReplayClock()
         self._run, self._asked = 0, ""
@@ -108,7 +121,7 @@ class WorkerLoop:
                 self._session.close()
                 return
             if isinstance(command, Question):
-                self._put(self._queries.answer(command, self._run))
+                self._put(answer(self._session, self._recent, command, self._run))
                 if self._says_compiling:  # an answer may compile other kernels than the run
                     self._report()
             else:
@@ -364,3 +377,115 @@ class WorkerLoop:
     def _fail(self, detail: str) -> None:
         self._held = True
         self._session.fail(detail)
+
+
+def answer(session: Session, recent: RecentScans, question: Question, run: int) -> Answer:
+    """Return the answer to a question, or why there is none. A question never changes the run.
+
+    Args:
+        session: Session of the run.
+        recent: Recently sent frames, to which questions refer.
+        question: Question of any kind.
+        run: Number of the open run.
+    """
+    try:
+        if question.run != run:
+            raise StemmapError("the run was left")
+        return _answer(session, recent, question)
+    except StemmapError as error:
+        return Answer(question.ticket, missing=str(error))
+    except Exception as error:  # an answer that fails must not stop the run
+        traceback.print_exc(file=sys.stderr)
+        fault = f"this is a fault in stemmap: {type(error).__name__}: {error}"
+        return Answer(question.ticket, missing=f"{fault}. The terminal shows where")
+
+
+def _answer(session: Session, recent: RecentScans, question: Question) -> Answer:
+    ticket, run = question.ticket, session.run
+    match question:
+        case AskCompare(sets=sets):
+            frames = session.compare([validated(values) for values in sets])
+            return Answer(ticket, frames=[for_comparison(frame) for frame in frames])
+        case AskCamera(stamp_ns=stamp_ns):
+            return Answer(ticket, camera=camera_picture(None if run is None else run.source, stamp_ns))
+        case AskTree(tree=tree):
+            return Answer(ticket, tree=tree_story(run, tree))
+        case AskCluster(scan=scan, cluster=cluster):
+            frame = recent.find(question.run, scan)
+            if frame is None:
+                raise StemmapError(
+                    f"scan {scan} was shown too long ago", remedy="Click a cluster of the newest one"
+                )
+            return Answer(ticket, cluster=cluster_story(run, frame, cluster))
+
+
+NS = 1_000_000_000
+RATE_SCANS = 20  # scans over which the rate is measured
+SLOWEST = 1e-3  # factor of real time; a smaller one would give times that no clock can wait for
+LONGEST_DELAY_S = 3600.0
+
+
+class ReplayClock:
+    """Replays at a factor of real time. No scan is skipped; `behind` counts the scans that are late.
+
+    Times of the computer are seconds from any start; times of the data are nanoseconds.
+    """
+
+    def __init__(self) -> None:
+        self._speed = 1.0
+        self._anchor: tuple[int, float] | None = None
+        self._mapped: deque[tuple[int, float]] = deque(maxlen=RATE_SCANS)
+
+    @property
+    def speed(self) -> float:
+        """Factor of real time, at least `SLOWEST`; 0 is as fast as possible."""
+        return self._speed
+
+    @speed.setter
+    def speed(self, factor: float) -> None:
+        self._speed = 0.0 if factor == 0.0 else max(factor, SLOWEST)
+
+    def anchor(self, stamp_ns: int, now: float) -> None:
+        """Count the scan of `stamp_ns` as shown at `now`; later scans follow from there."""
+        self._anchor = (stamp_ns, now)
+        self._mapped.clear()
+
+    def release(self) -> None:
+        """Let the next scan be the anchor: after a pause, a jump or a change of speed."""
+        self._anchor = None
+        self._mapped.clear()
+
+    def delay(self, stamp_ns: int, now: float) -> float:
+        """Seconds until the scan of `stamp_ns` is due, at most `LONGEST_DELAY_S`; 0 when it is late."""
+        if self.speed == 0.0:
+            return 0.0
+        if self._anchor is None:
+            self.anchor(stamp_ns, now)
+        return min(max(0.0, self._due(stamp_ns) - now), LONGEST_DELAY_S)
+
+    def mapped(self, stamp_ns: int, now: float) -> None:
+        """Note that a scan was mapped now."""
+        self._mapped.append((stamp_ns, now))
+
+    def behind(self, now: float) -> int:
+        """Number of scans that are due and not mapped yet."""
+        if self.speed == 0.0 or self._anchor is None or len(self._mapped) < 2:
+            return 0
+        first, last = self._mapped[0][0], self._mapped[-1][0]
+        period_ns = (last - first) / (len(self._mapped) - 1)
+        late_ns = (now - self._due(last)) * self.speed * NS
+        return max(0, int(late_ns / period_ns)) if period_ns > 0 else 0
+
+    @property
+    def rate_hz(self) -> float:
+        """Scans mapped per second of the computer's time, over the last scans; 0 when the run stands."""
+        if len(self._mapped) < 2:
+            return 0.0
+        spent = self._mapped[-1][1] - self._mapped[0][1]
+        return (len(self._mapped) - 1) / spent if spent > 0 else 0.0
+
+    def _due(self, stamp_ns: int) -> float:
+        if self._anchor is None:
+            raise RuntimeError("the replay clock has no anchor")
+        anchor_ns, anchor_s = self._anchor
+        return anchor_s + (stamp_ns - anchor_ns) / NS / self.speed

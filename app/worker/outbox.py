@@ -10,12 +10,12 @@ from typing import BinaryIO
 
 import numpy as np
 from msgspec import structs
+from numpy.typing import NDArray
 
 from app.explain.history import RecentScans
 from app.worker.codec import WireError, from_worker
-from app.worker.internal_protocol import FromWorker, Opened, Report, Shown
-from app.worker.thin_frame import picture_of
-from pipeline.types.records import HeightMap, Path
+from app.worker.protocol import FromWorker, Opened, Report, Shown
+from pipeline.types.records import Frame, HeightMap, Path
 
 # A higher frame rate is not visible and would only fill the pipe and the sockets.
 _SHORTEST_PAUSE_S = 0.05
@@ -180,3 +180,34 @@ def joined(old: Path | None, start: int, tail: Path) -> Path:
             for name in ("stamp_ns", "x", "y", "yaw", "sigma_xy")
         )
     )
+
+
+MOST_POINTS = 200_000
+NOT_DRAWN = "not drawn"
+
+
+def picture_of(frame: Frame) -> Frame:
+    """The frame with at most MOST_POINTS raw and MOST_POINTS filtered points, taken evenly; the count
+    "not drawn" says how many were left out."""
+    raw, filtered = _evenly(len(frame.raw)), _evenly(len(frame.filtered))
+    left_out = len(frame.raw) - len(raw) + len(frame.filtered) - len(filtered)
+    if left_out == 0:
+        return frame
+    return replace(
+        frame,
+        raw=frame.raw[raw],
+        filtered=frame.filtered[filtered],
+        labels=frame.labels[filtered],
+        counts={**frame.counts, NOT_DRAWN: left_out},
+    )
+
+
+def for_comparison(frame: Frame) -> Frame:
+    """The picture without what is the same under all parameters or is not drawn: the raw points, the
+    gathered columns and the ground."""
+    return picture_of(replace(frame, raw=np.zeros((0, 3), np.float32), columns=None, ground=None))
+
+
+def _evenly(n: int) -> NDArray[np.int64]:
+    """Rows of a table of n rows, at most MOST_POINTS of them and none twice."""
+    return np.arange(n) if n <= MOST_POINTS else np.arange(MOST_POINTS) * n // MOST_POINTS

@@ -13,18 +13,17 @@ import queue
 import signal
 import sys
 import threading
-from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import BinaryIO
 
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
 from app.worker.codec import WireError, to_worker
-from app.worker.internal_protocol import ToWorker
 from app.worker.loop import WorkerLoop
 from app.worker.outbox import Mailbox
-from app.worker.run_factory import caches_in, unnamed_caches
+from app.worker.protocol import ToWorker
+from app.worker.run import caches_in, unnamed_caches
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.jit import on_compiling
@@ -67,24 +66,16 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     recent = RecentScans()
     mailbox = Mailbox(outgoing, recent)
     driver = WorkerLoop(session, commands, mailbox.put, recent=recent)
-    with on_compiling(_said_once(driver.compiling)):
+    with on_compiling(_notify_compilation), on_compiling(driver.compiling):
         driver.run()
     mailbox.close()
     finished.set()
 
 
-def _said_once(told: Callable[[], None]) -> Callable[[], None]:
-    """Hands on each kernel that is being compiled, and says the first one in the terminal."""
-    said = False
-
-    def compiling() -> None:
-        nonlocal said
-        if not said:
-            said = True
-            print(f"stemmap: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
-        told()
-
-    return compiling
+@cache
+def _notify_compilation() -> None:
+    """Print once that a kernel is compiled."""
+    print(f"stemmap: {COMPILING}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def _read(

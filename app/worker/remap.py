@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
 
 from app.dashboard.map_changes import MapChanges, changes_between
 from app.explain.history import TreeHistory
-from app.worker.snapshots import ParameterHistory, Snapshots, nbytes
 from pipeline.config import Parameters
+from pipeline.front_end import SegmentedScan
 from pipeline.remapping import ClusterTable, Rerun
+from pipeline.remapping.rerun import Segment
+from pipeline.slam import Genealogy, Smoother
 from pipeline.types.records import Frame, Path, Step
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
-MOST_MAPS = 2  # earlier maps that are kept for undo and redo
-MOST_BYTES = 256 << 20  # of all earlier maps
-MOST_SNAPSHOT_BYTES = 64 << 20  # of the snapshots of one earlier map; fewer make going back slower
 NS = 1_000_000_000
 
 
@@ -84,11 +89,6 @@ class RunMap:
         """A map without scans."""
         return cls(ParameterHistory(parameters), mapper, Snapshots(mapper.snapshot()))
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the states of the mapper."""
-        return self.snapshots.nbytes + nbytes(self.before)
-
 
 class Remapping:
     """A run that is mapped again from its first scan.
@@ -129,37 +129,6 @@ class Remapping:
         return self.map
 
 
-class EarlierMaps:
-    """Maps of the same scans with earlier parameters, so that undo and redo need no rerun. Their number and
-    their size are bounded."""
-
-    def __init__(self) -> None:
-        self._maps: list[RunMap] = []
-
-    def __contains__(self, known: object) -> bool:
-        return any(each is known for each in self._maps)
-
-    def find(self, parameters: Parameters) -> RunMap | None:
-        """The map that was made with these parameters, if any."""
-        known = (m for m in self._maps if m.parameters.were_always(parameters, NOT_OF_THE_MAP))
-        return next(known, None)
-
-    def add(self, known: RunMap) -> None:
-        """Keep a map in its state before the current scan."""
-        known.mapper.restore(known.before)
-        self._maps.append(replace(known, snapshots=known.snapshots.within(MOST_SNAPSHOT_BYTES)))
-        while len(self._maps) > MOST_MAPS or sum(each.nbytes for each in self._maps) > MOST_BYTES:
-            del self._maps[0]
-
-    def remove(self, known: RunMap) -> None:
-        """Forget a map."""
-        self._maps = [each for each in self._maps if each is not known]
-
-    def clear(self) -> None:
-        """Forget all maps: the current scan is another one."""
-        self._maps.clear()
-
-
 @dataclass(slots=True)
 class MapComparison:
     """The map before a change of parameters, with which the new map is compared.
@@ -191,3 +160,126 @@ class MapComparison:
         if self._before is None or self._before.index != new.index:  # the run went on, or elsewhere
             self._before = shown
         return changes_between(self._before, shown, new, revision, time_s, confirmed_s)
+
+
+S = TypeVar("S")
+
+_SPACING = 50
+_MOST_STATES = 40
+_MOST_BYTES = 256 << 20
+
+
+def nbytes(state: object) -> int:
+    """Return the number of bytes of all arrays in nested dataclasses, lists and tuples."""
+    if isinstance(state, np.ndarray | Genealogy | Smoother):
+        return state.nbytes
+    if isinstance(state, list | tuple):
+        return sum(map(nbytes, state))
+    if is_dataclass(state):
+        return sum(nbytes(getattr(state, field.name)) for field in fields(state))
+    return 0
+
+
+class Snapshots(Generic[S]):
+    """States of the mapper by the number of scans they contain (0: before the first scan).
+
+    At most 40 states and 256 MB are kept: beyond that, every second state is dropped and the spacing doubles,
+    so that the memory is bounded for a run of any length. The first state is always kept.
+
+    Args:
+        start: State before the first scan.
+    """
+
+    def __init__(self, start: S) -> None:
+        self._states: dict[int, S] = {0: start}
+        self._sizes: dict[int, int] = {0: nbytes(start)}
+        self._spacing = _SPACING
+
+    def offer(self, scans: int, state: S) -> None:
+        """Store a state if it is due."""
+        if not self.is_due(scans):
+            return
+        self._states[scans], self._sizes[scans] = state, nbytes(state)
+        while len(self._states) > 1 and self._are_too_many():
+            self._spacing *= 2
+            self._states = {n: s for n, s in self._states.items() if n % self._spacing == 0}
+
+    def _are_too_many(self) -> bool:
+        return (
+            len(self._states) > _MOST_STATES or sum(map(self._sizes.__getitem__, self._states)) > _MOST_BYTES
+        )
+
+    def is_due(self, scans: int) -> bool:
+        """Return whether `offer` would store a state with this number of scans."""
+        return scans % self._spacing == 0 and scans not in self._states
+
+    def newest(self, scans: int) -> tuple[int, S]:
+        """Return the newest state with at most this number of scans, and its number of scans."""
+        best = max(n for n in self._states if n <= scans)
+        return best, self._states[best]
+
+    def forget_after(self, scans: int) -> None:
+        """Drop the states with more scans."""
+        self._states = {n: s for n, s in self._states.items() if n <= scans}
+
+
+class ParameterHistory:
+    """Parameters with which each scan of the run was mapped."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._starts = [0]
+        self._sets = [parameters]
+
+    def at(self, index: int) -> Parameters:
+        """Return the parameters with which a scan was or will be mapped."""
+        return self._sets[bisect_right(self._starts, index) - 1]
+
+    def were_always(self, parameters: Parameters, aside: set[str]) -> bool:
+        """Return whether every scan was mapped with these values, except those of some stages."""
+        wanted = parameters.model_dump(exclude=aside)
+        return all(known.model_dump(exclude=aside) == wanted for known in self._sets)
+
+    def set_from(self, index: int, parameters: Parameters) -> bool:
+        """Set the parameters from a scan onwards and return whether any value changes.
+
+        Without a change, the results of later scans remain valid.
+        """
+        if self.at(index) == parameters and self._starts[-1] <= index:
+            return False
+        kept = max(1, sum(start < index for start in self._starts))
+        self._starts, self._sets = self._starts[:kept], self._sets[:kept]
+        if index == 0:
+            self._sets[0] = parameters
+        elif self._sets[-1] != parameters:
+            self._starts.append(index)
+            self._sets.append(parameters)
+        return True
+
+
+AHEAD = 4  # scans that are segmented ahead of the mapping; more only take memory
+
+
+def segment_ahead(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Step, SegmentedScan]]:
+    """Each step with its segmented scan, in order. An error is raised in the turn of its scan.
+
+    The caller reads the steps, so that the source is read by one thread only. Another thread segments up to
+    `AHEAD` scans ahead.
+    """
+    waiting: deque[tuple[Step, Future[SegmentedScan]]] = deque()
+    pool = ThreadPoolExecutor(1, thread_name_prefix="segment")
+    try:
+        for step in steps:
+            waiting.append((step, pool.submit(segment, step)))
+            if len(waiting) > AHEAD:
+                first, scan = waiting.popleft()
+                yield first, scan.result()
+        for first, scan in waiting:
+            yield first, scan.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def segment_all(segment: Segment, steps: list[Step]) -> list[SegmentedScan]:
+    """Some segmented scans; two threads work at them."""
+    with ThreadPoolExecutor(2, thread_name_prefix="segment") as pool:
+        return list(pool.map(segment, steps))

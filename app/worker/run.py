@@ -7,19 +7,28 @@ mapped with, and on nothing else: not on pauses, jumps, or which states happen t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
+from pathlib import Path as FilePath
 
 import numpy as np
 
 from app.common.timers import Stopwatch
 from app.explain.history import TreeHistory
-from app.worker.cursor import Cursor, LiveCursor
-from app.worker.parallel import segment_ahead, segment_all
-from app.worker.remap import NOT_OF_THE_MAP, EarlierMaps, MapperLike, Remapping, RunMap
-from app.worker.snapshots import ParameterHistory
+from app.robot.source import LiveSource
+from app.sources.opening import with_odometry
+from app.worker.cursor import Cursor, LiveCursor, StepsFunction
+from app.worker.remap import (
+    NOT_OF_THE_MAP,
+    MapperLike,
+    Remapping,
+    RunMap,
+    segment_ahead,
+    segment_all,
+)
 from pipeline.config import Parameters
-from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers.base import Source
+from pipeline.config.model import validated
+from pipeline.errors import ParameterError, SourceError, StemmapError
+from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.remapping import KnownMap, Reread, Rerun, Sample, ScanCaches, preview_trees
 from pipeline.types.records import Float, Frame, Path, Step, Trees
@@ -75,8 +84,6 @@ class Run:
         self._cache = self._caches.of(parameters)
         self._sample = Sample()
         self._remapping: Remapping | None = None
-        self._earlier = EarlierMaps()
-        self._returning: tuple[RunMap, Parameters] | None = None
         self._preview: Trees | None = None
 
     @property
@@ -117,7 +124,6 @@ class Run:
         step = self._cursor.take()
         if step is None:
             return None
-        self._earlier.clear()
         self._map.before = self._map.mapper.snapshot()
         self._map.snapshots.offer(step.index, self._map.before)
         return self._map_step(step, hurried=hurried)
@@ -182,13 +188,6 @@ class Run:
         self.stay()
         if self._map.parameters.were_always(parameters, NOT_OF_THE_MAP):
             return
-        earlier = self._earlier.find(parameters)
-        if earlier is not None:
-            self._returning = (earlier, parameters)
-        else:
-            self._begin(parameters)
-
-    def _begin(self, parameters: Parameters) -> None:
         mapper = self._remake(parameters) if self._remake else None
         if not isinstance(mapper, Mapper):
             return
@@ -210,7 +209,6 @@ class Run:
 
     def stay(self) -> None:
         """Give up what `remap` began; the map stays as it is."""
-        self._returning = None
         if self._remapping is not None:
             self._remapping.rerun.close()
             self._remapping = None
@@ -218,12 +216,10 @@ class Run:
     @property
     def remapped(self) -> float | None:
         """How much of the run is mapped again, up to the current scan, from 0 to 1; None when nothing is."""
-        r = self._remapping
-        if self._returning is not None and self.is_whole:
-            return 1.0
-        if r is None or not self.is_whole:
+        remapping = self._remapping
+        if remapping is None or not self.is_whole:
             return None
-        return min(r.rerun.done / max(self.standing, 1), 1.0)
+        return min(remapping.rerun.done / max(self.standing, 1), 1.0)
 
     @property
     def preview(self) -> Trees | None:
@@ -246,11 +242,7 @@ class Run:
             StemmapError: A scan cannot be read again. The map stays as it is.
         """
         remapping = self._remapping
-        if self._step is None or self._broken:  # on the way to another scan
-            return None
-        if self._returning is not None:
-            return self._return_to(*self._returning)
-        if remapping is None:
+        if remapping is None or self._step is None or self._broken:  # or on the way to another scan
             return None
         try:
             with self.stopwatch.aside():
@@ -260,28 +252,9 @@ class Run:
             raise
         if not finished:
             return None
-        self._remapping = None
-        return self._take_over(remapping.finish())
-
-    def _return_to(self, earlier: RunMap, parameters: Parameters) -> tuple[Frame, dict[int, float]] | None:
-        """Take an earlier map of the same scans again; where it is forgotten meanwhile, begin a rerun."""
-        self._returning = None
-        if earlier not in self._earlier:
-            self._begin(parameters)
-            return None
-        earlier.mapper.restore(earlier.before)
-        return self._take_over(replace(earlier, parameters=ParameterHistory(parameters)), earlier)
-
-    def _take_over(self, new: RunMap, earlier: RunMap | None = None) -> tuple[Frame, dict[int, float]]:
-        """Go on with another map of the scans before the current one, and keep the present one for undo."""
-        assert self._step is not None  # noqa: S101 - the callers have checked
-        old, self._map = self._map, new
-        if earlier is not None:
-            self._earlier.remove(earlier)
-        if isinstance(old.mapper, Mapper) and 0 < self.standing <= old.parameters.until(self.standing):
-            self._earlier.add(replace(old, parameters=ParameterHistory(old.parameters.at(0))))
-        self._cache = self._caches.of(new.parameters.at(self.standing))
-        return self._map_step(self._step), new.record.confirmed_s
+        self._remapping, self._map = None, remapping.finish()
+        self._cache = self._caches.of(self._map.parameters.at(self.standing))
+        return self._map_step(self._step), self._map.record.confirmed_s
 
     def parameters_at(self, index: int) -> Parameters:
         """Parameters that a scan was or will be mapped with."""
@@ -328,7 +301,6 @@ class Run:
         scans, state = self._map.snapshots.newest(min(index, self._cursor.known))
         if not self._broken and self.standing < index and scans <= self.standing + 1:
             return
-        self._earlier.clear()
         self._broken = True  # until all of it has worked
         self._cursor.go_to(scans)
         self._map.mapper.restore(state)
@@ -344,6 +316,96 @@ class Run:
     def close(self) -> None:
         """Close the source and the scan caches."""
         self.stay()
-        self._earlier.clear()
         self._caches.close()
         self.source.close()
+
+
+MakeSynchroniser = Callable[[str], StepsFunction]
+OpenCaches = Callable[[Source | LiveSource, str, int], ScanCaches]
+
+_LARGE = FilePath("/var/tmp")  # noqa: S108 - the default may be in memory; the file has no name
+
+
+def unnamed_caches(_source: Source | LiveSource, _odometry: str, _seed: int) -> ScanCaches:
+    """Scan caches for as long as the run is open."""
+    return ScanCaches(_LARGE if _LARGE.is_dir() else None)
+
+
+def caches_in(folder: FilePath) -> OpenCaches:
+    """Opens scan caches that the next opening of a recording finds again.
+
+    A live source, and a source without a digest, get caches for as long as the run is open.
+
+    Args:
+        folder: Folder of all recordings; it is made when it is needed.
+    """
+
+    def open_caches(source: Source | LiveSource, odometry: str, seed: int) -> ScanCaches:
+        digest = source.description.digest
+        if not digest or isinstance(source, LiveSource):
+            return unnamed_caches(source, odometry, seed)
+        return ScanCaches(folder, f"{digest}\n{source.description.uri}\n{odometry}\n{seed}")
+
+    return open_caches
+
+
+@dataclass(frozen=True, slots=True)
+class RunFactory:
+    """Makes runs.
+
+    Attributes:
+        make_mapper: Returns a fresh mapper for a source, from parameters, seed and a stopwatch.
+        make_synchroniser: Returns the synchroniser for a choice of odometry.
+        open_caches: Opens the scan caches of a source, for its odometry and seed.
+    """
+
+    make_mapper: MakeMapper
+    make_synchroniser: MakeSynchroniser
+    open_caches: OpenCaches
+
+    def __call__(
+        self, source: Source | LiveSource, odometry: str, seed: int, parameters: Parameters
+    ) -> tuple[Run, tuple[str, ...]]:
+        """A run before its first scan, and warnings.
+
+        Raises:
+            SourceError: There is no such odometry; the source is closed.
+        """
+        try:
+            moving, chosen = with_odometry(source, odometry)
+        except SourceError:
+            source.close()
+            raise
+        stopwatch, synchronise = Stopwatch(), self.make_synchroniser(chosen.steps)
+        is_live = isinstance(source, LiveSource)
+        run = Run(
+            moving,
+            self.make_mapper(moving, parameters, seed, stopwatch),
+            LiveCursor(source, chosen, moving)
+            if isinstance(source, LiveSource)
+            else Cursor(moving, synchronise),
+            parameters,
+            stopwatch,
+            chosen.words,
+            remake=lambda parameters: self.make_mapper(moving, parameters, seed, stopwatch),
+            reread=None if is_live else lambda: synchronise(moving.records(None)),
+            caches=self.open_caches(source, chosen.words, seed),
+        )
+        return run, (*source.description.warnings, *([chosen.warning] if chosen.warning else []))
+
+
+def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Parameters], ...]:
+    """The sets of parameters that a recorded live run was mapped with, each with its first scan, in order.
+
+    A set that the whole run was mapped again with replaces those before it. The result is empty where no
+    parameters are recorded, or parameters of another version of stemmap.
+    """
+    sets: list[tuple[int, Parameters]] = []
+    try:
+        for each in description.revisions:
+            values = validated(each.values)
+            sets = [known for known in sets if known[0] < each.from_scan]
+            sets.append((each.from_scan, values))
+    except ParameterError:
+        return ()
+    return tuple(sets)

@@ -17,16 +17,12 @@ from app.batch.summary import driven
 from app.dashboard.map_changes import MapChanges
 from app.dashboard.payload import health_word
 from app.explain import build as stories
-from app.explain.records import ClusterStory, TreeStory
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
 from app.worker.camera import has_camera
-from app.worker.internal_protocol import Opened
-from app.worker.protocol import LONGEST_S, State, Status
+from app.worker.protocol import LONGEST_S, Opened, State, Status
 from app.worker.remap import MapComparison
-from app.worker.run import MakeMapper, Run
-from app.worker.run_factory import MakeSynchroniser, OpenCaches, RunFactory, unnamed_caches
-from app.worker.seek import SeekTarget
+from app.worker.run import MakeMapper, MakeSynchroniser, OpenCaches, Run, RunFactory, unnamed_caches
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import Source, SourceOptions
@@ -314,22 +310,6 @@ class Session:
             self._robot.use_parameters(self._revision, 0, run.parameters_at(0))
         return frame, changes
 
-    def cluster_story(self, frame: Frame, cluster: int) -> ClusterStory:
-        """Return the explanation of a cluster of a frame, which may lack its raw points.
-
-        Raises:
-            StemmapError: There is no such cluster.
-        """
-        return stories.cluster_story(self._run, frame, cluster)
-
-    def tree_story(self, number: int) -> TreeStory:
-        """Return the explanation of a tree at the current scan.
-
-        Raises:
-            StemmapError: There is no such tree now.
-        """
-        return stories.tree_story(self._run, number)
-
     def compare(self, sets: Sequence[Parameters]) -> list[Frame]:
         """Return the current scan mapped with other parameter sets, without a change of the run.
 
@@ -471,3 +451,81 @@ def opened_of(run: Run) -> Opened:
         truth=truth.trees if truth else None,
         digest=description.digest,
     )
+
+
+class SeekTarget:
+    """The scan to which a run goes: given by its number, by a time that it is not later than, or none."""
+
+    def __init__(self) -> None:
+        self._index: int | None = None
+        self._stamp_ns: int | None = None
+        self._under_way = False
+
+    @property
+    def sought(self) -> bool:
+        """Whether a scan is sought."""
+        return self._index is not None or self._stamp_ns is not None
+
+    @property
+    def index(self) -> int | None:
+        """Number of the sought scan; None where a time is sought."""
+        return self._index
+
+    def to_scan(self, index: int) -> None:
+        """Seek a scan by its number."""
+        self._index, self._stamp_ns, self._under_way = index, None, False
+
+    def to_time(self, run: Run, stamp_ns: int) -> None:
+        """Seek the last scan not later than a time."""
+        index = run.index_at(stamp_ns)
+        if index is not None:
+            self.to_scan(index)
+        else:
+            self._index, self._stamp_ns, self._under_way = None, stamp_ns, False
+
+    def forget(self) -> None:
+        """Seek nothing."""
+        self._index, self._stamp_ns, self._under_way = None, None, False
+
+    def set_out(self, run: Run) -> None:
+        """Return to a state before the target, once. This happens when work begins, so that targets that
+        another one replaces while the timeline is dragged cost nothing."""
+        if self._under_way or not self.sought:
+            return
+        self._under_way = True
+        if self._index is None:
+            run.approach(run.known)
+        elif self._index != run.standing or not run.is_whole:
+            run.approach(self._index)
+
+    def is_at_end(self, run: Run) -> bool:
+        """Whether the run has reached the sought scan."""
+        if self._index is not None:
+            return run.standing >= self._index
+        if self._stamp_ns is None or run.standing < 0:
+            return False
+        following = run.peek_ns()
+        return following is not None and following > self._stamp_ns
+
+    def words(self, run: Run | None) -> str:
+        """The sought scan in words; empty without one."""
+        if run is None or not self.sought:
+            return ""
+        time_s = self.time_s(run)
+        return f"scan {self._index}" if time_s is None else clock(time_s)
+
+    def time_s(self, run: Run | None) -> float | None:
+        """Time of the sought scan [s since the first scan]; None without one, or where it is not known."""
+        if run is None:
+            return None
+        if self._stamp_ns is not None:
+            return (self._stamp_ns - run.start_ns) / _NS
+        if self._index is not None and self._index < run.known:
+            return (run.stamp_ns(self._index) - run.start_ns) / _NS
+        return None
+
+
+def clock(seconds: float) -> str:
+    """A time in minutes and seconds."""
+    whole = int(seconds)
+    return f"{whole // 60}:{whole % 60:02d}"

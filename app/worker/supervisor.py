@@ -12,10 +12,24 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Literal
 
+from app.common.timers import cancel
 from app.robot.address import is_live
 from app.worker.codec import LENGTH_BYTES, WireError, check_size, from_worker, to_worker
-from app.worker.internal_protocol import Begin, FromWorker, Opened, Report, Shown, ToWorker
-from app.worker.protocol import Open, Pause, Play, SetParameters, SetSpeed, Status, WorkerBusyError
+from app.worker.protocol import (
+    Begin,
+    FromWorker,
+    Open,
+    Opened,
+    Pause,
+    Play,
+    Report,
+    SetParameters,
+    SetSpeed,
+    Shown,
+    Status,
+    ToWorker,
+    WorkerBusyError,
+)
 
 # -P: a folder that holds a file `app.py` must not decide what runs.
 WORKER = (sys.executable, "-P", "-m", "app.worker.process")
@@ -119,10 +133,7 @@ class WorkerProcess:
         """Ask the worker to end, and kill it if it does not."""
         self._closing = True
         self._stop_opening_timer()
-        if self._task is not None:
-            self._task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._task
+        await cancel(self._task)
         await self._end()
 
     async def _spawn(self) -> None:

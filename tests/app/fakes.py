@@ -11,7 +11,7 @@ from zlib import crc32
 import numpy as np
 
 from app.common.timers import Stopwatch
-from app.worker.internal_protocol import Opened, ToWorker
+from app.worker.protocol import Opened, ToWorker
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import ParameterError, SourceError

@@ -88,7 +88,7 @@ def main(port: str, robot: str, place: str = "") -> None:
             source.mapped(frame, mapper.path)
             mapped.append(time.monotonic())
         told = {
-            "came": source.scans_come,
+            "came": source._link.scans,
             "mapped": len(mapped),
             "losses": source.losses,
             "latency_s": [done - at for at, done in zip(arrived, mapped, strict=False)],

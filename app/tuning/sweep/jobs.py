@@ -17,8 +17,7 @@ import msgspec
 
 import pipeline
 from app.batch.run_folder import read_run, read_run_record
-from app.common.text import count
-from app.common.version import version
+from app.common.text import count, version
 from app.sources.opening import with_odometry
 from app.sources.request import SourceRequest, request_of_kept
 from app.tuning.plan import TruthTable

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.common.text import count
-from app.common.version import version
+from app.common.text import count, version
 from app.tuning.sweep.grid import shown, words_of
 from app.tuning.sweep.jobs import Answer, SweepPlan
 from pipeline.io.atomic_files import write_beside

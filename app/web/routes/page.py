@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import mimetypes
+from functools import cache
+from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from urllib.parse import urlsplit
 
@@ -11,8 +14,8 @@ from starlette.responses import FileResponse, RedirectResponse, Response
 
 from app.web.auth import role_of, ticket
 from app.web.responses import error_reply, json_reply
-from app.web.static_files import page_folder, plotly_script
 from app.web.viser_proxy import client_page
+from pipeline.errors import StemmapError
 
 router = APIRouter()
 
@@ -123,3 +126,32 @@ def _page_path(path: str) -> Path | None:
         return found if found.is_relative_to(folder) and found.is_file() else None
     except OSError:  # a name that no file system accepts
         return None
+
+
+@cache
+def page_folder() -> Path:
+    """Return the folder of index.html: `app/static` of an installed package, or `static/` of a checkout.
+
+    Raises:
+        StemmapError: Neither folder exists.
+    """
+    package = Path(str(files("app")))
+    for folder in (package / "static", package.parent / "static"):
+        if (folder / "index.html").is_file():
+            return folder
+    raise StemmapError("the page is missing", where=str(package / "static"), remedy="Install stemmap again")
+
+
+@cache
+def plotly_script() -> Path:
+    """Return the path of plotly.min.js without importing plotly, which is slow.
+
+    Raises:
+        StemmapError: plotly is not installed.
+    """
+    spec = find_spec("plotly")
+    for folder in spec.submodule_search_locations or () if spec else ():
+        script = Path(folder) / "package_data" / "plotly.min.js"
+        if script.is_file():
+            return script
+    raise StemmapError("plotly is not installed", remedy="Install stemmap again")

@@ -45,7 +45,9 @@ async def trees(dashboard: Dash) -> Response:
     shown = dashboard.shown
     if shown is None:
         return json_reply({"trees": []})
-    return json_reply({"trees": await asyncio.to_thread(trees_payload, shown.frame, dashboard.start_ns)})
+    return json_reply(
+        {"trees": await asyncio.to_thread(trees_payload, shown.frame.trees, dashboard.start_ns)}
+    )
 
 
 @router.get("/trees.csv")

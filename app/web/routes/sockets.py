@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
 from typing import Annotated
 
 import msgspec
 from fastapi import APIRouter
 from msgspec import Meta
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from app.common.user import current_user
+from app.dashboard.broadcast import Listener, Live
 from app.dashboard.dashboard import Dashboard
 from app.web.responses import LARGEST_NUMBER
 from app.web.routes.access import Bounds, CallerRole, Dash
 from app.web.viser_proxy import bridge
-from app.web.websocket_feed import telling
 
 router = APIRouter()
 
@@ -76,3 +79,21 @@ async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: Calle
             await browser.close(_TRY_AGAIN_LATER)
             return
         await bridge(browser, dashboard.scene, user=current_user.get(), looks_only=role != "owner")
+
+
+@contextlib.asynccontextmanager
+async def telling(browser: WebSocket, live: Live) -> AsyncIterator[None]:
+    """Send all state changes to a browser while the context is active."""
+    with live.listener() as listener:
+        sending = asyncio.create_task(_send(browser, listener))
+        try:
+            yield
+        finally:
+            sending.cancel()
+            with contextlib.suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
+                await sending
+
+
+async def _send(browser: WebSocket, listener: Listener) -> None:
+    async for message in listener.messages():
+        await browser.send_text(message.decode())

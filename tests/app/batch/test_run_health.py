@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.batch.run_health import MOST_SPANS, RunHealth
+from app.batch.summary import MOST_SPANS, RunHealth
 from app.dashboard.payload import JUST_BEGUN, health_payload, health_word
 from pipeline.types.pose_health import Health, HealthState
 from pipeline.types.records import Frame

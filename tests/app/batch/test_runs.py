@@ -20,8 +20,7 @@ from app.sources import inspection
 from app.sources.request import SourceRequest, request_of_kept, request_of_options
 from app.store.records import Author, Content
 from app.training.annotated_runs import annotated_run
-from app.worker.internal_protocol import Begin, Shown
-from app.worker.protocol import Open
+from app.worker.protocol import Begin, Open, Shown
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import SourceOptions
 from pipeline.types.records import TruthTrees

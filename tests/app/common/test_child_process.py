@@ -109,5 +109,5 @@ async def test_a_program_that_does_not_exist_is_an_error_for_people():
 
 def test_a_file_in_the_working_directory_does_not_replace_the_program(tmp_path: Path):
     (tmp_path / "app.py").write_text("print('replaced')")
-    done = subprocess.run(python_module("app.common.version"), cwd=tmp_path, capture_output=True, check=True)
+    done = subprocess.run(python_module("app.common.text"), cwd=tmp_path, capture_output=True, check=True)
     assert done.stdout == b""

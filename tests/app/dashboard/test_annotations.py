@@ -22,7 +22,7 @@ from app.dashboard.dashboard import Dashboard
 from app.store.async_store import AsyncStore
 from app.store.records import Annotation, Content
 from app.web.auth import session_value
-from app.worker.internal_protocol import Shown
+from app.worker.protocol import Shown
 from pipeline.io.ground_truth import parse_truth_trees
 from pipeline.types.records import TruthTrees
 from tests.app.fakes import frame, opened, path, truth_trees

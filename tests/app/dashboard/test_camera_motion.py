@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.dashboard.camera_marks import motion
+from app.dashboard.camera_view import motion
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Path
 

@@ -16,8 +16,18 @@ import pytest_asyncio
 from app.dashboard.broadcast import Live
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
-from app.worker.internal_protocol import Answer, AskCluster, Begin, Report, Shown
-from app.worker.protocol import Open, Play, Seek, SetParameters, Status
+from app.worker.protocol import (
+    Answer,
+    AskCluster,
+    Begin,
+    Open,
+    Play,
+    Report,
+    Seek,
+    SetParameters,
+    Shown,
+    Status,
+)
 from pipeline.config import preset
 from pipeline.errors import ParameterError
 from pipeline.ground.terrain_map import no_height_map

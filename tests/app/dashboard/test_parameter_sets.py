@@ -9,7 +9,7 @@ import pytest
 
 from app.cli.flags import chosen_parameters
 from app.dashboard.payload import BeforeAfter, Counts, counts_of
-from app.worker.internal_protocol import Shown
+from app.worker.protocol import Shown
 from pipeline.config import preset
 from tests.app.fakes import frame, opened, path, truth_trees
 from tests.app.server_for_tests import Running

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from app.dashboard.payload import in_centimetres, packed, stages_payload
-from app.worker.internal_protocol import Answer, AskCompare, FromWorker, Shown, ToWorker
 from app.worker.loop import WorkerLoop
 from app.worker.process import new_session
+from app.worker.protocol import Answer, AskCompare, FromWorker, Shown, ToWorker
 from app.worker.session import Session
 from pipeline.config import Parameters, preset
 from pipeline.errors import StemmapError

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.explain.build import cluster_story, tree_story
 from app.worker.session import Session
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame, Verdict
@@ -19,7 +20,7 @@ def test_the_verdict_of_every_cluster_is_that_of_its_first_check_that_fails(sess
     frame = frame_of(session)
     assert len(frame.clusters.size) > 20
     for row in range(len(frame.clusters.size)):
-        story = session.cluster_story(frame, row)
+        story = cluster_story(session.run, frame, row)
         failed = [check.verdict for check in story.checks if check.fails]
         assert story.verdict == (failed[0] if failed else "tree")
         assert story.verdict == Verdict(int(frame.clusters.verdict[row])).label
@@ -30,7 +31,7 @@ def test_the_verdict_of_every_cluster_is_that_of_its_first_check_that_fails(sess
 def test_the_fit_that_is_drawn_is_the_fit_that_was_judged(session: Session):
     frame = frame_of(session)
     for row in frame.detections.cluster:
-        story = session.cluster_story(frame, int(row))
+        story = cluster_story(session.run, frame, int(row))
         assert story.circle is not None
         assert story.circle.radius == pytest.approx(frame.clusters.radius[row], rel=1e-9)
         assert story.circle.arc_deg == pytest.approx(np.degrees(frame.clusters.arc[row]), rel=1e-9)
@@ -49,7 +50,7 @@ def test_the_fit_that_is_drawn_is_the_fit_that_was_judged(session: Session):
 def test_a_cluster_of_a_tree_names_the_tree(session: Session):
     frame = frame_of(session)
     trees = frame.trees
-    named = [session.cluster_story(frame, int(row)) for row in frame.detections.cluster]
+    named = [cluster_story(session.run, frame, int(row)) for row in frame.detections.cluster]
     with_tree = [story for story in named if story.tree is not None]
     assert len(with_tree) > 10
     for story in with_tree:
@@ -64,7 +65,7 @@ def test_a_tree_tells_its_votes_its_sides_and_how_it_became_sure(session: Sessio
     rows = np.flatnonzero(trees.confirmed & (trees.observations >= 12))
     assert len(rows) > 5
     for row in rows:
-        story = session.tree_story(int(trees.number[row]))
+        story = tree_story(session.run, int(trees.number[row]))
         assert 10 * sum(story.sides) == pytest.approx(story.coverage_deg)
         assert story.gathered is not None
         assert story.gathered.verdict == "tree"
@@ -82,9 +83,9 @@ def test_a_tree_tells_its_votes_its_sides_and_how_it_became_sure(session: Sessio
 def test_what_is_not_there_is_refused_in_words(session: Session):
     frame = frame_of(session)
     with pytest.raises(StemmapError, match="no cluster 9999"):
-        session.cluster_story(frame, 9999)
+        cluster_story(session.run, frame, 9999)
     with pytest.raises(StemmapError, match="tree 9999 is not known"):
-        session.tree_story(9999)
+        tree_story(session.run, 9999)
 
 
 def test_a_preset_that_fits_no_circle_is_told_without_one(session: Session):
@@ -100,7 +101,7 @@ def test_a_preset_that_fits_no_circle_is_told_without_one(session: Session):
     frame = frame_of(mapped)
     assert len(frame.clusters.size) > 0
     for row in range(len(frame.clusters.size)):
-        story = mapped.cluster_story(frame, row)
+        story = cluster_story(mapped.run, frame, row)
         assert story.circle is None
         assert story.residual == []
         assert story.gathered is None

@@ -18,10 +18,8 @@ from websockets.exceptions import InvalidStatus
 from app.common.settings import Settings
 from app.dashboard.run_recorder import _Page
 from app.fleet import fleet as fleet_module
-from app.fleet.fleet import Fleet
-from app.fleet.frames import Frames
-from app.fleet.robots import named
-from app.fleet.server import build_fleet, warm_kernels
+from app.fleet.fleet import Fleet, Frames
+from app.fleet.server import build_fleet, named, warm_kernels
 from app.sources.request import SourceRequest
 from app.store.book import NewRun
 from app.web.auth import viewer_token

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from app.fleet.robots import NAMELESS, Watching, address_of, recorded_apart
+from app.fleet.fleet import NAMELESS
+from app.fleet.server import Watching, address_of, recorded_apart
 from app.robot.address import ROOT, ZenohAddress, parse_address
 from app.robot.topics import Publisher, choose
 from app.worker.protocol import Open

@@ -13,8 +13,7 @@ from contextlib import closing
 from pathlib import Path
 
 from app.robot.recorder import Recorder
-from app.worker.internal_protocol import Begin
-from app.worker.protocol import Open
+from app.worker.protocol import Begin, Open
 from pipeline.config import Parameters
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.mcap_file import McapFile

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.worker.internal_protocol import Begin
-from app.worker.protocol import Open
+from app.worker.protocol import Begin, Open
 from pipeline.config import Parameters
 from pipeline.io.readers import open_source
 from pipeline.io.readers.ros_messages import IMU, ODOMETRY, POINT_CLOUD

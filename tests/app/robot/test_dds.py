@@ -29,10 +29,15 @@ DOMAIN = 100 + os.getpid() % 100
 
 
 def test_an_address_has_a_domain_and_stays_on_this_machine_unless_told():
-    assert parse_address("dds:") == DdsAddress("dds:")
+    assert parse_address("dds:") == DdsAddress(uri="dds:")
     uri = "dds:?domain=7&interface=192.168.1.10&peer=192.168.1.5,robot1&robot=/red/&scan=/red/points"
     assert parse_address(uri) == DdsAddress(
-        uri, 7, "192.168.1.10", ("192.168.1.5", "robot1"), "red", {"scan": "/red/points"}
+        uri=uri,
+        domain=7,
+        interface="192.168.1.10",
+        peers=("192.168.1.5", "robot1"),
+        robot="red",
+        topics={"scan": "/red/points"},
     )
 
 
@@ -106,7 +111,7 @@ def _taken(source: LiveSource, records: list[Record], enough: Callable[[list[Rec
         records.extend(source.take())
         return enough(records)
 
-    until(come, lambda: f"{source.scans_come} scans came, {source.losses}, {source.waiting_for()}")
+    until(come, lambda: f"{source._link.scans} scans came, {source.losses}, {source.waiting_for()}")
 
 
 def _scans(records: list[Record]) -> list[Scan]:
@@ -135,7 +140,7 @@ def test_a_robot_of_fast_dds_is_found_heard_lost_and_found_again(fast_dds: Path,
         assert {len(scan.points) for scan in _scans(records)} == {POINTS}
         assert any(isinstance(record, Odometry) for record in records)
         if reliable:
-            until(lambda: source.scans_come == SCANS, lambda: str(source.scans_come))
+            until(lambda: source._link.scans == SCANS, lambda: str(source._link.scans))
             assert source.losses == {}
         robot.withdraw(topic)
         until(lambda: not source.take() and "the robot is lost" in source.notices())

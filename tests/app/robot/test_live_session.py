@@ -13,11 +13,11 @@ import pytest
 
 from app.robot.address import ZenohAddress, parse_address
 from app.robot.inbox import Inbox
+from app.robot.link import Link
 from app.robot.source import LiveSource
 from app.robot.topics import Publisher
-from app.worker.internal_protocol import Begin, FromWorker, Opened, Report, Shown, ToWorker
 from app.worker.loop import WorkerLoop
-from app.worker.protocol import Advance, Open, Pause, Seek
+from app.worker.protocol import Advance, Begin, FromWorker, Open, Opened, Pause, Report, Seek, Shown, ToWorker
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
@@ -32,24 +32,27 @@ from tests.app.robot.conftest import SCANS, until
 URI = "zenoh:tcp/robot:7447"
 
 
-class FakeLink:
+class FakeLink(Link):
     """Gives what the test puts into the inbox."""
 
+    silence_s: float | None = None
+    place, nothing = "connected to a test", "no scans of a robot are announced"
+
     def __init__(self, _address: ZenohAddress, inbox: Inbox) -> None:
-        self.inbox = inbox
-        self.problem, self.losses, self.scans, self.version = "", {"scans lost on the way": 2}, 0, 0
-        self.silence_s: float | None = None
+        super().__init__(inbox, "fake")
+        self.problem, self.losses = "", {"scans lost on the way": 2}
         self.there: list[Publisher] = []
         self.channels: Sequence[Channel] = ()
-        self.place, self.nothing = "connected to a test", "no scans of a robot are announced"
-        self.session: Any = None
         self.closed = False
+
+    def receive(self) -> None:
+        raise NotImplementedError
+
+    def failure(self, error: Exception) -> str:
+        return str(error)
 
     def publishers(self) -> list[Publisher]:
         return self.there
-
-    def robots(self) -> list[str]:
-        return sorted({p.robot for p in self.there if p.msgtype == POINT_CLOUD})
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
         self.channels = channels

@@ -141,10 +141,10 @@ def test_a_session_that_opens_after_the_end_is_closed(monkeypatch: pytest.Monkey
     address = parse_address("zenoh:tcp/127.0.0.1:9")
     assert isinstance(address, ZenohAddress)
     link = ZenohLink(address, Inbox())
-    link._closing.set()  # as `close` does, which does not wait for ever
+    link.closing.set()  # as `close` does, which does not wait for ever
     go_on.set()
     assert closed.wait(60)
-    link._thread.join(60)
+    link.thread.join(60)
     assert link.session is None
 
 
@@ -177,7 +177,7 @@ def test_a_connection_that_fails_half_way_is_tried_again(monkeypatch: pytest.Mon
         sessions.append(FailingSession())
         return sessions[-1]
 
-    monkeypatch.setattr("app.robot.zenoh._RETRY_S", 0.05)
+    monkeypatch.setattr("app.robot.link._RETRY_S", 0.05)
     monkeypatch.setattr(zenoh, "open", opened)
     address = parse_address("zenoh:tcp/127.0.0.1:9")
     assert isinstance(address, ZenohAddress)
@@ -207,7 +207,7 @@ def test_a_sensor_link_goes_on_after_an_error_of_any_kind(monkeypatch: pytest.Mo
 
     taken: list[bytes] = []
     monkeypatch.setattr(VelodyneLink, "_take", take)
-    monkeypatch.setattr("app.robot.velodyne._RETRY_S", 0.05)
+    monkeypatch.setattr("app.robot.link._RETRY_S", 0.05)
     link = VelodyneLink(address, Inbox())
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender, closing(link):
 

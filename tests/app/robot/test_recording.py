@@ -16,13 +16,12 @@ from mcap.reader import make_reader
 
 from app.batch.map_run import OfflineRun, map_run
 from app.cli import main
-from app.cli.live_commands import begin_recording, told_of_frames
 from app.robot import recorder as recorder_module
 from app.robot.address import parse_address
 from app.robot.inbox import SKIPPED
 from app.robot.recorder import NOT_RECORDED, RawFile, Recorder
 from app.robot.source import LiveSource
-from app.worker.run_factory import recorded_parameters
+from app.worker.run import recorded_parameters
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.io.readers import SourceOptions, open_source
@@ -136,9 +135,13 @@ def test_the_replay_gives_the_map_of_the_live_run_byte_for_byte(
     recording = Recorder(tmp_path / "live.mcap")
     heard = Heard(stand, recording)
     played = Played(heard)
-    begin_recording(heard.source, TUNED)
-    on_frame = told_of_frames(heard.source)
-    live = map_files(played, tmp_path / "a", parameters=TUNED, on_frame=on_frame)
+    heard.source.use_parameters(0, 0, TUNED)
+    live = map_files(
+        played,
+        tmp_path / "a",
+        parameters=TUNED,
+        on_frame=lambda frame, mapper: heard.source.mapped(frame, mapper.path),
+    )
     played.close()
     assert recording.problem == ""
     with closing(open_source(str(recording.path))) as replay:
@@ -173,7 +176,7 @@ def test_other_programs_read_the_recording(stand: Path, tmp_path: Path):
     recording = Recorder(tmp_path / "live.mcap")
     heard = Heard(stand, recording)
     played = Played(heard)
-    map_files(played, tmp_path / "a", on_frame=told_of_frames(heard.source))
+    map_files(played, tmp_path / "a", on_frame=lambda frame, mapper: heard.source.mapped(frame, mapper.path))
     played.close()
     with recording.path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
@@ -205,8 +208,13 @@ def test_a_mapper_five_times_slower_than_the_robot_loses_nothing_in_the_recordin
     recording = Recorder(tmp_path / "live.mcap")
     heard = Heard(stand, recording, take_every=5)
     played = Played(heard)
-    begin_recording(heard.source, TUNED)
-    live = map_files(played, tmp_path / "a", parameters=TUNED, on_frame=told_of_frames(heard.source))
+    heard.source.use_parameters(0, 0, TUNED)
+    live = map_files(
+        played,
+        tmp_path / "a",
+        parameters=TUNED,
+        on_frame=lambda frame, mapper: heard.source.mapped(frame, mapper.path),
+    )
     losses = heard.source.losses
     played.close()
     sent, kept = count_messages(stand), count_messages(recording.path)

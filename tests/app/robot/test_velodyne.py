@@ -170,7 +170,7 @@ def test_packets_of_another_sender_are_refused_and_counted():
         with sensor(port, turn()):
             until(lambda: not source.listen() and source.losses.get(OTHERS, 0) > 20)
             until(lambda: "packets of other senders were refused" in source.waiting_for())
-        assert source.scans_come == 0
+        assert source._link.scans == 0
 
 
 def test_a_port_in_use_is_said():

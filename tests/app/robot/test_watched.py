@@ -87,11 +87,11 @@ def test_such_an_address_is_watched_and_not_mapped():
     watched = serve._watched([Open(uri)])
     assert watched is not None
     assert watched[0].mapped_there
-    with pytest.raises(SourceError, match="is watched, not made again"):
+    with pytest.raises(SourceError, match="is shown and not mapped again"):
         open_live(uri)
-    with pytest.raises(SourceError, match="one robot at a time"):
+    with pytest.raises(SourceError, match="only one robot"):
         open_live("zenoh:tcp/127.0.0.1:9?robot=*")
-    with pytest.raises(SourceError, match="no place where maps are made"):
+    with pytest.raises(SourceError, match="is unknown"):
         open_live("zenoh:tcp/127.0.0.1:9?mapped=moon")
 
 

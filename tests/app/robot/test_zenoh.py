@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from app.robot.link import LOST_SCANS
 from app.robot.source import LiveSource, open_live
-from app.robot.zenoh import LOST_SCANS
 from pipeline.io.recording import outputs
 from pipeline.types.clearance import Clearance, Zone
 from pipeline.types.records import Odometry, Record, Scan
@@ -26,7 +26,7 @@ def taken(source: LiveSource, records: list[Record], scans: int) -> None:
         records.extend(source.take())
         return sum(isinstance(record, Scan) for record in records) >= scans
 
-    until(come, lambda: f"{source.scans_come} scans came, {source.losses}, {source.waiting_for()}")
+    until(come, lambda: f"{source._link.scans} scans came, {source.losses}, {source.waiting_for()}")
 
 
 def subscribed(source: LiveSource) -> bool:
@@ -50,7 +50,7 @@ def test_a_robot_is_found_heard_lost_and_found_again(router: int, robots: Callab
         assert robot.sent() == SCANS
         # On a loaded machine the other library lets messages fall out; holes between them are counted.
         assert source.losses.keys() <= {LOST_SCANS}
-        assert SCANS // 2 <= source.scans_come + source.losses.get(LOST_SCANS, 0) <= SCANS
+        assert SCANS // 2 <= source._link.scans + source.losses.get(LOST_SCANS, 0) <= SCANS
         assert {len(scan.points) for scan in records if isinstance(scan, Scan)} == {POINTS}
         assert any(isinstance(record, Odometry) for record in records)
         robot.kill()

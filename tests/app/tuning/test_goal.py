@@ -23,9 +23,10 @@ from app.tuning.plan import (
     pool,
     values_of,
 )
-from app.tuning.result import Result, best_parameters, provenance_in, toml_of, warning_of
+from app.tuning.result import Result, best_parameters, toml_of, warning_of
 from pipeline.config import field_specs, preset
 from pipeline.errors import ParameterError
+from tests.app.tuning.provenance import provenance_in
 
 FOREST = preset("forest")
 # Eight of ten trees and one of two poles; two of four trees and three where nothing stands.

@@ -18,10 +18,11 @@ from app.cli.tune import files_of
 from app.dashboard.parameters import read_file
 from app.sources.request import SourceRequest
 from app.tuning.plan import Plan, PlannedRun, Trial, TruthTable, axes_of
-from app.tuning.result import provenance_in, result_of
+from app.tuning.result import result_of
 from app.tuning.search import Search, SearchWorkers, StoppedError
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
+from tests.app.tuning.provenance import provenance_in
 
 RUN, OTHER = "sim:stand?duration=1", "sim:stand?duration=1&seed=3"
 OVER = ["detection.e_max=5..200", "classification.tree_share=0.1..1"]

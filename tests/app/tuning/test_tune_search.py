@@ -17,13 +17,14 @@ import pytest_asyncio
 from app.sources.request import SourceRequest
 from app.tuning.job import TuneSearch
 from app.tuning.plan import Plan, PlannedRun, RunScore, Trial, TruthTable, axes_of
-from app.tuning.result import Result, SearchMessage, provenance_in
+from app.tuning.result import Result, SearchMessage
 from app.worker.protocol import Open
 from pipeline.config import preset
 from pipeline.errors import StemmapError
 from tests.app.batch.test_runs import play
 from tests.app.fakes import opened, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
+from tests.app.tuning.provenance import provenance_in
 
 PLAN = Plan(
     runs=(PlannedRun(SourceRequest("sim:stand?duration=1")),),

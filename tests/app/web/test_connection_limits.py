@@ -10,9 +10,9 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from app.web import connection_limits
 from app.web.auth import Role, viewer_token
-from app.web.connection_limits import Places, Turns
+from app.web.routes import access
+from app.web.routes.access import Places, Turns
 from tests.app.server_for_tests import BEARER, TOKEN, served
 
 VIEWER = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
@@ -21,7 +21,7 @@ VIEWER = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     most: dict[Role, int] = {"owner": 1, "viewer": 2}
-    monkeypatch.setattr(connection_limits, "MOST", most)
+    monkeypatch.setattr(access, "MOST", most)
 
 
 @pytest.mark.usefixtures("few")

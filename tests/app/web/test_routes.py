@@ -18,15 +18,20 @@ from app.dashboard.dashboard import Dashboard
 from app.dashboard.map_changes import MapChanges
 from app.web.auth import viewer_token
 from app.web.routes.run import permitted_uri
-from app.worker.internal_protocol import Answer, AskCluster, Remapped, Report, Rough, Shown
 from app.worker.protocol import (
     Advance,
+    Answer,
+    AskCluster,
     Open,
     Pause,
     Play,
+    Remapped,
+    Report,
+    Rough,
     Seek,
     SetParameters,
     SetSpeed,
+    Shown,
     Status,
     WorkerBusyError,
 )

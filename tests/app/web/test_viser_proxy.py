@@ -234,7 +234,7 @@ async def test_a_slow_browser_holds_viser_back() -> None:
 
 
 async def test_more_browsers_than_the_machine_can_bear_are_sent_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.web.connection_limits.MOST", {"owner": 2, "viewer": 2})
+    monkeypatch.setattr("app.web.routes.access.MOST", {"owner": 2, "viewer": 2})
 
     async def handler(connection: ServerConnection) -> None:
         await connection.send(b"hello")

@@ -15,17 +15,22 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from app.worker.codec import LARGEST_MESSAGE, LENGTH_BYTES, WireError, from_worker, to_worker
-from app.worker.internal_protocol import Answer, AskCluster, AskTree, Opened, Report, Shown
 from app.worker.protocol import (
     FASTEST,
     LONGEST_S,
     MOST_SCANS,
     Advance,
+    Answer,
+    AskCluster,
+    AskTree,
     Open,
+    Opened,
     Play,
+    Report,
     Seek,
     SetParameters,
     SetSpeed,
+    Shown,
     Status,
 )
 from pipeline.config import Parameters

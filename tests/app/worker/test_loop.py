@@ -17,21 +17,28 @@ import pytest
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
 from app.worker.codec import from_worker
-from app.worker.internal_protocol import (
+from app.worker.loop import WorkerLoop
+from app.worker.outbox import MOST_POINTS, Mailbox, joined, picture_of, rows_in_common
+from app.worker.protocol import (
+    Advance,
     Answer,
     AskCluster,
     AskTree,
     Begin,
     FromWorker,
+    Open,
     Opened,
+    Pause,
+    Play,
     Report,
+    Seek,
+    SetParameters,
+    SetSpeed,
     Shown,
+    State,
+    Status,
     ToWorker,
 )
-from app.worker.loop import WorkerLoop
-from app.worker.outbox import Mailbox, joined, rows_in_common
-from app.worker.protocol import Advance, Open, Pause, Play, Seek, SetParameters, SetSpeed, State, Status
-from app.worker.thin_frame import MOST_POINTS, picture_of
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import Path
@@ -126,11 +133,11 @@ def test_an_answer_that_compiled_leaves_nothing_to_wait_for(monkeypatch: pytest.
         waiting.put(message)
     driver = WorkerLoop(session, waiting, said.append)
 
-    def compile_first(number: int) -> None:
+    def compile_first(_run: object, number: int) -> None:
         driver.compiling()
         raise StemmapError(f"tree {number} is not known")
 
-    monkeypatch.setattr(session, "tree_story", compile_first)
+    monkeypatch.setattr("app.worker.loop.tree_story", compile_first)
     driver.run()
     assert any(m.status.detail == COMPILING.capitalize() for m in said if isinstance(m, Report))
     assert last_status(said).detail == ""
@@ -443,11 +450,11 @@ def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_story_that_fails_is_logged_and_stops_nothing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(_number: int) -> None:
+    def fail(_run: object, _number: int) -> None:
         raise ZeroDivisionError("on purpose")
 
     session = make_session(FakeSource(3))
-    monkeypatch.setattr(session, "tree_story", fail)
+    monkeypatch.setattr("app.worker.loop.tree_story", fail)
     waiting: queue.Queue[ToWorker | None] = queue.Queue()
     said: list[FromWorker] = []
     for message in (Open("fake:"), AskTree(1, 1, 1), None):

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.worker.replay_clock import LONGEST_DELAY_S, ReplayClock
+from app.worker.loop import LONGEST_DELAY_S, ReplayClock
 
 NS = 1_000_000_000
 

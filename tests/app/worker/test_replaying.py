@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from app.worker.run_factory import recorded_parameters
+from app.worker.run import recorded_parameters
 from pipeline.config import Parameters
 from pipeline.io.readers.base import Revision
 from tests.app.fakes import FakeSource

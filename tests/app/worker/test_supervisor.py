@@ -13,8 +13,18 @@ from typing import Any
 import pytest
 import pytest_asyncio
 
-from app.worker.internal_protocol import FromWorker, Opened, Report, Shown
-from app.worker.protocol import Advance, Open, Play, SetParameters, SetSpeed, WorkerBusyError
+from app.worker.protocol import (
+    Advance,
+    FromWorker,
+    Open,
+    Opened,
+    Play,
+    Report,
+    SetParameters,
+    SetSpeed,
+    Shown,
+    WorkerBusyError,
+)
 from app.worker.supervisor import WorkerProcess
 from pipeline.config import Parameters
 

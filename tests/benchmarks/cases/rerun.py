@@ -119,7 +119,7 @@ def _rerun_s(
     source: Source, parameters: Parameters, caches: ScanCaches, scans: int, held: list[Step] | None
 ) -> float:
     """Seconds of a rerun; a short one before compiles the kernels."""
-    from app.worker.parallel import segment_ahead
+    from app.worker.remap import segment_ahead
     from pipeline.remapping import Rerun, ScanCaches
 
     spent, reread = 0.0, None if held is None else lambda: iter(held)
@@ -139,7 +139,7 @@ def _preview(
     words: str, known: KnownMap, parameters: Parameters, source: Source, sample: Sample | None
 ) -> tuple[Cell, ...]:
     """The preview; one before compiles the kernels."""
-    from app.worker.parallel import segment_all
+    from app.worker.remap import segment_all
     from pipeline.remapping import preview_trees
 
     trees, spent = None, 0.0

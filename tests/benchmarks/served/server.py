@@ -22,8 +22,7 @@ from app.scene.scene import RENEW_AFTER, Scene
 from app.web.app import build
 from app.web.auth import new_token
 from app.web.serving import bind, uvicorn_config
-from app.worker.internal_protocol import FromWorker, Shown
-from app.worker.protocol import Open
+from app.worker.protocol import FromWorker, Open, Shown
 from app.worker.supervisor import WorkerProcess
 from tests.benchmarks.child import answers
 

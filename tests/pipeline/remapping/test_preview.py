@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.worker.parallel import segment_all
+from app.worker.remap import segment_all
 from pipeline.io.checkpoints import encode
 from pipeline.remapping import ClusterTable, Rerun, Sample, ScanCaches, preview_trees
 from pipeline.remapping.preview import MOST_PLACES, SAMPLE_SCANS, _grouped

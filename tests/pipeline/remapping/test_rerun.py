@@ -10,7 +10,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from app.worker.parallel import AHEAD, segment_ahead
+from app.worker.remap import AHEAD, segment_ahead
 from pipeline.config import FieldSpec, Parameters, field_specs, preset
 from pipeline.config.model import Value
 from pipeline.errors import StemmapError
