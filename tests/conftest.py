@@ -7,12 +7,31 @@ import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from xdist.scheduler import LoadFileScheduling
 
 ROOT = Path(__file__).resolve().parents[1]
 _WORKERS = 2
+# Folder and files that take longest, in this order (uv run pytest --durations=0 lists the times).
+_LONGEST = (
+    "browser",
+    "app/worker/test_remap.py",
+    "app/web/test_serve.py",
+    "pipeline/test_jit.py",
+    "app/worker/test_supervisor.py",
+    "app/cli/test_continue.py",
+    "app/tuning/test_search.py",
+    "pipeline/detection/test_people.py",
+    "test_saved_by_earlier_versions.py",
+    "app/cli/test_merge.py",
+    "pipeline/slam/test_troubles.py",
+    "pipeline/loop_closure/test_stem_matching.py",
+    "app/worker/test_session.py",
+    "app/robot/test_live_rerun.py",
+)
 
 # No deadline, because a kernel compiles at its first call. The default profile draws the same few examples at
 # each run; `deep` draws many, and others at each run (--hypothesis-profile=deep).
@@ -52,6 +71,30 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """Return 2 processes for the whole suite and none for named paths, which then start at once."""
     return _WORKERS if config.args_source is pytest.Config.ArgsSource.TESTPATHS else 0
+
+
+class _Scheduler(LoadFileScheduling):  # type: ignore[misc]
+    """Gives a process the tests of one file, or all of the browser, which share a server and a browser."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = nodeid.split("::", 1)[0]
+        return "tests/browser" if file.startswith("tests/browser/") else file
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduler:
+    """Return the scheduler of the test processes."""
+    return _Scheduler(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put what takes longest first, so that the test processes end together."""
+    order = {name: k for k, name in enumerate(_LONGEST)}
+
+    def rank(item: pytest.Item) -> int:
+        name = item.path.relative_to(ROOT / "tests").as_posix()
+        return order.get("browser" if name.startswith("browser/") else name, len(order))
+
+    items.sort(key=rank)
 
 
 @pytest.fixture(scope="session", autouse=True)

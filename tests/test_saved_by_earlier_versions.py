@@ -7,6 +7,7 @@ The tests use the command line and the HTTP interface only, so that they do not 
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import re
@@ -17,13 +18,19 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import httpx
 import numpy as np
 import pytest
+
+from app.cli import main
+
+# The saved files use names that the parameters had then.
+pytestmark = pytest.mark.filterwarnings("ignore:the parameter .* is now called")
 
 SAVED = Path(__file__).parent / "data" / "saved_by_0_1_0"
 RUN, MERGED, DATA_FOLDER = SAVED / "run", SAVED / "merged", SAVED / "data_folder"
@@ -84,11 +91,11 @@ def console_script() -> str:
 
 def stemmap(*words: str | Path, folder: Path | None = None) -> str:
     """What a command prints; `folder` is the data folder."""
-    environment = {**os.environ, **({} if folder is None else {"STEMMAP_FOLDER": str(folder)})}
-    command = [console_script(), *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600, env=environment)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    environment = {} if folder is None else {"STEMMAP_FOLDER": str(folder)}
+    printed = io.StringIO()
+    with patch.dict(os.environ, environment), redirect_stdout(printed):
+        assert main([*map(str, words)]) == 0
+    return printed.getvalue()
 
 
 def table(folder: Path, name: str = "trees.csv") -> list[dict[str, str]]:

@@ -125,8 +125,10 @@ class ChildProcess:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._wait(), grace_s)
         finally:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+            if self._process.returncode is None:
+                # `Process.kill` would reap a child that has just died, and its return code would be lost.
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(self.pid, signal.SIGKILL)
             await self._wait()
         return self._process.returncode or 0
 

@@ -1,5 +1,6 @@
-"""A real Chromium, a real server, and the dashboard open in it. Software rendering is slow: the window is
-small, the scene is drawn coarsely, and everything is waited for, patiently.
+"""One Chromium and one server for all browser tests, and the dashboard open in it.
+
+Software rendering is slow: the window is small and the scene has a coarse resolution.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Playwright, expect, sync_playwright
 
-from tests.browser.dashboard import FEW_FRAMES, MIDDLE_S, PATIENCE_S, Dashboard
+from tests.browser.dashboard import FEW_FRAMES, PATIENCE_S, RUN, Dashboard
 from tests.browser.flags import FLAGS
 from tests.browser.serving import Server
 
@@ -21,27 +22,21 @@ expect.set_options(timeout=PATIENCE_MS)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what drives a browser, and let it come last: while Playwright runs, its event loop is the running
-    one of this thread, and a test that is a coroutine could not start.
-    """
+    """Mark the tests of this folder."""
     for item in items:
-        if drives_browser(item):
+        if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.browser)
-    items.sort(key=drives_browser)
 
 
-def drives_browser(item: pytest.Item) -> bool:
-    """Whether a test stands in this folder."""
-    return Path(__file__).parent in item.path.parents
-
-
-@pytest.fixture(scope="session")
+# Not of the session: while Playwright runs, its event loop is the running one of the thread, and an
+# asynchronous test of another folder could not start.
+@pytest.fixture(scope="package")
 def playwright() -> Iterator[Playwright]:
     with sync_playwright() as started:
         yield started
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def chromium(playwright: Playwright) -> Iterator[Browser]:
     path = os.environ.get("CHROMIUM", "/usr/bin/chromium")
     if not Path(path).exists():
@@ -54,9 +49,9 @@ def chromium(playwright: Playwright) -> Iterator[Browser]:
     browser.close()
 
 
-@pytest.fixture(scope="session")
-def server(chromium: Browser) -> Iterator[Server]:
-    with Server() as running:
+@pytest.fixture(scope="package")
+def server(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with Server(STEMMAP_FOLDER=str(tmp_path_factory.mktemp("stemmap"))) as running:
         yield running
 
 
@@ -64,7 +59,7 @@ def server(chromium: Browser) -> Iterator[Server]:
 def opened(
     chromium: Browser, link: str, width: int = 1260, height: int = 720, scene: bool = False
 ) -> Iterator[Dashboard]:
-    """The dashboard in a browser of its own, past the card of the first visit."""
+    """Open the dashboard in a new browser context and close the card of the first visit."""
     context = chromium.new_context(viewport={"width": width, "height": height})
     try:
         context.set_default_timeout(PATIENCE_MS)
@@ -74,24 +69,24 @@ def opened(
         page.goto(f"{link}&fixedDpr=0.3")
         page.locator("#welcome-on").click()
         yield dashboard
-    finally:  # a page that a failed test left would go on drawing, and slow down all that come
+    finally:  # the page of a failed test would otherwise continue to draw
         context.close()
 
 
 @pytest.fixture(scope="module")
 def dashboard(chromium: Browser, server: Server) -> Iterator[Dashboard]:
+    """A page on the default run and the preset, without annotations."""
     with opened(chromium, server.link) as made:
+        made.reset()
         yield made
+        made.open(RUN)
+        assert made.errors == [], "the page reported errors that no test expected"
 
 
 @pytest.fixture
 def calm(dashboard: Dashboard) -> Iterator[None]:
-    """Each test begins on a standing scan in the middle of the run, with the parameters of the preset."""
-    dashboard.pause()
-    # To a place between two scans, so that the one before it is not taken for the end of the way.
-    dashboard.command({"type": "seek", "time_s": MIDDLE_S})
-    there = f"it.time_s > {MIDDLE_S} - 0.08 && it.time_s < {MIDDLE_S} + 0.01"
-    dashboard.until_server("/api/status", f"it.state === 'paused' && {there}")
+    """Begin a test on a paused scan in the middle of the run with the parameters of the preset."""
+    dashboard.stand()
     yield
     for dialog in dashboard.page.locator("dialog[open]").all():
         dialog.press("Escape")

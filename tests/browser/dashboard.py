@@ -14,8 +14,10 @@ PATIENCE_S = 150
 COMPILING_S = 600
 STANDS = "['playing', 'paused', 'finished']"
 
-# Where tests stand: trees are mapped and judged there, and each second before it is mapped by each server.
+# Time of the scan on which tests begin: trees are mapped and classified by then.
 MIDDLE_S = 15.05
+# The run that the server opens at its start.
+RUN = "sim:stand"
 
 # What software rendering says of itself is not an error of ours.
 HARMLESS = ("GPU stall", "GL Driver Message", "Automatic fallback to software WebGL")
@@ -91,11 +93,32 @@ class Dashboard:
             assert time.monotonic() < deadline, f"it never came about: {told()}"
             self.page.wait_for_timeout(100)
 
+    def points(self) -> tuple[int, int]:
+        """Return how many points the raw and the filtered scan of the server have."""
+        _, _, raw, filtered = self.page.evaluate(SHOWN)
+        return raw, filtered
+
     def drawn(self) -> None:
         """Wait until what was planned to be drawn on the page is drawn."""
         self.page.evaluate(NEXT_FRAME)
 
-    # --- playing ---------------------------------------------------------------------------------
+    # --- the run ---------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Show the default run again, without annotations, a loop or another speed, and with the preset."""
+        self.open(RUN)
+        self.pause()
+        self.page.evaluate(RESET)
+        self.page.evaluate(PRESET, "forest")
+        self.until_server("/api/parameters", "it.preset === 'forest' && it.changed.length === 0")
+        self.until_server("/api/annotations", "it.trees.length === 0")
+
+    def open(self, uri: str) -> None:
+        """Open a source unless it is the present one, and wait for its first scan."""
+        if self.ask("/api/status")["source"] == uri:
+            return
+        self.page.evaluate(OPEN, uri)
+        self.until_server("/api/status", f"it.source === {uri!r} && it.scan_index >= 0")
 
     def pause(self) -> None:
         """Stand still, wherever the run is."""
@@ -262,6 +285,20 @@ FEW_FRAMES = """if (location.pathname.startsWith('/viser/')) {
   };
   window.cancelAnimationFrame = (id) => { planned.get(id)?.(); planned.delete(id); };
 }"""
+
+# All annotations of the run are deleted, as another browser would; its loop and speed are those of the start.
+RESET = """async () => {
+  const send = (method, path, body) => fetch(path, { method, body: JSON.stringify(body),
+    headers: { "Content-Type": "application/json" } });
+  await send("POST", "/api/loop", { from_s: null, to_s: null });
+  await send("POST", "/api/command", { type: "set_speed", factor: 1 });
+  const { run, trees } = await (await fetch("/api/annotations")).json();
+  for (const { id, version } of trees)
+    await send("DELETE", `/api/annotations/${id}`, { run, version, browser: "c".repeat(32), who: "reset" });
+}"""
+
+OPEN = """uri => fetch('/api/open', { method: 'POST', body: JSON.stringify({ uri }),
+  headers: { 'Content-Type': 'application/json' } })"""
 
 PRESET = """name => fetch('/api/parameters/preset', { method: 'POST', body: JSON.stringify({ name }),
   headers: { 'Content-Type': 'application/json' } })"""

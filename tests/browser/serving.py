@@ -1,4 +1,4 @@
-"""A real server in a process of its own, as a person starts it."""
+"""A real server in its own process."""
 
 from __future__ import annotations
 
@@ -18,16 +18,21 @@ _START = "import sys; from app.cli import main; sys.exit(main())"
 
 
 class Server:
-    """`stemmap serve SOURCE --no-browser`; `link` is what it printed.
+    """`stemmap serve SOURCE --no-browser`.
 
     Args:
-        source: What it opens, several with spaces between.
+        source: Sources that it opens, separated by spaces.
         port: 0 for any free one.
-        token: Of the link; empty for a new one.
+        token: Token of the link; empty for a new one.
         settings: Further variables of its environment.
+
+    Attributes:
+        link: The printed link.
+        folder: Folder of its database and its recordings.
     """
 
     def __init__(self, source: str = "sim:stand", port: int = 0, token: str = "", **settings: str) -> None:
+        self.folder = Path(settings.get("STEMMAP_FOLDER") or os.environ["STEMMAP_FOLDER"])
         self._log: deque[str] = deque(maxlen=50)
         self._process = subprocess.Popen(
             [sys.executable, "-c", _START, "serve", *source.split(), "--no-browser", "--port", str(port)],

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, expect
 
 from app.cli import main
 from tests.browser.conftest import opened
-from tests.browser.dashboard import Dashboard
+from tests.browser.dashboard import RUN, Dashboard
 from tests.browser.serving import Server
 
 
@@ -23,11 +23,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def dashboard(chromium: Browser, run: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Dashboard]:
+def dashboard(chromium: Browser, run: Path, server: Server) -> Iterator[Dashboard]:
     """The recording, opened with another mounting."""
-    folder = tmp_path_factory.mktemp("folder")
-    server = Server("sim:stand?duration=1", STEMMAP_FOLDER=str(folder))
-    with server, opened(chromium, server.link) as made:
+    with opened(chromium, server.link) as made:
         page = made.page
         page.locator("#source-button").click()
         page.locator("#source-uri").fill(str(run))
@@ -38,6 +36,7 @@ def dashboard(chromium: Browser, run: Path, tmp_path_factory: pytest.TempPathFac
         expect(page.locator("#source-dialog")).to_be_hidden()
         made.until_server("/api/status", f"it.source === {str(run)!r} && it.scan_index >= 0")
         yield made
+        made.open(RUN)
 
 
 def test_topics_and_mounting_are_chosen_and_kept_with_the_run(dashboard: Dashboard):

@@ -148,10 +148,6 @@ def test_a_run_that_is_not_there_is_told_with_what_to_do(dashboard: Dashboard):
     expect(page.locator("#source-dialog")).not_to_be_visible()
 
 
-def test_nothing_was_complained_about(dashboard: Dashboard):
-    assert dashboard.errors == []
-
-
 # Draws numbers of trees that stand close together with a pen that remembers where; [boxes, what is named].
 NUMBERS = """() => import('/static/js/map/draw.js').then(({ drawNumbers }) => {
   const boxes = [], radius = 6;

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
+import pytest
 from playwright.sync_api import Browser, WebSocketRoute, expect
 
 from tests.browser.conftest import PATIENCE_MS
@@ -17,10 +18,79 @@ RIGHT_OF_STRIP = (
 RUNS = "sim:paper?duration=4 sim:paper?duration=5"
 
 
-def test_two_runs_on_one_page(chromium: Browser):
+@pytest.fixture(scope="module")
+def fleet() -> Iterator[Server]:
+    """A server of two runs."""
+    with Server(RUNS) as running:
+        yield running
+
+
+MEMBER = {
+    "source": "zenoh:tcp/h:7447",
+    "remote": True,
+    "state": "playing",
+    "detail": "",
+    "live": True,
+    "rate_hz": 10.0,
+    "behind": None,
+    "health": None,
+    "trees": 3,
+    "distance_m": 2.0,
+    "recording": "",
+    "clearance": None,
+}
+MAP = {"trees": [], "path": [[0, 0], [1, 0]], "pose": [1, 0, 0], "common": [0, 0, 0], "how": "fake"}
+
+
+def test_a_robot_keeps_its_letter_and_colour_when_another_leaves(chromium: Browser, fleet: Server):
     context = chromium.new_context(viewport={"width": 1280, "height": 800})
     context.set_default_timeout(PATIENCE_MS)
-    with Server(RUNS) as server:
+    told: list[WebSocketRoute] = []
+    page = context.new_page()
+    page.route_web_socket("**/api/fleet", lambda socket: told.append(socket))
+    page.add_init_script(
+        "window.letters = []; const write = CanvasRenderingContext2D.prototype.fillText;"
+        "CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {"
+        " if (/^[A-Z]$/.test(text)) window.letters.push(text); write.call(this, text, ...place); };"
+    )
+    page.goto(fleet.link)
+    cards = page.locator(".card")
+
+    def wait(condition: Callable[[], bool]) -> None:
+        for _ in range(PATIENCE_MS // 20):
+            if condition():
+                return
+            page.wait_for_timeout(20)
+        raise AssertionError("it was waited for in vain")
+
+    wait(lambda: bool(told))
+
+    def tell(*names: str) -> None:
+        page.evaluate("window.letters.length = 0")
+        members = [{**MEMBER, "name": name} for name in names]
+        told[0].send(json.dumps({"type": "fleet", "members": members, "notice": ""}))
+        told[0].send(json.dumps({"type": "maps", "maps": dict.fromkeys(names, MAP)}))
+        expect(cards).to_have_count(len(names))
+        wait(lambda: page.evaluate("window.letters.length") >= len(names))
+
+    def letter(name: str) -> str:
+        return page.locator(f".card[data-robot={name}] h2 i").inner_text()
+
+    tell("red", "blue")
+    assert (letter("red"), letter("blue")) == ("A", "B")
+    tell("blue")
+    assert letter("blue") == "B"
+    assert set(page.evaluate("window.letters")) == {"B"}
+    tell("green", "blue", "red")
+    assert [letter(name) for name in ("green", "blue", "red")] == ["C", "B", "A"]
+    assert set(page.evaluate("window.letters")) == {"A", "B", "C"}
+    context.close()
+
+
+def test_two_runs_on_one_page(chromium: Browser, fleet: Server):
+    context = chromium.new_context(viewport={"width": 1280, "height": 800})
+    context.set_default_timeout(PATIENCE_MS)
+    with fleet as server:
         page = context.new_page()
         seen = Dashboard(page)
         page.goto(server.link)
@@ -49,68 +119,6 @@ def test_two_runs_on_one_page(chromium: Browser):
         page.set_viewport_size({"width": 390, "height": 844})
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         assert seen.errors == []
+    # The server has ended; this test is the last one of the file.
     expect(page.locator("#fleet-notice")).to_contain_text("No connection")
-    context.close()
-
-
-MEMBER = {
-    "source": "zenoh:tcp/h:7447",
-    "remote": True,
-    "state": "playing",
-    "detail": "",
-    "live": True,
-    "rate_hz": 10.0,
-    "behind": None,
-    "health": None,
-    "trees": 3,
-    "distance_m": 2.0,
-    "recording": "",
-    "clearance": None,
-}
-MAP = {"trees": [], "path": [[0, 0], [1, 0]], "pose": [1, 0, 0], "common": [0, 0, 0], "how": "fake"}
-
-
-def test_a_robot_keeps_its_letter_and_colour_when_another_leaves(chromium: Browser):
-    context = chromium.new_context(viewport={"width": 1280, "height": 800})
-    context.set_default_timeout(PATIENCE_MS)
-    told: list[WebSocketRoute] = []
-    with Server(RUNS) as server:
-        page = context.new_page()
-        page.route_web_socket("**/api/fleet", lambda socket: told.append(socket))
-        page.add_init_script(
-            "window.letters = []; const write = CanvasRenderingContext2D.prototype.fillText;"
-            "CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {"
-            " if (/^[A-Z]$/.test(text)) window.letters.push(text); write.call(this, text, ...place); };"
-        )
-        page.goto(server.link)
-        cards = page.locator(".card")
-
-        def wait(condition: Callable[[], bool]) -> None:
-            for _ in range(PATIENCE_MS // 20):
-                if condition():
-                    return
-                page.wait_for_timeout(20)
-            raise AssertionError("it was waited for in vain")
-
-        wait(lambda: bool(told))
-
-        def tell(*names: str) -> None:
-            page.evaluate("window.letters.length = 0")
-            members = [{**MEMBER, "name": name} for name in names]
-            told[0].send(json.dumps({"type": "fleet", "members": members, "notice": ""}))
-            told[0].send(json.dumps({"type": "maps", "maps": dict.fromkeys(names, MAP)}))
-            expect(cards).to_have_count(len(names))
-            wait(lambda: page.evaluate("window.letters.length") >= len(names))
-
-        def letter(name: str) -> str:
-            return page.locator(f".card[data-robot={name}] h2 i").inner_text()
-
-        tell("red", "blue")
-        assert (letter("red"), letter("blue")) == ("A", "B")
-        tell("blue")
-        assert letter("blue") == "B"
-        assert set(page.evaluate("window.letters")) == {"B"}
-        tell("green", "blue", "red")
-        assert [letter(name) for name in ("green", "blue", "red")] == ["C", "B", "A"]
-        assert set(page.evaluate("window.letters")) == {"A", "B", "C"}
     context.close()

@@ -35,8 +35,9 @@ def test_the_four_stages_of_a_scan_stand_side_by_side(dashboard: Dashboard):
     raw, filtered, clusters, trunks = (
         over.locator(f"[data-stage={name}] b") for name in ("raw", "filtered", "clusters", "trunks")
     )
-    expect(raw).to_have_text(f"{dashboard.node_points('/world/robot/scan/raw'):,} points")
-    expect(filtered).to_have_text(f"{dashboard.node_points('/world/robot/scan/filtered'):,} points")
+    returns, kept = dashboard.points()
+    expect(raw).to_have_text(f"{returns:,} points")
+    expect(filtered).to_have_text(f"{kept:,} points")
     expect(trunks).to_have_text(re.compile(r"\d+ of " + (clusters.inner_text().split()[0])))
     canvases = over.locator("canvas")
     painted = [coloured(canvases.nth(k)) for k in range(4)]

@@ -79,7 +79,7 @@ def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
     dashboard.until_server("/api/parameters", "it.preset === 'paper'")
     expect(page.locator("#palette")).to_be_hidden()
 
-    dashboard.scene.locator("canvas").first.press("Control+k")
+    page.locator("#map").press("Control+k")
     find.fill("eps")
     expect(options.first).to_contain_text("Radius eps (0.25 m)")
     find.press("Enter")
@@ -88,9 +88,7 @@ def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
     page.keyboard.press("Control+k")  # also while somebody types
     find.fill("layer raw")
     find.press("Enter")
-    dashboard.scene.wait_for_function(
-        "() => window.__viserSceneTree.getState()['/world/robot/scan/raw'].visibility === false"
-    )
+    expect(page.locator("[data-layer=raw]")).not_to_be_checked()
     page.keyboard.press("Control+k")
     find.fill("layer raw")
     expect(options.first).to_contain_text("show")

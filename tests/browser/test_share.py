@@ -20,8 +20,7 @@ POINTS = (
 def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server: Server):
     with opened(chromium, server.link, scene=True) as dashboard:
         page = dashboard.page
-        dashboard.until_server("/api/status", "it.scan_index > 5")
-        dashboard.pause()
+        dashboard.reset()
         dashboard.command({"type": "seek", "time_s": 4.05})
         dashboard.until("() => document.querySelector('#time-now').textContent === '0:04.0'")
         dashboard.scene.wait_for_function(POINTS)
@@ -29,7 +28,7 @@ def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server
             "() => window.__viserMutable.cameraControl.setLookAt(1, 12, 3, 0, 0, 0, false)"
         )
         dashboard.scene.wait_for_function(f"() => Math.abs(({AT})()[1] - 12) < 0.01")
-        page.get_by_role("button", name="Share").click()
+        page.locator("#share-button").click()
         moment = page.locator("#share-here").input_value()
         viewers = page.locator("#share-viewer").input_value()
         stands_s = dashboard.ask("/api/status")["time_s"]
@@ -48,11 +47,10 @@ def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server
 
 
 def looks(chromium: Browser, link: str, scan: int) -> None:
-    with opened(chromium, link, scene=True) as viewer:
+    with opened(chromium, link) as viewer:
         page = viewer.page
         expect(page.locator("#looks-only")).to_be_visible()
         expect(page.locator("#trees tbody tr").first).to_be_visible()
-        viewer.scene.wait_for_function(POINTS)
         page.locator("#map").press("ArrowRight")
         page.locator("#map").press("y")
         refused = page.evaluate(

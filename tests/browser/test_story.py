@@ -7,8 +7,6 @@ from playwright.sync_api import expect
 
 from tests.browser.dashboard import Dashboard
 
-MARKERS = "/world/robot/scan/markers"
-
 
 @pytest.fixture(autouse=True)
 def _standing(dashboard: Dashboard):
@@ -109,42 +107,3 @@ SQUARES = """() => {
   }
   return places;
 }"""
-
-
-def test_a_click_on_a_cluster_in_the_scene_tells_why_it_is_no_tree(dashboard: Dashboard):
-    page = dashboard.page
-    dashboard.tab("Trees")
-    scan = dashboard.ask("/api/status")["scan_index"]
-    dashboard.until_server("/api/story/cluster/0", f"it.scan === {scan}")
-    dashboard.load_scene()
-    page.locator("#map").press("t")  # from above nothing hides anything
-    box = page.locator("#scene").bounding_box()
-    assert box is not None
-    panel = page.locator("#panel-story")
-    read: dict[str, int] = {}
-    for cluster, (x, y) in enumerate(dashboard.settled_places(MARKERS)):
-        # Not below viser's own panel and notices.
-        if not (
-            box["x"] + 20 < x < box["x"] + box["width"] - 360 and 250 < y < box["y"] + box["height"] - 30
-        ):
-            continue
-        wanted = f"cluster {scan} {cluster}"
-        dashboard.click_until(x, y, lambda: panel.get_attribute("data-story"), wanted)
-        expect(panel).to_be_visible()
-        story = dashboard.ask(f"/api/story/cluster/{cluster}?scan={scan}")
-        expect(panel.locator(".verdict b")).to_have_text(story["verdict"])
-        expect(panel.locator("table.checks tr")).to_have_count(len(story["checks"]))
-        expect(panel.locator(".story-fit circle.point")).to_have_count(len(story["points"]))
-        if story["circle"] is not None:
-            radius = f"{100 * story['circle']['radius']:#.3g}"
-            expect(panel.locator(".story-fit .list")).to_contain_text(f"{radius} ±")
-        for check in story["checks"]:
-            if check["fails"]:
-                expect(panel.locator("tr.decides")).to_contain_text(story["verdict"])
-                expect(panel.locator(".verdict p")).to_contain_text(check["title"] or "occluded")
-                break
-        read[story["verdict"]] = cluster
-        if len(read) >= 2:
-            break
-    assert read, "no cluster was in sight"
-    expect(panel.locator(".story-head")).to_contain_text(f"of scan {scan}")

@@ -1,4 +1,4 @@
-"""Marks of what happened, a part that is played again and again, and a distance on the map."""
+"""Marks of events, a loop of a part of the run, and a distance on the map."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ from playwright.sync_api import expect
 from tests.browser.dashboard import Dashboard
 
 
-def test_marks_lead_to_what_happened_and_a_loop_goes_round(dashboard: Dashboard):
+def test_a_mark_seeks_to_its_event_and_a_loop_is_repeated(dashboard: Dashboard):
     page = dashboard.page
-    dashboard.pause()
-    dashboard.command({"type": "seek", "time_s": 12.05})
-    dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 11.97 && it.time_s < 12.06")
+    dashboard.stand(12.05)
     confirmed = page.locator("#marks .mark.tree")
     expect(confirmed.first).to_be_attached()
     expect(confirmed.first).to_have_attribute("title", re.compile(r"Tree \d+ confirmed"))
@@ -101,7 +99,7 @@ UNDER = """async changes => {
 }"""
 
 
-def test_a_seek_says_that_it_goes_there_and_compiling_counts_from_its_start(dashboard: Dashboard):
+def test_a_seek_shows_its_target_and_compiling_counts_from_its_start(dashboard: Dashboard):
     page = dashboard.page
     dashboard.stand()
     going = {

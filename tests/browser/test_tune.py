@@ -39,8 +39,6 @@ def test_a_value_is_typed_marked_taken_back_and_reset(dashboard: Dashboard):
     expect(trees).to_contain_text(f"{clusters} → ")  # before and after the change, of the same scan
     expect(page.locator("[data-stage=Clustering] summary")).to_contain_text("1 changed")
     expect(page.locator("[data-figure=f1] dt")).to_contain_text("this scan")
-    # viser's slider is in step.
-    expect(dashboard.row("Radius eps").locator("input[type=text]")).to_have_value("5")
 
     page.locator("#tune-undo").focus()
     page.keyboard.press("Control+z")
@@ -53,7 +51,7 @@ def test_a_value_is_typed_marked_taken_back_and_reset(dashboard: Dashboard):
     expect(row.get_by_role("button", name="Reset Radius eps")).to_be_hidden()
 
 
-def test_a_slider_moves_by_its_step_and_shows_the_same_in_the_scene(dashboard: Dashboard):
+def test_a_slider_moves_by_its_step_and_to_its_end(dashboard: Dashboard):
     page = dashboard.page
     slider = page.get_by_role("slider", name="Radius eps, slider")
     slider.press("ArrowRight")
@@ -62,10 +60,6 @@ def test_a_slider_moves_by_its_step_and_shows_the_same_in_the_scene(dashboard: D
     dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
     expect(value(page, "clustering.eps")).to_have_value("5")
     assert dashboard.state == "paused"
-    box = dashboard.row("Radius eps").locator("input[type=text]")
-    box.fill("0.3")
-    box.press("Tab")
-    expect(value(page, "clustering.eps")).to_have_value("0.3")
 
 
 def test_what_is_refused_is_told_and_goes_back(dashboard: Dashboard):

@@ -1,4 +1,4 @@
-"""`stemmap serve` as a person runs it: a real process, real sockets, real signals."""
+"""`stemmap serve` in a real process, with real sockets and signals."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ import httpx
 import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
+from app.cli import main
 from app.common.settings import Settings
 from app.web.serving import bind
 from pipeline.errors import StemmapError
@@ -164,13 +165,6 @@ def runs(pid: int) -> bool:
         return False
 
 
-async def ended(*words: str) -> tuple[int | None, str]:
-    process = await start(*words)
-    async with asyncio.timeout(60):
-        _, errors = await process.communicate()
-    return process.returncode, errors.decode()
-
-
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
@@ -186,21 +180,25 @@ async def ended(*words: str) -> tuple[int | None, str]:
         (["simulate", "stand", "--out", "never.mcap", "--seed", "-1"], 2, "'-1' is not a whole number"),
     ],
 )
-async def test_a_wrong_start_is_one_line(words: list[str], code: int, said: str) -> None:
-    returned, errors = await ended(*words)
-    assert returned == code
+def test_a_wrong_start_is_one_line(
+    words: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == code
+    errors = capsys.readouterr().err
     assert said in errors
     assert len(errors.strip().splitlines()) == 1
 
 
 async def test_a_port_in_use_is_one_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        returned, errors = await ended("serve", "--no-browser", "--port", str(port))
-    assert returned == 1
-    assert "address already in use" in errors
-    assert "--port" in errors
-    assert len(errors.strip().splitlines()) == 1
+        process = await start("serve", "--no-browser", "--port", str(taken.getsockname()[1]))
+        async with asyncio.timeout(60):
+            _, errors = await process.communicate()
+    assert process.returncode == 1
+    told = errors.decode()
+    assert "address already in use" in told
+    assert "--port" in told
+    assert len(told.strip().splitlines()) == 1
 
 
 async def test_the_browser_is_started_without_the_token_and_no_file_stays(

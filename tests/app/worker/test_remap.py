@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import fields, is_dataclass
+from functools import cache
 
 import numpy as np
 import pytest
@@ -67,7 +68,12 @@ def mapped_from_start(parameters: Parameters, last: int) -> Iterator[Session]:
 
 def mapped_with(parameters: Parameters, last: int) -> tuple[object, object]:
     """The scan and the path of such a run."""
-    with mapped_from_start(parameters, last) as opened:
+    return _mapped_once(parameters.model_dump_json(), last)
+
+
+@cache
+def _mapped_once(parameters: str, last: int) -> tuple[object, object]:
+    with mapped_from_start(Parameters.model_validate_json(parameters), last) as opened:
         return told(opened.frame), told(opened.path)
 
 

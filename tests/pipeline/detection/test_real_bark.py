@@ -59,20 +59,20 @@ def fits_of_scan(run, trees, k):
 
 
 def test_diameters_on_real_bark_are_near_those_of_other_tools(fits):
-    """They stand for breast height, while many a butt is seen lower: 1 to 3 cm wider."""
+    """The reference is at breast height; many stems are seen lower, where they are 1 to 3 cm wider."""
     error, sigma = fits[:, 0], fits[:, 1]
     assert len(error) > 50
-    assert abs(np.median(error)) < 0.05, np.median(error)
+    assert 0.0 < np.median(error) < 0.04, np.median(error)
     assert abs(np.average(error, weights=sigma**-2.0)) < 0.03, np.average(error, weights=sigma**-2.0)
-    assert np.mean(np.abs(error) < 0.08) > 0.6, np.mean(np.abs(error) < 0.08)
+    assert np.mean(np.abs(error) < 0.08) > 0.7, np.mean(np.abs(error) < 0.08)
 
 
-def test_what_errs_much_is_not_believed(fits):
+def test_a_large_error_has_a_large_sigma(fits):
     error, sigma = fits[:, 0], fits[:, 1]
-    assert np.mean(np.abs(error) < 3.0 * sigma) > 0.7, np.mean(np.abs(error) < 3.0 * sigma)
+    assert np.mean(np.abs(error) < 3.0 * sigma) > 0.75, np.mean(np.abs(error) < 3.0 * sigma)
 
 
 def test_centres_on_real_bark_lie_on_the_axis(fits):
-    assert abs(np.median(fits[:, 2])) < 0.03, np.median(fits[:, 2])
+    assert abs(np.median(fits[:, 2])) < 0.015, np.median(fits[:, 2])
     assert abs(np.median(fits[:, 3])) < 0.01, np.median(fits[:, 3])
-    assert np.sqrt(np.median(fits[:, 2] ** 2)) < 0.05
+    assert np.sqrt(np.median(fits[:, 2] ** 2)) < 0.03

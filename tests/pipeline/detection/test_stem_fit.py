@@ -62,9 +62,9 @@ def cast(rng, *, radius, distance, sigma, rows=5):
 
 @pytest.mark.parametrize("radius", [0.1, 0.15, 0.25])
 @pytest.mark.parametrize("distance", [3.0, 5.0, 8.0])
-def test_the_covariance_promises_what_the_fit_keeps(radius, distance):
-    """With noise along the rays NEES is chi-square with 2 degrees: its mean over 150 fits lies within 1.7
-    and 2.3 in 95 of 100 cases. Priors, bark and the beam's width, which this trunk has not, lower it."""
+def test_the_covariance_bounds_the_error_of_the_fit(radius, distance):
+    """An exact covariance gives a mean NEES of 2 (two degrees of freedom). The model adds the roughness of
+    bark and the width of the beam, which this trunk lacks; so the mean NEES of 150 fits is 0.44 to 1.17."""
     rng = np.random.default_rng(6)
     nees, bias, z_radius = [], [], []
     for _ in range(150):
@@ -74,10 +74,10 @@ def test_the_covariance_promises_what_the_fit_keeps(radius, distance):
         nees.append(error @ np.linalg.solve(told.covariance[0], error))
         bias.append(error @ true / distance)
         z_radius.append((told.radius[0] - radius) / told.radius_sigma[0])
-    assert 0.4 < np.mean(nees) < 2.5, np.mean(nees)
+    assert 0.4 < np.mean(nees) < 1.3, np.mean(nees)
     assert abs(np.mean(bias)) < (0.004 if distance < 4.0 else 0.008), np.mean(bias)
-    assert abs(np.mean(z_radius)) < 0.5, np.mean(z_radius)
-    assert np.std(z_radius) < 1.3, np.std(z_radius)
+    assert abs(np.mean(z_radius)) < 0.35, np.mean(z_radius)
+    assert 0.4 < np.std(z_radius) < 1.0, np.std(z_radius)
 
 
 @pytest.mark.parametrize("distance", [2.0, 5.0, 10.0])
