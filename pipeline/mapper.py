@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.classification import ForestOf, Gathering, GatheringState, View, package_alone
+from pipeline.classification import ColumnClassifier, ColumnClassifierState, ForestOf, ScanView, package_alone
 from pipeline.config import Parameters
 from pipeline.detection.free_space import BINS
 from pipeline.front_end import DetectionResult, SegmentedScan, detect, segment
@@ -62,7 +62,7 @@ class MapperState:
     """
 
     slam: BackEndState
-    gathering: GatheringState
+    gathering: ColumnClassifierState
     ground: HeightMapState
     tracks: TrackTable
     next_number: int
@@ -107,7 +107,9 @@ class Mapper:
         self._T_base_lidar = T_base_lidar
         self._timer = timer
         self._slam = BackEnd(parameters.slam, seed)
-        self._columns = Gathering(parameters.classification, all_around=sensor.rings > 0, forests=forests)
+        self._columns = ColumnClassifier(
+            parameters.classification, all_around=sensor.rings > 0, forests=forests
+        )
         self._terrain = HeightMapper()
         self._tracker = Tracker(parameters.tracking)
         self._relocaliser: Relocaliser[MapperState] = Relocaliser(seed)
@@ -308,7 +310,7 @@ class Mapper:
             return
         with self._timer("gathering"):
             pose, offset = estimate.T_map_base, scan.sensor_offset
-            view = View(pose, offset, scan.free, given.steepest, given.depth, given.terrain)
+            view = ScanView(pose, offset, scan.free, given.steepest, given.depth, given.terrain)
             self._columns.add(given.points, given.height, step.index, view)
             self._columns.columns = self._tracker.judge(
                 step.scan.stamp_ns, self._columns.columns, self._parameters.classification

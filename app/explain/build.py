@@ -10,9 +10,14 @@ from numpy.typing import NDArray
 from app.explain.history import TreeHistory, half_axes
 from app.explain.records import Check, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
 from app.training.learned_forests import kept_forests
-from pipeline.classification.feature_attribution import what_told
 from pipeline.classification.features import NAMES
-from pipeline.classification.forest import CLASSES, TREE_IN_FREE_AIR, standard_forest, tree_in_free_air
+from pipeline.classification.forest import (
+    CLASSES,
+    TREE_IN_FREE_AIR,
+    feature_effects,
+    standard_forest,
+    tree_in_free_air,
+)
 from pipeline.config import Parameters, field_specs
 from pipeline.detection.cylinder_fit import StemFit, fit_one
 from pipeline.detection.verdicts import checks
@@ -36,7 +41,7 @@ def warm_up(sensor: Sensor) -> None:
     angle = np.linspace(2.0, 4.0, 12)
     arc = np.column_stack([5.0 + 0.2 * np.cos(angle), 0.2 * np.sin(angle), np.linspace(0.0, 1.0, 12)])
     fit_one(arc, sensor)
-    what_told(np.zeros(len(NAMES)), standard_forest(sensor.rings > 0), Verdict.TREE)
+    feature_effects(np.zeros(len(NAMES)), standard_forest(sensor.rings > 0), Verdict.TREE)
 
 
 def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
@@ -183,7 +188,7 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sen
     figures = columns.figures[row]
     in_free_air = float(tree_in_free_air(figures[None], forest)[0])
     refused = forest.free_end if in_free_air < TREE_IN_FREE_AIR else None
-    effect = what_told(figures, refused or forest, Verdict.TREE)
+    effect = feature_effects(figures, refused or forest, Verdict.TREE)
     strongest = np.argsort(-np.abs(effect), kind="stable")[:_MOST_FEATURES]
     return ColumnStory(
         verdict=verdict.label,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from app.training.examples import UNKNOWN, Examples
-from pipeline.classification import Gathering, View, depth_image, steepest_by_direction
+from pipeline.classification import ColumnClassifier, ScanView, depth_image, steepest_by_direction
 from pipeline.classification.forest import CLASSES, Forest
 from pipeline.config import Parameters
 from pipeline.detection.free_space import clear_range
@@ -53,7 +53,7 @@ def columns_of(
     """Yield the columns of a run that is mapped with its own poses, after each of MARKS scans and at the
     end."""
     taken = 0
-    gathering = Gathering(parameters.classification, all_around=sensor.rings > 0, forests=_no_forest)
+    gathering = ColumnClassifier(parameters.classification, all_around=sensor.rings > 0, forests=_no_forest)
     before = b""
     for step in run:
         repeated = step.scan.points.tobytes()
@@ -66,7 +66,7 @@ def columns_of(
         free = clear_range(raw, scan_ground.in_band(raw, height, parameters.ground), offset)
         steepest = steepest_by_direction(raw, offset, sensor.rings > 0)
         pose = step.T_odom_base or Pose2()
-        view = View(pose, offset, free, steepest, depth_image(raw), terrain.height)
+        view = ScanView(pose, offset, free, steepest, depth_image(raw), terrain.height)
         gathering.add(raw, height, step.index, view)
         taken += 1
         if taken in MARKS:

@@ -119,7 +119,7 @@ def warm_front_end() -> None:
     of the odometry: all of the mapper but SLAM and the Kalman filters of the trees."""
     from contextlib import closing
 
-    from pipeline.classification import Gathering, View
+    from pipeline.classification import ColumnClassifier, ScanView
     from pipeline.front_end import detect, segment
     from pipeline.geometry.poses import Pose2
     from pipeline.ground.terrain_map import HeightMapper
@@ -130,7 +130,7 @@ def warm_front_end() -> None:
 
     source = open_source(_SCENE)
     known, parameters = source.description, Parameters()
-    gathering = Gathering(
+    gathering = ColumnClassifier(
         parameters.classification, all_around=known.sensor.rings > 0, forests=kept_forests()
     )
     heights = HeightMapper()
@@ -146,7 +146,9 @@ def warm_front_end() -> None:
             detect(scan, parameters.detection)
             pose, given = step.T_odom_base or Pose2(), scan.column_input
             if given is not None:
-                view = View(pose, scan.sensor_offset, scan.free, given.steepest, given.depth, given.terrain)
+                view = ScanView(
+                    pose, scan.sensor_offset, scan.free, given.steepest, given.depth, given.terrain
+                )
                 gathering.add(given.points, given.height, step.index, view)
             if scan.terrain is not None:
                 heights.add(scan.terrain, pose, scan.sensor_offset)

@@ -1,21 +1,21 @@
-"""Gathering: the second level of evidence, what all scans together say of each place."""
+"""Classification of voxel columns: what all scans together show at each position of the map."""
 
-from pipeline.classification.column_classifier import Gathering, GatheringState, no_columns
-from pipeline.classification.decision_rule import Judged, judged
+from pipeline.classification.column_classifier import ColumnClassifier, ColumnClassifierState, no_columns
+from pipeline.classification.decision_rule import ColumnVotes, column_votes
 from pipeline.classification.forest import Forest, ForestOf, package_alone
-from pipeline.classification.packed_voxel_map import PackedMemory
-from pipeline.classification.ray_statistics import View, depth_image, steepest_by_direction
+from pipeline.classification.ray_statistics import ScanView, depth_image, steepest_by_direction
+from pipeline.classification.voxel_map import PackedVoxelMap
 
 __all__ = [
+    "ColumnClassifier",
+    "ColumnClassifierState",
+    "ColumnVotes",
     "Forest",
     "ForestOf",
-    "Gathering",
-    "GatheringState",
-    "Judged",
-    "PackedMemory",
-    "View",
+    "PackedVoxelMap",
+    "ScanView",
+    "column_votes",
     "depth_image",
-    "judged",
     "no_columns",
     "package_alone",
     "steepest_by_direction",

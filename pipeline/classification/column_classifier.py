@@ -1,4 +1,4 @@
-"""Gathering: voxels of all scans, the columns in them, and what each column is."""
+"""The column classifier: voxels of all scans, the columns in them, and the class of each column."""
 
 from __future__ import annotations
 
@@ -8,92 +8,203 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.classification.column_extraction import MARGIN, PROFILE, examine
-from pipeline.classification.decision_rule import judged
-from pipeline.classification.features import COUNT, features
+from pipeline.classification.decision_rule import column_votes
+from pipeline.classification.features import COUNT, NAMES, features
 from pipeline.classification.forest import CLASSES, ForestOf, package_alone, vote
-from pipeline.classification.map_correction import bent, bent_columns
-from pipeline.classification.packed_voxel_map import PackedMemory
-from pipeline.classification.ray_statistics import View, look, look_through
-from pipeline.classification.stale_tiles import seen_higher
-from pipeline.classification.voxel_map import SLICE, SLICES, TILE, Memory
-from pipeline.config.stages import Classification as GatheringParameters
+from pipeline.classification.ray_statistics import ScanView, count_rays, update_visibility
+from pipeline.classification.voxel_map import (
+    SLICE,
+    SLICES,
+    TILE,
+    PackedVoxelMap,
+    VoxelMap,
+    index,
+    keys_of,
+    tiles_of,
+)
+from pipeline.config.stages import Classification as Classification
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.loop_closure.map_correction import Bend
-from pipeline.types.records import Bool, Columns, Float32, Int, Verdict
+from pipeline.types.records import Bool, Columns, Float32, Int, Int32, Verdict
 
-GROWN = 1.1  # a tile is judged anew when it holds so many times the returns it held
-SAME = 0.35  # m; a column found again so near is the one of before
-FOLD = 25  # scans after which a snapshot no longer repeats them one by one; as many are kept
+LOW, HIGH = 0.6, 1.6  # m above the ground; voxels in this band decide when a column was last seen
+
+
+def bent(memory: VoxelMap, bend: Bend) -> VoxelMap:
+    """Return the voxels after a correction of the path: each moves with the last scan that saw it, and voxels
+    in
+    the same cell are joined. Tiles that changed become due for classification."""
+    n = memory.used
+    mean = memory.mean[:n].copy()
+    latest = memory.latest[:n].astype(np.int64)
+    mean[:, :2] = bend.moved(memory.mean[:n, :2].astype(np.float64), latest)
+    key = np.where(latest > bend.first, keys_of(mean), memory.key[:n])
+    kept = np.flatnonzero(key >= 0)  # coordinates within 1,000 km have a key
+    names, first, of = np.unique(key[kept], return_index=True, return_inverse=True)
+    order = np.argsort(first)  # in the previous order
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    of = rank[of.ravel()]
+    fresh = VoxelMap.empty(len(memory.key), _room(len(memory.tile_key), names))
+    rows = len(names)
+    weight = memory.returns[kept].astype(np.float64)
+    total = np.bincount(of, weight, rows)
+    fresh.key[:rows] = names[order]
+    for axis in range(3):
+        fresh.mean[:rows, axis] = np.bincount(of, weight * mean[kept, axis], rows) / total
+    fresh.returns[:rows] = total
+    np.maximum.at(fresh.scans, of, memory.scans[kept])
+    np.maximum.at(fresh.latest, of, memory.latest[kept])
+    fresh.added = memory.added
+    index(fresh, rows)
+    return fresh
+
+
+def _room(room: int, keys: Int) -> int:
+    """Return the number of rows for tiles, at least as many as before: a rotated tile covers up to four."""
+    tiles = len(np.unique(tiles_of(keys)))
+    while room <= tiles:
+        room *= 2
+    return room
+
+
+def bent_columns(columns: Columns, memory: VoxelMap, bend: Bend) -> Columns:
+    """Return the columns after a correction of the path: each moves with the voxels around it.
+
+    Args:
+        columns: The columns.
+        memory: The voxels before the correction.
+        bend: The correction.
+    """
+    from scipy.spatial import cKDTree
+
+    height = memory.mean[: memory.used, 2]
+    rows = np.flatnonzero((height >= LOW) & (height < HIGH))
+    if not len(rows) or not len(columns.axis):
+        return columns
+    _, nearest = cKDTree(memory.mean[rows, :2]).query(columns.axis[:, :2])
+    scan = memory.latest[rows[nearest]].astype(np.int64)
+    axis = columns.axis.copy()
+    axis[:, :2] = bend.moved(columns.axis[:, :2], scan)
+    turn = bend.turned(columns.axis[:, :2], scan)
+    c, s = np.cos(turn), np.sin(turn)
+    u, v = columns.axis[:, 2], columns.axis[:, 3]
+    axis[:, 2], axis[:, 3] = c * u - s * v, s * u + c * v
+    return replace(columns, axis=axis, tile=np.floor(axis[:, :2] / TILE).astype(np.int64))
+
+
+HIGHER = 0.5  # m; least increase of the visible height
+MOST_STALE = 2  # tiles per scan, which bounds the time of a scan
+_LOOKED, _RAYS = NAMES.index("looked at up to"), NAMES.index("rays up to")
+
+
+def seen_higher(columns: Columns) -> Int:
+    """Return at most MOST_STALE tiles, shape (T, 2), with columns above which scans have looked since they
+    were
+    classified, largest increase of the visible height first.
+
+    A person next to the robot at the start is seen from two metres, where no ring reaches above the head.
+    Later views from a distance add few returns, so that the tile does not count as grown.
+    """
+    c = columns
+    gain = _gains(c.viewed, c.met, c.passed, c.figures)
+    rows = np.argsort(-gain, kind="stable")
+    rows = rows[: np.count_nonzero(gain > HIGHER)]
+    _, first = np.unique(c.tile[rows], axis=0, return_index=True)
+    tiles: Int = c.tile[rows[np.sort(first)[:MOST_STALE]]]
+    return tiles
+
+
+@compiled
+def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
+    """Return the increase of the visible height of each column since its features were computed, shape (K,)
+    [m]."""
+    gain = np.zeros(viewed.shape[0])
+    for k in range(gain.shape[0]):
+        told = 0
+        for s in range(1, met.shape[1]):
+            if met[k, s] + passed[k, s] > 0:
+                told = s
+        gain[k] = max(viewed[k] - figures[k, _LOOKED], told * SLICE - figures[k, _RAYS])
+    return gain
+
+
+GROWN = 1.1  # factor by which the returns of a tile grow before its columns are classified again
+SAME = 0.35  # m; a column within this distance of an earlier one is the same column
+FOLD = 25  # scans that a state stores one by one, before they are folded into its voxels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GatheringState:
-    """What is known between two scans: a memory that nobody changes any more, the scans since, and the
-    columns. It shares all of that with the gathering, so that taking it costs nothing."""
+class ColumnClassifierState:
+    """State between two scans: packed voxels, the scans since, and the columns.
 
-    base: PackedMemory
+    It shares the data with the classifier, so that taking it costs nothing.
+    """
+
+    base: PackedVoxelMap
     since: tuple[tuple[Float32, int, int], ...]
     columns: Columns
 
-    def folded(self) -> Memory:
-        """The memory with the scans since, of its own."""
+    def folded(self) -> VoxelMap:
+        """Return an independent voxel map with the scans since."""
         memory = self.base.unpacked()
         for points, scan, most in self.since:
             memory.add(points, scan, most)
-            memory.judge_anew(GROWN)
+            memory.due_tiles(GROWN)
         return memory
 
 
-class Gathering:
-    """All that is remembered of places, and the columns in it.
+class ColumnClassifier:
+    """Integrates scans into voxels and classifies the columns in them.
 
     Args:
-        parameters: Of this stage.
-        all_around: Whether the sensor sees all around, or one way.
-        forests: Where the forest that votes on the columns is found.
+        parameters: Parameters of this stage.
+        all_around: Whether the sensor sees all around.
+        forests: Finds the random forest by its name.
 
     Raises:
         StemmapError: There is no such forest.
     """
 
     def __init__(
-        self, parameters: GatheringParameters, *, all_around: bool, forests: ForestOf = package_alone
+        self, parameters: Classification, *, all_around: bool, forests: ForestOf = package_alone
     ) -> None:
         self._all_around, self._forests = all_around, forests
         self.parameters = parameters
-        self._memory: Memory | None = Memory.empty(1 << parameters.voxels_log2)
-        self._folded: Callable[[], Memory] | None = None  # gives the memory where nobody has asked for it yet
+        self._memory: VoxelMap | None = VoxelMap.empty(1 << parameters.voxels_log2)
+        self._folded: Callable[[], VoxelMap] | None = None  # makes the voxel map on demand after `restore`
         self.columns = no_columns()
-        self._base = PackedMemory.of(self.memory)
+        self._base = PackedVoxelMap.of(self.memory)
         self._since: list[tuple[Float32, int, int]] = []
 
     @property
-    def parameters(self) -> GatheringParameters:
-        """In force; new ones act from the next scan that is taken on."""
+    def parameters(self) -> Classification:
+        """Parameters; changes apply from the next scan onwards."""
         return self._parameters
 
     @parameters.setter
-    def parameters(self, parameters: GatheringParameters) -> None:
+    def parameters(self, parameters: Classification) -> None:
         self._forest = self._forests(parameters.forest, self._all_around)
         self._parameters = parameters
         self._vote_again = True
 
     @property
-    def memory(self) -> Memory:
-        """The voxels of all scans. After a step back it is unpacked once somebody asks for it."""
+    def memory(self) -> VoxelMap:
+        """The voxels of all scans. After `restore` they are unpacked on demand."""
         if self._memory is None:
-            assert self._folded is not None  # noqa: S101 - one of both is there
+            assert self._folded is not None  # noqa: S101 - one of both exists
             self._memory, self._folded = self._folded(), None
         return self._memory
 
-    def add(self, points: Float32, height: Float32, scan: int, view: View) -> None:
-        """Take one scan.
+    def add(self, points: Float32, height: Float32, scan: int, view: ScanView) -> None:
+        """Integrate a scan and classify the columns of the tiles that are due.
 
         Args:
-            points: Level sensor frame, float32, shape (N, 3) [m]; height: above the ground, (N,) [m].
-            scan: Its number.
-            view: From where, how far and how high it looked.
+            points: Points in the level sensor frame, float32, shape (N, 3) [m].
+            height: Their heights above the ground, shape (N,) [m].
+            scan: Number of the scan.
+            view: Pose and visibility of the scan.
         """
         p, pose = self.parameters, view.T_map_base.as_array()
         here = _to_map(points, height, pose, view.sensor_offset, p.range_max)
@@ -102,50 +213,50 @@ class Gathering:
         c = self.columns
         first = len(c.verdict) - len(profiles)
         seen = (view.clear_range, view.steepest, view.sensor_offset, view.terrain)
-        look(c.axis, c.viewed, c.present, c.absent, pose, *seen, p.range_max)
+        update_visibility(c.axis, c.viewed, c.present, c.absent, pose, *seen, p.range_max)
         through = (view.depth, view.sensor_offset, view.terrain)
-        look_through(c.axis, c.met, c.passed, pose, *through, p.range_max)
+        count_rays(c.axis, c.met, c.passed, pose, *through, p.range_max)
         new = slice(first, None)
         scans, rays = (c.viewed[new], c.present[new], c.absent[new]), (c.met[new], c.passed[new])
         features(c.axis[new], profiles, *scans, *rays, c.figures[new])
-        self._judge(first)
+        self._classify(first)
 
-    def snapshot(self) -> GatheringState:
-        """All state; parameters are not part of it."""
-        return GatheringState(self._base, tuple(self._since), self.columns)
+    def snapshot(self) -> ColumnClassifierState:
+        """Return the state without the parameters."""
+        return ColumnClassifierState(self._base, tuple(self._since), self.columns)
 
-    def restore(self, state: GatheringState) -> None:
-        """Go back to a snapshot; the state itself is left untouched."""
+    def restore(self, state: ColumnClassifierState) -> None:
+        """Return to a state; the state itself does not change."""
         self._base, self._since = state.base, list(state.since)
         self._memory, self._folded = None, state.folded
         self.columns = state.columns
-        self._vote_again = True  # another forest may have voted then
+        self._vote_again = True  # another forest may have voted at that time
 
     def bend(self, bend: Bend) -> None:
-        """Move what is known with a path that was bent."""
+        """Move voxels and columns with a corrected path."""
         self.columns = bent_columns(self.columns, self.memory, bend)
         self._memory = bent(self.memory, bend)
         self.settle()
 
     @property
     def is_unsettled(self) -> bool:
-        """Whether so many scans were taken that `settle` is due."""
+        """Whether `settle` is due."""
         return len(self._since) >= FOLD
 
     def settle(self) -> None:
-        """Fold the scans since into what a snapshot shares. It changes nothing that is known, so it may be
-        done at any time, best between two scans that are taken; else the next one does it."""
-        self._base, self._since = PackedMemory.of(self.memory), []
+        """Fold the scans since the last call into the packed voxels of later states. The result of the
+        classification does not depend on it; if it is not called between two scans, `add` calls it."""
+        self._base, self._since = PackedVoxelMap.of(self.memory), []
 
     def _remember(self, points: Float32, scan: int, most: int) -> Int:
         if self.is_unsettled:
             self.settle()
         self._since.append((points, scan, most))
         self.memory.add(points, scan, most)
-        return self.memory.judge_anew(GROWN)
+        return self.memory.due_tiles(GROWN)
 
     def _find_again(self, tiles: Int) -> Float:
-        """Find the columns of tiles anew, at the end of a new table; returns their profiles."""
+        """Extract the columns of tiles again, at the end of a new table; return their profiles."""
         old = self.columns
         kept = ~_among(old.tile, tiles)
         axes, homes, profiles = [old.axis[kept]], [old.tile[kept]], [np.zeros((0, SLICES, PROFILE))]
@@ -166,17 +277,18 @@ class Gathering:
         self.columns = fresh
         return np.concatenate(profiles)
 
-    def _judge(self, first: int) -> None:
-        """Give the columns from a row on their verdict; who walked away is told at any time."""
+    def _classify(self, first: int) -> None:
+        """Classify the columns from a row onwards; all columns get their verdict, because objects may have
+        left."""
         c = self.columns
         if self._vote_again:
             first, self._vote_again = 0, False
         c.share[first:] = vote(c.figures[first:], self._forest)
-        self.columns = replace(c, verdict=judged(c).verdict(self.parameters.tree_share))
+        self.columns = replace(c, verdict=column_votes(c).verdict(self.parameters.tree_share))
 
 
 def no_columns() -> Columns:
-    """A table of columns without rows."""
+    """Return a table of columns without rows."""
     return _rows(np.zeros((0, 5)), np.zeros((0, 2), np.int64))
 
 
@@ -198,7 +310,7 @@ def _rows(axis: Float, tile: Int) -> Columns:
 
 
 def _joined(tiles: Int, more: Int) -> Int:
-    """The tiles and those of the others that are not among them."""
+    """Return the tiles and those of the others that are not among them."""
     return np.concatenate([tiles, more[~_among(more, tiles)]])
 
 
@@ -209,7 +321,7 @@ def _among(home: Int, tiles: Int) -> Bool:
 
 @compiled
 def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_max: float) -> Float32:
-    """x, y in the frame of the map and the height of the points that are kept, float32, shape (M, 3)."""
+    """Return x, y in the frame of the map and the height of the points in range, float32, shape (M, 3)."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     kept = np.empty((points.shape[0], 3), np.float32)
     n = 0
@@ -224,7 +336,7 @@ def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_
 
 @compiled
 def _nearest_before(old: Float, axis: Float, first: int) -> Int:
-    """For each column from a row on the nearest one of before within SAME, -1 where there is none."""
+    """Return for each column from a row onwards the nearest earlier one within SAME, -1 without."""
     nearest = np.full(axis.shape[0] - first, -1, np.int64)
     for k in range(first, axis.shape[0]):
         best = SAME * SAME

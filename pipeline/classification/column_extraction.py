@@ -1,8 +1,5 @@
-"""Columns: upright runs of voxels that may be stems, each with its axis and its profile over height.
-
-Everything of one tile is laid into a dense block of cells first, because a column is asked for its
-neighbourhood again and again.
-"""
+"""Extraction of columns: upright runs of voxels that may be stems, each with its axis and its profile over
+height."""
 
 from __future__ import annotations
 
@@ -13,32 +10,33 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int, Int32
 
-BUCKET = 0.9  # m; as far as a column's neighbourhood reaches
-MARGIN = 1.2  # m around a tile; a column looks so far for its neighbours
-LOW, LOW_HIGH, HIGH = 1, 7, 15  # slices: 0.2 to 1.4 m and to 3 m, where a column must show
-LEAST = 3  # of them hold returns
-TWIN = 0.02  # m; two axes nearer than that are one
-APART = 0.3  # m; of two columns nearer than that the weaker one is the same thing
+BUCKET = 0.9  # m; radius of the neighbourhood of a column
+MARGIN = 1.2  # m around a tile in which neighbours are considered
+LOW, LOW_HIGH, HIGH = 1, 7, 15  # slices: 0.2 to 1.4 m, and to 3 m, in which a column has returns
+LEAST = 3  # slices with returns
+TWIN = 0.02  # m; axes within this distance are the same
+APART = 0.3  # m; of two columns within this distance the weaker one is dropped
 INSIDE, RING_NEAR, RING_FAR = 0.3, 0.45, 0.9  # m around the axis
 OCTANTS = 8
-ARC = 11  # where the moments of a slice's arc begin, see `profile`
-PROFILE = 20  # figures of a slice, see `profile`
+ARC = 11  # first column of the moments of an arc, see `profile`
+PROFILE = 20  # columns of a profile, see `profile`
 
 
 @compiled
 def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Float:
-    """Columns whose foot lies in a square tile or near to it.
+    """Return the columns with their foot in or near a square tile.
 
-    They are looked for twice, over all heights and over the low ones, where a trunk shows below a crown
-    that hides it from a count over all.
+    The search uses all heights, and then the low ones only, where a trunk is visible below a crown that
+    dominates the count over all heights.
 
     Args:
-        mean: Voxels in and around the tile, shape (N, 3): x, y, height [m]; returns: shape (N,).
-        low: Corner of the tile, shape (2,) [m]; side: its length [m].
+        mean: Voxels in and around the tile, x, y, height [m], shape (N, 3).
+        returns: Number of returns of each voxel, shape (N,).
+        low: Corner of the tile, shape (2,) [m].
+        side: Its side [m].
 
     Returns:
-        Shape (K, 5): the axis, x, y at 1.3 m above the ground and its shift per metre of height, and
-        the strength.
+        Axis (x, y at 1.3 m above the ground and shift per metre of height) and strength, shape (K, 5).
     """
     cells = int(np.ceil((side + 2 * MARGIN) / SIDE))
     reach, border = int(APART / SIDE), int(MARGIN / SIDE) - 4
@@ -71,8 +69,9 @@ def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
 
 @compiled
 def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) -> Float:
-    """Sum over the slices of the logarithm of the returns in the cell and its eight neighbours; 0 where
-    fewer than `LEAST` slices hold any."""
+    """Return the sum over the slices of the logarithm of the returns in a cell and its eight neighbours; 0
+    with returns
+    in fewer than `LEAST` slices."""
     block = np.zeros((cells, cells, high - LOW), np.float32)
     for i in range(mean.shape[0]):
         a = int(np.floor((mean[i, 0] - low[0] + MARGIN) / SIDE))
@@ -101,7 +100,8 @@ def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) 
 
 @compiled
 def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
-    """The voxels bucket by bucket of `BUCKET` seen from above: order (N,) and bounds (buckets + 1,)."""
+    """Sort the voxels into horizontal buckets of side `BUCKET`; return order (N,) and bounds (buckets +
+    1,)."""
     across = int(np.ceil((side + 2 * MARGIN) / BUCKET))
     bucket = np.empty(mean.shape[0], np.int64)
     bounds = np.zeros(across * across + 1, np.int64)
@@ -120,7 +120,7 @@ def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
 
 @compiled
 def near_rows(x: float, y: float, low: Float, bounds: Int) -> Int:
-    """Runs of rows (first, one past the last) of the buckets around a place, shape (3, 2)."""
+    """Return the runs of rows (first, one past the last) of the buckets around a position, shape (3, 2)."""
     across = int(np.sqrt(bounds.shape[0] - 1) + 0.5)
     a = min(max(int((x - low[0] + MARGIN) / BUCKET), 0), across - 1)
     b = min(max(int((y - low[1] + MARGIN) / BUCKET), 0), across - 1)
@@ -134,14 +134,13 @@ def near_rows(x: float, y: float, low: Float, bounds: Int) -> Int:
 
 @compiled
 def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Float, Float]:
-    """The columns of a tile and what stands around each.
+    """Return the columns of a tile and their profiles.
 
     Args:
         mean, returns, low, side: See `find_columns`.
 
     Returns:
-        The columns, shape (K, 5), those whose foot lies in the tile; their profiles, shape
-        (K, SLICES, PROFILE).
+        Columns with their foot in the tile, shape (K, 5), and their profiles, shape (K, SLICES, PROFILE).
     """
     found = find_columns(mean, returns, low, side)
     order, bounds = in_buckets(mean, low, side)
@@ -165,7 +164,7 @@ def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Flo
 
 @compiled
 def _is_known(axis: Float, found: Float, kept: int) -> bool:
-    """Whether the search over other heights has led to the same axis before."""
+    """Return whether the search over other heights has given the same axis."""
     known = False
     for k in range(kept):
         known |= abs(axis[0] - found[k, 0]) < TWIN and abs(axis[1] - found[k, 1]) < TWIN
@@ -174,8 +173,9 @@ def _is_known(axis: Float, found: Float, kept: int) -> bool:
 
 @compiled
 def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: float) -> None:
-    """One round; a slice weighs by how much of what is around the axis lies at it, however many returns
-    it has, so that foliage does not draw the axis away. A weak prior keeps it upright."""
+    """Refine an axis. The weight of a slice is the share of its returns that is at the axis, not their
+    number, so that
+    foliage does not shift the axis. A weak prior keeps it upright."""
     w, x, y, around = np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES)
     for run in range(runs.shape[0]):
         for i in range(runs[run, 0], runs[run, 1]):
@@ -216,17 +216,19 @@ def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: floa
 
 @compiled
 def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) -> None:
-    """What stands around an axis, slice by slice, into `rows` of zeros, shape (SLICES, PROFILE).
+    """Fill `rows` of zeros, shape (SLICES, PROFILE), with the profile of a column.
 
-    Columns: returns inside, returns between, returns in the ring, voxels inside, filled octants of the
-    ring, middle of the inside (x, y from the axis) [m], rms distance of the inside from the axis [m],
-    and the second moments xx, xy, yy of the inside about its middle [m^2]. From ARC on, of what lies
-    nearer than RING_NEAR, sums from which a circle is fitted (Kasa 1976), with z = x^2 + y^2 from the
-    axis: 1, x, y, xx, xy, yy, xz, yz, zz.
+    Columns: returns inside, returns between, returns in the ring, voxels inside, filled octants of the ring,
+        middle of
+    the inside (x, y from the axis) [m], rms distance of the inside from the axis [m], and the second moments
+    xx, xy, yy of the inside about its middle [m^2]. From ARC onwards sums over the returns within RING_NEAR
+    for a circle fit (Kasa 1976), with z = x^2 + y^2 from the axis: 1, x, y, xx, xy, yy, xz, yz, zz.
 
     Args:
-        axis: See `find_columns`; mean, returns: voxels, bucket by bucket; runs: see `near_rows`.
-        rows: Is filled.
+        axis: See `find_columns`.
+        mean, returns: Voxels in the order of buckets.
+        runs: See `near_rows`.
+        rows: Filled with the profile.
     """
     octants = np.zeros((SLICES, OCTANTS), np.bool_)
     for run in range(runs.shape[0]):

@@ -1,4 +1,4 @@
-"""Features: the figures of a column by which it is judged, none of them in the sensor's own units."""
+"""Features of columns for the classifier; none of them depends on the units of a sensor."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Int32
 
-# Bands of height above the ground, as slices: first, one past the last.
+# Bands of height above the ground, as slices: first, and one past the last.
 BANDS = np.array([[1, 4], [4, 7], [7, 11], [11, 16], [16, 30]])
-CLEAN, CLEAN_NEAR = 0.5, 0.7  # of the returns around a clean slice lie at the axis, see `_stem`
-GAP = 2  # slices that a stem may be hidden over
+CLEAN, CLEAN_NEAR = 0.5, 0.7  # share of the returns around a clean slice that is at the axis, see `_stem`
+GAP = 2  # slices in which a stem may be hidden
 
 _BAND_WORDS = ("0.2-0.8", "0.8-1.4", "1.4-2.2", "2.2-3.2", "3.2-6")
 NAMES = tuple(
@@ -57,9 +57,9 @@ NAMES = tuple(
     ]
 )
 COUNT = len(NAMES)
-# The figures from RAYS on are what rays tell.
+# The features from RAYS onwards are those of rays.
 LAST, RAYS = NAMES.index("clean to"), NAMES.index("opaque 0.2-0.8 m")
-UNSEEN = -1.0  # of a figure of a band that no return tells anything of
+UNSEEN = -1.0  # value of a feature of a band without returns
 
 
 @compiled
@@ -73,15 +73,15 @@ def features(
     passed: Int32,
     figures: Float,
 ) -> None:
-    """The features of columns, into `figures`, shape (K, COUNT), in the order of NAMES.
+    """Fill `figures`, shape (K, COUNT), with the features of columns in the order of NAMES.
 
     Args:
-        axis: shape (K, 5), see `find_columns`.
-        profiles: shape (K, SLICES, PROFILE).
-        viewed: How high above the ground any scan looked there, shape (K,) [m].
-        present, absent: In how many scans something, or nothing, stood there in free view, shape (K,).
-        met, passed: Rays that ended at it or passed its axis, shape (K, SLICES).
-        figures: Is filled.
+        axis: Axes, shape (K, 5), see `find_columns`.
+        profiles: Profiles, shape (K, SLICES, PROFILE).
+        viewed: Largest height above the ground that a scan saw there, shape (K,) [m].
+        present, absent: Number of scans with free view in which the column was present or absent, shape (K,).
+        met, passed: Number of rays that ended at it or passed its axis, shape (K, SLICES).
+        figures: Filled with the features.
     """
     for c in range(axis.shape[0]):
         _features(axis[c], profiles[c], viewed[c], present[c], absent[c], figures[c])
@@ -134,9 +134,10 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
 
 @compiled
 def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None:
-    """Of each band the part of the rays that ended at the column; then how much was seen to be free above
-    the clean slices before the next return, and above the highest return; up to where rays tell something;
-    and how far above the clean slices the next return lies, as far as that. All in metres."""
+    """Fill in the features of rays: for each band the share of rays that ended at the column; the free height
+    above
+    the clean slices up to the next return, and above the highest return; the height up to which there are
+    rays; and the gap between the clean slices and the next return, as far as there are rays [m]."""
     n = BANDS.shape[0]
     for b in range(n):
         ended, went = 0.0, 0.0
@@ -144,7 +145,7 @@ def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None
             ended += met[s]
             went += passed[s]
         out[b] = ended / (ended + went) if ended + went > 0.0 else UNSEEN
-    free, above, told, top = 0, 0, 0, 0
+    free, above, seen, top = 0, 0, 0, 0
     gap = -1
     for s in range(1, SLICES):
         if rows[s, 0] > 0.0:
@@ -155,16 +156,16 @@ def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None
             above += 1
             free += s > last and gap < 0
         if met[s] + passed[s] > 0:
-            told = s
+            seen = s
     out[n] = free * SLICE
     out[n + 1] = above * SLICE
-    out[n + 2] = told * SLICE
-    out[n + 3] = (gap if gap >= 0 else max(told - top, 0)) * SLICE
+    out[n + 2] = seen * SLICE
+    out[n + 3] = (gap if gap >= 0 else max(seen - top, 0)) * SLICE
 
 
 @compiled
 def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
-    """Of what lies nearer than 0.9 m, the part nearer than 0.45 m, and of that the part at the axis."""
+    """Share of the returns within 0.9 m that is within 0.45 m, and share of these at the axis."""
     inside, near, ring = 0.0, 0.0, 0.0
     for s in range(first, end):
         inside += rows[s, 0]
@@ -176,8 +177,9 @@ def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
 
 @compiled
 def _shape(rows: Float, last: int, out: Float) -> None:
-    """Of the slices up to `last`: standard deviation of the inside across its long side and along it,
-    averaged [m], and how unevenly wide the slices are."""
+    """Of the slices up to `last`: mean standard deviation of the inside across and along its long side [m],
+    and the
+    relative variation of the width."""
     xx, xy, yy, n, total, squares = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for s in range(1, min(last + 1, SLICES)):
         if rows[s, 3] >= 2.0:
@@ -197,8 +199,9 @@ def _shape(rows: Float, last: int, out: Float) -> None:
 
 @compiled
 def _circle(rows: Float, last: int, out: Float) -> None:
-    """Radius of the circle through the clean slices laid upon one another, rms distance from it [m], and
-    their ratio; UNSEEN where the returns do not tell (Kasa 1976: z + B x + C y + D = 0 by least squares)."""
+    """Radius of the circle through all clean slices together, rms distance from it [m], and their ratio;
+    UNSEEN where
+    the fit fails (Kasa 1976: z + B x + C y + D = 0 by least squares)."""
     m = np.zeros(9)
     for s in range(1, min(last + 1, SLICES)):
         if rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2]):
@@ -227,8 +230,9 @@ def _circle(rows: Float, last: int, out: Float) -> None:
 
 @compiled
 def _above(rows: Float, last: int, out: Float) -> None:
-    """Standard deviations of what lies above the clean slices, across its long side and along it [m]:
-    the plate of a sign is flat, foliage is not."""
+    """Standard deviations of the returns above the clean slices, across and along their long side [m]: the
+    plate of a
+    sign is flat, foliage is not."""
     n, xx, xy, yy = 0.0, 0.0, 0.0, 0.0
     for s in range(last + 1, SLICES):
         if rows[s, 3] >= 2.0:
@@ -244,7 +248,7 @@ def _above(rows: Float, last: int, out: Float) -> None:
 
 @compiled
 def _band(rows: Float, first: int, end: int, out: Float) -> None:
-    """Filled part of the slices, part of the returns that lies at the axis, open part of the ring."""
+    """Share of filled slices, share of the returns at the axis, open share of the ring."""
     inside, around, filled, octants = 0.0, 0.0, 0.0, 0.0
     for s in range(first, end):
         inside += rows[s, 0]
@@ -258,10 +262,11 @@ def _band(rows: Float, first: int, end: int, out: Float) -> None:
 
 @compiled
 def _stem(rows: Float) -> tuple[int, int, int, int, int]:
-    """Slices: lowest with a return, first and last clean one of the run, their number, highest return.
+    """Return slices: lowest with a return, first and last clean slice of the run, their number, highest with
+    a return.
 
-    A thick neighbour returns more than a thin stem does and leaves it no clean slice; there a slice is
-    clean by what lies nearer than the neighbour.
+    Next to a thick neighbour, which returns more than a thin stem, no slice would be clean; then only the
+    returns nearer than the neighbour count.
     """
     bottom, top = SLICES, 0
     for s in range(1, SLICES):
@@ -276,8 +281,13 @@ def _stem(rows: Float) -> tuple[int, int, int, int, int]:
 
 @compiled
 def _run(rows: Float, part: float, ring: float) -> tuple[int, int, int]:
-    """First and last clean slice of the run, and their number: slices in which such a part of the returns
-    lies at the axis; those of the ring count so much."""
+    """Return first and last clean slice of the run, and their number.
+
+    Args:
+        rows: Profile of the column.
+        part: Least share of the returns that is at the axis.
+        ring: Weight of the returns in the ring.
+    """
     first, last, clean = SLICES, 0, 0
     for s in range(1, SLICES):
         at_axis = rows[s, 0] >= part * (rows[s, 0] + rows[s, 1] + ring * rows[s, 2])

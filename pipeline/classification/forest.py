@@ -1,4 +1,5 @@
-"""A few small decision trees as columns, read from JSON and walked in compiled code."""
+"""Random forests as columns, read from JSON and evaluated by compiled code, and the effect of single
+features."""
 
 from __future__ import annotations
 
@@ -19,17 +20,17 @@ from pipeline.types.records import CLASSES as CLASSES
 from pipeline.types.records import Bool, Int32, Verdict
 
 ALL_AROUND, ONE_WAY = "all around", "one way"
-FREE_END = "one way, ends in free air"  # trees that tell what ends there from a pole
-PACKAGE = "package"  # the name of the trees that come with the package
+FREE_END = "one way, ends in free air"  # key of the forest that separates trees from poles with a free end
+PACKAGE = "package"  # name of the forest of the package
 FILE = Path(__file__).with_name("forest.json")
 _MOST_BYTES = 4_000_000
 _MOST_NODES = 100_000
 
 _TREE, _POLE = CLASSES.index(Verdict.TREE), CLASSES.index(Verdict.POLE)
 _TOP, _FREE = NAMES.index("highest return"), NAMES.index("free above the highest return")
-_TALL, _SEEN_FREE = 2.0 - 1e-6, 1.0 - 1e-6  # m; so high is what ends in free air, so much of it was seen
+_TALL, _SEEN_FREE = 2.0 - 1e-6, 1.0 - 1e-6  # m; least height of a free end, and least free height above it
 
-TREE_IN_FREE_AIR = 0.5  # with a smaller share of `free_end` it is a pole
+TREE_IN_FREE_AIR = 0.5  # columns with a smaller share of `free_end` are poles
 
 _Row = tuple[int, float, int, int, list[float]]
 
@@ -39,11 +40,11 @@ class Forest:
     """Nodes of all trees as columns of length N.
 
     Attributes:
-        root: int32, shape (T,): the first node of each tree.
-        feature: int32: which figure is asked for, -1 at a leaf.
-        threshold: At most this goes to `left`, more to `right` (int32, nodes).
-        share: shape (N, classes): at a leaf the shares of the kinds among what it was trained on.
-        free_end: Asked whether a tree that ends in free air is a pole; None: nobody is asked.
+        root: First node of each tree, int32, shape (T,).
+        feature: Index of the feature, -1 at a leaf, int32.
+        threshold: Values up to it continue at `left`, others at `right` (int32, nodes).
+        share: Class shares of the training examples of a leaf, shape (N, classes).
+        free_end: Forest that decides whether a tree with a free upper end is a pole; None without.
     """
 
     root: Int32
@@ -55,15 +56,15 @@ class Forest:
     free_end: Forest | None = None
 
 
-# By a name, as the parameter `gathering.forest` gives it, and whether the sensor sees all around.
+# Returns a forest by its name (parameter `classification.forest`) and whether the sensor sees all around.
 ForestOf = Callable[[str, bool], Forest]
 
 
 def package_alone(name: str, all_around: bool) -> Forest:
-    """The forest of the package; it knows no other.
+    """Return the forest of the package.
 
     Raises:
-        StemmapError: Another one is asked for.
+        StemmapError: The name is that of another forest.
     """
     if name != PACKAGE:
         raise StemmapError(f"the decision trees {name} are not known here")
@@ -72,25 +73,26 @@ def package_alone(name: str, all_around: bool) -> Forest:
 
 @cache
 def standard_forest(all_around: bool) -> Forest:
-    """The forest that comes with the package for sensors that see all around, or for those that look one
-    way: what these see of a trunk differs too much for one to serve both."""
+    """Return the forest of the package for sensors that see all around, or for sensors that look one way:
+    their
+    views of a trunk differ too much for a common forest."""
     return read_forest(FILE, ALL_AROUND if all_around else ONE_WAY)
 
 
 def read_forest(path: Path, kind: str) -> Forest:
-    """Read a forest for a kind of sensor, ALL_AROUND or ONE_WAY.
+    """Return a forest for a kind of sensor, ALL_AROUND or ONE_WAY.
 
     Raises:
-        StemmapError: The file is too large, is no such JSON, or asks for figures that do not exist.
+        StemmapError: The file is too large, is not such JSON, or names unknown features.
     """
     return read_forests(path, kind)[1][0]
 
 
 def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]:
-    """What a file of decision trees holds, and the forests for some kinds of sensors.
+    """Return the JSON of a file, and the forests for some kinds of sensors.
 
     Raises:
-        StemmapError: As `read_forest`.
+        StemmapError: See `read_forest`.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -105,16 +107,19 @@ def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]
 
 def _damaged(path: Path, why: str) -> StemmapError:
     return StemmapError(
-        f"the decision trees cannot be read: {why}", where=str(path), remedy="`stemmap train` makes them anew"
+        f"the decision trees cannot be read: {why}",
+        where=str(path),
+        remedy="`stemmap train` trains them again",
     )
 
 
 def forest_of(data: dict[str, Any], kind: str) -> Forest:
-    """The forest for a kind of sensor out of what JSON holds, for one that looks one way with the trees of
-    FREE_END where there are any: forests of before have none.
+    """Return the forest of a JSON for a kind of sensor; for sensors that look one way with the forest of
+    FREE_END,
+    which earlier files do not have.
 
     Raises:
-        ValueError, TypeError, KeyError: It holds something else.
+        ValueError, TypeError, KeyError: The JSON is not that of a forest.
     """
     if data["classes"] != [verdict.label for verdict in CLASSES]:
         raise ValueError("it was trained for other classes")
@@ -135,7 +140,7 @@ def forest_of(data: dict[str, Any], kind: str) -> Forest:
 
 
 def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
-    """Append a node and what hangs below it; returns its row."""
+    """Append a node and the nodes below it; return its row."""
     row, nothing = len(rows), [0.0] * len(CLASSES)
     if row >= _MOST_NODES:
         raise ValueError("it has too many nodes")
@@ -153,10 +158,10 @@ def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
 
 
 def vote(figures: Float, forest: Forest) -> Float:
-    """Shares of the kinds in the order of CLASSES, mean over the trees, shape (K, figures) -> (K, 6).
+    """Return the class shares in the order of CLASSES, mean over the trees, shape (K, classes).
 
-    Of what ends in free air the votes for a tree are a pole's where `free_end` says so: beside all else that
-    is no tree poles are too few to be learned (docs/trunks.md).
+    For columns with a free upper end, votes for a tree count for a pole where `free_end` decides so, because
+    among all other objects there are too few poles to learn from (docs/trunks.md).
     """
     f = forest
     votes = _vote(figures, f.root, f.feature, f.threshold, f.left, f.right, f.share)
@@ -167,8 +172,9 @@ def vote(figures: Float, forest: Forest) -> Float:
 
 
 def tree_in_free_air(figures: Float, forest: Forest) -> Float:
-    """The share of `free_end` for a tree, of what ends in free air, shape (K,); NaN of all else, and where
-    nobody is asked."""
+    """Return the share of `free_end` for a tree, shape (K,); NaN for columns without a free end and without
+    such a
+    forest."""
     share = np.full(len(figures), np.nan)
     if forest.free_end is not None:
         ends = ends_in_free_air(figures)
@@ -177,7 +183,8 @@ def tree_in_free_air(figures: Float, forest: Forest) -> Float:
 
 
 def ends_in_free_air(figures: Float) -> Bool:
-    """Columns above whose highest return, that of a thing of some height, rays went on, shape (K,)."""
+    """Return which columns of sufficient height have a free upper end, above which rays passed, shape
+    (K,)."""
     ends: Bool = (figures[:, _TOP] >= _TALL) & (figures[:, _FREE] >= _SEEN_FREE)
     return ends
 
@@ -195,3 +202,68 @@ def _vote(
             for c in range(share.shape[1]):
                 votes[k, c] += share[node, c] / root.shape[0]
     return votes
+
+
+_DEEPEST = 1024  # levels of a tree; training allows far less
+
+
+def feature_effects(figures: Float, forest: Forest, kind: Verdict) -> Float:
+    """Return by how much each feature of a column raises the share of votes for a class.
+
+    The effect of a feature is the share of votes minus the share when the feature is unknown, where both
+    branches of each split on it count by half.
+
+    Args:
+        figures: Features of one column, shape (F,).
+        forest: The forest.
+        kind: One of CLASSES.
+
+    Returns:
+        Effects between -1 and 1, shape (F,); 0 for features that no tree uses for this column.
+    """
+    f = forest
+    share = np.ascontiguousarray(f.share[:, CLASSES.index(kind)])
+    return _feature_effects(figures, f.root, f.feature, f.threshold, f.left, f.right, share)
+
+
+@compiled
+def _feature_effects(
+    figures: Float, root: Int32, feature: Int32, threshold: Float, left: Int32, right: Int32, share: Float
+) -> Float:
+    told = np.zeros(figures.shape[0])
+    for t in range(root.shape[0]):
+        known = _share(figures, -2, root[t], feature, threshold, left, right, share)
+        for f in range(figures.shape[0]):
+            unknown = _share(figures, f, root[t], feature, threshold, left, right, share)
+            told[f] += (known - unknown) / root.shape[0]
+    return told
+
+
+@compiled
+def _share(
+    figures: Float,
+    unknown: int,
+    root: int,
+    feature: Int32,
+    threshold: Float,
+    left: Int32,
+    right: Int32,
+    share: Float,
+) -> float:
+    """Return the share at the leaf, averaged over both branches of each split on the unknown feature."""
+    waiting, weight = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)
+    waiting[0], weight[0] = root, 1.0
+    n, total = 1, 0.0
+    while n > 0:
+        n -= 1
+        node, w = waiting[n], weight[n]
+        while feature[node] >= 0:
+            if feature[node] == unknown and n < _DEEPEST:
+                w *= 0.5
+                waiting[n], weight[n] = right[node], w
+                n += 1
+                node = left[node]
+            else:
+                node = left[node] if figures[feature[node]] <= threshold[node] else right[node]
+        total += w * share[node]
+    return total

@@ -1,5 +1,6 @@
-"""Sight: how high a scan looked at each place, whether something stood there, and what its rays met on the
-way: the column, or what stands behind it."""
+"""Visibility of columns: how high scans looked at them, whether they were present, and how many rays ended at
+them
+or passed them."""
 
 from __future__ import annotations
 
@@ -17,16 +18,16 @@ from pipeline.types.records import Float32, Int32, UInt16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """From where a scan looked, and how far and high.
+class ScanView:
+    """Pose and visibility of a scan.
 
     Attributes:
-        T_map_base: The pose.
-        sensor_offset: The sensor in the level base frame, shape (3,) [m].
-        clear_range: How far the view was free by direction of the base frame, shape (BINS,) [m].
+        T_map_base: Pose of the base.
+        sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
+        clear_range: Free range by direction in the base frame, shape (BINS,) [m].
         steepest: Tangent of the steepest elevation of a return by direction, shape (BINS,).
-        depth: How far away the nearest return lies, see `depth_image`.
-        terrain: The ground under this scan, as `Terrain.height`.
+        depth: Range of the nearest return, see `depth_image`.
+        terrain: Ground height below the scan, as `Terrain.height`.
     """
 
     T_map_base: Pose2
@@ -37,18 +38,23 @@ class View:
     terrain: Float
 
 
-ELEVATIONS, LOWEST, STEP = 96, -0.84, 0.0175  # of a depth image: tangents, so that a step is about a degree
-MET, PASSED = 0.45, 0.5  # m; so near to the axis a ray met the column, so far behind it passed
-NEAR = 0.6  # m; what is seen so near to a column is the column
+ELEVATIONS, LOWEST, STEP = 96, -0.84, 0.0175  # of a depth image, as tangents; a step is about one degree
+MET, PASSED = (
+    0.45,
+    0.5,
+)  # m; a ray that ends this near to the axis met the column, one this far behind passed it
+NEAR = 0.6  # m; a return this near to a column belongs to it
 
 
 @compiled
 def steepest_by_direction(points: Float32, offset: Float, all_around: bool) -> Float:
-    """Tangent of the steepest elevation seen in each direction of the base frame, shape (BINS,).
+    """Return the tangent of the steepest elevation in each direction of the base frame, shape (BINS,).
 
     Args:
-        points: Level sensor frame, shape (N, 3) [m]; offset: the sensor in the base frame, shape (3,).
-        all_around: Whether the sensor looks equally high in all directions, so that one tells for all.
+        points: Points in the level sensor frame, shape (N, 3) [m].
+        offset: Position of the sensor in the base frame, shape (3,).
+        all_around: Whether the sensor has the same elevations in all directions, so that the maximum applies
+            to all.
     """
     steepest = np.full(BINS, -1.0)
     for i in range(points.shape[0]):
@@ -63,7 +69,7 @@ def steepest_by_direction(points: Float32, offset: Float, all_around: bool) -> F
 
 
 @compiled
-def look(
+def update_visibility(
     axis: Float,
     viewed: Float,
     present: Float,
@@ -75,14 +81,16 @@ def look(
     terrain: Float,
     range_max: float,
 ) -> None:
-    """Count for each column in view whether something stood there, and how high the scan looked.
+    """Update for each column in view whether it was present or absent, and how high the scan looked.
 
     Args:
-        axis: Columns, shape (K, 5); viewed, present, absent: shape (K,), changed in place.
-        pose: x, y [m], yaw [rad] of the base; offset: the sensor in the base frame, shape (3,) [m].
-        clear_range, steepest: By direction of the base frame, shape (BINS,).
-        terrain: Of this scan, as `Terrain.height`.
-        range_max: Columns farther away are not asked for [m].
+        axis: Axes of the columns, shape (K, 5).
+        viewed, present, absent: Statistics of the columns, shape (K,), changed in place.
+        pose: x, y [m], yaw [rad] of the base.
+        clear_range, steepest: By direction in the base frame, shape (BINS,).
+        offset: Position of the sensor in the base frame, shape (3,) [m].
+        terrain: Terrain of this scan, as `Terrain.height`.
+        range_max: Columns farther away are skipped [m].
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for k in range(axis.shape[0]):
@@ -103,11 +111,12 @@ def look(
 
 @compiled
 def depth_image(points: Float32) -> UInt16:
-    """Horizontal distance of the nearest return by direction and elevation in centimetres, 0 where none is,
-    uint16, shape (BINS, ELEVATIONS): a run keeps these for all gathered scans.
+    """Return the horizontal distance of the nearest return by direction and elevation [cm], 0 without a
+    return, uint16,
+    shape (BINS, ELEVATIONS).
 
     Args:
-        points: Level sensor frame, shape (N, 3) [m].
+        points: Points in the level sensor frame, shape (N, 3) [m].
     """
     depth = np.zeros((BINS, ELEVATIONS), np.uint16)
     for i in range(points.shape[0]):
@@ -124,7 +133,7 @@ def depth_image(points: Float32) -> UInt16:
 
 
 @compiled
-def look_through(
+def count_rays(
     axis: Float,
     met: Int32,
     passed: Int32,
@@ -135,11 +144,14 @@ def look_through(
     range_max: float,
 ) -> None:
     """Count for each column and slice the rays that ended at it, and those that passed its axis and ended
-    behind it. A ray that ends before it, or nowhere, tells nothing.
+    behind it.
+    Rays that end before it, or have no return, do not count.
 
     Args:
-        axis: Columns, shape (K, 5); met, passed: shape (K, SLICES), changed in place.
-        depth: See `depth_image`; all else: see `look`.
+        axis: Axes of the columns, shape (K, 5).
+        met, passed: Numbers of rays, shape (K, SLICES), changed in place.
+        pose, offset, terrain, range_max: See `update_visibility`.
+        depth: See `depth_image`.
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for k in range(axis.shape[0]):

@@ -1,46 +1,84 @@
-"""The memory: what was seen at each place of the map over the scans, in voxels, bounded.
+"""The voxel map: the returns of all scans in voxels of bounded number.
 
-A voxel holds how many returns fell into it and their mean position; many scans of one trunk then take
-no more memory than its surface does, and their mean is sharper than any one return.
+A voxel holds the number of returns in it and their mean position. Many scans of one trunk need no more memory
+than its surface, and the mean is more precise than a single return.
 """
 
 from __future__ import annotations
 
+import math
+import mmap
+import sys
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
-from pipeline.geometry.mmap_arrays import zeros
 from pipeline.jit import compiled
 from pipeline.types.records import Float32, Int, Int32
 
-SIDE = 0.1  # m, of a voxel seen from above
-SLICE = 0.2  # m, its height
-SLICES = 30  # so that 6 m above the ground are remembered
-TILE_CELLS = 40  # places are judged again tile by tile, of 4 m
+SMALL = 1 << 16  # bytes; smaller arrays use the heap
+
+
+def zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Return zeros like numpy.zeros; of a large array only pages that were written to take memory.
+
+    The system provides a page at the first write and takes back all pages when the array is deleted. On the
+    heap of the allocator, long-lived arrays of different sizes leave holes, which the process keeps.
+    """
+    kind = np.dtype(dtype)
+    count = shape if isinstance(shape, int) else math.prod(shape)
+    if count * kind.itemsize < SMALL:
+        return np.zeros(shape, kind)
+    return np.frombuffer(_mapped(count * kind.itemsize), kind, count).reshape(shape)
+
+
+def _mapped(size: int) -> mmap.mmap:
+    if sys.platform == "win32":
+        return mmap.mmap(-1, size)
+    return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+
+
+def copied(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a copy on separate pages."""
+    copy = zeros(array.shape, array.dtype)
+    copy[...] = array
+    return copy
+
+
+SIDE = 0.1  # m; horizontal side of a voxel
+SLICE = 0.2  # m; its height
+SLICES = 30  # voxels up to 6 m above the ground
+TILE_CELLS = 40  # columns are classified by tiles of 4 m
 TILE = TILE_CELLS * SIDE
-MOST_TILES = 4  # are judged anew at a scan,
-FIRST_SCANS = 10  # but for these, when a map may end soon
+MOST_TILES = 4  # classified per scan,
+FIRST_SCANS = 10  # except in the first scans, because a map may be short
 _OFFSET = TILE_CELLS << 18  # cells; keys stay positive within 1,000 km of the origin
 _FARTHEST = np.float32((_OFFSET - 2 * TILE_CELLS) * SIDE)
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
-KEPT = ("key", "mean", "returns", "scans", "latest")  # of each voxel; all else follows from these
+KEPT = ("key", "mean", "returns", "scans", "latest")  # columns from which all others follow
 
 _Tables = tuple[Int, Int32, Float32, Int32, Int32, Int32, Int32, Int32, Int, Int32, Int32, Int]
 
 
 @dataclass(slots=True, eq=False)
-class Memory:
+class VoxelMap:
     """Voxels as columns, of which the first `used` rows count, and likewise tiles.
 
     Attributes:
-        key: int64, the cell; slot: int32, hash table of row + 1, 0 where free.
-        mean: float32, shape (rows, 3): x, y in the frame of the map, height above the ground [m].
-        returns, scans: int32, how many fell into it, and in how many scans; latest: the last of these.
-        following: int32, the next voxel of the same tile, -1 for none; home: int32, row of that tile.
-        tile_key, tile_slot: As for voxels; tile_first: int32, the first voxel of each tile.
-        tile_returns: int64; tile_judged: int64, the returns that it had when it was last judged.
-        used, tiles: Voxels and tiles in use; added: scans that were taken.
+        key: Cell, int64.
+        slot: Hash table of row + 1, 0 where free, int32.
+        mean: x, y in the frame of the map and height above the ground [m], float32, shape (rows, 3).
+        returns, scans, latest: Number of returns, number of scans with returns, and the last of these, int32.
+        following: Next voxel of the same tile, -1 for none, int32.
+        home: Row of the tile, int32.
+        tile_key, tile_slot: As for voxels.
+        tile_first: First voxel of each tile, int32.
+        tile_returns, tile_judged: Number of returns, and that number when the tile was last classified,
+            int64.
+        used, tiles: Voxels and tiles in use.
+        added: Number of scans.
     """
 
     key: Int
@@ -61,11 +99,12 @@ class Memory:
     added: int
 
     @classmethod
-    def empty(cls, room: int = 1 << 12, tile_room: int = 1 << 8) -> Memory:
-        """Nothing is known; `room` and `tile_room` are powers of two.
+    def empty(cls, room: int = 1 << 12, tile_room: int = 1 << 8) -> VoxelMap:
+        """Return an empty map; `room` and `tile_room` are powers of two.
 
-        All is zeros, so that the system gives pages only as rows come into use: room for a whole map
-        costs nothing before it is filled, and a map that grows need never move.
+        All columns are zero, so the system provides pages when rows are first used: room for a whole map
+            costs nothing
+        before it is filled.
         """
         return cls(
             key=zeros(room, np.int64),
@@ -86,19 +125,19 @@ class Memory:
             added=0,
         )
 
-    def copy(self) -> Memory:
-        """An independent copy with the same room; only what is in use takes memory."""
+    def copy(self) -> VoxelMap:
+        """Return an independent copy with the same room; only rows in use take memory."""
         return self._with_room(np.arange(self.used), len(self.key), len(self.tile_key))
 
     def add(self, points: Float32, scan: int, most: int) -> None:
-        """Take the points of one scan.
+        """Add the points of a scan.
 
-        When more than `most` voxels are known, the half that was seen longest ago is forgotten.
+        When there are more than `most` voxels, the half that was seen longest ago is removed.
 
         Args:
-            points: float32, shape (N, 3): x, y in the frame of the map, height above the ground [m].
-            scan: Its number.
-            most: Voxels kept, a power of two.
+            points: x, y in the frame of the map, height above the ground [m], float32, shape (N, 3).
+            scan: Number of the scan.
+            most: Largest number of voxels, a power of two.
         """
         begin = 0
         self.added += 1
@@ -108,15 +147,15 @@ class Memory:
                 return
             self._make_room(most)
 
-    def judge_anew(self, grown: float) -> Int:
-        """Tiles, shape (T, 2), that hold `grown` times what they held when they were judged last; from
-        now on they count as judged. After the first scans the `MOST_TILES` that grew most come first, so
-        that no scan takes long; the others' turn comes soon."""
+    def due_tiles(self, grown: float) -> Int:
+        """Return the tiles, shape (T, 2), whose returns have grown by the factor `grown` since they were last
+        classified, and mark them as classified. After the first scans at most the `MOST_TILES` with the
+        largest growth are returned, which bounds the time of a scan."""
         most = MOST_TILES if self.added > FIRST_SCANS else self.tiles
-        return _due_tiles(self.tile_key, self.tile_returns, self.tile_judged, self.tiles, grown, most)
+        return _select_due(self.tile_key, self.tile_returns, self.tile_judged, self.tiles, grown, most)
 
     def around(self, tile: Int, margin: float) -> tuple[Float32, Int32]:
-        """Mean (N, 3) and returns (N,) of the voxels of a tile and `margin` [m] around it."""
+        """Return mean (N, 3) and returns (N,) of the voxels of a tile and `margin` [m] around it."""
         rows = _rows_around(
             tile[0],
             tile[1],
@@ -148,8 +187,8 @@ class Memory:
         for f in fields(self):
             setattr(self, f.name, getattr(fresh, f.name))
 
-    def _with_room(self, rows: Int, room: int, tile_room: int) -> Memory:
-        fresh = Memory.empty(room, tile_room)
+    def _with_room(self, rows: Int, room: int, tile_room: int) -> VoxelMap:
+        fresh = VoxelMap.empty(room, tile_room)
         for name in KEPT:
             np.take(getattr(self, name), rows, axis=0, out=getattr(fresh, name)[: len(rows)])
         fresh.added = self.added
@@ -161,7 +200,7 @@ class Memory:
 
 
 def keys_of(mean: Float32) -> Int:
-    """The cells of places, shape (N, 3); -1 where there is none."""
+    """Return the cells of positions of shape (N, 3), shape (N,); -1 outside of the map."""
     place = mean.astype(np.float64)
     cell = np.floor(place / np.array([SIDE, SIDE, SLICE]))
     inside = (cell[:, 2] >= 0) & (cell[:, 2] < SLICES) & np.all(np.abs(place[:, :2]) < _FARTHEST, axis=1)
@@ -170,20 +209,20 @@ def keys_of(mean: Float32) -> Int:
 
 
 def tiles_of(keys: Int) -> Int:
-    """The tiles of cells, shape (N,)."""
+    """Return the tiles of cells, shape (N,)."""
     ix, iy = keys >> 36, (keys >> 5) & ((1 << 31) - 1)
     return (ix // TILE_CELLS) << 31 | (iy // TILE_CELLS)
 
 
 @compiled
 def _first_place(key: int | np.int64, mask: int) -> int:
-    # The upper bits of the product are well mixed, 26 of them enough for any table that is allowed.
+    # The upper bits of the product are well mixed; 26 bits are enough for the largest table.
     return int(np.int64((np.uint64(key) * _SPREAD) >> np.uint64(38)) & mask)
 
 
 @compiled
 def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
-    """The place in the hash table of a key, or where it would go."""
+    """Return the position of a key in the hash table, or the free position for it."""
     mask = slot.shape[0] - 1
     at = _first_place(key, mask)
     while slot[at] > 0 and keys[slot[at] - 1] != key:
@@ -191,8 +230,8 @@ def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
     return int(at)
 
 
-def index(memory: Memory, rows: int) -> None:
-    """Fill the tables of a memory of which the first rows of columns were set."""
+def index(memory: VoxelMap, rows: int) -> None:
+    """Fill the tables of a map whose first rows are set."""
     memory.used = rows
     memory.tiles = _index(rows, *memory._tables())
 
@@ -204,7 +243,7 @@ def _tile_of(key: int | np.int64) -> int:
 
 
 @compiled
-def _hang_in(
+def _link(
     row: int | np.int64,
     key: int | np.int64,
     following: Int32,
@@ -214,7 +253,7 @@ def _hang_in(
     tile_first: Int32,
     tiles: int,
 ) -> int:
-    """Put a voxel into the chain of its tile; returns the tiles in use."""
+    """Add a voxel to the chain of its tile; return the number of tiles in use."""
     tile = _tile_of(key)
     at = _find(tile, tile_key, tile_slot)
     if tile_slot[at] == 0:
@@ -244,11 +283,11 @@ def _index(
     tile_first: Int32,
     tile_returns: Int,
 ) -> int:
-    """Fill the hash tables and chains of rows that are there already; returns the number of tiles."""
+    """Fill the hash tables and chains of existing rows; return the number of tiles."""
     tiles = 0
     for row in range(used):
         slot[_find(keys[row], keys, slot)] = row + 1
-        tiles = _hang_in(row, keys[row], following, home, tile_key, tile_slot, tile_first, tiles)
+        tiles = _link(row, keys[row], following, home, tile_key, tile_slot, tile_first, tiles)
         tile_returns[home[row]] += returns[row]
     return tiles
 
@@ -262,15 +301,16 @@ def _keep_judged(old_key: Int, old_judged: Int, key: Int, slot: Int32, judged: I
 
 
 @compiled
-def _due_tiles(key: Int, returns: Int, judged: Int, tiles: int, grown: float, most: int) -> Int:
-    """Tiles, shape (T, 2), at most so many, that are due, in the order of the table; marks them judged."""
+def _select_due(key: Int, returns: Int, judged: Int, tiles: int, grown: float, most: int) -> Int:
+    """Return at most `most` tiles, shape (T, 2), that are due, in the order of the table, and mark them as
+    classified."""
     growth = np.zeros(tiles)
     due = 0
     for t in range(tiles):
         if returns[t] > grown * judged[t]:
             growth[t] = returns[t] / max(judged[t], 1)
             due += 1
-    for _ in range(due - most):  # rarely more than a few stay behind, and rarely many are due
+    for _ in range(due - most):  # rarely more than a few
         least = -1
         for t in range(tiles):
             if growth[t] > 0.0 and (least < 0 or growth[t] <= growth[least]):
@@ -305,7 +345,7 @@ def _add(
     used: int,
     tiles: int,
 ) -> tuple[int, int, int]:
-    """Returns the first point that found no room (their number when all did), voxels and tiles in use."""
+    """Return the first point without room (the number of points when all fit), voxels and tiles in use."""
     wanted, guess = _guess(points, begin, keys, slot)
     row, last = np.int64(-1), np.int64(-1)
     for i in range(begin, points.shape[0]):
@@ -324,7 +364,7 @@ def _add(
                     used += 1
                     slot[at] = used
                     keys[row], latest[row] = key, -1
-                    tiles = _hang_in(row, key, following, home, tile_key, tile_slot, tile_first, tiles)
+                    tiles = _link(row, key, following, home, tile_key, tile_slot, tile_first, tiles)
             last = key
         returns[row] += 1
         for a in range(3):
@@ -338,18 +378,19 @@ def _add(
 
 @compiled
 def _guess(points: Float32, begin: int, keys: Int, slot: Int32) -> tuple[Int, Int]:
-    """Of each point its key, -1 where it has none, and the row of its voxel where that is the first that
-    the hash table tells, else -1.
+    """Return the key of each point, -1 outside of the map, and the row of its voxel where the hash table
+    gives it at the
+    first position, else -1.
 
-    The table lies far from the processor, and a look into it takes as long as all else. Here no look waits
-    for another one, so that many are under way at a time.
+    The table does not fit into the caches, so lookups take most of the time. Here no lookup depends on
+    another one, so the processor overlaps them.
     """
     n = points.shape[0]
     wanted, guess = np.empty(n, np.int64), np.empty(n, np.int64)
     for i in range(begin, n):
         x, y = points[i, 0], points[i, 1]
         h = np.int64(np.floor(points[i, 2] / SLICE))
-        # Written so that a coordinate that is not a number fails it.
+        # The comparison is false for NaN.
         if not (0 <= h < SLICES and abs(x) < _FARTHEST and abs(y) < _FARTHEST):
             wanted[i] = -1
             continue
@@ -395,3 +436,73 @@ def _rows_around(
                     n += 1
                 row = np.int64(following[row])
     return rows[:n].copy()
+
+
+LARGEST_ROOM = 1 << 25  # rows; the parameters allow less
+MASK = (1 << 31) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedVoxelMap:
+    """An immutable copy of a voxel map: columns of the voxels and tiles in use, without the hash tables.
+    `room` and
+    `tile_room` are the sizes of the tables. See `VoxelMap`."""
+
+    key: Int
+    mean: Float32
+    returns: Int32
+    scans: Int32
+    latest: Int32
+    tile_judged: Int
+    room: int
+    tile_room: int
+    added: int
+
+    @classmethod
+    def of(cls, memory: VoxelMap) -> PackedVoxelMap:
+        """Return a packed copy."""
+        columns = {name: copied(getattr(memory, name)[: memory.used]) for name in KEPT}
+        judged = memory.tile_judged[: memory.tiles].copy()
+        return cls(
+            **columns,
+            tile_judged=judged,
+            room=len(memory.key),
+            tile_room=len(memory.tile_key),
+            added=memory.added,
+        )
+
+    def unpacked(self) -> VoxelMap:
+        """Return the voxel map with the same bits."""
+        n = len(self.key)
+        memory = VoxelMap.empty(self.room, self.tile_room)
+        for name in KEPT:
+            getattr(memory, name)[:n] = getattr(self, name)
+        memory.added = self.added
+        index(memory, n)
+        memory.tile_judged[: memory.tiles] = self.tile_judged
+        return memory
+
+    def checked(self) -> PackedVoxelMap:
+        """Return this object after a check of the columns, which may come from a file.
+
+        Raises:
+            ValueError: The columns contradict each other or a key is not valid.
+        """
+        n, tiles = len(self.key), len(self.tile_judged)
+        for room, used in ((self.room, n), (self.tile_room, tiles)):
+            if not (max(used, 1) <= room <= LARGEST_ROOM and room & (room - 1) == 0):
+                raise ValueError(f"there is no room of {room} for {used} voxels or tiles")
+        lengths = {len(self.mean), len(self.returns), len(self.scans), len(self.latest), n}
+        if (
+            len(lengths) > 1
+            or self.mean.shape[1:] != (3,)
+            or self.key.ndim != 1
+            or self.tile_judged.ndim != 1
+        ):
+            raise ValueError("the columns of the voxels have other lengths")
+        if n and (self.key.min() < 0 or len(np.unique(self.key)) < n):
+            raise ValueError("two voxels are one")
+        tile = ((self.key >> 36) // TILE_CELLS << 31) | ((self.key >> 5) & MASK) // TILE_CELLS
+        if len(np.unique(tile)) != tiles:
+            raise ValueError("the tiles are not those of the voxels")
+        return self

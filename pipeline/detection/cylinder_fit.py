@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.geometry.cholesky import factorise, solve
+from pipeline.geometry.gaussian import factorise, solve
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_sums
 from pipeline.types.records import Int, Sensor

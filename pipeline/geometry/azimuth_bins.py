@@ -1,4 +1,4 @@
-"""Directions around the sensor, cheap enough to ask for every point."""
+"""Azimuth bins: sectors around the sensor without an arctangent, fast enough for every point."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pipeline.jit import compiled
 
 @compiled
 def direction_turn(x: float, y: float) -> float:
-    """The direction (x, y) as part of a whole turn, 0 to 1, from -x over -y, +x and +y on.
+    """Return the direction (x, y) as a share of a whole turn, 0 to 1, from -x over -y, +x and +y.
 
-    It runs evenly along the diamond |x| + |y| = 1 instead of the circle, which needs no arctangent.
-    The origin counts as the direction +x.
+    It is uniform along the diamond |x| + |y| = 1 instead of the circle, which needs no arctangent. The origin
+    counts as the direction +x.
     """
     length = abs(x) + abs(y)
     if length == 0.0:
@@ -25,15 +25,15 @@ def direction_turn(x: float, y: float) -> float:
 
 @compiled
 def direction_bin(x: float, y: float, bins: int) -> int:
-    """Which of `bins` sectors around the origin the direction (x, y) lies in, from -x over -y on.
+    """Return in which of `bins` sectors around the origin the direction (x, y) is, counted from -x over -y.
 
-    The sectors are cut by the diamond of `direction_turn`; the widest is twice as wide as the narrowest.
+    The sectors divide the diamond of `direction_turn`; the widest is twice as wide as the narrowest.
     """
     return min(int(np.floor(direction_turn(x, y) * bins)), bins - 1)
 
 
 def bin_direction(k: int, bins: int) -> tuple[float, float]:
-    """The unit vector to the middle of a sector of `direction_bin`; k counts around, over the last too."""
+    """Return the unit vector to the middle of a sector of `direction_bin`; k is taken modulo `bins`."""
     along = 4.0 * ((k % bins + 0.5) / bins) - 1.0
     side = along - 1.0 if 0.0 <= along <= 2.0 else (-1.0 - along if along < 0.0 else 3.0 - along)
     x = (1.0 - abs(side)) * (1.0 if 0.0 <= along <= 2.0 else -1.0)

@@ -1,5 +1,8 @@
-"""Gaussians of a pose and of places in the plane, written out: rows are scalars, which stay in registers,
-and the library's products of such small matrices cost more than all else here."""
+"""Gaussians of poses and positions in the plane, and small positive definite systems.
+
+The products are written out with scalars, which stay in registers; library calls for such small matrices take
+longer than all the rest.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +32,13 @@ class Pose(NamedTuple):
 
 @compiled_borrowing
 def pose_of(mu: Float, P: Float) -> Pose:
-    """A pose from its mean, shape (3,), and covariance, shape (3, 3)."""
+    """Return a pose by its mean, shape (3,), and covariance, shape (3, 3)."""
     return Pose(mu[0], mu[1], mu[2], P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
 
 
 @compiled_borrowing
 def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
-    """The inverse of `pose_of`, into arrays."""
+    """Write a pose into arrays, the inverse of `pose_of`."""
     mu[0], mu[1], mu[2] = pose.x, pose.y, pose.yaw
     P[0, 0], P[1, 1], P[2, 2] = pose.xx, pose.yy, pose.tt
     P[0, 1] = P[1, 0] = pose.xy
@@ -45,7 +48,7 @@ def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
 
 @compiled
 def rows_of(covariance: Float) -> Float:
-    """xx, xy, yy, shape (D, 3), of covariances of shape (D, 2, 2)."""
+    """Return xx, xy, yy, shape (D, 3), of covariances of shape (D, 2, 2)."""
     rows = np.empty((covariance.shape[0], 3))
     for d in range(covariance.shape[0]):
         rows[d, 0], rows[d, 1], rows[d, 2] = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
@@ -54,7 +57,7 @@ def rows_of(covariance: Float) -> Float:
 
 @compiled_within
 def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
-    """The covariance R[d] (xx, xy, yy) turned by the angle of cosine c and sine s."""
+    """Return the covariance R[d] (xx, xy, yy) rotated by the angle with cosine c and sine s."""
     xx, xy, yy = R[d, 0], R[d, 1], R[d, 2]
     return (
         c * c * xx - 2.0 * c * s * xy + s * s * yy,
@@ -67,12 +70,14 @@ def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
 def expected_spread(
     pose: Pose, c: float, s: float, ax: float, ay: float, R: Float, d: int
 ) -> tuple[float, float, float]:
-    """C R C^T + J P J^T of detection d, xx, xy, yy: how far it may lie by the pose and by its own error.
+    """Return xx, xy, yy of C R C^T + J P J^T, the covariance of detection d by the pose and by its own error.
 
     Args:
-        pose: With its covariance P; c, s: cosine and sine of its yaw.
-        ax, ay: From the robot to the detection, frame of the map: J = [I, (-ay, ax)^T].
+        pose: Pose with its covariance P.
+        c, s: Cosine and sine of its yaw.
+        ax, ay: Vector from the robot to the detection in the frame of the map: J = [I, (-ay, ax)^T].
         R: xx, xy, yy in the base frame, shape (D, 3) [m^2].
+        d: Row of R.
     """
     xx, xy, yy = rotated(R, d, c, s)
     return (
@@ -86,7 +91,8 @@ def expected_spread(
 def corrected(
     pose: Pose, ax: float, ay: float, S0: float, S1: float, S2: float, y0: float, y1: float
 ) -> Pose:
-    """Kalman update of a pose by one landmark; S: xx, xy, yy of its innovation y, J as in
+    """Return the Kalman update of a pose by one landmark with innovation y of covariance S (xx, xy, yy); J as
+    in
     `expected_spread`."""
     scale = 1.0 / (S0 * S2 - S1 * S1)
     a0, a1, a2 = pose.xx - ay * pose.xt, pose.xy - ay * pose.yt, pose.xt - ay * pose.tt
@@ -109,7 +115,7 @@ def corrected(
 
 @compiled_within
 def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
-    """Cosine and sine of a yaw from those before it turned by a little."""
+    """Return cosine and sine of a yaw by those before a small turn."""
     if abs(by) > SMALL_TURN:
         return np.cos(yaw), np.sin(yaw)
     b2 = by * by
@@ -119,7 +125,7 @@ def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
 
 @compiled_within
 def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
-    """out[p] = mu + L noise[p] with L L^T = P (Cholesky); a direction without variance gets no noise."""
+    """Set out[p] = mu + L noise[p] with L L^T = P (Cholesky); a direction without variance gets no noise."""
     l00 = np.sqrt(max(P[0, 0], 0.0))
     l10 = P[1, 0] / l00 if l00 > 1e-12 else 0.0
     l20 = P[2, 0] / l00 if l00 > 1e-12 else 0.0
@@ -130,3 +136,34 @@ def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
     out[p, 0] = mu[0] + l00 * n0
     out[p, 1] = mu[1] + l10 * n0 + l11 * n1
     out[p, 2] = (mu[2] + l20 * n0 + l21 * n1 + l22 * n2 + np.pi) % (2.0 * np.pi) - np.pi
+
+
+@compiled
+def factorise(H: Float, L: Float) -> None:
+    """Fill the lower triangle of L with that of H = L L^T, shape (n, n); H must be positive definite."""
+    for a in range(H.shape[0]):
+        for b in range(a):
+            total = H[a, b]
+            for k in range(b):
+                total -= L[a, k] * L[b, k]
+            L[a, b] = total / L[b, b]
+        total = H[a, a]
+        for k in range(a):
+            total -= L[a, k] * L[a, k]
+        L[a, a] = np.sqrt(total)
+
+
+@compiled
+def solve(L: Float, b: Float, x: Float) -> None:
+    """Fill x with the solution of L L^T x = b, shape (n,)."""
+    n = b.shape[0]
+    for a in range(n):
+        total = b[a]
+        for k in range(a):
+            total -= L[a, k] * x[k]
+        x[a] = total / L[a, a]
+    for a in range(n - 1, -1, -1):
+        total = x[a]
+        for k in range(a + 1, n):
+            total -= L[k, a] * x[k]
+        x[a] = total / L[a, a]

@@ -1,4 +1,4 @@
-"""Places in cells, so that only those near another one are asked for it."""
+"""Hash grid: positions in cells, for searches within a radius."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from pipeline.jit import compiled, compiled_borrowing, compiled_within
 Bool = NDArray[np.bool_]
 Int32 = NDArray[np.int32]
 
-SIDE = 32  # cells; the plane is folded into so many squared, for what is in reach spans fewer
-WIDER = 1.0 + 1e-6  # than the search, so that rounding at a border loses nobody
+SIDE = 32  # cells per side; the plane is folded into these cells, because a search covers fewer
+WIDER = 1.0 + 1e-6  # factor of the cell size, so that rounding at a border loses no position
 
 
 class Cells(NamedTuple):
-    """Chains of places, one a cell.
+    """Chains of positions, one per cell.
 
     Attributes:
-        head: int32, shape (SIDE * SIDE,): the first place of a cell, -1 for none.
-        following: int32, shape (L,): the one after each; cell: int32, shape (L,): where each one is.
+        head: First position of a cell, -1 for none, int32, shape (SIDE * SIDE,).
+        following: Next position in the chain, int32, shape (L,).
+        cell: Cell of each position, int32, shape (L,).
     """
 
     head: Int32
@@ -32,38 +33,39 @@ class Cells(NamedTuple):
 
 @compiled
 def cells_for(places: int) -> Cells:
-    """Empty cells with room for so many places."""
+    """Return empty cells with room for a number of positions."""
     return Cells(np.full(SIDE * SIDE, -1, np.int32), np.empty(places, np.int32), np.empty(places, np.int32))
 
 
 @compiled_borrowing
 def per_metre(radius: float) -> float:
-    """Cells a metre for searches of this radius [m]: four of them hold all within it of a place."""
+    """Return the cells per metre for searches of a radius [m]: four cells contain all positions within it."""
     return 0.5 / (WIDER * radius)
 
 
 @compiled_within
 def cell_of(u: int, v: int) -> int:
-    """The number of a cell in a row and a column of the plane."""
+    """Return the number of the cell in a row and a column of the plane."""
     return (u & (SIDE - 1)) * SIDE + (v & (SIDE - 1))
 
 
 @compiled_within
 def first_of_four(x: float, y: float, scale: float) -> tuple[int, int]:
-    """Row and column of the first of the two by two cells that hold all within the radius of a place."""
+    """Return row and column of the first of the two by two cells that contain all within the radius of a
+    position."""
     return int(np.floor(scale * x - 0.5)), int(np.floor(scale * y - 0.5))
 
 
 @compiled_within
 def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
-    """Put the first rows of `mean`, shape (L, 2 or more) [m], into empty cells, `scale` of them a metre."""
+    """Put the first rows of `mean`, shape (L, 2 or more) [m], into empty cells, `scale` of them per metre."""
     for j in range(known - 1, -1, -1):
         put_in(cells, mean, j, scale)
 
 
 @compiled_within
 def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
-    """File a place under the cell that it lies in."""
+    """Add a position to its cell."""
     at = cell_of(int(np.floor(scale * mean[j, 0])), int(np.floor(scale * mean[j, 1])))
     cells.cell[j] = at
     cells.following[j] = cells.head[at]
@@ -72,7 +74,7 @@ def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
 
 @compiled_within
 def take_out(cells: Cells, j: int) -> None:
-    """Take a place out of the cell that it is filed under."""
+    """Remove a position from its cell."""
     before = cells.head[cells.cell[j]]
     if before == j:
         cells.head[cells.cell[j]] = cells.following[j]
@@ -84,7 +86,7 @@ def take_out(cells: Cells, j: int) -> None:
 
 @compiled_within
 def clear(cells: Cells, known: int) -> None:
-    """Empty the cells again, of so many places."""
+    """Empty the cells of a number of positions."""
     for j in range(known):
         cells.head[cells.cell[j]] = -1
 
@@ -93,7 +95,7 @@ def clear(cells: Cells, known: int) -> None:
 def holds_unseen(
     cells: Cells, mean: Float, seen: Bool, x: float, y: float, radius2: float, scale: float
 ) -> bool:
-    """Whether a landmark that was not seen stands within a radius (its square is given) of a place."""
+    """Return whether a position that was not seen is within a radius (given as its square) of x, y."""
     u, v = first_of_four(x, y, scale)
     for quarter in range(4):
         at = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
@@ -107,7 +109,7 @@ def holds_unseen(
 
 @compiled_within
 def nearest_in(cells: Cells, mean: Float, x: float, y: float, reach: float, scale: float) -> int:
-    """The place nearest to another one, the first of equals; -1 where none is nearer than the reach."""
+    """Return the position nearest to x, y, the first of equal ones; -1 without any within the reach."""
     u, v = first_of_four(x, y, scale)
     best, nearest = reach * reach, -1
     for quarter in range(4):

@@ -1,7 +1,7 @@
 """Poses and angles. `T_a_b` maps the coordinates of a point in frame b to those in frame a.
 
-Frames: `lidar` (the sensor), `base` (the robot, x forward, y left, z up), `odom` (where the wheels
-say it is), `map` (where SLAM says it is).
+Frames: `lidar` (the sensor), `base` (the robot, x forward, y left, z up), `odom` (frame of the odometry),
+`map` (frame of SLAM).
 """
 
 from __future__ import annotations
@@ -15,16 +15,10 @@ Float = NDArray[np.float64]
 
 
 def wrap_angle(angle: ArrayLike) -> Float:
-    """Bring angles [rad] into [-pi, pi)."""
+    """Return angles [rad] in [-pi, pi)."""
     wrapped = (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
-    # The remainder of an angle just below -pi rounds up to the whole turn.
+    # The remainder of an angle just below -pi is rounded up to a whole turn.
     return np.where(wrapped >= np.pi, -np.pi, wrapped)
-
-
-def mean_angle(angles: Float, weights: Float | None = None) -> float:
-    """Mean direction [rad] of angles of shape (N,): the angle of the mean of their unit vectors."""
-    w = np.ones_like(angles) if weights is None else weights
-    return float(np.arctan2(np.dot(w, np.sin(angles)), np.dot(w, np.cos(angles))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +39,7 @@ class Pose2:
         )
 
     def inverse(self) -> Pose2:
-        """`T_b_a` of this `T_a_b`."""
+        """Return `T_b_a` of this `T_a_b`."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return Pose2(
             float(-c * self.x - s * self.y), float(s * self.x - c * self.y), float(wrap_angle(-self.yaw))
@@ -57,12 +51,12 @@ class Pose2:
         return moved
 
     def rotation(self) -> Float:
-        """The rotation matrix, shape (2, 2)."""
+        """Return the rotation matrix, shape (2, 2)."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([[c, -s], [s, c]])
 
     def as_array(self) -> Float:
-        """`[x, y, yaw]`, shape (3,)."""
+        """Return `[x, y, yaw]`, shape (3,)."""
         return np.array([self.x, self.y, self.yaw])
 
 
@@ -75,12 +69,13 @@ class Pose3:
 
     @classmethod
     def identity(cls) -> Pose3:
-        """The pose that changes nothing."""
+        """Return the identity."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
     def from_quaternion(cls, t: ArrayLike, wxyz: ArrayLike) -> Pose3:
-        """From a translation (3,) and a quaternion (4,) in the order w, x, y, z; it is normalised.
+        """Return the pose of a translation (3,) and a quaternion (4,) in the order w, x, y, z, which is
+        normalised.
 
         Raises:
             ValueError: The quaternion has no length or a number is not finite.
@@ -102,7 +97,7 @@ class Pose3:
 
     @classmethod
     def from_euler(cls, t: ArrayLike, roll: float, pitch: float, yaw: float) -> Pose3:
-        """From a translation (3,) [m] and R = Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
+        """Return the pose of a translation (3,) [m] and R = Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
         cr, sr = np.cos(roll), np.sin(roll)
         cp, sp = np.cos(pitch), np.sin(pitch)
         cy, sy = np.cos(yaw), np.sin(yaw)
@@ -120,7 +115,7 @@ class Pose3:
         return Pose3(self.R @ other.R, self.R @ other.t + self.t)
 
     def inverse(self) -> Pose3:
-        """`T_b_a` of this `T_a_b`."""
+        """Return `T_b_a` of this `T_a_b`."""
         return Pose3(self.R.T, -self.R.T @ self.t)
 
     def apply(self, points: Float) -> Float:
@@ -128,7 +123,7 @@ class Pose3:
         return points @ self.R.T + self.t
 
     def euler(self) -> tuple[float, float, float]:
-        """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+        """Return roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
         R = self.R
         return (
             float(np.arctan2(R[2, 1], R[2, 2])),
@@ -137,7 +132,7 @@ class Pose3:
         )
 
     def quaternion(self) -> Float:
-        """Unit quaternion w, x, y, z with w >= 0, shape (4,)."""
+        """Return the unit quaternion w, x, y, z with w >= 0, shape (4,)."""
         R = self.R
         # The largest of the four squares is never small, so the division is safe for every rotation.
         squares = np.array(
@@ -161,12 +156,12 @@ class Pose3:
         return -q if q[0] < 0 else q
 
     def planar(self) -> Pose2:
-        """The pose on the ground: x, y and the heading of the x axis."""
+        """Return the planar pose: x, y and the heading of the x axis."""
         return Pose2(float(self.t[0]), float(self.t[1]), self.euler()[2])
 
 
 def interpolate(a: Pose2, b: Pose2, fraction: float) -> Pose2:
-    """The pose at a fraction of the way from a (0) to b (1), with the shorter turn."""
+    """Return the pose at a fraction of the path from a (0) to b (1), with the shorter turn."""
     turn = float(wrap_angle(b.yaw - a.yaw))
     return Pose2(
         a.x + fraction * (b.x - a.x),

@@ -1,7 +1,7 @@
-"""A whole cloud of a plot, as a terrestrial or mobile scanner gives it, mapped at once.
+"""Stem inventory of a whole cloud of a plot, as a terrestrial or mobile scanner gives it.
 
-`map_plot` reads from top to bottom: extent, ground, thinned points above it, slices, circles, stems. The
-cloud is read three times part by part, so that its size decides the time and not the memory.
+The steps of `map_plot` are extent, ground, thinned points above it, slices, circles, stems. The cloud is read
+three times in parts, so that its size decides the time and not the memory.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ from pipeline.classification import ForestOf, package_alone
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.inventory.cloud import Cloud
-from pipeline.inventory.column_candidates import CLASSES, find_upright
+from pipeline.inventory.cloud import Cloud, Thinned, find_extent
 from pipeline.inventory.cross_sections import HIGHEST, LOWEST, Slices, cut, find_circles
-from pipeline.inventory.extent import find_extent
 from pipeline.inventory.stem_model import (
     COVERAGE,
     FIRST,
@@ -33,34 +31,34 @@ from pipeline.inventory.stem_model import (
     VAR_Y,
     X,
     Y,
+    classify_stems,
     describe_stems,
     diameters,
-    judge,
+    is_repeated,
     middles,
-    same,
 )
-from pipeline.inventory.stem_tracing import chain, follow
+from pipeline.inventory.stem_tracing import CLASSES, chain, find_upright, follow
 from pipeline.inventory.terrain_raster import HeightMap, LowestReturns, heights_above
-from pipeline.inventory.thinning import Thinned
 from pipeline.types.records import Float32, Int32, Trees, Verdict
 
 MOST_RASTER = 96 << 20  # bytes
-COARSE = 0.04  # m; above this the thinning tells on diameters
-SURE = 0.5  # of the votes for pole, person or wall against a stem
-BESIDE = 0.4  # m; a column so near to a stem is the stem
-NEVER = -1  # a time that nobody knows
+COARSE = 0.04  # m; coarser thinning makes diameters less precise
+SURE = 0.5  # share of the votes for pole, person or wall that rejects a stem
+SAME_OBJECT = 0.4  # m; a column within this distance of a stem is the stem
+NEVER = -1  # an unknown time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """All that was asked whether it is a tree, in the frame of the cloud less its offset; columns of
-    length K.
+    """Candidates for trees in the frame of the cloud minus its offset, as columns of length K.
 
     Attributes:
-        place: shape (K, 2) [m]; radius, radial_std [m]; arc [rad]; points: on the
-            circle of a usual slice.
-        verdict: int32, see Verdict.
-        height: Between the lowest and the highest slice [m].
+        place: Position, shape (K, 2) [m].
+        radius, radial_std: [m].
+        arc: Visible arc [rad].
+        points: Median number of points on the circle of a slice.
+        height: Distance between the lowest and the highest slice [m].
+        verdict: See Verdict, int32.
     """
 
     place: Float
@@ -74,16 +72,20 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlotMap:
-    """The map of a plot, in the frame of the cloud less its offset.
+    """Map of a plot in the frame of the cloud minus its offset.
 
     Attributes:
-        trees: All confirmed; observations are slices.
-        slices: Circles of the trees, shape (T, S, FIGURES), see `fit_circle`; slice_height: shape (S,) [m].
-        candidates: With their verdicts.
-        ground: Height map; points: thinned, between LOWEST and HIGHEST above it, shape (N, 4).
-        counts: Of points, by name; voxel_size: to which they were thinned [m].
-        lean: Shift of the axis per metre of height of each tree, shape (T, 2); taper: of the radius (T,).
-        warnings: For people.
+        trees: All trees, confirmed; their observations are slices.
+        slices: Circles of the trees, shape (T, S, FIGURES), see `fit_circle`.
+        slice_height: Heights of the slices, shape (S,) [m].
+        candidates: All candidates with their verdicts.
+        ground: Height map.
+        points: Thinned points between LOWEST and HIGHEST above the ground, shape (N, 4).
+        counts: Numbers of points by name.
+        voxel_size: Side of the voxels of the thinning [m].
+        lean: Shift of the axis of each tree per metre of height, shape (T, 2).
+        taper: Change of the radius of each tree per metre of height, shape (T,).
+        warnings: Messages for the user.
     """
 
     trees: Trees
@@ -100,10 +102,10 @@ class PlotMap:
 
 
 def map_plot(cloud: Cloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
-    """Map a whole cloud.
+    """Map the stems of a whole cloud.
 
     Raises:
-        SourceError: It cannot be read, has no points, or is wider than a plot.
+        SourceError: The cloud cannot be read, has no points, or is larger than a plot.
     """
     r_min, r_max = parameters.detection.radius_min, parameters.detection.radius_max
     ground, near, counts = find_ground(cloud, parameters.ground.slope_max)
@@ -113,13 +115,13 @@ def map_plot(cloud: Cloud, parameters: Parameters, forests: ForestOf = package_a
     fits = follow(slices, circles, number, stems, max(r_min, 0.02), r_max)
     height = middles(slices)
     figures = describe_stems(fits, height)
-    verdict = judge(figures, r_min, r_max)
-    kept = ~same(figures, verdict)
+    verdict = classify_stems(figures, r_min, r_max)
+    kept = ~is_repeated(figures, verdict)
     fits, figures, verdict = fits[kept], figures[kept], verdict[kept]
     places, share = find_upright(near.points, forests(parameters.classification.forest, True))
-    _refuse_what_is_known(figures, verdict, places, share)
+    _reject_other_objects(figures, verdict, places, share)
     tree = verdict == Verdict.TREE
-    # From west to east, so that numbers can be found again.
+    # Numbers increase from west to east.
     order = np.flatnonzero(tree)[np.lexsort((figures[tree, Y], figures[tree, X]))]
     return PlotMap(
         trees=_trees(figures[order], np.radians(parameters.tracking.dbh_arc_min)),
@@ -139,16 +141,17 @@ def map_plot(cloud: Cloud, parameters: Parameters, forests: ForestOf = package_a
 def find_ground(
     cloud: Cloud, slope_max: float, *, band: tuple[float, float] = (LOWEST, HIGHEST), most: int = 1 << 21
 ) -> tuple[HeightMap, Thinned, dict[str, int]]:
-    """The ground under a cloud, and its thinned points (x, y, z, height above the ground) in a band.
+    """Return the ground below a cloud, its thinned points (x, y, z, height above the ground) in a band, and
+    counts.
 
     Args:
-        cloud: Is read three times.
-        slope_max: Of the terrain against the plane of the plot [degrees].
-        band: Lowest and highest point kept, above the ground [m].
-        most: Points that are kept after thinning, a power of two.
+        cloud: The cloud, which is read three times.
+        slope_max: Largest slope of the terrain against the plane of the plot [degrees].
+        band: Lowest and highest height above the ground that is kept [m].
+        most: Largest number of points after thinning, a power of two.
 
     Raises:
-        SourceError: It cannot be read, has no points, or is wider than a plot.
+        SourceError: The cloud cannot be read, has no points, or is larger than a plot.
     """
     extent = find_extent(cloud.parts(), cloud.description.uri)
     room = LowestReturns.room(extent.low, extent.high)
@@ -176,8 +179,8 @@ def find_ground(
     return ground, near, counts
 
 
-def _refuse_what_is_known(figures: Float, verdict: Int32, places: Float, share: Float) -> None:
-    """Stems that the votes say are poles, persons or walls are none, in place."""
+def _reject_other_objects(figures: Float, verdict: Int32, places: Float, share: Float) -> None:
+    """Change the verdict of stems that the forest classifies as poles, persons or walls, in place."""
     from scipy.spatial import cKDTree
 
     tree = np.flatnonzero(verdict == Verdict.TREE)
@@ -188,7 +191,7 @@ def _refuse_what_is_known(figures: Float, verdict: Int32, places: Float, share: 
     strongest = votes[:, 1:5].argmax(axis=1) + 1
     others = (Verdict.POLE, Verdict.PERSON, Verdict.WALL)
     kind = np.array(CLASSES, np.int32)[strongest]
-    known = (away < BESIDE) & (votes[np.arange(len(votes)), strongest] > SURE) & np.isin(kind, others)
+    known = (away < SAME_OBJECT) & (votes[np.arange(len(votes)), strongest] > SURE) & np.isin(kind, others)
     verdict[tree[known]] = kind[known]
 
 
@@ -214,11 +217,11 @@ def _trees(stems: Float, arc_min: float) -> Trees:
 
 
 def _candidates(figures: Float, verdict: Int32, places: Float, share: Float) -> Candidates:
-    """Stems, and the upright columns that are none of them."""
-    alone = _away_from(places, figures[:, [X, Y]]) > BESIDE
-    places, share = places[alone], share[alone]
+    """Return the stems, and the upright columns that are not stems."""
+    others = _away_from(places, figures[:, [X, Y]]) > SAME_OBJECT
+    places, share = places[others], share[others]
     kind = np.array(CLASSES, np.int32)[share.argmax(axis=1)] if len(share) else np.zeros(0, np.int32)
-    kind[kind == Verdict.TREE] = Verdict.NO_ARC  # it stands like a stem, and no circle carries it
+    kind[kind == Verdict.TREE] = Verdict.NO_ARC  # upright like a stem, but without a circle
     nothing = np.full(len(places), np.nan)
     span = figures[:, LAST] - figures[:, FIRST]
     columns = (RADIUS, SCATTER, COVERAGE, POINTS)
@@ -245,17 +248,17 @@ def _away_from(places: Float, others: Float) -> Float:
 
 
 def _warnings(cloud: Cloud, near: Thinned, slices: Slices, ground: HeightMap) -> tuple[str, ...]:
-    told = list(cloud.description.warnings)
+    warnings = list(cloud.description.warnings)
     if near.side > COARSE:
-        told.append(
+        warnings.append(
             f"the cloud was thinned to {100.0 * near.side:.0f} cm, which makes diameters less sharp: "
             "cut it into smaller plots"
         )
     if len(slices.points) == 0:
-        told.append("nothing stands higher than 0.2 m above the lowest returns")
+        warnings.append("there are no points higher than 0.2 m above the lowest returns")
     if ground.seen.mean() < 0.1:
-        told.append("less than a tenth of the plot shows its ground: heights are uncertain")
-    return tuple(told)
+        warnings.append("the ground is visible in less than 10 % of the plot: heights are uncertain")
+    return tuple(warnings)
 
 
 __all__ = ["Candidates", "PlotMap", "find_ground", "map_plot"]

@@ -1,13 +1,17 @@
-"""What a whole cloud is to those who map it: points that come part by part, as often as asked for."""
+"""Whole clouds: the interface of their sources, the extent of the plot, and thinning in bounded memory."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
+from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.types.records import Float32
+from pipeline.jit import compiled
+from pipeline.types.records import Float32, Int, Int32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -16,14 +20,14 @@ class CloudDescription:
 
     Attributes:
         uri: As the user wrote it.
-        kind: The format in words, e.g. "LAS 1.4 compressed".
-        points: Number of points that the file promises.
-        offset: shape (3,) [m]: what was taken from its coordinates, so that 32 bits hold the rest.
-        crs: Its coordinate reference system, as WKT or "EPSG:32632"; empty when it is not said.
+        kind: Name of the format, e.g. "LAS 1.4 compressed".
+        points: Number of points by the header.
+        offset: Offset that is subtracted from the coordinates, so that 32 bits hold the rest, shape (3,) [m].
+        crs: Coordinate reference system as WKT or "EPSG:32632"; empty when unknown.
         digest: SHA-256 (hex) of the file.
-        warnings: What a person should know.
-        low, high: Corners that the file promises, in its own coordinates, shape (3,) [m]; not checked.
-        attributes: What the file says of each point besides its place, by the names of the format.
+        warnings: Messages for the user.
+        low, high: Corners by the header in the coordinates of the file, shape (3,) [m]; not checked.
+        attributes: Names of the columns besides the coordinates.
     """
 
     uri: str
@@ -39,19 +43,177 @@ class CloudDescription:
 
 
 class Cloud(Protocol):
-    """A whole cloud of a plot, read part by part."""
+    """A whole cloud of a plot, read in parts."""
 
     @property
     def description(self) -> CloudDescription:
-        """What is known before reading."""
+        """Description that is known before reading."""
 
     @property
     def losses(self) -> dict[str, int]:
-        """What was left out at the last reading, by reason in words."""
+        """Points left out in the latest reading, by reason."""
 
     def parts(self) -> Iterator[Float32]:
-        """All points from the first on, float32, shape (N, 3) each: x, y, z less the offset [m], finite.
+        """Yield all points in parts: x, y, z minus the offset [m], finite, float32, shape (N, 3).
 
         Raises:
-            SourceError: It is damaged so far that nothing can be read.
+            SourceError: Nothing can be read.
         """
+
+
+SQUARE = 8.0  # m
+LEAST = 20  # points of a square that belongs to the plot with its neighbours
+MOST_SQUARES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extent:
+    """Extent of a plot.
+
+    Attributes:
+        low, high: Corners, shape (2,) [m].
+        points: Number of all points.
+        apart: Number of points outside, far from all others.
+    """
+
+    low: Float
+    high: Float
+    points: int
+    apart: int
+
+
+def find_extent(parts: Iterable[Float32], where: str) -> Extent:
+    """Return the extent of a cloud that comes in parts of shape (N, 3) [m].
+
+    Raises:
+        SourceError: There are no points, or they are in too many squares.
+    """
+    squares: dict[int, tuple[int, Float]] = {}
+    for part in parts:
+        if len(part):
+            _count(part, squares)
+        if len(squares) > MOST_SQUARES:
+            raise SourceError("the points are spread too widely for a plot", where=where)
+    if not squares:
+        raise SourceError("the cloud has no points", where=where, remedy="Export it again")
+    count = np.array([n for n, _ in squares.values()])
+    bounds = np.array([bound for _, bound in squares.values()])
+    key = np.array(list(squares))
+    dense = set(key[count >= LEAST].tolist()) or set(key.tolist())
+    steps = [(a << 32) + b for a in (-1, 0, 1) for b in (-1, 0, 1)]
+    part_of = np.array([any(k + step in dense for step in steps) for k in key.tolist()])
+    total = int(count.sum())
+    return Extent(
+        bounds[part_of, :2].min(axis=0),
+        bounds[part_of, 2:].max(axis=0),
+        total,
+        total - int(count[part_of].sum()),
+    )
+
+
+def _count(part: Float32, squares: dict[int, tuple[int, Float]]) -> None:
+    cell = np.floor(part[:, :2] / SQUARE).astype(np.int64) + (1 << 30)
+    key = (cell[:, 0] << 32) + cell[:, 1]
+    order = np.argsort(key, kind="stable")
+    key, xy = key[order], part[order, :2].astype(np.float64)
+    starts = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
+    low, high = np.minimum.reduceat(xy, starts), np.maximum.reduceat(xy, starts)
+    sizes = np.diff(np.append(starts, len(key)))
+    for k, n, a, b in zip(key[starts].tolist(), sizes.tolist(), low, high, strict=True):
+        before, bound = squares.get(k, (0, np.append(a, b)))
+        squares[k] = (before + n, np.append(np.minimum(bound[:2], a), np.maximum(bound[2:], b)))
+
+
+FINEST = 0.01  # m
+COARSER = 1.5  # factor of the side when the table is full
+_AXIS_BITS, _MIDDLE = 21, 1 << 20
+_SPREAD = np.uint64(0x9E3779B97F4A7C15)
+
+
+class Thinned:
+    """Thins points: the points of a cube become their mean.
+
+    When there are more than `most` cubes, the cubes become larger and the means so far are thinned again.
+
+    Args:
+        most: Largest number of cubes, a power of two.
+        side: Side of a cube at the beginning [m].
+    """
+
+    def __init__(self, most: int = 1 << 21, side: float = FINEST) -> None:
+        self.side = side
+        self._most = most
+        self._begin(min(1 << 16, most))
+
+    def _begin(self, room: int) -> None:
+        self._key = np.zeros(room, np.int64)
+        self._mean = np.zeros((room, 4), np.float32)
+        self._count = np.zeros(room, np.int32)
+        self._slot = np.full(2 * room, -1, np.int32)
+        self._used = 0
+
+    def add(self, points: Float32) -> None:
+        """Add points of shape (N, 4): x, y, z within 10 km of the origin [m], and another value."""
+        self._add(points, np.ones(len(points), np.int32))
+
+    def _add(self, points: Float32, weight: Int32) -> None:
+        begin = 0
+        while True:
+            begin, self._used = _add(
+                points, weight, begin, self.side, self._key, self._mean, self._count, self._slot, self._used
+            )
+            if begin == len(points):
+                return
+            self._make_room()
+
+    def _make_room(self) -> None:
+        mean, count, room = self._mean[: self._used], self._count[: self._used], len(self._key)
+        if 2 * room <= self._most:
+            room *= 2
+        else:
+            self.side *= COARSER
+        self._begin(room)
+        self._add(mean, count)
+
+    @property
+    def points(self) -> Float32:
+        """The means in the order of the first points of their cubes, float32, shape (M, 4)."""
+        return self._mean[: self._used]
+
+
+@compiled
+def _add(
+    points: Float32,
+    weight: Int32,
+    begin: int,
+    side: float,
+    keys: Int,
+    mean: Float32,
+    count: Int32,
+    slot: Int32,
+    used: int,
+) -> tuple[int, int]:
+    """Return the first point without room (the number of points when all fit) and the cubes in use."""
+    mask = slot.shape[0] - 1
+    shift = np.uint64(64 - int(np.log2(slot.shape[0]) + 0.5))
+    for i in range(begin, points.shape[0]):
+        key = np.int64(0)
+        for a in range(3):
+            key = (key << _AXIS_BITS) | (
+                (np.int64(np.floor(points[i, a] / side)) + _MIDDLE) & (2 * _MIDDLE - 1)
+            )
+        at = np.int64((np.uint64(key) * _SPREAD) >> shift)
+        while slot[at] >= 0 and keys[slot[at]] != key:
+            at = (at + 1) & mask
+        row = slot[at]
+        if row < 0:
+            if used == keys.shape[0]:
+                return i, used
+            row = np.int32(used)
+            used += 1
+            slot[at], keys[row] = row, key
+        count[row] += weight[i]
+        share = np.float32(weight[i]) / np.float32(count[row])
+        for a in range(4):
+            mean[row, a] += (points[i, a] - mean[row, a]) * share
+    return points.shape[0], used

@@ -1,4 +1,10 @@
-"""Circles in the horizontal slices of a plot, each of which may be a slice of a stem."""
+"""Circles in the horizontal slices of a plot, which may be cross-sections of stems, with branches and bark
+next to them.
+
+The positions of the scanner are unknown, so the residual of a point is its distance from the circle. The
+start is the best of many circles through three points; then follows a robust geometric fit (Gauss-Newton with
+Tukey weights).
+"""
 
 from __future__ import annotations
 
@@ -8,32 +14,216 @@ import numpy as np
 
 from pipeline.detection.clustering import dbscan_grid
 from pipeline.geometry.poses import Float
-from pipeline.inventory.circle import FIGURES, best_circle, fit_circle, on_circle, share_inside
 from pipeline.jit import compiled
-from pipeline.types.records import Float32, Int
+from pipeline.types.records import Bool, Float32, Int
 
-LOWEST, HIGHEST = 0.2, 6.2  # m above the ground; stems are followed between
+TRIES = 160  # circles through three points
+MOST_POINTS = 250  # of a cluster that vote
+TUKEY = 4.7  # sigma
+BARK = 0.004  # m; roughness of a trunk, the smallest scatter
+SECTORS = 36
+FIGURES = 11  # cx, cy, r, var x, cov xy, var y, var r, scatter, coverage, inliers, contrast
+BESIDE, BESIDE_OF_RADIUS = 0.1, 0.5  # m, and share of the radius; width of the ring around a circle
+
+
+@compiled
+def best_circle(xy: Float, tolerance: float, r_min: float, r_max: float, out: Float) -> float:
+    """Find the circle through three of the points with the most other points on it.
+
+    Points inside count against a circle as much as points on it count for it: the cross-section of a trunk is
+        hollow,
+    that of a bush is not.
+
+    Args:
+        xy: Points, shape (N, 2) [m].
+        tolerance: Largest distance of a point on the circle [m].
+        r_min, r_max: Smallest and largest radius [m].
+        out: Filled with x, y, r.
+
+    Returns:
+        Points on it minus points inside, 0 without a circle.
+    """
+    n = xy.shape[0]
+    best = 0.0
+    stride = max(n // MOST_POINTS, 1)
+    draw = np.uint64(0x9E3779B97F4A7C15)
+    pick = np.empty(3, np.int64)
+    for _ in range(TRIES):
+        for k in range(3):  # own random numbers: the same points give the same circle
+            draw = draw * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+            pick[k] = np.int64((draw >> np.uint64(33)) % np.uint64(n))
+        x, y, r = _through_three(xy[pick[0]], xy[pick[1]], xy[pick[2]])
+        if not r_min <= r <= r_max:
+            continue
+        votes = 0.0
+        for i in range(0, n, stride):
+            off = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) - r
+            if abs(off) < tolerance:
+                votes += 1.0 - abs(off) / tolerance
+            elif off < 0.0:
+                votes -= 1.0
+        if votes > best:
+            best = votes
+            out[0], out[1], out[2] = x, y, r
+    return float(best * stride)
+
+
+@compiled
+def _through_three(a: Float, b: Float, c: Float) -> tuple[float, float, float]:
+    bx, by, cx, cy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
+    d = 2.0 * (bx * cy - by * cx)
+    if abs(d) < 1e-9:
+        return 0.0, 0.0, -1.0
+    b2, c2 = bx * bx + by * by, cx * cx + cy * cy
+    x, y = (cy * b2 - by * c2) / d, (bx * c2 - cx * b2) / d
+    return a[0] + x, a[1] + y, np.sqrt(x * x + y * y)
+
+
+@compiled
+def fit_circle(xy: Float, reach: float, r_min: float, r_max: float, out: Float) -> bool:
+    """Fit a circle geometrically from x, y, r in `out[:3]`, and fill `out`, shape (FIGURES,).
+
+    Args:
+        xy: Points, shape (N, 2) [m].
+        reach: Points farther from the circle are ignored [m].
+        r_min, r_max: Smallest and largest radius [m].
+        out: Start and result.
+
+    Returns:
+        Whether there is a circle with at least five points on it.
+    """
+    n = xy.shape[0]
+    x, y, r = out[0], out[1], out[2]
+    off = np.empty(n)
+    scatter, near = 0.5 * reach, 0
+    H, g = np.empty((3, 3)), np.empty(3)
+    for turn in range(20):
+        near = 0
+        for i in range(n):
+            d = abs(np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) - r)
+            if d < reach:
+                off[near] = d
+                near += 1
+        if near < 5:
+            return False
+        scatter = max(np.median(off[:near]) / 0.6745, BARK)
+        H[:] = 0.0
+        g[:] = 0.0
+        for i in range(n):
+            dx, dy = xy[i, 0] - x, xy[i, 1] - y
+            d = max(np.sqrt(dx * dx + dy * dy), 1e-9)
+            e = d - r
+            u2 = e * e / (TUKEY * scatter) ** 2
+            if u2 >= 1.0 or abs(e) >= reach:
+                continue
+            w = (1.0 - u2) ** 2
+            row = (dx / d, dy / d, 1.0)
+            for a in range(3):
+                g[a] += w * row[a] * e
+                for b in range(3):
+                    H[a, b] += w * row[a] * row[b]
+        for a in range(3):
+            H[a, a] += 1e-6
+        step = np.linalg.solve(H, g)
+        longest = np.abs(step).max()
+        if longest > 0.5 * r:
+            step *= 0.5 * r / longest
+        x, y, r = x + step[0], y + step[1], r + step[2]
+        if not r_min <= r <= r_max:
+            return False
+        if longest < 1e-5 and turn > 2:
+            break
+    out[0], out[1], out[2] = x, y, r
+    C = np.linalg.inv(H) * scatter * scatter
+    out[3], out[4], out[5], out[6] = C[0, 0], C[0, 1], C[1, 1], C[2, 2]
+    out[7] = scatter
+    out[8], out[9] = _coverage(xy, x, y, r, 3.0 * scatter)
+    out[10] = _contrast(xy, x, y, r, 3.0 * scatter, out[8], out[9])
+    return bool(out[9] >= 5.0)
+
+
+def without_scatter(radius: Float, scatter: Float) -> Float:
+    """Return radii [m] without the bias by the scatter of the points [m].
+
+    Points with an error of s in both directions are s^2 / 2 r farther from the centre in the mean (Rice).
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.maximum(radius - 0.5 * scatter * scatter / radius, 0.5 * radius)
+
+
+@compiled
+def _coverage(xy: Float, x: float, y: float, r: float, tolerance: float) -> tuple[float, float]:
+    """Return the angle of the circle that points on it fill [rad], and their number."""
+    filled = np.zeros(SECTORS, np.bool_)
+    on = 0.0
+    for i in range(xy.shape[0]):
+        dx, dy = xy[i, 0] - x, xy[i, 1] - y
+        if abs(np.sqrt(dx * dx + dy * dy) - r) < tolerance:
+            on += 1.0
+            filled[int((np.arctan2(dy, dx) / (2.0 * np.pi) + 0.5) * SECTORS) % SECTORS] = True
+    # A sector between two filled ones counts as filled, because points have gaps.
+    count = 0
+    for k in range(SECTORS):
+        both = filled[k - 1] and filled[(k + 1) % SECTORS]
+        count += filled[k] or both
+    return 2.0 * np.pi * count / SECTORS, on
+
+
+@compiled
+def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered: float, on: float) -> float:
+    """Return the ratio of the densities of points on the visible part of a circle and in the ring around
+    it."""
+    near, far = r + tolerance, r + tolerance + max(BESIDE, BESIDE_OF_RADIUS * r)
+    in_ring = 0.0
+    for i in range(xy.shape[0]):
+        in_ring += near <= np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) < far
+    band = near * near - max(r - tolerance, 0.0) ** 2
+    # One more point in the ring, so that a single leaf next to a thin stem has no effect.
+    return (on / (0.5 * covered * band)) / ((in_ring + 1.0) / (np.pi * (far * far - near * near)))
+
+
+@compiled
+def share_inside(xy: Float, x: float, y: float, r: float) -> float:
+    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r."""
+    inside, all_of_it = 0, 0
+    for i in range(xy.shape[0]):
+        d = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2)
+        inside += d < 0.7 * r
+        all_of_it += d < 1.3 * r
+    return inside / max(all_of_it, 1)
+
+
+@compiled
+def on_circle(xy: Float, x: float, y: float, r: float, tolerance: float) -> Bool:
+    """Return which points are on or in a circle, shape (N,)."""
+    on = np.empty(xy.shape[0], np.bool_)
+    for i in range(xy.shape[0]):
+        on[i] = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) < r + tolerance
+    return on
+
+
+LOWEST, HIGHEST = 0.2, 6.2  # m above the ground; heights in which stems are traced
 STEP = 0.2  # m; between slices
-THICK = 2  # steps that a slice is thick, so that neighbours overlap
+THICK = 2  # thickness of a slice in steps; neighbours overlap
 LEAST = 8  # points on a circle
-WINDOW = 0.6  # m; wider clusters are searched window by window, each twice as wide
+WINDOW = 0.6  # m; wider clusters are searched in windows of twice this width
 WIDE = 1.6  # m
 CIRCLES = 3  # in one cluster
-HOLLOW = 0.25  # part of a circle's points that may lie inside it
-SCATTER, SCATTER_OF_RADIUS = 0.05, 0.3  # m, and part of the radius
-ARC = np.radians(70.0)  # of a circle that may begin a stem
+HOLLOW = 0.25  # largest share of points inside of a circle
+SCATTER, SCATTER_OF_RADIUS = 0.05, 0.3  # m, and share of the radius
+ARC = np.radians(70.0)  # least arc of a circle of a stem
 NEAREST, EPS_MIN, EPS_MAX = 8, 0.05, 0.25  # neighbours; m
-SLAB, INSIDE = FIGURES, FIGURES + 1  # columns of a circle beyond those of its fit
+SLAB, INSIDE = FIGURES, FIGURES + 1  # further columns of a circle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slices:
-    """The points between LOWEST and HIGHEST above the ground, slice by slice.
+    """The points between LOWEST and HIGHEST above the ground, sorted into slices.
 
     Attributes:
-        points: float64, shape (N, 3): x, y [m], height above the ground [m], lowest slice first.
-        bounds: shape (S + 1,): where each step of height begins.
-        spacing: Usual distance to the eighth neighbour [m].
+        points: x, y [m], height above the ground [m], lowest slice first, shape (N, 3).
+        bounds: First row of each step of height, shape (S + 1,).
+        spacing: Median distance to the eighth neighbour [m].
     """
 
     points: Float
@@ -41,7 +231,7 @@ class Slices:
     spacing: float
 
     def slab(self, k: int) -> Float:
-        """The points of slice k, shape (M, 3)."""
+        """Return the points of slice k, shape (M, 3)."""
         return self.points[self.bounds[k] : self.bounds[min(k + THICK, len(self.bounds) - 1)]]
 
     @property
@@ -51,7 +241,7 @@ class Slices:
 
     @staticmethod
     def middle(k: Float | Int) -> Float:
-        """Height of the middle of slices above the ground [m]."""
+        """Return the height of the middle of slices above the ground [m]."""
         return LOWEST + STEP * (np.asarray(k, np.float64) + 0.5 * THICK)
 
 
@@ -73,21 +263,21 @@ def _spacing(points: Float) -> float:
     if len(points) <= NEAREST:
         return EPS_MAX
     part = points[:400_000] if len(points) <= 400_000 else points[:: len(points) // 400_000 + 1]
-    thinned = (len(points) / len(part)) ** 0.5  # points lie on surfaces
+    thinned = (len(points) / len(part)) ** 0.5  # points are on surfaces
     some = part[:: max(len(part) // 2000, 1)]
     distance: Float = cKDTree(part).query(some, k=NEAREST + 1)[0][:, -1]
     return float(np.median(distance) / thinned)
 
 
 def find_circles(slices: Slices, r_min: float, r_max: float) -> Float:
-    """All circles of all slices that may be stems.
+    """Return all circles of all slices that may be stems.
 
     Args:
-        slices: Of the plot.
-        r_min, r_max: Radii that are looked for [m].
+        slices: Slices of the plot.
+        r_min, r_max: Smallest and largest radius [m].
 
     Returns:
-        Shape (K, FIGURES + 2): the figures of `fit_circle`, the slice, and the part of the points inside.
+        Values of `fit_circle`, the slice, and the share of the points inside, shape (K, FIGURES + 2).
     """
     eps = float(np.clip(1.3 * slices.spacing, EPS_MIN, EPS_MAX))
     tolerance = float(np.clip(0.3 * slices.spacing, 0.01, 0.03))
@@ -127,7 +317,8 @@ def _circles(xy: Float, bounds: Int, tolerance: float, r_min: float, r_max: floa
 
 @compiled
 def _in_windows(xy: Float, x0: float, y0: float, wide: float) -> tuple[Int, Int, int]:
-    """Points in the order of square cells of WINDOW, and where each cell begins."""
+    """Return the order of points by square cells of WINDOW, the first row of each cell, and the cells per
+    side."""
     across = int(wide / WINDOW) + 1
     cell = np.empty(xy.shape[0], np.int64)
     cells = np.zeros(across * across + 1, np.int64)
@@ -144,7 +335,7 @@ def _in_windows(xy: Float, x0: float, y0: float, wide: float) -> tuple[Int, Int,
 
 @compiled
 def _window(xy: Float, order: Int, cells: Int, across: int, a: int, b: int) -> Float:
-    """The points of a cell and of the next ones along x and y."""
+    """Return the points of a cell and of the next ones along x and y."""
     n = 0
     for i in range(a, min(a + 2, across)):
         n += cells[i * across + min(b + 2, across)] - cells[i * across + b]
@@ -161,7 +352,7 @@ def _window(xy: Float, order: Int, cells: Int, across: int, a: int, b: int) -> F
 def _peel(
     xy: Float, tolerance: float, r_min: float, r_max: float, k: float, n: int, out: Float
 ) -> tuple[int, Float]:
-    """Circles of one cluster, one after the other, what lies on one taken away before the next."""
+    """Find the circles of a cluster in turn; the points of a circle are removed before the next."""
     rest = xy
     row = np.zeros(FIGURES + 2)
     for _ in range(CIRCLES):

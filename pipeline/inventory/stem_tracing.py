@@ -1,33 +1,49 @@
-"""Stems: circles of several slices that stand above one another, followed up and down."""
+"""Stems: circles of several slices above one another, traced upwards and downwards; and upright columns of
+voxels, which
+the random forest classifies."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from pipeline.classification.column_extraction import MARGIN, examine
+from pipeline.classification.features import COUNT, features
+from pipeline.classification.forest import CLASSES, Forest, vote
+from pipeline.classification.voxel_map import SLICE, SLICES, TILE, VoxelMap
 from pipeline.geometry.poses import Float
-from pipeline.inventory.circle import FIGURES, fit_circle, share_inside
-from pipeline.inventory.cross_sections import ARC, HOLLOW, INSIDE, LEAST, SLAB, STEP, THICK, Slices
+from pipeline.inventory.cross_sections import (
+    ARC,
+    FIGURES,
+    HOLLOW,
+    INSIDE,
+    LEAST,
+    SLAB,
+    STEP,
+    THICK,
+    Slices,
+    fit_circle,
+    share_inside,
+)
 from pipeline.jit import compiled
-from pipeline.types.records import Int
+from pipeline.types.records import Float32, Int
 
 BREAST = 1.3  # m above the ground
-LINK_STEPS = 3  # slices that may lie between two circles of one stem
+LINK_STEPS = 3  # largest distance of two circles of one stem in slices
 LINK, LINK_LEAN = 0.06, 0.25  # m, and metres per metre of height
-ALIKE = 0.4  # part by which the radii of neighbours may differ
+ALIKE = 0.4  # largest relative difference of the radii of neighbours
 LEAST_SLICES = 4
-REACH = 0.25  # m around the circle of the slice before that is looked at
-WANDER, WANDER_OF_RADIUS = 0.06, 0.25  # m, and part of the radius, by which the next circle may be off
-LOST = 5  # slices without a circle that end a stem
+REACH = 0.25  # m around the circle of the previous slice in which points are used
+WANDER, WANDER_OF_RADIUS = 0.06, 0.25  # m, and share of the radius; largest offset of the next circle
+LOST = 5  # slices without a circle after which a stem ends
 BUCKET = 0.5  # m
 TUKEY = 4.7
-FOOT = 9  # x, y at breast height, their shift per metre of height, radius there, its change per metre, ...
 
 
 def chain(circles: Float) -> tuple[Int, int]:
-    """Which circles stand above one another: number of the stem of each, -1 for none, and how many stems.
+    """Return the number of the stem of each circle, -1 for none, and the number of stems.
 
     Args:
-        circles: As `find_circles` gives them, slice after slice.
+        circles: Result of `find_circles`, in the order of slices.
     """
     if len(circles) == 0:
         return np.zeros(0, np.int64), 0
@@ -36,7 +52,7 @@ def chain(circles: Float) -> tuple[Int, int]:
     root = _link(circles, bounds)
     size = np.bincount(root, minlength=len(root))
     levels = np.bincount(np.unique(root * 1000 + slabs) // 1000, minlength=len(root))
-    # Best first, so that of two chains of one stem the better one begins it.
+    # Best first, so that the better one of two chains of a stem is traced first.
     worth = np.bincount(root, weights=circles[:, 8], minlength=len(root))
     keep = np.flatnonzero((size > 0) & (levels >= LEAST_SLICES))
     keep = keep[np.argsort(-worth[keep], kind="stable")]
@@ -74,10 +90,10 @@ def _root(parent: Int, c: int) -> int:
 
 
 def follow(slices: Slices, circles: Float, number: Int, stems: int, r_min: float, r_max: float) -> Float:
-    """Each stem in all slices: from its best circle up and down, with what lies around the next circle.
+    """Trace each stem from its best circle upwards and downwards, with the points around the next circle.
 
     Returns:
-        Shape (stems, slices, FIGURES): the figures of `fit_circle`, radius NaN where there is none.
+        Values of `fit_circle`, NaN in slices without a circle, shape (stems, slices, FIGURES).
     """
     buckets = _Buckets(slices)
     return _follow(
@@ -95,7 +111,7 @@ def follow(slices: Slices, circles: Float, number: Int, stems: int, r_min: float
 
 
 class _Buckets:
-    """The points of each step of height in square buckets seen from above."""
+    """The points of each step of height in horizontal square buckets."""
 
     def __init__(self, slices: Slices) -> None:
         xy = slices.points[:, :2]
@@ -116,7 +132,7 @@ class _Buckets:
 def _around(
     xy: Float, start: Int, low: Float, across: Int, k: int, x: float, y: float, reach: float
 ) -> Float:
-    """The points of slice k within `reach` of a place, shape (M, 2)."""
+    """Return the points of slice k within `reach` of a position, shape (M, 2)."""
     a0, a1 = int((x - reach - low[0]) / BUCKET), int((x + reach - low[0]) / BUCKET)
     b0, b1 = int((y - reach - low[1]) / BUCKET), int((y + reach - low[1]) / BUCKET)
     a0, a1, b0, b1 = max(a0, 0), min(a1, across[0] - 1), max(b0, 0), min(b1, across[1] - 1)
@@ -167,7 +183,7 @@ def _follow(
                 row[0], row[1], row[2] = x, y, r
                 if _fits(near, row, r_min, r_max, missed):
                     out[s, k] = row
-                    # The way on follows what was found, a little at a time.
+                    # The prediction follows the found circles smoothly.
                     lean_x += 0.2 * (row[0] - x)
                     lean_y += 0.2 * (row[1] - y)
                     x, y, r = x + 0.7 * (row[0] - x), y + 0.7 * (row[1] - y), r + 0.5 * (row[2] - r)
@@ -185,7 +201,7 @@ def _worth(circle: Float) -> float:
 
 @compiled
 def _fits(near: Float, row: Float, r_min: float, r_max: float, missed: int) -> bool:
-    """Fit a circle from where the stem should go on, and tell whether it is it."""
+    """Fit a circle from the predicted one, and return whether it can be the next one of the stem."""
     x, y, r = row[0], row[1], row[2]
     if near.shape[0] < LEAST or not fit_circle(near, max(0.04, 0.4 * r), r_min, r_max, row):
         return False
@@ -204,8 +220,9 @@ def _fits(near: Float, row: Float, r_min: float, r_max: float, missed: int) -> b
 
 @compiled
 def lines(height: Float, value: Float, weight: Float) -> tuple[float, float, float, float]:
-    """A line through values over height by weights that forget what lies off it: value at breast
-    height, its change per metre, their standard deviations. A weak prior holds the slope near 0."""
+    """Fit a line through values over height robustly; return the value at breast height, its change per
+    metre, and
+    their standard deviations. A weak prior keeps the slope near 0."""
     n = height.shape[0]
     a, b, scale = np.median(value), 0.0, 1.0
     saa, sab, sbb = 1.0, 0.0, 1.0
@@ -227,3 +244,59 @@ def lines(height: Float, value: Float, weight: Float) -> tuple[float, float, flo
         a, b = (sbb * ta - sab * tb) / D, (saa * tb - sab * ta) / D
     D = saa * sbb - sab * sab
     return a, b, scale * np.sqrt(sbb / D), scale * np.sqrt(saa / D)
+
+
+TWICE = 0.3  # m; columns within this distance are one
+OFTEN = 50.0  # number of scans in which a column counts as present
+MOST_VOXELS = 1 << 20
+
+
+def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
+    """Return upright columns of voxels and the votes of a forest on them.
+
+    A whole cloud counts as seen by a robot from everywhere: each position was visible up to the height in
+        which stems
+    are traced, and no column was ever absent.
+
+    Args:
+        points: x, y, z, height above the ground [m], shape (N, 4).
+        forest: The forest.
+
+    Returns:
+        Positions, shape (K, 2) [m], and class shares in the order of CLASSES, shape (K, 6).
+    """
+    memory = VoxelMap.empty()
+    memory.add(np.ascontiguousarray(points[:, [0, 1, 3]]), 0, MOST_VOXELS)
+    axes, figures = [np.zeros((0, 5))], [np.zeros((0, COUNT))]
+    for tile in memory.due_tiles(1.0):
+        mean, returns = memory.around(tile, MARGIN)
+        axis, profiles = examine(mean, returns, tile * TILE, TILE)
+        n = len(axis)
+        row = np.zeros((n, COUNT))
+        met = (profiles[:, :, 0] > 0.0).astype(np.int32)
+        always = (np.full(n, SLICES * SLICE), np.full(n, OFTEN), np.zeros(n))
+        features(axis, profiles, *always, met, 1 - met, row)
+        axes.append(axis)
+        figures.append(row)
+    axis = np.concatenate(axes)
+    share = vote(np.concatenate(figures), forest)
+    strongest = np.argsort(-axis[:, 4], kind="stable")
+    kept = _apart(axis[strongest, :2])
+    return axis[strongest, :2][kept], share[strongest][kept]
+
+
+def _apart(places: Float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Return which positions have no earlier one within TWICE."""
+    from scipy.spatial import cKDTree
+
+    kept = np.ones(len(places), np.bool_)
+    if len(places) > 1:
+        pairs = cKDTree(places).query_pairs(TWICE, output_type="ndarray")
+        pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+        for first, second in pairs:  # few: only repeated columns
+            if kept[first]:
+                kept[second] = False
+    return kept
+
+
+__all__ = ["CLASSES", "find_upright"]

@@ -1,10 +1,9 @@
-"""The height of the ground over a plot: a raster under a whole cloud, found in one pass over its points.
+"""Ground height of a plot: a raster below a whole cloud, computed in one pass over its points.
 
-Of each cell the lowest returns are kept. One that lies alone below the others is noise; a cell that lies
-alone below its neighbours is noise too; a cell that rises steeper than the terrain can, seen from any
-lower one, is a stem, a bush or a crown. What is left carries planes, and holes are filled between them.
-All of this is done relative to the plane that the whole plot lies on, so that a steep hillside is as
-easy as flat land.
+The lowest returns of each cell are kept. A single return below the others is noise, and so is a single cell
+below its neighbours. A cell that is steeper above a lower one than the terrain can be is a stem, a bush or a
+crown. Planes are fitted to the other cells, and holes are interpolated. Heights are relative to the plane of
+the plot, so that a hillside is no harder than flat ground.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ UInt64 = NDArray[np.uint64]
 
 CELL = 0.5  # m
 KEPT = 8  # lowest returns of a cell
-TOGETHER = 0.3  # m; a ground return has two more so little above it
-PIT = 0.5  # m; a cell that lies so far below its neighbours is noise
-TOLERANCE = 0.15  # m; grass and noise over the steepest slope
-WINDOW = 2  # cells to each side that carry a plane
+TOGETHER = 0.3  # m; a ground return has two more returns within this height above it
+PIT = 0.5  # m; a cell this far below its neighbours is noise
+TOLERANCE = 0.15  # m; grass and noise above the steepest slope
+WINDOW = 2  # cells to each side to which a plane is fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,10 +32,10 @@ class HeightMap:
     """Heights of the ground at the corners and centres of a raster.
 
     Attributes:
-        low: shape (2,) [m]: corner of the raster.
+        low: Corner of the raster, shape (2,) [m].
         cell: Side of a cell [m].
-        height: shape (columns, rows) [m], at the centres of the cells.
-        seen: shape (columns, rows): whether returns of the ground lay in the cell.
+        height: Heights at the centres of the cells, shape (columns, rows) [m].
+        seen: Whether a cell has ground returns, shape (columns, rows).
     """
 
     low: Float
@@ -45,20 +44,20 @@ class HeightMap:
     seen: Bool
 
     def at(self, x: Float, y: Float) -> Float:
-        """Heights [m] at places of shape (N,) [m], between the cells bilinear."""
+        """Return heights [m] at positions of shape (N,) [m], by bilinear interpolation."""
         return self.evaluate(x, y)[:, 0]
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Height, dz/dx and dz/dy at places of shape (N,) [m]; shape (N, 3)."""
+        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         return _evaluate(self.height, self.low, self.cell, np.ascontiguousarray(x), np.ascontiguousarray(y))
 
 
 class LowestReturns:
-    """The lowest returns of each cell, gathered part by part.
+    """Collects the lowest returns of each cell.
 
     Args:
-        low, high: Corners of the raster, shape (2,) [m]; what lies outside is not taken.
+        low, high: Corners of the raster, shape (2,) [m]; points outside are ignored.
     """
 
     def __init__(self, low: Float, high: Float) -> None:
@@ -70,19 +69,19 @@ class LowestReturns:
 
     @staticmethod
     def room(low: Float, high: Float) -> int:
-        """Bytes that a raster between two corners takes."""
+        """Return the bytes of a raster between two corners."""
         columns, rows = (max(int(np.ceil(v / CELL)), 1) for v in (high - low).tolist())
         return columns * rows * (12 * KEPT + 4 + 8)
 
     def add(self, points: Float32) -> None:
-        """Take points of shape (N, 3) [m]."""
+        """Add points of shape (N, 3) [m]."""
         _keep_lowest(points, self._low, self._lowest, self._count, self._occupied)
 
     def ground(self, slope_max: float) -> HeightMap:
-        """The ground under all points so far.
+        """Return the ground below all points so far.
 
         Args:
-            slope_max: The terrain never rises steeper than this against the plane of the plot [rad].
+            slope_max: Largest slope of the terrain against the plane of the plot [rad].
         """
         ground = _supported(self._lowest, self._count)
         continuous = _continues_upwards(ground, self._occupied)
@@ -100,7 +99,7 @@ class LowestReturns:
 
 
 def heights_above(points: Float32, ground: HeightMap) -> Float32:
-    """Height of each point (N, 3) above the ground, float32, shape (N,) [m]."""
+    """Return the height of each point (N, 3) above the ground, float32, shape (N,) [m]."""
     return _heights_above(points, ground.height, ground.low, ground.cell)
 
 
@@ -162,8 +161,8 @@ def _supported(lowest: Float32, count: Int32) -> Float:
 
 
 def _trend(ground: Float) -> Float:
-    """The plane z = a x + b y + c that the lowest cells of squares of 4 m lie on, by weights that forget
-    what lies off it; shape (3,)."""
+    """Return the plane z = a x + b y + c through the lowest cells of squares of 4 m, fitted robustly, shape
+    (3,)."""
     squares = 8
     columns, rows = (-(-n // squares) * squares for n in ground.shape[:2])
     padded = np.full((columns, rows, 3), np.inf)
@@ -180,7 +179,7 @@ def _trend(ground: Float) -> Float:
     plane = np.array([0.0, 0.0, middle])
     for _ in range(10):
         root = np.sqrt(weight)[:, None]
-        # A little towards level: few squares in a row say nothing of the slope across them.
+        # A weak prior for level ground: squares in a row do not determine the slope across them.
         G = np.vstack([A * root, np.diag([0.3, 0.3, 0.0])])
         plane = np.linalg.lstsq(G, np.append(place[:, 2] * root[:, 0], np.zeros(3)), rcond=None)[0]
         off = np.abs(place[:, 2] - A @ plane)
@@ -268,8 +267,9 @@ def _remove_overhanging(ground: Float, slope: float) -> None:
 
 @compiled
 def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
-    """Height at the centre of each cell with ground, by a plane through the lowest returns around it,
-    which lie anywhere in their cells; NaN elsewhere. And which cells were seen."""
+    """Return the height at the centre of each cell with ground, by a plane through the lowest returns around
+    it, NaN
+    elsewhere; and which cells have ground."""
     columns, rows = ground.shape[0], ground.shape[1]
     height = np.full((columns, rows), np.nan)
     seen = np.zeros((columns, rows), np.bool_)
@@ -282,7 +282,7 @@ def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
             x, y = low[0] + (a + 0.5) * CELL, low[1] + (b + 0.5) * CELL
             H[:] = 0.0
             g[:] = 0.0
-            H[0, 0] = H[1, 1] = 0.02  # towards level, where too few say it
+            H[0, 0] = H[1, 1] = 0.02  # prior for level ground
             n = 0
             for i in range(max(a - WINDOW, 0), min(a + WINDOW + 1, columns)):
                 for j in range(max(b - WINDOW, 0), min(b + WINDOW + 1, rows)):
@@ -306,7 +306,7 @@ def _add_row(H: Float, g: Float, dx: float, dy: float, z: float, w: float) -> No
 
 
 def _fill(height: Float) -> None:
-    """Fill what is NaN from ever coarser means around it (a pyramid there and back), in place."""
+    """Replace NaN by interpolated means of coarser and coarser cells (a pyramid), in place."""
     if not np.isfinite(height).any():
         height[:] = 0.0
         return
@@ -336,7 +336,8 @@ def _evaluate(height: Float, low: Float, cell: float, x: Float, y: Float) -> Flo
 
 @compiled
 def ground_at(height: Float, low: Float, cell: float, x: float, y: float) -> tuple[float, float, float]:
-    """Height [m] of the raster at a place and its slope along x and y; beyond the border as at it."""
+    """Return the height [m] of the raster at a position and its slope along x and y; outside those at the
+    border."""
     columns, rows = height.shape
     u = min(max((x - low[0]) / cell - 0.5, 0.0), columns - 1.0)
     v = min(max((y - low[1]) / cell - 0.5, 0.0), rows - 1.0)

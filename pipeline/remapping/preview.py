@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.classification import judged
+from pipeline.classification import column_votes
 from pipeline.config import Parameters
 from pipeline.config.stages import Detection
 from pipeline.detection.verdicts import classify_clusters
@@ -258,7 +258,7 @@ def _columns(known: KnownMap, p: Parameters) -> Columns | None:
         return None
     from dataclasses import replace
 
-    return replace(known.columns, verdict=judged(known.columns).verdict(p.classification.tree_share))
+    return replace(known.columns, verdict=column_votes(known.columns).verdict(p.classification.tree_share))
 
 
 def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters) -> _Places:

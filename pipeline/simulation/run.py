@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.poses import Pose3
+from pipeline.geometry.poses import Pose3, wrap_angle
 from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
 from pipeline.simulation.motion_sensors import (
     IMU_HZ,
@@ -89,7 +89,7 @@ class SimulatedRun:
         """Return the true pose of the base at the stamp of each scan, in the frame of the map."""
         rows = np.arange(self.scans) * (RATE_HZ * self.lidar.period_ns // 1_000_000_000)
         d = self.motion.drive
-        yaw = (d.yaw[rows] + np.pi) % (2.0 * np.pi) - np.pi
+        yaw = wrap_angle(d.yaw[rows])
         return TruthPath(self.scan_stamps(), d.x[rows], d.y[rows], yaw, same_frame=True)
 
     def digest(self) -> str:

@@ -39,7 +39,7 @@ def back(
         cells: Of the columns, `scale` of them a metre, for searches of `REACH` at least.
         place: Of the columns, x, y first, shape (C, 2 or more) [m]; votes: shape (C, 6); verdict: of the
             votes and the rules, shape (C,), in place; what moved or is too few voxels stays so.
-        tree_share: See `Gathering`.
+        tree_share: See `ColumnClassifier`.
     """
     for t in range(count):
         if rows.radii[t] < FITS or sides_of(rows.sides[t]) < SIDES:

@@ -59,7 +59,7 @@ def judge(
         sight: Of the scan.
         place: Of the columns, x, y first, shape (C, 2 or more) [m]; votes: shape (C, 6); verdict: of the
             votes and the rules, shape (C,): those that the tracks back become trees in place (see `backing`).
-        tree_share, range_max: See `Gathering`.
+        tree_share, range_max: See `ColumnClassifier`.
 
     Returns:
         The number of tracks, and that of the next new one.

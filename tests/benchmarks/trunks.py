@@ -28,7 +28,7 @@ from pipeline.classification.forest import ALL_AROUND, ONE_WAY, Forest, forest_o
 from pipeline.config import preset
 from pipeline.evaluation import evaluate
 from pipeline.evaluation.matching import match
-from pipeline.inventory.circle import FIGURES, best_circle, fit_circle, without_scatter
+from pipeline.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.mapper import Mapper

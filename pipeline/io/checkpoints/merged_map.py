@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from pipeline.classification import PackedMemory
+from pipeline.classification import PackedVoxelMap
 from pipeline.classification.voxel_map import TILE
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
@@ -176,16 +176,16 @@ def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemo
     )
 
 
-def _memory(a: PackedMemory, b: PackedMemory, T: Pose2, scan: int, most: int) -> PackedMemory:
+def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int) -> PackedVoxelMap:
     """The voxels of a, and the means of those of b as often as they were seen, up to a bound."""
     memory = a.unpacked()
     points = b.mean.copy()
     points[:, :2] = T.apply(b.mean[:, :2].astype(np.float64))
     memory.add(np.repeat(points, np.minimum(b.returns, MOST_RETURNS), axis=0), scan, most)
     memory.added += b.added - 1
-    while len(memory.judge_anew(1.0)):  # the columns of both stand until more is seen
+    while len(memory.due_tiles(1.0)):  # the columns of both stand until more is seen
         pass
-    return PackedMemory.of(memory)
+    return PackedVoxelMap.of(memory)
 
 
 def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from pipeline.classification import GatheringState, PackedMemory, no_columns
+from pipeline.classification import ColumnClassifierState, PackedVoxelMap, no_columns
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.ground.terrain_map import PackedHeightMap
@@ -39,7 +39,7 @@ class SavedMap:
     """See MapperState; `stamp_ns`, `sigma_xy` and `motion` are those of the path, one a scan."""
 
     slam: SlamState
-    memory: PackedMemory
+    memory: PackedVoxelMap
     columns: Columns
     ground: PackedHeightMap
     tracks: TrackTable
@@ -61,7 +61,7 @@ class SavedMap:
             slam = slam.as_particles(mapper.parameters.slam.particles, seed=0)
         return cls(
             slam,
-            PackedMemory.of(state.gathering.folded()),
+            PackedVoxelMap.of(state.gathering.folded()),
             state.gathering.columns,
             PackedHeightMap.of(state.ground),
             state.tracks,
@@ -98,7 +98,7 @@ class SavedMap:
             and not 0 < self.tracks.number.min() <= self.tracks.number.max() < self.next_number
         ):
             raise ValueError("the numbers of the trees are out of order")
-        gathering = GatheringState(self.memory.checked(), (), self.columns)
+        gathering = ColumnClassifierState(self.memory.checked(), (), self.columns)
         return MapperState(
             self.slam, gathering, self.ground.unpacked(), self.tracks, self.next_number, self.odometry, n,
             self.placed, self.closed, self._recovery(n),

@@ -10,7 +10,7 @@ from tests.benchmarks.machine import peak_mib, resident_mib
 from tests.benchmarks.table import Cell, Table, verdict
 
 if TYPE_CHECKING:
-    from pipeline.classification.voxel_map import Memory
+    from pipeline.classification.voxel_map import VoxelMap
     from pipeline.mapper import Mapper
 
 NAME = "memory"
@@ -31,7 +31,7 @@ def run() -> list[Table]:
     )
     return [
         Table(
-            "Memory of the process while it simulates and maps sim:long, preset forest",
+            "VoxelMap of the process while it simulates and maps sim:long, preset forest",
             ("scans", "resident MiB", "path and map MiB", "the rest MiB", "landmarks"),
             rows,
             (
@@ -71,7 +71,7 @@ def _known_mib(mapper: Mapper) -> float:
     return (array_bytes(mapper.snapshot()) + array_bytes(mapper.path) + voxels) / 2**20
 
 
-def in_use_bytes(memory: Memory) -> int:
+def in_use_bytes(memory: VoxelMap) -> int:
     """Bytes of the rows of a memory that are in use and of its tables: room that was never filled has no
     pages."""
     rows = (memory.key, memory.mean, memory.returns, memory.scans, memory.latest, memory.following)

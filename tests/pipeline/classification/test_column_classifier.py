@@ -1,4 +1,4 @@
-"""Gathering: what stands over many scans is told from what does not, and going back in time is exact."""
+"""The column classifier separates stems from other objects over many scans, and `restore` is exact."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.classification import Forest, Gathering, View, depth_image, no_columns
+from pipeline.classification import ColumnClassifier, Forest, ScanView, depth_image, no_columns
 from pipeline.classification.column_classifier import FOLD
 from pipeline.classification.decision_rule import GONE_SCANS
 from pipeline.classification.forest import CLASSES
@@ -30,11 +30,11 @@ NOTHING_SEEN = depth_image(np.zeros((0, 3), np.float32))
 def view(free=NOWHERE_FREE, pose=None):
     """From the origin, 1 m above flat ground, as steep as 45 degrees."""
     flat = np.full((SECTORS, 200), -1.0)
-    return View(pose or Pose2(), np.zeros(3), free, np.ones(BINS), NOTHING_SEEN, flat)
+    return ScanView(pose or Pose2(), np.zeros(3), free, np.ones(BINS), NOTHING_SEEN, flat)
 
 
 def gathered(*clouds: Float32, free=NOWHERE_FREE, scans=1):
-    gathering = Gathering(FOREST.classification, all_around=True)
+    gathering = ColumnClassifier(FOREST.classification, all_around=True)
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3), np.float32)
     for k in range(scans):
         gathering.add(points, points[:, 2].copy(), k, view(free))
@@ -82,7 +82,7 @@ def test_another_forest_votes_on_all_columns_from_the_next_scan_on():
         kind = 0 if name == "package" else 1
         return Forest(one, none, np.zeros(1), one, one, np.eye(len(CLASSES))[kind : kind + 1])
 
-    gathering = Gathering(FOREST.classification, all_around=True, forests=sure)
+    gathering = ColumnClassifier(FOREST.classification, all_around=True, forests=sure)
     points = trunk(5.0, 1.0, 0.15, top=5.9)
     gathering.add(points, points[:, 2].copy(), 0, view())
     tree = at(gathering.columns, 5.0, 1.0)
@@ -102,7 +102,7 @@ def test_another_forest_votes_on_all_columns_from_the_next_scan_on():
 
 def test_going_back_gives_the_same_again():
     clouds = [trunk(4.0 + 0.001 * k, 1.0, 0.1, points=300, seed=k) for k in range(FOLD + 20)]
-    gathering = Gathering(FOREST.classification, all_around=True)
+    gathering = ColumnClassifier(FOREST.classification, all_around=True)
     states, seen = {}, {}
     for k, cloud in enumerate(clouds):
         if k in (0, 5, FOLD - 1, FOLD, FOLD + 7):

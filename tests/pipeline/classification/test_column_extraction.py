@@ -7,14 +7,14 @@ import pytest
 
 from pipeline.classification.column_extraction import OCTANTS, PROFILE, examine
 from pipeline.classification.features import COUNT, NAMES, features
-from pipeline.classification.voxel_map import SLICES, TILE, Memory
+from pipeline.classification.voxel_map import SLICES, TILE, VoxelMap
 from tests.pipeline.classification.clouds import bush, trunk
 
 LOW = np.zeros(2)
 
 
 def examined(points):
-    memory = Memory.empty()
+    memory = VoxelMap.empty()
     memory.add(points, 0, 1 << 18)
     mean, returns = memory.around(np.array([0, 0]), 1.2)
     return examine(mean, returns, LOW, TILE)

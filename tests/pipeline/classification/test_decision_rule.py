@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.classification import judged, no_columns
+from pipeline.classification import column_votes, no_columns
 from pipeline.classification.decision_rule import BREAST_HEIGHT, RAYS
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES
@@ -24,7 +24,7 @@ def verdict(stopped: int, passed: int, height: float = 1.5) -> Verdict:
     one = replace(none, **rows)
     one.figures[0, NAMES.index("voxels to 3 m")] = 100.0
     one.share[0, CLASSES.index(Verdict.TREE)] = 1.0
-    return Verdict(int(judged(replace(one, met=met, passed=through)).verdict(0.4)[0]))
+    return Verdict(int(column_votes(replace(one, met=met, passed=through)).verdict(0.4)[0]))
 
 
 def test_a_motorcycle_is_no_tree_because_rays_pass_above_it_at_breast_height():

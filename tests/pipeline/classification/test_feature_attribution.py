@@ -6,9 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.classification.feature_attribution import what_told
 from pipeline.classification.features import COUNT, NAMES
-from pipeline.classification.forest import CLASSES, forest_of, standard_forest, vote
+from pipeline.classification.forest import CLASSES, feature_effects, forest_of, standard_forest, vote
 from pipeline.types.records import Verdict
 
 TREE, NO_TREE = [1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0]
@@ -33,11 +32,11 @@ def figures(tilt: float, crown: float):
 
 
 def test_the_effect_of_each_figure_by_hand():
-    told = what_told(figures(tilt=0.0, crown=1.0), one_tree(), Verdict.TREE)
+    told = feature_effects(figures(tilt=0.0, crown=1.0), one_tree(), Verdict.TREE)
     assert told[NAMES.index("tilt")] == 1.0 - 0.5  # unknown tilt: half of the tree, half of the pole
     assert told[NAMES.index("crown")] == 1.0 - 0.75
     assert np.count_nonzero(told) == 2
-    leaning = what_told(figures(tilt=0.5, crown=1.0), one_tree(), Verdict.TREE)
+    leaning = feature_effects(figures(tilt=0.5, crown=1.0), one_tree(), Verdict.TREE)
     assert leaning[NAMES.index("tilt")] == 0.0 - 0.5
     assert leaning[NAMES.index("crown")] == 0.0  # was not asked on the way
 
@@ -47,6 +46,6 @@ def test_no_figure_tells_more_than_the_vote_holds(seed: int):
     forest = standard_forest(all_around=True)
     row = np.random.default_rng(seed).uniform(-1.0, 6.0, COUNT)
     share = vote(row[None], forest)[0, 0]
-    told = what_told(row, forest, Verdict.TREE)
+    told = feature_effects(row, forest, Verdict.TREE)
     assert np.all(told <= share + 1e-9)
     assert np.all(told >= share - 1.0 - 1e-9)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.classification.map_correction import bent
-from pipeline.classification.voxel_map import TILE, Memory, keys_of, tiles_of
+from pipeline.classification.column_classifier import bent
+from pipeline.classification.voxel_map import TILE, VoxelMap, keys_of, tiles_of
 from pipeline.loop_closure.map_correction import Bend
 
 
-def filled(side: int, room: int) -> Memory:
+def filled(side: int, room: int) -> VoxelMap:
     """A square of tiles with a voxel in each corner and in the middle of every one."""
-    memory = Memory.empty(1 << 14, room)
+    memory = VoxelMap.empty(1 << 14, room)
     corners = np.array([[0.2, 0.2], [3.8, 0.2], [0.2, 3.8], [3.8, 3.8], [2.0, 2.0]])
     origin = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 1, 2) * TILE
     places = (origin + corners).reshape(-1, 2)

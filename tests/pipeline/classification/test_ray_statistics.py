@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.classification.column_extraction import PROFILE
 from pipeline.classification.features import COUNT, NAMES, UNSEEN, features
-from pipeline.classification.ray_statistics import depth_image, look_through
+from pipeline.classification.ray_statistics import count_rays, depth_image
 from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.ground.terrain import SECTORS
 
@@ -19,7 +19,7 @@ def looked(points, pose=(0.0, 0.0, 0.0), offset=(0.0, 0.0, 0.0), farthest=25.0):
     """Rays that met the column and that passed it, by slice; points in the level sensor frame."""
     met, passed = np.zeros((1, SLICES), np.int32), np.zeros((1, SLICES), np.int32)
     depth = depth_image(np.array(points, np.float32).reshape(-1, 3))
-    look_through(AXIS, met, passed, np.array(pose), depth, np.array(offset), FLAT, farthest)
+    count_rays(AXIS, met, passed, np.array(pose), depth, np.array(offset), FLAT, farthest)
     return met[0], passed[0]
 
 

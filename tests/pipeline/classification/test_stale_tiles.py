@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.classification import Gathering, View, depth_image
+from pipeline.classification import ColumnClassifier, ScanView, depth_image
+from pipeline.classification.column_classifier import HIGHER, MOST_STALE, seen_higher
 from pipeline.classification.features import NAMES
-from pipeline.classification.stale_tiles import HIGHER, MOST, seen_higher
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
 from pipeline.geometry.poses import Pose2
@@ -21,13 +21,13 @@ LEVEL = np.full((SECTORS, 200), -1.0)
 
 def view(behind, steepest, x=0.0):
     """From 1 m above level ground, before returns 20 m away up to a steepness."""
-    return View(Pose2(x, 0.0, 0.0), np.zeros(3), np.zeros(BINS), np.full(BINS, steepest), behind, LEVEL)
+    return ScanView(Pose2(x, 0.0, 0.0), np.zeros(3), np.zeros(BINS), np.full(BINS, steepest), behind, LEVEL)
 
 
 def person_then_from_afar(steepest):
     """Somebody 1.7 m tall at (3, 0), seen ten times from 3 m and then with few returns from 15 m, with what
     stands 20 m behind them as high as that."""
-    gathering = Gathering(preset("forest").classification, all_around=True)
+    gathering = ColumnClassifier(preset("forest").classification, all_around=True)
     body = trunk(3.0, 0.0, 0.15, top=1.7)
     nothing = depth_image(np.zeros((0, 3), np.float32))
     for k in range(10):
@@ -51,7 +51,7 @@ def test_few_returns_from_afar_tell_that_a_person_ends():
 
 
 def test_a_column_asks_once_and_few_at_a_time():
-    gathering = Gathering(preset("forest").classification, all_around=True)
+    gathering = ColumnClassifier(preset("forest").classification, all_around=True)
     nothing = depth_image(np.zeros((0, 3), np.float32))
     places = [(-6.0, 2.0), (2.0, 2.0), (6.0, -6.0), (10.0, 2.0)]
     points = np.concatenate([trunk(x, y, 0.15, top=1.7) for x, y in places])
@@ -60,6 +60,6 @@ def test_a_column_asks_once_and_few_at_a_time():
     c = gathering.columns
     higher = replace(c, viewed=c.figures[:, HIGHEST] + HIGHER + 0.1 * np.arange(1, len(c.viewed) + 1))
     tiles = seen_higher(higher)
-    assert tiles.shape == (MOST, 2)
+    assert tiles.shape == (MOST_STALE, 2)
     np.testing.assert_array_equal(tiles[0], c.tile[-1], "where was looked highest comes first")
-    assert len(np.unique(tiles, axis=0)) == MOST
+    assert len(np.unique(tiles, axis=0)) == MOST_STALE

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.classification.voxel_map import FIRST_SCANS, MOST_TILES, SIDE, SLICE, SLICES, TILE, Memory
+from pipeline.classification.voxel_map import FIRST_SCANS, MOST_TILES, SIDE, SLICE, SLICES, TILE, VoxelMap
 
 MOST = 1 << 16
 
@@ -24,7 +24,7 @@ def remembered(points):
 
 @given(seed=st.integers(0, 2**16), n=st.integers(0, 400), scans=st.integers(1, 4))
 def test_every_return_is_counted_once_and_the_means_are_theirs(seed, n, scans):
-    memory = Memory.empty(1 << 4, 1 << 1)  # so small that it must grow
+    memory = VoxelMap.empty(1 << 4, 1 << 1)  # so small that it must grow
     clouds = [cloud(seed + k, n) for k in range(scans)]
     for k, points in enumerate(clouds):
         memory.add(points, k, MOST)
@@ -37,7 +37,7 @@ def test_every_return_is_counted_once_and_the_means_are_theirs(seed, n, scans):
 
 
 def test_a_voxel_knows_in_how_many_scans_it_was_seen():
-    memory = Memory.empty()
+    memory = VoxelMap.empty()
     point = np.array([[1.05, 2.05, 1.1]], np.float32)
     for scan in (0, 0, 3, 9):
         memory.add(point, scan, MOST)
@@ -47,7 +47,7 @@ def test_a_voxel_knows_in_how_many_scans_it_was_seen():
 
 
 def test_a_full_memory_forgets_what_was_seen_longest_ago():
-    memory = Memory.empty(1 << 6, 1 << 4)
+    memory = VoxelMap.empty(1 << 6, 1 << 4)
     for scan in range(40):
         memory.add(cloud(scan, 200), scan, 1 << 10)
     assert memory.used <= 1 << 10
@@ -56,7 +56,7 @@ def test_a_full_memory_forgets_what_was_seen_longest_ago():
 
 
 def test_around_a_tile_is_what_lies_there():
-    memory = Memory.empty()
+    memory = VoxelMap.empty()
     memory.add(cloud(1, 3000), 0, MOST)
     mean, returns = memory.around(np.array([-1, 0]), 1.2)
     everything = memory.mean[: memory.used]
@@ -67,18 +67,18 @@ def test_around_a_tile_is_what_lies_there():
 
 
 def test_a_tile_is_due_when_it_has_grown_and_few_are_due_at_once():
-    memory = Memory.empty()
+    memory = VoxelMap.empty()
     memory.add(cloud(1, 3000), 0, MOST)
-    first = memory.judge_anew(1.1)
+    first = memory.due_tiles(1.1)
     assert len(first) == memory.tiles > MOST_TILES
-    assert len(memory.judge_anew(1.1)) == 0
+    assert len(memory.due_tiles(1.1)) == 0
     for k in range(FIRST_SCANS):
         memory.add(cloud(2 + k, 3000), 1 + k, MOST)
-    assert len(memory.judge_anew(1.1)) == MOST_TILES
+    assert len(memory.due_tiles(1.1)) == MOST_TILES
 
 
 def test_a_copy_stays_as_it_was():
-    memory = Memory.empty()
+    memory = VoxelMap.empty()
     memory.add(cloud(1), 0, MOST)
     copy = memory.copy()
     before = copy.mean[: copy.used].copy()
@@ -88,7 +88,7 @@ def test_a_copy_stays_as_it_was():
 
 
 def test_positions_that_are_no_numbers_or_too_far_are_left_out():
-    memory = Memory.empty()
+    memory = VoxelMap.empty()
     bad = np.array([[np.nan, 0, 1], [0, np.inf, 1], [0, 0, np.nan], [1e9, 0, 1], [0, 0, 1]], np.float32)
     memory.add(bad, 0, MOST)
     assert memory.used == 1

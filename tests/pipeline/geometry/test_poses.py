@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.geometry.poses import Pose2, Pose3, interpolate, mean_angle, wrap_angle
+from pipeline.geometry.poses import Pose2, Pose3, interpolate, wrap_angle
 from tests.pipeline.strategies import angles, poses2, poses3
 
 
@@ -106,9 +106,3 @@ def test_interpolation_meets_its_ends_and_turns_the_shorter_way(a, b, fraction):
     turn = abs(float(wrap_angle(b.yaw - a.yaw)))
     part = abs(float(wrap_angle(interpolate(a, b, fraction).yaw - a.yaw)))
     assert part == pytest.approx(fraction * turn, abs=1e-9)
-
-
-def test_the_mean_of_headings_is_not_the_mean_of_numbers():
-    assert abs(mean_angle(np.array([3.1, -3.1]))) == pytest.approx(np.pi)
-    assert mean_angle(np.array([0.0, 1.0]), np.array([1.0, 0.0])) == pytest.approx(0.0)
-    assert mean_angle(np.array([0.2, 0.4])) == pytest.approx(0.3)

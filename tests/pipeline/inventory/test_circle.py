@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.config import preset
 from pipeline.inventory import map_plot
-from pipeline.inventory.circle import FIGURES, best_circle, fit_circle, without_scatter
+from pipeline.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
 from tests.pipeline.inventory.plots import Made, ground, stem
 
 

@@ -120,7 +120,7 @@ LOW = np.random.default_rng(2).uniform(0.0, 10.0, (60_000, 3)) * (1.0, 1.0, 0.01
 @pytest.mark.parametrize(
     ("points", "warns"),
     [
-        (LOW, "nothing stands higher"),
+        (LOW, "no points higher"),
         (np.vstack([CANOPY, [[5.0, 5.0, 0.0]]]), ""),
         (CANOPY, ""),
     ],

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.classification import PackedMemory
-from pipeline.classification.voxel_map import Memory
+from pipeline.classification import PackedVoxelMap
+from pipeline.classification.voxel_map import VoxelMap
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import decode, encode, read_archive, write_archive
@@ -244,13 +244,13 @@ def test_every_record_comes_back_bit_by_bit(numbers, parts, flag):
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6))
 def test_a_memory_comes_back_bit_by_bit(seed, scans):
     rng = np.random.default_rng(seed)
-    memory = Memory.empty(1 << 6, 1 << 2)
+    memory = VoxelMap.empty(1 << 6, 1 << 2)
     for k in range(scans):
         points = rng.uniform([-15, -15, 0], [15, 15, 5], (60, 3)).astype(np.float32)
         memory.add(points, k, 1 << 7)
-        memory.judge_anew(1.1)
-    back = PackedMemory.of(memory).unpacked()
-    for f in fields(Memory):
+        memory.due_tiles(1.1)
+    back = PackedVoxelMap.of(memory).unpacked()
+    for f in fields(VoxelMap):
         one: Any = getattr(memory, f.name)
         other: Any = getattr(back, f.name)
         if isinstance(one, np.ndarray):

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.classification.column_classifier import no_columns
-from pipeline.classification.map_correction import bent as bent_memory
-from pipeline.classification.map_correction import bent_columns
-from pipeline.classification.voxel_map import SIDE, Memory
+from pipeline.classification.column_classifier import bent as bent_memory
+from pipeline.classification.column_classifier import bent_columns, no_columns
+from pipeline.classification.voxel_map import SIDE, VoxelMap
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground.terrain_map import CELL, COLUMNS, VIEWS, WEIGHT
@@ -157,7 +156,7 @@ def test_of_two_trees_that_were_one_the_older_number_stays_and_two_beside_it_sta
 @given(seeds)
 def test_voxels_move_and_no_return_is_lost(seed):
     random = np.random.default_rng(seed)
-    memory = Memory.empty()
+    memory = VoxelMap.empty()
     for scan in range(0, 60, 3):
         near = 0.5 * scan + random.uniform(-4, 4, (40, 1))
         points = np.column_stack([near, random.uniform(-4, 4, 40), random.uniform(0.0, 5.9, 40)])
@@ -176,7 +175,7 @@ def test_voxels_move_and_no_return_is_lost(seed):
 
 
 def test_columns_go_with_their_voxels():
-    memory = Memory.empty()
+    memory = VoxelMap.empty()
     for scan, x in ((5, 1.0), (50, 25.0)):
         height = np.linspace(0.2, 3.0, 30)
         memory.add(np.column_stack([np.full(30, x), np.ones(30), height]).astype(np.float32), scan, 1 << 12)

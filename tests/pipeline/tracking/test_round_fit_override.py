@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.classification import judged
+from pipeline.classification import column_votes
 from pipeline.classification.column_classifier import no_columns
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES
@@ -80,7 +80,7 @@ def rays(columns, met, passed):
     """The columns after so many rays between 2.2 and 3.2 m ended at them or behind them."""
     seen = replace(columns, met=columns.met.copy(), passed=columns.passed.copy())
     seen.met[:, 12], seen.passed[:, 12] = met, passed
-    return replace(seen, verdict=judged(seen).verdict(0.4))
+    return replace(seen, verdict=column_votes(seen).verdict(0.4))
 
 
 @pytest.mark.parametrize(("met", "passed"), [(0, 10), (2, 8), (29, 71)])

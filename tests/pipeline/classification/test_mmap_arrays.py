@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.geometry.mmap_arrays import SMALL, copied, zeros
+from pipeline.classification.voxel_map import SMALL, copied, zeros
 from tests.benchmarks.machine import resident_mib
 
 
