@@ -1,4 +1,4 @@
-"""A person annotates: judges what was found, adds what was missed, corrects, takes back; another looks on."""
+"""The tab Annotate: review of detected trees, new annotations, edits, undo, two users, and training."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def place_of(dashboard: Dashboard, x: float, y: float) -> Position:
     return {"x": px, "y": py}
 
 
-def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
+def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     page = person.page
     canvas = page.locator("#map")
     expect(page.locator("#annotate-count")).to_contain_text("0 of")
@@ -157,7 +157,7 @@ def test_a_person_judges_adds_corrects_and_takes_back(person: Dashboard):
     assert person.errors == []
 
 
-def test_whoever_clicks_next_goes_on_by_keys(person: Dashboard):
+def test_keys_work_after_a_click_on_next(person: Dashboard):
     page = person.page
     page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
     nothing = "() => import('/static/js/core/store.js').then(({ state }) => state.selected === null)"
@@ -182,7 +182,7 @@ def test_whoever_clicks_next_goes_on_by_keys(person: Dashboard):
     expect(page.locator("#annotate-next")).to_be_focused()  # who walks by Tab stays among the buttons
 
 
-def test_two_people_see_one_another_and_a_stale_edit_is_refused(
+def test_two_users_see_the_same_annotations_and_a_stale_edit_is_refused(
     person: Dashboard, chromium: Browser, server: Server
 ):
     page = person.page
@@ -215,7 +215,7 @@ def test_two_people_see_one_another_and_a_stale_edit_is_refused(
     assert person.errors == []
 
 
-def test_learning_says_what_it_needs_begins_when_asked_and_is_stopped(person: Dashboard):
+def test_training_states_what_it_needs_starts_on_request_and_is_stopped(person: Dashboard):
     page = person.page
     learn = page.get_by_role("region", name="Learn")
     grow = learn.get_by_role("button", name="Train decision trees")
@@ -237,7 +237,9 @@ def test_learning_says_what_it_needs_begins_when_asked_and_is_stopped(person: Da
 
 
 @pytest.mark.slow
-def test_learned_trees_are_shown_beside_the_old_ones_and_used_when_asked(chromium: Browser, tmp_path: Path):
+def test_trained_decision_trees_are_compared_with_the_present_ones_and_used_on_request(
+    chromium: Browser, tmp_path: Path
+):
     uri = "sim:stand?duration=4&trees=40"
     truth = open_source(uri).truth()
     assert truth is not None
@@ -267,7 +269,7 @@ def test_learned_trees_are_shown_beside_the_old_ones_and_used_when_asked(chromiu
 
 
 @pytest.mark.slow
-def test_what_was_annotated_outlives_a_killed_server_and_goes_out_as_files(chromium: Browser, tmp_path: Path):
+def test_annotations_survive_a_killed_server_and_are_exported(chromium: Browser, tmp_path: Path):
     with Server(STEMMAP_FOLDER=str(tmp_path)) as first, opened(chromium, first.link) as person:
         person.stand(15.05)
         person.until_server("/api/trees", "it.trees.length > 20")

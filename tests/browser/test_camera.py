@@ -39,12 +39,12 @@ def dashboard(chromium: Browser, run: Path, server: Server) -> Iterator[Dashboar
         made.open(RUN)
 
 
-def test_topics_and_mounting_are_chosen_and_kept_with_the_run(dashboard: Dashboard):
+def test_topics_and_mounting_are_stored_with_the_run(dashboard: Dashboard):
     dashboard.until_server("/api/runs", "it.runs.some(run => run.chosen && run.chosen.mount[2] === 2)")
     assert dashboard.errors == []
 
 
-def test_the_picture_of_the_standing_scan_shows_what_stands_in_it(dashboard: Dashboard):
+def test_the_picture_of_the_current_scan_marks_its_objects(dashboard: Dashboard):
     page = dashboard.page
     dashboard.pause()
     dashboard.command({"type": "seek", "time_s": 0.55})

@@ -44,7 +44,7 @@ def in_both_themes(dashboard: Dashboard) -> list[str]:
     return low
 
 
-def test_texts_stand_out_from_what_is_behind_them(page_of_a_run: Dashboard):
+def test_texts_have_enough_contrast(page_of_a_run: Dashboard):
     dashboard, page = page_of_a_run, page_of_a_run.page
     low: dict[str, list[str]] = {}
     page.locator("#map").press("Escape")  # what was selected before, by whomever
@@ -105,7 +105,7 @@ FOCUSED = """() => {
 }"""
 
 
-def test_whoever_goes_by_tab_sees_where_they_are(chromium: Browser, server: Server):
+def test_the_focused_control_is_visible(chromium: Browser, server: Server):
     with opened(chromium, server.link) as dashboard:
         page = dashboard.page
         dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")

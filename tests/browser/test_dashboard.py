@@ -1,4 +1,4 @@
-"""A person at the dashboard: what they do, what the page shows, and what the server holds."""
+"""The dashboard: playback, selection, scores, plots and the dialog that opens a run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_play_pause_step_and_seek(dashboard: Dashboard):
     )
 
 
-def test_the_speed_is_the_servers(dashboard: Dashboard):
+def test_the_speed_is_set_on_the_server(dashboard: Dashboard):
     dashboard.page.locator("#speed").select_option("4")
     dashboard.until_server("/api/status", "it.speed === 4")
     dashboard.page.locator("#speed").select_option("1")
@@ -112,7 +112,7 @@ CENTIMETRES = {
 }
 
 
-def test_the_columns_say_which_way_the_axes_point(dashboard: Dashboard):
+def test_the_columns_name_the_directions_of_the_axes(dashboard: Dashboard):
     dashboard.tab("Trees")
     for key, words in {"x": "Along the first heading", "y": "left of the first heading"}.items():
         button = dashboard.page.locator(f"#trees th[data-key={key}] button")
@@ -128,7 +128,7 @@ def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
     expect(drawn.first).to_be_attached()
 
 
-def test_a_run_that_is_not_there_is_told_with_what_to_do(dashboard: Dashboard):
+def test_a_missing_run_is_reported_with_a_remedy(dashboard: Dashboard):
     page = dashboard.page
     dashboard.tab("Trees")
     expect(page.locator("#trees tbody tr").first).to_be_visible()
@@ -168,7 +168,7 @@ NUMBERS = """() => import('/static/js/map/draw.js').then(({ drawNumbers }) => {
 })"""
 
 
-def test_numbers_on_the_map_cover_neither_one_another_nor_a_symbol(dashboard: Dashboard):
+def test_numbers_on_the_map_overlap_neither_each_other_nor_a_symbol(dashboard: Dashboard):
     named, covered = dashboard.page.evaluate(NUMBERS)
     assert covered == []
     assert named[0] == "99"  # what is selected comes first, and is named in any case

@@ -1,4 +1,4 @@
-"""Two runs on one page: a card each, one map of both, and the way to the dashboard of each."""
+"""The page of a fleet: a card for each run, one map of all, and links to the dashboards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The camera of a robot that drives now: its pictures beside the scans, with the trees of the map in them."""
+"""The camera of a live robot: its pictures with the trees of the map."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Robot, int
     router.kill()
 
 
-def test_a_live_robots_pictures_show_the_trees_of_its_map(
+def test_pictures_of_a_live_robot_show_the_trees_of_its_map(
     chromium: Browser, robot: tuple[Robot, int], tmp_path: Path
 ):
     sender, port = robot

@@ -1,4 +1,4 @@
-"""What lies over the scene: the four stages of a scan, and two sets of parameters side by side."""
+"""The overlays of the scene: the four stages of a scan, and the comparison of two parameter sets."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def coloured(canvas: Locator) -> int:
     return int(canvas.evaluate(count))
 
 
-def test_the_four_stages_of_a_scan_stand_side_by_side(dashboard: Dashboard):
+def test_the_four_stages_of_a_scan_are_drawn_side_by_side(dashboard: Dashboard):
     page = dashboard.page
     scan = dashboard.ask("/api/status")["scan_index"]
     page.locator("#map").press("s")

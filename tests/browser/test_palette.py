@@ -1,4 +1,4 @@
-"""Ctrl+K finds whatever can be done, and the sheet of keys names every key that acts."""
+"""The command palette (Ctrl+K) finds every action, and the list of shortcuts names every key."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FOUND = {
 }
 
 
-def test_the_arrows_choose_and_the_list_is_read_aloud(dashboard: Dashboard):
+def test_arrow_keys_select_and_the_list_is_accessible(dashboard: Dashboard):
     page = dashboard.page
     page.locator("#palette-button").click()
     find = page.locator("#palette-find")
@@ -34,7 +34,7 @@ def test_the_arrows_choose_and_the_list_is_read_aloud(dashboard: Dashboard):
     expect(page.locator("#palette-button")).to_be_focused()
 
 
-def test_the_sheet_names_every_key_that_acts(dashboard: Dashboard):
+def test_the_list_of_shortcuts_names_every_key(dashboard: Dashboard):
     page = dashboard.page
     page.locator("#map").press("?")
     told = page.locator("#keys-list kbd").all_inner_texts()
@@ -48,7 +48,7 @@ def test_the_sheet_names_every_key_that_acts(dashboard: Dashboard):
     page.keyboard.press("Escape")
 
 
-def test_every_control_has_a_name_and_every_parameter_its_sentence(dashboard: Dashboard):
+def test_every_control_has_a_name_and_every_parameter_its_description(dashboard: Dashboard):
     page = dashboard.page
     dashboard.tab("Tune")
     assert page.evaluate(NAMELESS) == []
@@ -64,7 +64,7 @@ NAMELESS = """() => [...document.querySelectorAll('button, input, select, a[href
   .map(node => node.outerHTML.slice(0, 120))"""
 
 
-def test_what_is_typed_is_found_and_done(dashboard: Dashboard):
+def test_actions_are_found_and_executed(dashboard: Dashboard):
     page = dashboard.page
     dashboard.stand()  # where there are trees
     dashboard.tab("Trees")

@@ -1,4 +1,4 @@
-"""The server goes and comes back; the page says so and goes on by itself."""
+"""A page that loses its server reports it and reconnects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POINTS = """() => {
 }"""
 
 
-def test_a_lost_server_is_told_and_found_again(chromium: Browser):
+def test_a_lost_server_is_reported_and_the_page_reconnects(chromium: Browser):
     first = Server(token=TOKEN)
     with first, opened(chromium, first.link, scene=True) as dashboard:
         page = dashboard.page

@@ -1,4 +1,4 @@
-"""A person at the page of all runs: looks, compares, renames, deletes, takes it back, plays again."""
+"""The page of all runs: details, comparison, rename, delete, undo and replay."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def map_again(dashboard: Dashboard, changes: dict[str, object]) -> None:
     )
 
 
-def test_runs_are_kept_compared_renamed_deleted_and_played_again(own: Dashboard, tmp_path: Path):
+def test_runs_are_stored_compared_renamed_deleted_and_replayed(own: Dashboard, tmp_path: Path):
     page = own.page
     own.until_server("/api/status", "it.state === 'finished'")
     own.until_server("/api/runs", "it.runs.length === 1 && it.runs[0].scans === 40")

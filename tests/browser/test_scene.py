@@ -16,7 +16,7 @@ SEEN = """name => {
 }"""
 
 
-def test_the_page_shows_the_run_and_complains_about_nothing(dashboard: Dashboard):
+def test_the_scene_shows_the_run_without_errors(dashboard: Dashboard):
     page = dashboard.page
     expect(page.locator("#source-name")).to_have_text("sim:stand")
     dashboard.tab("Trees")
@@ -32,7 +32,7 @@ def test_the_page_shows_the_run_and_complains_about_nothing(dashboard: Dashboard
     assert dashboard.errors == []
 
 
-def test_the_eps_slider_changes_the_clusters_of_the_standing_scan(dashboard: Dashboard):
+def test_the_eps_slider_changes_the_clusters_of_the_current_scan(dashboard: Dashboard):
     before = dashboard.clusters()
     assert before > 3
     box = dashboard.row("Radius eps").locator("input[type=text]")
@@ -67,7 +67,7 @@ def test_the_eps_slider_moves_by_the_keyboard(dashboard: Dashboard):
     assert dashboard.state == "paused"  # the arrow moved the slider, and not the run
 
 
-def test_a_value_that_contradicts_another_goes_back_and_says_why(dashboard: Dashboard):
+def test_a_contradictory_value_is_reverted_with_the_reason(dashboard: Dashboard):
     box = dashboard.row("Minimum eccentricity").locator("input[type=text]")
     box.fill("900")
     box.press("Tab")
@@ -139,7 +139,7 @@ def test_keys_work_on_the_page_and_in_the_scene(dashboard: Dashboard):
     expect(page.get_by_role("heading", name="Keyboard shortcuts")).to_be_visible()
 
 
-def test_following_is_switched_by_a_key_of_the_page(dashboard: Dashboard):
+def test_a_key_of_the_page_switches_following(dashboard: Dashboard):
     scene = dashboard.scene
     follow = dashboard.page.locator("#follow")
     expect(follow).to_have_attribute("aria-pressed", "true")
@@ -266,7 +266,7 @@ def test_a_shift_click_on_a_stem_in_the_scene_adds_it(dashboard: Dashboard):
     dashboard.until_server("/api/annotations", "it.trees.length === 0")
 
 
-def test_light_and_dark_are_remembered(dashboard: Dashboard):
+def test_the_theme_is_stored(dashboard: Dashboard):
     page = dashboard.page
     dashboard.scene.evaluate("() => { window.isTheSame = true; }")
     page.get_by_role("button", name="Light or dark theme").click()

@@ -1,4 +1,4 @@
-"""Links for others: to a moment of a run with its camera, and for looking only."""
+"""Links to share: to a moment of a run with its camera, and view-only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POINTS = (
 )
 
 
-def test_links_bring_back_a_moment_and_let_others_look(chromium: Browser, server: Server):
+def test_a_link_restores_a_moment_and_a_view_only_link_changes_nothing(chromium: Browser, server: Server):
     with opened(chromium, server.link, scene=True) as dashboard:
         page = dashboard.page
         dashboard.reset()

@@ -37,7 +37,7 @@ OVERLAPS = """() => {
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (1280, 800), (1024, 768), (390, 844)])
-def test_nothing_spills_over_the_edge(chromium: Browser, server: Server, size: tuple[int, int]):
+def test_nothing_overflows_the_page(chromium: Browser, server: Server, size: tuple[int, int]):
     with opened(chromium, server.link, *size, scene=size[0] == 390) as dashboard:
         dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")
         assert dashboard.page.evaluate(SPILLS) == []

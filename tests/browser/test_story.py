@@ -1,4 +1,4 @@
-"""A person clicks what they see, wherever they see it, and reads why it is what it is."""
+"""A click on a tree or a cluster explains its verdict."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def _standing(dashboard: Dashboard):
     dashboard.page.locator("#map").press("Escape")
 
 
-def test_a_tree_from_the_table_stays_selected_and_its_story_goes_on(dashboard: Dashboard):
+def test_the_story_of_a_selected_tree_is_updated_while_the_run_plays(dashboard: Dashboard):
     page = dashboard.page
     dashboard.tab("Trees")
     page.locator("#trees tbody tr").nth(3).click()
@@ -37,7 +37,7 @@ def test_a_tree_from_the_table_stays_selected_and_its_story_goes_on(dashboard: D
     expect(panel.locator(".empty")).to_contain_text("Nothing selected")
 
 
-def test_a_cluster_of_the_list_stands_while_the_run_plays_on(dashboard: Dashboard):
+def test_the_story_of_a_cluster_remains_while_the_run_plays(dashboard: Dashboard):
     page = dashboard.page
     panel = dashboard.tab("Clusters")
     scan = dashboard.ask("/api/status")["scan_index"]

@@ -1,4 +1,4 @@
-"""The table of trees: sorted by each column, sifted by what is typed, and the files of all four results."""
+"""The table of trees: sorting, filters, and the exported files of map, table and plots."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_every_column_sorts_both_ways_by_what_the_server_holds(dashboard: Dashbo
     page.locator("#trees th[data-key=number] button").click()
 
 
-def test_what_is_typed_sifts_the_trees(dashboard: Dashboard):
+def test_a_filter_selects_trees(dashboard: Dashboard):
     page, held = dashboard.page, trees(dashboard)
     thick = sorted(tree["dbh_cm"] for tree in held if tree["dbh_cm"] is not None)
     middle = thick[len(thick) // 2]
@@ -90,7 +90,7 @@ def test_what_is_typed_sifts_the_trees(dashboard: Dashboard):
     expect(page.locator("#find")).to_have_attribute("aria-invalid", "true")
 
 
-def test_trees_are_sifted_by_what_truly_stands_there(dashboard: Dashboard):
+def test_trees_are_filtered_by_their_true_class(dashboard: Dashboard):
     page, held = dashboard.page, trees(dashboard)
     found = dashboard.ask("/api/evaluation")["TA"]["count"]
     numbers: list[int] = []
@@ -181,7 +181,7 @@ TALL = """rows => import('/static/js/trees/table.js').then(async ({ pictureOf })
 })"""
 
 
-def test_a_picture_of_a_stand_of_any_size_is_made(dashboard: Dashboard):
+def test_a_picture_of_a_table_of_any_size_is_made(dashboard: Dashboard):
     """Browsers make no picture of a canvas that is too tall, and the button did nothing then."""
     dashboard.pause()
     small, large, larger = (dashboard.page.evaluate(TALL, rows) for rows in (10, 580, 5000))
@@ -203,7 +203,7 @@ ASSUMED = """async number => {
 }"""
 
 
-def test_a_sigma_that_nobody_measured_is_called_assumed(dashboard: Dashboard):
+def test_an_unmeasured_sigma_is_called_assumed(dashboard: Dashboard):
     number = trees(dashboard)[0]["number"]
     cell = dashboard.page.locator(f"#trees tr[data-tree='{number}'] td").nth(list(COLUMNS).index("sigma"))
     assert "≈" not in (cell.text_content() or "")

@@ -1,4 +1,4 @@
-"""A person tunes in the tab Tune: types, slides, resets, takes back, saves sets and shares them."""
+"""The tab Tune: values, sliders, reset, undo, search and parameter sets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def value(page: Page, name: str):
     return page.locator(f"[id='tune-{name}']")
 
 
-def test_a_value_is_typed_marked_taken_back_and_reset(dashboard: Dashboard):
+def test_a_value_is_typed_marked_undone_and_reset(dashboard: Dashboard):
     page = dashboard.page
     row = page.locator("[data-parameter='clustering.eps']")
     trees = page.locator("[data-chip=tree] b")
@@ -62,7 +62,7 @@ def test_a_slider_moves_by_its_step_and_to_its_end(dashboard: Dashboard):
     assert dashboard.state == "paused"
 
 
-def test_what_is_refused_is_told_and_goes_back(dashboard: Dashboard):
+def test_a_refused_value_is_reported_and_reverted(dashboard: Dashboard):
     page = dashboard.page
     lowest = value(page, "detection.e_min")
     for typed, words in (("900", "must be less than"), ("many", "is not a number"), ("-3", "greater than")):
@@ -76,7 +76,7 @@ def test_what_is_refused_is_told_and_goes_back(dashboard: Dashboard):
     expect(page.locator("#tune-error")).to_be_hidden()
 
 
-def test_parameters_are_found_by_their_words(dashboard: Dashboard):
+def test_parameters_are_found_by_words(dashboard: Dashboard):
     page = dashboard.page
     page.locator("#tune-find").fill("Heading distance")
     rows = page.locator(".tune-row:visible")

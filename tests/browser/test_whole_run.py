@@ -1,4 +1,4 @@
-"""A slider is moved, and the whole map, its trees and its score follow; what changed is told and drawn."""
+"""A change of a parameter re-maps the run: map, trees, score and the list of changes follow."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     assert dashboard.errors == []
 
 
-def test_a_change_can_act_from_the_standing_scan_on(dashboard: Dashboard):
+def test_a_change_can_apply_from_the_current_scan_onwards(dashboard: Dashboard):
     dashboard.stand()
     dashboard.tab("Tune")
     page = dashboard.page
@@ -142,7 +142,7 @@ POINTS = """() => import('/static/js/core/store.js').then(({ state, changed }) =
 })"""
 
 
-def test_how_much_a_parameter_matters_is_drawn_and_a_click_sets_it(dashboard: Dashboard):
+def test_the_sensitivity_is_drawn_and_a_click_sets_the_value(dashboard: Dashboard):
     dashboard.stand()
     dashboard.tab("Tune")
     page = dashboard.page

@@ -144,7 +144,7 @@ async def test_a_killed_worker_is_replaced_under_the_page() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-async def test_a_signal_ends_all_of_it_quietly(number: signal.Signals) -> None:
+async def test_a_signal_ends_server_and_worker_without_output(number: signal.Signals) -> None:
     async with serving("sim:stand?duration=20") as server, server.browser() as (_, page):
         await page.until("map")
         workers = children(server)
@@ -180,7 +180,7 @@ def runs(pid: int) -> bool:
         (["simulate", "stand", "--out", "never.mcap", "--seed", "-1"], 2, "'-1' is not a whole number"),
     ],
 )
-def test_a_wrong_start_is_one_line(
+def test_a_wrong_start_prints_one_line(
     words: list[str], code: int, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words) == code
@@ -189,7 +189,7 @@ def test_a_wrong_start_is_one_line(
     assert len(errors.strip().splitlines()) == 1
 
 
-async def test_a_port_in_use_is_one_line() -> None:
+async def test_a_port_in_use_prints_one_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         process = await start("serve", "--no-browser", "--port", str(taken.getsockname()[1]))
         async with asyncio.timeout(60):
@@ -201,7 +201,7 @@ async def test_a_port_in_use_is_one_line() -> None:
     assert len(told.strip().splitlines()) == 1
 
 
-async def test_the_browser_is_started_without_the_token_and_no_file_stays(
+async def test_the_browser_is_started_without_the_token_and_no_file_remains(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A browser of our own writes down what it was called with, and what it read there."""

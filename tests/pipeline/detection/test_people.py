@@ -1,4 +1,4 @@
-"""A person who walks leaves no tree behind, and one who stands still for a minute is no tree: whole runs."""
+"""Whole runs with people: a walking or standing person is not mapped as a tree."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def away(place: Float, other: Float) -> Float:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_who_walks_leaves_no_tree_behind(seed):
+def test_walking_people_leave_no_tree_behind(seed):
     told, found = looks(seed, ("along", "ahead", "across", "pausing", "pausing"))
     assert found.all(), "no tree is lost to who walks before it"
     left = []
@@ -66,7 +66,7 @@ def test_who_walks_leaves_no_tree_behind(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_who_stands_still_for_a_minute_is_no_tree(seed):
+def test_people_who_stand_still_for_a_minute_are_no_trees(seed):
     told, found = looks(seed, ("still", "still", "still", "still", "still", "by a trunk"))
     assert found.all()
     taken = [

@@ -134,6 +134,15 @@ def test_a_map_by_hand():
     assert e.mean_pair_error_percent == pytest.approx(100 * (5 - d) / 5)
 
 
+def test_the_truth_decides_whether_a_pair_at_the_edge_of_the_reach_counts():
+    near, far = FOREST.reach - 0.1, FOREST.reach + 0.1
+    at_origin = np.zeros((1, 2))
+    beyond = evaluate(trees([[near, 0.0]]), truth_trees([[far, 0.0]]), FOREST, at_origin)
+    assert (beyond.TA.count, beyond.TA.of, beyond.spurious, beyond.correctness) == (0, 0, 0, None)
+    within = evaluate(trees([[far, 0.0]]), truth_trees([[near, 0.0]]), FOREST, at_origin)
+    assert (within.TA.count, within.TA.of, within.spurious, within.correctness) == (1, 1, 0, 1.0)
+
+
 def test_unconfirmed_trees_do_not_count():
     e = evaluate(trees([[0, 0]], confirmed=False), truth_trees([[0, 0]]), FOREST)
     assert (e.TA.count, e.FR.count, e.spurious) == (0, 1, 0)

@@ -232,7 +232,7 @@ def test_a_shared_error_is_taken_from_all_landmarks_by_the_first():
 
 
 @given(seeds)
-def test_moving_a_joint_gaussian_moves_its_pose_alone(seed):
+def test_moving_a_joint_gaussian_moves_its_pose_and_turns_the_noise_into_the_map(seed):
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(5, 5))
     m, Sigma = rng.normal(size=5), A @ A.T
@@ -244,8 +244,11 @@ def test_moving_a_joint_gaussian_moves_its_pose_alone(seed):
     assert np.cos(m[2] - expected.yaw) == pytest.approx(1.0)
     np.testing.assert_allclose(m[3:], before[3:])
     np.testing.assert_allclose(Sigma, Sigma.T, atol=1e-9)
-    np.testing.assert_allclose(Sigma[3:, 3:], covariance[3:, 3:])
-    assert np.linalg.eigvalsh(Sigma).min() > -1e-9
+    c, s = np.cos(before[2]), np.sin(before[2])
+    F, G = np.eye(5), np.zeros((5, 3))
+    F[:2, 2] = -s * motion[0] - c * motion[1], c * motion[0] - s * motion[1]
+    G[:3] = [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(Sigma, F @ covariance @ F.T + G @ Q @ G.T, atol=1e-9)
     correct_by_pose(m, Sigma, m[:3] + 0.1, np.eye(3) * 1e-12)
     assert np.abs(Sigma[:3]).max() < 1e-5
 

@@ -89,13 +89,13 @@ def test_people_who_were_known_and_walk_off_carry_no_robot_away(seed, trees, dro
         assert worst(left_by(seed, 5, trees, speed=speed, stride=stride, dropouts=dropouts)) <= 0.1
 
 
-def test_of_people_who_walk_off_it_is_said_that_nobody_can_tell():
+def test_the_pose_is_uncertain_when_known_people_walk_off():
     told = [left_by(seed, 5, 0, speed=1.0) for seed in range(6)]
     assert any(e.health.doubt == UNSURE and e.health.state == "weak" for one in told for e, _ in one)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_more_of_them_may_carry_it_but_it_does_not_say_that_all_is_good(seed):
+def test_the_pose_is_not_reported_as_good_when_many_people_walk_off(seed):
     told = left_by(seed, 8, 0, speed=WALK)
     assert all(e.health.state != "good" for e, _ in told if e.health.doubt)
     assert worst(told) <= 0.1 or told[-1][0].health.state == "weak"
@@ -103,7 +103,7 @@ def test_more_of_them_may_carry_it_but_it_does_not_say_that_all_is_good(seed):
 
 @pytest.mark.parametrize("trees", [1, 2, 3])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_tree_that_stands_beside_outvotes_people_who_stroll(seed, trees):
+def test_one_tree_outvotes_slow_people(seed, trees):
     assert worst(walked(seed, 5, trees, sigma=0.03, speed=0.7)) <= 0.1
 
 
@@ -139,7 +139,7 @@ def test_a_robot_whose_view_changes_is_not_lost(seed, free):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_nor_where_a_bend_shows_other_trees_and_a_known_one_fell(seed):
+def test_a_robot_is_not_lost_where_a_curve_shows_other_trees_and_a_known_one_fell(seed):
     left, right = stand(seed)
     fell = np.concatenate([left, [[1.0, -1.5]]])
     assert "lost" not in looked(fell, right, free=free_to_the_right())
