@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from app.batch.map_run import Outcome
+from app.batch.map_run import MappingResult
 from app.batch.run_folder import as_written
 from app.batch.summary import evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
@@ -44,7 +44,7 @@ SLICE_COLUMNS = (
 
 def map_plot_run(
     cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, folder: FilePath
-) -> Outcome:
+) -> MappingResult:
     """Map a whole cloud and write its files.
 
     Raises:
@@ -61,7 +61,7 @@ def map_plot_run(
 
 def _map(
     cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, files: RunFiles
-) -> Outcome:
+) -> MappingResult:
     about = cloud.description
     plot = map_plot(cloud, parameters, kept_forests())
     trees = replace(plot.trees, position=plot.trees.position + about.offset[:2])
@@ -89,7 +89,7 @@ def _map(
         },
     )
     summary = [*_summary(about.uri, plot, trees, evaluation), preset_words(preset, parameters)]
-    return Outcome(summary, warnings, losses)
+    return MappingResult(summary, warnings, losses)
 
 
 _OWN_FRAME = {**ROBOTS_FRAME, "origin": "that of the cloud"}

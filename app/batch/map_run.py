@@ -25,7 +25,7 @@ from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
 from app.common.text import changed_values, count, preset_words, version
 from app.common.timers import Stopwatch
-from app.sources.opening import Chosen, with_odometry
+from app.sources.opening import ChosenOdometry, with_odometry
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
@@ -76,7 +76,7 @@ class OfflineRun:
 
 
 @dataclass(slots=True, eq=False)
-class Outcome:
+class MappingResult:
     """The result of a mapping command, for people.
 
     Attributes:
@@ -95,7 +95,7 @@ class Outcome:
 
 def map_run(
     plan: OfflineRun, folder: FilePath, progress: Progress, earlier: FilePath | None = None
-) -> Outcome:
+) -> MappingResult:
     """Map a run and write its files.
 
     Args:
@@ -133,7 +133,7 @@ class _Mapped(NamedTuple):
 
 def _map(
     plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopwatch
-) -> tuple[Outcome, _Mapped]:
+) -> tuple[MappingResult, _Mapped]:
     moving, chosen = with_odometry(plan.source, plan.odometry)
     plan = replace(plan, source=moving)
     description = plan.source.description
@@ -157,7 +157,7 @@ def _map(
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
     record["odometry_used"] = chosen.words
-    outcome = Outcome(
+    outcome = MappingResult(
         summary=[
             *summary_lines(description.uri, frame, (seconds, metres), evaluation, error),
             f"odometry: {chosen.words}",
@@ -203,7 +203,7 @@ def _map_scans(
     return frame, start_ns
 
 
-def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: Outcome) -> None:
+def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: MappingResult) -> None:
     """The map is complete already; errors here become warnings."""
     try:
         kept, told = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
@@ -225,18 +225,18 @@ def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
 
 def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
     """The changes of each revision, for run.json."""
-    told: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
+    revisions: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
     before = plan.parameters.flat()
     for first, parameters in plan.revisions:
         after = parameters.flat()
         changes = {name: value for name, value in after.items() if value != before[name]}
         if changes:
-            told.append({"revision": len(told), "from_scan": first, "changes": changes})
+            revisions.append({"revision": len(revisions), "from_scan": first, "changes": changes})
         before = after
-    return told
+    return revisions
 
 
-def _beginning(plan: OfflineRun, mapper: Mapper, chosen: Chosen) -> RunStart:
+def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunStart:
     told = (chosen.warning,) if chosen.warning else ()
     warnings = [*told, *plan.source.description.warnings]
     if plan.continued is None:

@@ -101,7 +101,7 @@ class RunHealth:
             self._worst[name] = min(value, self._worst.get(name, math.inf))
 
     def record(self, start_ns: int) -> dict[str, Any]:
-        """As it stands in run.json; times are seconds after `start_ns`."""
+        """Return the record for run.json; times are seconds after `start_ns`."""
         return {
             "scans": {state: self._scans[state] for state in ("good", "weak", "lost")},
             "worst": {name: round(value, 4) for name, value in sorted(self._worst.items())},

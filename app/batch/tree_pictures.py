@@ -12,7 +12,7 @@ from pipeline.io.atomic_files import write_beside
 from pipeline.io.readers.base import Source
 from pipeline.io.readers.camera import Camera, PictureSource, nearest
 from pipeline.odometry.odometry_override import OdometryOverride
-from pipeline.types.records import Bool, Int, Path, Trees
+from pipeline.types.records import Bool, Float, Int, Path, Trees
 
 FOLDER = "pictures"
 MOST = 300  # pictures
@@ -21,7 +21,7 @@ FROM_Z, TO_Z, THIN = 0.0, 2.0, 0.2  # m above the base; width of a stem of unkno
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class StemPicture:
     """The best view of a tree.
 
     Attributes:
@@ -35,13 +35,13 @@ class View:
     box: tuple[float, float, float, float]
 
 
-def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[View]:
+def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[StemPicture]:
     """Return the best view of each confirmed tree that the camera saw, ordered by time, at most MOST.
 
     Args:
         stamps: Times of the pictures, ascending [ns].
     """
-    views: list[View] = []
+    views: list[StemPicture] = []
     if not len(stamps):
         return views
     taken, there = nearest(stamps, path.stamp_ns)
@@ -52,11 +52,12 @@ def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[Vi
     return sorted(views, key=lambda view: (view.stamp_ns, view.tree))
 
 
-def _best_view(camera: Camera, trees: Trees, row: int, path: Path, taken: Int, there: Bool) -> View | None:
+def _best_view(
+    camera: Camera, trees: Trees, row: int, path: Path, taken: Int, there: Bool
+) -> StemPicture | None:
     dx, dy = trees.position[row, 0] - path.x, trees.position[row, 1] - path.y
     c, s = np.cos(path.yaw), np.sin(path.yaw)
     ahead, left = c * dx + s * dy, c * dy - s * dx
-    half = 0.5 * (float(trees.dbh[row]) if np.isfinite(trees.dbh[row]) else THIN)
     at = np.stack([ahead, left, np.full(len(ahead), 0.5 * (FROM_Z + TO_Z))], axis=1)
     pixels, depth = camera.project(at)
     inside = (
@@ -68,13 +69,22 @@ def _best_view(camera: Camera, trees: Trees, row: int, path: Path, taken: Int, t
     off_centre = np.abs(pixels[:, 0] - 0.5 * camera.width) / camera.width
     cost = np.where(inside, np.abs(np.log(np.maximum(depth, 1e-3) / BEST)) + 2.0 * off_centre, np.inf)
     k = int(np.argmin(cost))
-    reach = float(np.hypot(ahead[k], left[k]))
-    across = np.array([-left[k], ahead[k], 0.0]) / reach * half
-    corners = np.array([[*at[k, :2], z] + side * across for z in (FROM_Z, TO_Z) for side in (-1.0, 1.0)])
-    seen, _ = camera.project(corners)
+    seen, _ = camera.project(stem_corners(float(ahead[k]), float(left[k]), float(trees.dbh[row])))
     low, high = seen.min(axis=0), seen.max(axis=0)
     box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    return View(int(trees.number[row]), int(taken[k]), box)
+    return StemPicture(int(trees.number[row]), int(taken[k]), box)
+
+
+def stem_corners(x: float, y: float, dbh: float) -> Float:
+    """Return the corners of a stem as seen from the robot, shape (4, 3) [m].
+
+    Args:
+        x, y: Position in the base frame [m].
+        dbh: Diameter [m]; NaN where unknown.
+    """
+    half = 0.5 * (dbh if np.isfinite(dbh) else THIN)
+    across = np.array([-y, x, 0.0]) * half / np.hypot(x, y)
+    return np.array([[x, y, z] + side * across for z in (FROM_Z, TO_Z) for side in (-1.0, 1.0)])
 
 
 def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) -> tuple[int, str]:

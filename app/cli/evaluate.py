@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from app.batch.run_folder import FinishedRun
     from app.tuning.sweep.jobs import PreparedRun, SweepPlan
     from app.tuning.sweep.report import Comparison
-    from app.tuning.sweep.sweep import Outcome, Workers
+    from app.tuning.sweep.sweep import SweepResult, Workers
     from pipeline.config import Parameters
     from pipeline.config.model import Value
     from pipeline.evaluation import Evaluation
@@ -302,14 +302,14 @@ def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Va
     return chosen_parameters(arguments, suits, present)[1]
 
 
-def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> Outcome:
+def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> SweepResult:
     from tqdm import tqdm
 
-    from app.common.settings import from_environment
-    from app.tuning.sweep.sweep import KeptAnswers, sweep
+    from app.common.environment import from_environment
+    from app.tuning.sweep.sweep import AnswerStore, sweep
 
     folder = from_environment().folder
-    kept = KeptAnswers(arguments.keep or (folder and folder / "results"))
+    kept = AnswerStore(arguments.keep or (folder and folder / "results"))
     with (
         _workers(arguments, len(plan.jobs)) as workers,
         tqdm(
@@ -336,7 +336,7 @@ def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
 
 
 def _print_comparison(
-    arguments: argparse.Namespace, comparison: Comparison, outcome: Outcome, *, refused: int
+    arguments: argparse.Namespace, comparison: Comparison, outcome: SweepResult, *, refused: int
 ) -> int:
     """Print the comparison; returns the exit code."""
     from app.common.text import count

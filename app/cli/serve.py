@@ -18,7 +18,7 @@ from app.cli.flags import (
     source,
     whole_number,
 )
-from app.common.settings import DEFAULT_PORT, VARIABLES, Settings, from_environment
+from app.common.settings import DEFAULT_PORT, VARIABLES, Settings
 from pipeline.errors import SourceError
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
+    from app.common.environment import from_environment
+
     settings = from_environment()
     if arguments.host is not None:
         settings = replace(settings, host=arguments.host)

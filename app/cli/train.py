@@ -172,7 +172,7 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
     """
     from contextlib import closing
 
-    from app.common.settings import from_environment
+    from app.common.environment import from_environment
     from app.store.store import Store
     from app.training.learned_forests import Forests, name_of, write_forest
     from app.training.learning import LearningOptions, learn, table_lines

@@ -212,7 +212,7 @@ def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
 
 
 def _storage(arguments: argparse.Namespace) -> str:
-    from app.common.settings import from_environment
+    from app.common.environment import from_environment
     from app.tuning.storage import is_server
 
     if arguments.storage is None:

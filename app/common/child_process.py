@@ -50,7 +50,7 @@ def exit_reason(returncode: int) -> str:
 
 
 class ChildProcess:
-    """A child process, used from an event loop. `start` makes one.
+    """A child process, used from an event loop. `start` makes one; as a context manager it is ended.
 
     Attributes:
         pid: Its process number.
@@ -88,6 +88,12 @@ class ChildProcess:
         except OSError as error:
             raise _cannot_start(error) from None
         return cls(process)
+
+    async def __aenter__(self) -> ChildProcess:
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        await self.end()
 
     async def send(self, message: object) -> None:
         """Send a message. A child that has ended is not an error here; `receive` reports it."""
@@ -285,8 +291,7 @@ def run_child(
         os.nice(10)
     if memory_limit is not None:
         _limit_memory(memory_limit)
-    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
+    incoming, outgoing = private_streams()
     code = 0
     try:
         main(ParentConnection(incoming, outgoing, on_close or (lambda: os._exit(1))))
@@ -297,6 +302,17 @@ def run_child(
         code = 1
     sys.stderr.flush()
     os._exit(code)  # the thread that reads from the parent still waits
+
+
+def private_streams() -> tuple[BinaryIO, BinaryIO]:
+    """Return the pipes from and to the parent, moved away from where a library may read or print: standard
+    input is empty then, and standard output is standard error."""
+    incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nowhere, 0)
+    os.close(nowhere)
+    os.dup2(2, 1)
+    return incoming, outgoing
 
 
 def _limit_memory(limit: int) -> None:

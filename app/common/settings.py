@@ -5,10 +5,7 @@ Each setting has an environment variable; command-line flags take precedence.
 
 from __future__ import annotations
 
-import contextlib
 import ipaddress
-import os
-import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,7 +18,7 @@ from pipeline.errors import StemmapError
 VARIABLES: dict[str, str] = {
     "STEMMAP_HOST": "address to listen on, a loopback one (another needs the flag --host)",
     "STEMMAP_PORT": "port to listen on",
-    "STEMMAP_TOKEN": "token of the link, 16 characters or more; else a new one at each start",
+    "STEMMAP_TOKEN": "token of the link, 16 or more letters, digits, - and _; else a new one at each start",
     "STEMMAP_HOSTS": "further host names by which browsers may call the server, with commas between",
     "STEMMAP_RECORDINGS": "folder whose recordings the page offers",
     "STEMMAP_FOLDER": "folder for runs, annotations and uploads (default: stemmap in your folder for data)",
@@ -34,7 +31,6 @@ VARIABLES: dict[str, str] = {
 Files = Literal["", "any", "folders"]
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
-_TOKEN = re.compile(r"[A-Za-z0-9_-]{16,200}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,41 +91,6 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
-    """Return the settings from the environment variables STEMMAP_*.
-
-    Raises:
-        StemmapError: A variable has an invalid value.
-    """
-    given = os.environ if environment is None else environment
-    host = given.get("STEMMAP_HOST", DEFAULT_HOST)
-    if not is_loopback(host):
-        raise StemmapError(
-            f"{host} is not a loopback address", where="STEMMAP_HOST", remedy="Use the flag --host for it"
-        )
-    token = given.get("STEMMAP_TOKEN", "")
-    if token and not _TOKEN.fullmatch(token):
-        raise StemmapError(
-            "the token is too short or has odd characters",
-            where="STEMMAP_TOKEN",
-            remedy="Give 16 or more letters, digits, - and _",
-        )
-    recordings = given.get("STEMMAP_RECORDINGS")
-    return Settings(
-        host=host,
-        port=_port(given["STEMMAP_PORT"]) if "STEMMAP_PORT" in given else None,
-        token=token,
-        hosts=tuple(
-            name.strip().lower() for name in given.get("STEMMAP_HOSTS", "").split(",") if name.strip()
-        ),
-        recordings=_folder(recordings) if recordings else None,
-        folder=data_folder(given),
-        database=given.get("STEMMAP_DATABASE", ""),
-        files=_files(given.get("STEMMAP_FILES", "")),
-        upload_limit=_gigabytes(given.get("STEMMAP_UPLOAD_GB", "20")),
-    )
-
-
 def recordings_place(settings: Settings, now_s: float) -> Path:
     """Return the path of a new recording in the data folder, named by the time [s since 1970].
 
@@ -148,32 +109,3 @@ def data_folder(given: Mapping[str, str]) -> Path | None:
     home = given.get("HOME") or given.get("USERPROFILE")
     base = given.get("XDG_DATA_HOME") or given.get("LOCALAPPDATA") or (home and f"{home}/.local/share")
     return Path(base) / "stemmap" if base else None
-
-
-def _port(text: str) -> int:
-    if text.isdecimal() and int(text) <= 65535:
-        return int(text)
-    raise StemmapError(
-        f"{text!r} is not a port", where="STEMMAP_PORT", remedy="Give a number from 0 to 65535"
-    )
-
-
-def _files(text: str) -> Files:
-    known: dict[str, Files] = {"": "", "any": "any", "folders": "folders"}
-    if text in known:
-        return known[text]
-    raise StemmapError(f"{text!r} is unknown", where="STEMMAP_FILES", remedy="Give any or folders")
-
-
-def _gigabytes(text: str) -> int:
-    with contextlib.suppress(ValueError, OverflowError):
-        if 0.0 < float(text) <= 1e6:
-            return round(1e9 * float(text))
-    raise StemmapError(f"{text!r} is not a size", where="STEMMAP_UPLOAD_GB", remedy="Give a number of GB")
-
-
-def _folder(text: str) -> Path:
-    folder = Path(text).expanduser()
-    if folder.is_dir():
-        return folder
-    raise StemmapError(f"{text} is not a folder", where="STEMMAP_RECORDINGS")

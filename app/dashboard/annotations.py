@@ -21,22 +21,19 @@ if TYPE_CHECKING:
 Against = Literal["both", "own", "annotations"]
 Counted = Literal["none", "source", "annotations", "both"]
 
-# So near to an annotation, what the source says to stand there is the same thing [m].
+# Largest distance between an annotation and the object of the source's ground truth that it is of [m].
 SAME_THING = 0.5
-# So many things of the source are looked at for an annotation: no more stems stand within SAME_THING.
+# Objects of the source that are compared with an annotation; no more stems fit within SAME_THING.
 _MOST_NEAR = 8
 
 
 def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> TruthTrees | None:
-    """The truth that counts.
+    """Return the ground truth against which the map is scored; None where there is none.
 
     Args:
-        own: What the source knows, if anything. It is never changed.
+        own: Ground truth of the source, if any. It is not changed.
         rows: The annotations.
-        against: "own" leaves annotations aside, "annotations" the source's truth, "both" neither.
-
-    Returns:
-        None where nothing counts.
+        against: "own" ignores the annotations, "annotations" the ground truth of the source.
     """
     used = counted(own, rows, against)
     if used == "both":
@@ -47,10 +44,10 @@ def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Agains
 
 
 def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> Counted:
-    """What counts, where one of the two may not be there."""
+    """Return which ground truth is used, where one of the two may be missing."""
     if own is None:
         return "annotations" if rows and against != "own" else "none"
-    # Who asked for what people say is not told what the source knows.
+    # A person who chose the annotations is not shown the ground truth of the source instead.
     if not rows and against == "annotations":
         return "none"
     if not rows or against == "own":
@@ -59,9 +56,11 @@ def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against
 
 
 def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees | None:
-    """What the source knows, and over it what was annotated within SAME_THING: what says otherwise takes its
-    place; what agrees leaves the source's place and diameter (unless one was typed), for who confirms a tree
-    that was found did not measure where it stands.
+    """Return the ground truth of the source with the annotations applied.
+
+    An annotation replaces the object within SAME_THING that has another class. One of the same class keeps
+    the position of the source, and its diameter unless one was typed, because a person who confirms a
+    mapped tree has not measured its position.
     """
     if not rows:
         return own
@@ -69,19 +68,19 @@ def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees 
         return _as_truth([row.content for row in rows])
     nearest = _nearest(own, rows)
     contents = [_agreed(own, k, row.content) for k, row in zip(nearest.tolist(), rows, strict=True)]
-    said = _as_truth(contents)
-    # Only what an annotation is of: who confirms one stem says nothing of another that stands beside it.
+    annotated = _as_truth(contents)
+    # An annotation replaces one object only; a neighbouring stem stays.
     keep = np.setdiff1d(np.arange(len(own.x)), nearest)
     return TruthTrees(
-        np.concatenate([own.x[keep], said.x]),
-        np.concatenate([own.y[keep], said.y]),
-        np.concatenate([own.dbh[keep], said.dbh]),
-        (*(own.kind[k] for k in keep), *said.kind),
+        np.concatenate([own.x[keep], annotated.x]),
+        np.concatenate([own.y[keep], annotated.y]),
+        np.concatenate([own.dbh[keep], annotated.dbh]),
+        (*(own.kind[k] for k in keep), *annotated.kind),
     )
 
 
 def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
-    """How many annotations say of a thing that the source knows that it is something else."""
+    """Return the number of annotations whose class differs from that of the source."""
     if own is None or not rows or not len(own.x):
         return 0
     near = zip(_nearest(own, rows).tolist(), rows, strict=True)
@@ -89,7 +88,7 @@ def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
 
 
 def contents_of(truth: TruthTrees) -> list[Content]:
-    """The rows of a table of trees."""
+    """Return the rows of a table of trees."""
     columns = zip(truth.x.tolist(), truth.y.tolist(), truth.kind, truth.dbh.tolist(), strict=True)
     return [Content(x, y, kind, dbh if dbh == dbh else None) for x, y, kind, dbh in columns]
 
@@ -104,7 +103,7 @@ def _as_truth(contents: Sequence[Content]) -> TruthTrees:
 
 
 def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
-    """An annotation, at the place of what the source knows (row k, -1: nothing is near) if both agree."""
+    """Return an annotation, at the position of the source (row k, -1: none) if both have the same class."""
     if k < 0 or own.kind[k] != content.kind:
         return content
     known = float(own.dbh[k])
@@ -113,8 +112,10 @@ def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
 
 
 def _nearest(own: TruthTrees, rows: Sequence[Annotation]) -> NDArray[np.int64]:
-    """Which row of what the source knows each annotation is of, each of at most one, the nearest pairs first;
-    -1 where nothing that is left stands within SAME_THING: (A,)."""
+    """Return the row of the source for each annotation, shape (A,); -1 where none is within SAME_THING.
+
+    A row belongs to one annotation at most; the nearest pairs are assigned first.
+    """
     from scipy.spatial import cKDTree
 
     places = np.array([(row.content.x, row.content.y) for row in rows])
@@ -138,21 +139,21 @@ T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 
-class Annotating:
-    """What people say of the trees of the run that is open.
+class AnnotationEditor:
+    """The annotations of the open run.
 
     Args:
-        keeper: Of the store.
+        keeper: The store.
 
     Attributes:
         run: Number of the run in the store, None while none is open.
         rows: The annotations of the run.
-        truth: What the map is scored against.
-        against: Which of the source's truth and the annotations that is, see `truth_of`.
+        truth: Ground truth against which the map is scored.
+        against: Choice of the ground truth, see `truth_of`.
         problem: Why nothing can be annotated, empty when all is well.
-        changed: Called when something else stands.
-        edited: Called with who edited and how many annotations, after an edit.
-        serial: Grows with each edit, so that a page knows when it has seen what it did.
+        changed: Called when the ground truth may have changed.
+        edited: Called after an edit with the author and the number of annotations.
+        serial: Grows with each edit, so that a page knows when its edit is shown.
     """
 
     def __init__(self, keeper: AsyncStore) -> None:
@@ -206,20 +207,20 @@ class Annotating:
         self.run, self.rows, self.truth, self._own, self.against = None, [], None, None, "both"
 
     def score_against(self, against: Against) -> None:
-        """Choose what the map is scored against; neither the source's truth nor an annotation is changed."""
+        """Choose the ground truth for the scores; nothing is edited."""
         self.against = against
         self.truth = truth_of(self._own, self.rows, against)
         self.changed()
 
     async def edit(self, run: int, function: Callable[[Store], T]) -> T:
-        """Let something be done to the store, and tell what stands afterwards.
+        """Run an edit in the thread of the store, and update the annotations.
 
         Args:
-            run: That the edit is meant for.
-            function: What is to be done, in the thread of the store.
+            run: Number of the run that is edited.
+            function: The edit.
 
         Raises:
-            StaleError: Another run was opened since, or somebody else has changed the same.
+            StaleError: Another run was opened meanwhile, or another person has changed the annotation.
             StemmapError: Nothing can be annotated.
         """
         if self.problem:
@@ -235,7 +236,7 @@ class Annotating:
             done: T | StaleError
             try:
                 done = function(store)
-            except StaleError as error:  # then what stands is news
+            except StaleError as error:  # the current state is shown to the person
                 done = error
             rows = store.annotations(run)
             return done, rows, truth_of(own, rows, against)

@@ -23,7 +23,7 @@ MAP_PAUSE_S = 0.09
 _EMPTY_MAP: dict[str, Any] = {"type": "map", "index": -1, "trees": []}
 
 
-class Live:
+class Broadcast:
     """The newest message of each kind, and the browsers that listen."""
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class Live:
 class Listener:
     """The messages that one browser still has to receive."""
 
-    def __init__(self, live: Live) -> None:
+    def __init__(self, live: Broadcast) -> None:
         self.news = asyncio.Event()
         self.news.set()
         self._live = live

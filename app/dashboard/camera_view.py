@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from app.batch.tree_pictures import stem_corners
 from app.common.draw_picture import Drawing, draw_safely
 from app.dashboard.payload import clusters_payload
 from app.explain.client import NoStoryError, WorkerClient
@@ -22,7 +23,7 @@ _PAUSE_S = 0.3
 _MOST_KEPT = 8
 
 
-class CameraDesk:
+class CameraView:
     """Pictures of the run that is shown.
 
     Args:
@@ -43,7 +44,7 @@ class CameraDesk:
         self._of += 1
 
     def jpeg(self, stamp_ns: int) -> bytes | None:
-        """A picture that was told of lately."""
+        """Return a recently announced picture as JPEG."""
         return self._kept.get(stamp_ns)
 
     async def look(self, frame: Frame, path: Path | None) -> dict[str, Any]:
@@ -91,15 +92,14 @@ class CameraDesk:
             raise NoStoryError("another run was opened", remedy="Its picture comes with its first scan")
 
 
-#: Trees farther away are a few pixels; so much of a stem is marked [m]; its width where no diameter is known.
-FARTHEST, NEAREST, FROM_Z, TO_Z, THIN = 25.0, 0.5, 0.0, 2.0, 0.2
+FARTHEST, NEAREST = 25.0, 0.5  # m; trees farther away are only a few pixels wide
 MOST = 150
 
 
 def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
     """Boxes of clusters and of trees that are in view, the farthest of each first; the MOST nearest at most.
 
-    The robot's tilt is not known here, so on a slope the boxes of trees stand a little high or low.
+    The robot's tilt is not known here, so on a slope the boxes of trees are a little too high or low.
 
     Args:
         frame: Of the scan.
@@ -121,10 +121,7 @@ def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
         reach = float(np.hypot(x, y))
         if not NEAREST < reach < FARTHEST:
             continue
-        half = 0.5 * (float(trees.dbh[row]) if np.isfinite(trees.dbh[row]) else THIN)
-        across = np.array([-y, x, 0.0]) * half / reach
-        corners = np.array([[x, y, z] + side * across for z in (FROM_Z, TO_Z) for side in (-1.0, 1.0)])
-        box = _box(camera, corners)
+        box = _box(camera, stem_corners(float(x), float(y), float(trees.dbh[row])))
         if box is not None:
             number = int(trees.number[row])
             marks.append({"kind": "tree", "number": number, "verdict": "tree", "distance_m": reach, **box})

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from app.common.timers import Throttle
 from app.common.user import SOMEBODY, current_user
-from app.dashboard.annotations import Annotating
-from app.dashboard.broadcast import Live
-from app.dashboard.camera_view import CameraDesk
+from app.dashboard.annotations import AnnotationEditor
+from app.dashboard.broadcast import Broadcast
+from app.dashboard.camera_view import CameraView
 from app.dashboard.events import Events
 from app.dashboard.map_changes import MapChanges
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, Counts, counts_of, map_payload, truth_payload
-from app.dashboard.run_recorder import Glance, Logbook
+from app.dashboard.run_recorder import RunRecorder, RunState
 from app.dashboard.scores import Scores, score_map
-from app.dashboard.selection import Selecting
+from app.dashboard.selection import Selector
 from app.explain.client import WorkerClient
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
@@ -105,11 +105,11 @@ class Dashboard:
     worker: WorkerLike
     scene: SceneLike
 
-    def __init__(self, parameters: ParameterState, live: Live, keeper: AsyncStore | None = None) -> None:
+    def __init__(self, parameters: ParameterState, live: Broadcast, keeper: AsyncStore | None = None) -> None:
         self.parameters = parameters
         self.keeper = keeper or AsyncStore(None)
-        self.logbook = Logbook(self.keeper)
-        self.annotating = Annotating(self.keeper)
+        self.logbook = RunRecorder(self.keeper)
+        self.annotating = AnnotationEditor(self.keeper)
         self.annotating.changed, self.annotating.edited = self._use_truth, self._mark_edits
         self.live = live
         self.scores = Scores(self._tell_score)
@@ -122,8 +122,8 @@ class Dashboard:
         self.sets = ParameterSets(self.keeper, self._show_parameters)
         self._before_after = BeforeAfter()
         self.asking = WorkerClient(lambda question: self.worker.send(question), lambda: self._run)
-        self.camera = CameraDesk(self.asking)
-        self.selecting = Selecting(
+        self.camera = CameraView(self.asking)
+        self.selecting = Selector(
             self.asking,
             live,
             lambda tree, ring: self.scene.select(tree, ring),
@@ -134,7 +134,7 @@ class Dashboard:
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
         self.search = TuneSearch(lambda told: live.tell("search", told))
-        self.loop = Loop(live, self._send_if_ready)
+        self.loop = LoopPlayback(live, self._send_if_ready)
         self._run: int | None = None
         self._notice = ""
         self._restarts = 0
@@ -262,7 +262,7 @@ class Dashboard:
         change(self.parameters)
         if self.parameters.step != step:
             self._before_after.step()
-        await self._send_parameters()  # first of all: the scan is mapped again while all others are told
+        await self._send_parameters()  # first: the scan is mapped again while the browsers are updated
         self._show_parameters()
         if self.shown is not None:
             self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
@@ -295,7 +295,7 @@ class Dashboard:
         self.selecting.tree(number)
 
     async def select_cluster(self, scan: int, cluster: int) -> None:
-        """Select a cluster everywhere, as it stands in a scan that was shown lately, with its tree.
+        """Select a cluster of a recently shown scan everywhere, with its tree.
 
         Raises:
             NoStoryError: It is not known any more.
@@ -367,7 +367,7 @@ class Dashboard:
         self.logbook.begin(self.annotating.run, self.source, opened, again=restarted)
         play = self._go or not restarted
         if not play:
-            self._notice = "The mapping process ended and was started again. Press play to begin anew"
+            self._notice = "The mapping process ended and was started again. Press play to start again"
         self._go = False
         state = self.parameters
         # Always with the parameters: those sent for a run that was left since did not reach the worker.
@@ -411,7 +411,7 @@ class Dashboard:
         number = self._opens
         self.path = joined(self.path, shown.path_start, shown.path)
         if shown.frame.ground is None and self.shown is not None:
-            # An earlier picture brought it, which the scene may not have drawn, or before it was built anew.
+            # The ground is sent only when it changes; the scene may not have drawn the earlier frame.
             frame = replace(shown.frame, ground=self.shown.frame.ground)
             shown = msgspec.structs.replace(shown, frame=frame)
         self.shown = shown
@@ -431,9 +431,9 @@ class Dashboard:
         self._show_scene(shown.frame, self.path_xy)
         await self.loop.shown(shown.time_s, self.status)
 
-    def _glance(self, shown: Shown) -> Glance:
+    def _glance(self, shown: Shown) -> RunState:
         state = self.parameters
-        return Glance(
+        return RunState(
             shown, self.path_xy, state.preset, state.parameters.flat(), self.truth, self.scores.latest
         )
 
@@ -472,7 +472,7 @@ def _open_command(request: SourceRequest) -> Open:
 Span = tuple[float, float]
 
 
-class Loop:
+class LoopPlayback:
     """From where to where, and when to turn.
 
     Args:
@@ -483,7 +483,7 @@ class Loop:
         span: First and last time [s since the first scan], None for no loop.
     """
 
-    def __init__(self, live: Live, send: Callable[[ToWorker], Awaitable[None]]) -> None:
+    def __init__(self, live: Broadcast, send: Callable[[ToWorker], Awaitable[None]]) -> None:
         self.span: Span | None = None
         self._live, self._send = live, send
         self._turning = False

@@ -119,14 +119,11 @@ class Learning:
 
     async def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
         """Return the last message of the process; those before are progress."""
-        process = await ChildProcess.start(self._command, line_limit=LONGEST_LINE)
         last: dict[str, Any] = {}
-        try:
+        async with await ChildProcess.start(self._command, line_limit=LONGEST_LINE) as process:
             await process.send(question)
             while (message := await process.receive(dict)) is not None:
                 last = message
                 if "progress" in message:
                     self._become("working", str(message["progress"])[:300])
-        finally:
-            await process.end()
         return last

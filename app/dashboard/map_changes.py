@@ -1,6 +1,4 @@
-"""What became of the trees of a map when the run was mapped again: which stayed, came, went or moved, and
-why.
-"""
+"""Differences between the maps before and after the run was mapped again, with reasons."""
 
 from __future__ import annotations
 
@@ -13,18 +11,18 @@ import numpy as np
 from pipeline.evaluation import match
 from pipeline.types.records import Columns, Float, Frame, Trees, Verdict
 
-SAME = 0.5  # m; a tree that is found so near is the same one
-MOVED = 0.05  # m; less is not worth telling
+SAME = 0.5  # largest distance of the same tree in two maps [m]
+MOVED = 0.05  # smallest reported motion [m]
 
 
 class TreeChange(msgspec.Struct, frozen=True):
-    """One tree that is not as it was.
+    """A tree that differs between the maps.
 
     Attributes:
-        kind: What became of it.
-        number: In the map where it is: the new one, or of a tree that is gone the old one.
-        x, y: There [m], in the frame of the map.
-        why: In words.
+        kind: Kind of the difference.
+        number: Number in the new map, or in the old one for a tree that vanished.
+        x, y: Position in that map [m].
+        why: Reason, as text.
     """
 
     kind: Literal["appeared", "vanished", "moved"]
@@ -35,19 +33,19 @@ class TreeChange(msgspec.Struct, frozen=True):
 
 
 class MapChanges(msgspec.Struct, frozen=True):
-    """A map beside the one before.
+    """Differences between two maps.
 
     Attributes:
-        revision: Of the parameters.
-        scans: Scans that were mapped again.
-        time_s: Of the last of them, since the run's first one.
+        revision: Revision of the parameters.
+        scans: Number of scans that were mapped again.
+        time_s: Time of the last of them since the first scan [s].
         before, after: Number of trees.
-        ghost: x, y [m] and DBH [m] (None where it is not known) of every tree before.
+        ghost: x, y [m] and DBH [m] (None where unknown) of each tree of the old map.
         renamed: Old and new number of each tree that stayed.
-        followed: The same of the trees that were shown last, where that is another map than the one before.
-        changes: The others, and those that moved.
-        confirmed: New number of each tree that ever was confirmed, also of one that went again later, and
-            when that was [s since the run's first scan]: what a run marks that was mapped so from its start.
+        followed: The same for the map that was shown last, if it is not the old map.
+        changes: Trees that appeared, vanished or moved.
+        confirmed: New number of each tree that was confirmed, also of one that vanished later, and the time
+            of its confirmation since the first scan [s].
     """
 
     revision: int
@@ -142,29 +140,29 @@ def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: i
 
 
 def _why_not(frame: Frame, place: Float) -> str:
-    """Why no tree stands at a place of a map."""
+    """Return the reason why a map has no tree at a place."""
     if frame.columns is not None:
         near = _nearest(frame.columns.axis[:, :2], place)
         if near >= 0:
-            told = _column(frame.columns, near)
-            if told:
-                return told
+            reason = _column(frame.columns, near)
+            if reason:
+                return reason
     near = _nearest(frame.trees.position, place)
     if near < 0:
-        return "nothing was taken for a tree there"
+        return "no tree was detected there"
     seen = int(frame.trees.observations[near])
     return f"seen {seen} time{'s' * (seen != 1)}, which does not confirm it"
 
 
 def _column(columns: Columns, row: int) -> str:
-    """What was gathered there, unless it was a tree."""
+    """Return the verdict of a column as text; "" for a tree."""
     verdict = Verdict(int(columns.verdict[row]))
     if verdict is Verdict.TREE:
         return ""
     if verdict in (Verdict.TOO_FEW_POINTS, Verdict.MOVING):
-        return f"what stands there is judged {verdict.label!r}"
+        return f"the object there is classified as {verdict.label!r}"
     share = 100 * float(columns.share[row, 0])
-    return f"what stands there is judged {verdict.label!r} ({share:.0f} % of the votes for a tree)"
+    return f"the object there is classified as {verdict.label!r} ({share:.0f} % of the votes for a tree)"
 
 
 def _nearest(places: Float, place: Float) -> int:

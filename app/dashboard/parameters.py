@@ -77,7 +77,7 @@ class ParameterState:
 
         Args:
             gesture: Of a slider that is held: all values until it is let go are one step, however long that
-                takes. Empty where nobody knows; then those that follow one another fast are one.
+                takes. Empty where unknown; then changes in quick succession are one step.
 
         Raises:
             ParameterError: A name is unknown, a value is out of bounds, or two values contradict;
@@ -237,11 +237,11 @@ def read_file(text: str, where: str, otherwise: str = DEFAULT_PRESET) -> tuple[s
 
 
 class ParameterSets:
-    """The saved sets, as they stand in the store.
+    """The saved sets of the store.
 
     Args:
         keeper: Of the store.
-        changed: Called when others stand there.
+        changed: Called when the saved sets have changed.
     """
 
     def __init__(self, keeper: AsyncStore, changed: Callable[[], None]) -> None:
@@ -258,7 +258,9 @@ class ParameterSets:
         self._sets = {row.name: row for row in rows}
         self._values.clear()
         for row in rows:
-            with contextlib.suppress(ParameterError):  # of another version; who asks for it is told why
+            with contextlib.suppress(
+                ParameterError
+            ):  # of another version; the error is raised when the set is used
                 self._values[row.name] = read_file(row.toml, row.name)
         self._changed()
 

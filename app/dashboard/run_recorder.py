@@ -34,7 +34,7 @@ MOST_PATH_POINTS = 3000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Glance:
+class RunState:
     """State of a run at one moment; it is not modified afterwards.
 
     Attributes:
@@ -59,8 +59,8 @@ class _Page:
     beginning: NewRun
     all_scans: int | None
     record: int | None = None
-    best: Glance | None = None
-    newest: Glance | None = None
+    best: RunState | None = None
+    newest: RunState | None = None
     dirty: bool = False
     changes: list[Change] = field(default_factory=list)
     reviser: asyncio.Task[None] | None = None
@@ -68,7 +68,7 @@ class _Page:
     lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
 
-class Logbook:
+class RunRecorder:
     """Writes the results of runs to the store, with a delay of some seconds and at their end.
 
     Args:
@@ -115,7 +115,7 @@ class Logbook:
         if page is not None and page.dirty:
             self._start(self._write(page))
 
-    def shown(self, glance: Glance) -> None:
+    def shown(self, glance: RunState) -> None:
         """Record a displayed scan; the farthest scan counts, so that stepping back keeps the map."""
         page = self._page
         if page is None:
@@ -220,7 +220,7 @@ async def _quietly(work: Any) -> None:  # noqa: ANN401 - any coroutine
         await work
 
 
-def _standing(glance: Glance, all_scans: int | None) -> RunFigures:
+def _standing(glance: RunState, all_scans: int | None) -> RunFigures:
     shown = glance.shown
     frame = shown.frame
     trees = trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * 1e9))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from app.dashboard.broadcast import Live
+from app.dashboard.broadcast import Broadcast
 from app.explain.client import NoStoryError, WorkerClient
 from app.explain.records import ClusterStory
 
@@ -46,7 +46,7 @@ class Selection:
 Ring = tuple[float, float, float] | None
 
 
-class Selecting:
+class Selector:
     """The selection, and how it comes about.
 
     Args:
@@ -60,7 +60,7 @@ class Selecting:
     def __init__(
         self,
         asking: WorkerClient,
-        live: Live,
+        live: Broadcast,
         mark: Callable[[int | None, Ring], None],
         *,
         run: Callable[[], int | None],

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.explain.history import TreeHistory, half_axes
-from app.explain.records import Check, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
+from app.explain.records import CheckResult, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
 from app.training.learned_forests import kept_forests
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import (
@@ -148,13 +148,13 @@ def tree_of_frame(
     )
 
 
-def checks_of(clusters: Clusters, row: int, parameters: Parameters) -> list[Check]:
+def checks_of(clusters: Clusters, row: int, parameters: Parameters) -> list[CheckResult]:
     """Return the checks of one cluster in the order in which they decide; empty for an external stem."""
     titles = {spec.name: spec.title for spec in field_specs()}
     if np.isnan(clusters.eccentricity[row]):  # an external stem
         return []
     return [
-        Check(
+        CheckResult(
             figure=check.figure,
             unit=check.unit,
             value=float(check.value[row]),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import msgspec
 
 
-class Check(msgspec.Struct, frozen=True):
+class CheckResult(msgspec.Struct, frozen=True):
     """One check of a cluster.
 
     Attributes:
@@ -115,7 +115,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
     cluster: int
     time_s: float
     verdict: str
-    checks: list[Check]
+    checks: list[CheckResult]
     size: int
     eccentricity: float
     position: tuple[float, float]

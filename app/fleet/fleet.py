@@ -18,12 +18,12 @@ from fastapi import FastAPI
 from app.batch.compare import align
 from app.common.settings import Settings
 from app.common.timers import cancel
-from app.dashboard.broadcast import Live
+from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
 from app.dashboard.payload import clearance_payload, trees_payload
-from app.web.app import MakeScene, MakeWorker, OfFleet, build
-from app.web.routes.access import Places
+from app.web.app import FleetLink, MakeScene, MakeWorker, build
+from app.web.routes.access import ConnectionLimit
 from app.web.serving import bound, uvicorn_config
 from app.worker.protocol import Open
 from pipeline.errors import StemmapError
@@ -53,11 +53,11 @@ class Frames:
         self._how: dict[str, str] = {}
         self._of: dict[str, str] = {}  # digest of the run that the two above were found for
         self._tried: dict[str, int] = {}  # trees at the last try
-        self._few: set[str] = set()  # who had too few trees for a try
+        self._few: set[str] = set()  # names of maps with too few trees
         self._first: tuple[str, str] | None = None
 
     def pose(self, name: str) -> Pose2 | None:
-        """Where the frame of a map stands in the common one; None where it is not known."""
+        """Pose of the frame of a map in the common frame; None where it is unknown."""
         return self._pose.get(name)
 
     def how(self, name: str) -> str:
@@ -281,7 +281,7 @@ class Fleet:
         make_worker: MakeWorker | None = None,
         warm: Callable[[], Awaitable[None]] | None = None,
     ) -> None:
-        self.live, self.pages = Live(), Places()
+        self.live, self.pages = Broadcast(), ConnectionLimit()
         self.members: dict[str, Member] = {}
         self.notice = ""
         self.remote: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}  # card and map, mapped elsewhere
@@ -315,7 +315,7 @@ class Fleet:
             parameter_state=self._make_parameters(),
             make_scene=self._make[0],
             make_worker=self._make[1],
-            fleet=OfFleet(self._port, self._open_records),
+            fleet=FleetLink(self._port, self._open_records),
         )
         self.members[name] = Member(name, source, listening, app, self._settings)
         if self._is_warm:

@@ -57,7 +57,7 @@ class RobotReport(msgspec.Struct, frozen=True):
     alive: bool
 
 
-class Report(msgspec.Struct, frozen=True):
+class FleetReport(msgspec.Struct, frozen=True):
     """Message to the server: the connection in words, and the robots by namespace."""
 
     problem: str
@@ -175,7 +175,7 @@ def _tree(detection: Any) -> dict[str, Any]:  # noqa: ANN401
 _BY_TYPE = {topic: outputs.TYPES[topic] for topic in TOPICS}
 
 
-class Hearing:
+class ResultReceiver:
     """The results of all robots at a router.
 
     Args:
@@ -213,11 +213,11 @@ class Hearing:
             robot, topic = self._topics[message.channel]
             self._robots[robot].take(topic, message.payload, now_s)
 
-    def report(self, now_s: float) -> Report:
+    def report(self, now_s: float) -> FleetReport:
         """The present state of all robots."""
         alive = {found[0] for p in self._link.publishers() if (found := results_topic(p.topic)) is not None}
         robots = {name: self._report_of(name, name in alive, now_s) for name in self._robots}
-        return Report(self._link.problem, self._link.place, robots)
+        return FleetReport(self._link.problem, self._link.place, robots)
 
     def _report_of(self, name: str, alive: bool, now_s: float) -> RobotReport:
         """Report of one robot. Results that cannot be reported are dropped and counted."""
@@ -250,7 +250,7 @@ def main(uri: str, ending: threading.Event, parent: ParentConnection) -> None:
         raise SystemExit("results are received over Zenoh only")
     inbox = Inbox()
     link = ZenohLink(address, inbox)
-    hearing = Hearing(link, inbox)
+    hearing = ResultReceiver(link, inbox)
     reported_s = 0.0
     while not ending.wait(_POLL_S):
         now_s = time.monotonic()

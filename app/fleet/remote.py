@@ -13,7 +13,7 @@ import msgspec
 from app.common.child_process import ChildProcess, python_module
 from app.common.timers import cancel
 from app.fleet.fleet import NAMELESS, Fleet
-from app.fleet.hearing import Report, RobotReport
+from app.fleet.hearing import FleetReport, RobotReport
 from pipeline.errors import StemmapError
 
 _log = logging.getLogger(__name__)
@@ -59,14 +59,12 @@ class RemoteRobots:
             await asyncio.sleep(_RETRY_S)
 
     async def _receive(self) -> None:
-        child = await ChildProcess.start((*self._command, self._uri), line_limit=_LONGEST_LINE)
-        try:
-            while (report := await child.receive(Report)) is not None:
+        command = (*self._command, self._uri)
+        async with await ChildProcess.start(command, line_limit=_LONGEST_LINE) as child:
+            while (report := await child.receive(FleetReport)) is not None:
                 self._take(report)
-        finally:
-            await child.end()
 
-    def _take(self, report: Report) -> None:
+    def _take(self, report: FleetReport) -> None:
         self._fleet.notice = f"Waiting: {report.problem}" if report.problem else ""
         if not report.robots and not report.problem:
             self._fleet.notice = f"Waiting: {report.place}; no robot publishes a map of its own"

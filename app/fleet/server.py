@@ -43,12 +43,9 @@ async def warm_kernels(command: Sequence[str] = WARMING) -> None:
     Raises:
         StemmapError: The process cannot be started.
     """
-    child = await ChildProcess.start(command)
-    try:
+    async with await ChildProcess.start(command) as child:
         with contextlib.suppress(TimeoutError, ProtocolError):
             await child.receive(object, PATIENCE_S)  # None when it ends
-    finally:
-        await child.end()
 
 
 def named(sources: Sequence[Open]) -> dict[str, Open]:
@@ -103,7 +100,7 @@ _LOOK_S = 0.5
 _DISCOVERY_S, _SETTLED_S = 3.0, 0.7
 
 
-class Watching:
+class RobotWatch:
     """Adds each robot that appears at a router to a fleet. It receives no messages of theirs.
 
     Args:
@@ -178,7 +175,7 @@ def build_fleet(
     port: int,
     token: str,
     fleet: Fleet,
-    watching: Watching | RemoteRobots | None = None,
+    watching: RobotWatch | RemoteRobots | None = None,
 ) -> FastAPI:
     """The application.
 
@@ -217,7 +214,7 @@ def fleet_page(request: Request) -> Response:
 
 @router.get("/robots/{name:path}")
 def robot_page(request: Request, name: str) -> Response:
-    """Lead on to a robot's own dashboard, with the token that who asks may use there."""
+    """Redirect to the dashboard of a robot, with a ticket for the role of the caller."""
     fleet: Fleet = request.app.state.fleet
     member = fleet.members.get(name)
     if member is None:
@@ -276,11 +273,11 @@ def serve_fleet(
         fleet = Fleet(replace(settings, port=port), port, token, make_parameters, warm=warm_kernels)
         for name, source in sources.items():
             fleet.add(name, source)
-        watching: Watching | RemoteRobots | None = None
+        watching: RobotWatch | RemoteRobots | None = None
         if watched is not None:
             address, source = watched
             there = address.mapped_there
-            watching = RemoteRobots(fleet, address.uri) if there else Watching(fleet, address, source)
+            watching = RemoteRobots(fleet, address.uri) if there else RobotWatch(fleet, address, source)
         app = build_fleet(settings, port=port, token=token, fleet=fleet, watching=watching)
         server = LinkedServer(
             uvicorn_config(app, settings), settings, link_of(settings, port, token), open_browser=open_browser

@@ -29,7 +29,7 @@ class Label:
     place: tuple[float, float, float]
 
 
-class Labels:
+class LabelNodes:
     """A pool of label nodes. A node stays with its key, so that an unchanged text is not sent again."""
 
     def __init__(self, scene: viser.SceneApi, name: str, scale: float = 0.9) -> None:

@@ -48,7 +48,7 @@ CHOICES = {"colour_by": COLOUR_BY, "label_by": LABEL_BY}
 
 
 @dataclass(slots=True)
-class View:
+class ViewSettings:
     """Visible layers, colouring, labels and following; shared by all browsers."""
 
     colour_by: str = COLOUR_BY[0]

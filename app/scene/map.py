@@ -10,9 +10,9 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene import colours, nodes
-from app.scene.labels import NUMBER_WIDTH, Label, Labels, apart
-from app.scene.layers import View
-from app.scene.nodes import Batch, Circles, Cloud, Float, GroundNode, Segments, first_change
+from app.scene.labels import NUMBER_WIDTH, Label, LabelNodes, apart
+from app.scene.layers import ViewSettings
+from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments, first_change
 from pipeline.config.stages import Evaluation
 from pipeline.types.records import Frame, Trees, TruthTrees
 
@@ -37,7 +37,7 @@ class MapNodes:
         self._trees = Batch(scene, "/world/trees", nodes.cylinder(), opacity=0.55)
         self._truth = Circles(scene, "/world/truth", 0.04, 2.5)
         self._mark = Circles(scene, "/world/selection", 0.06, 5.0)
-        self._labels = Labels(scene, "/world/numbers", 1.0)
+        self._labels = LabelNodes(scene, "/world/numbers", 1.0)
         self._shown: NDArray[np.float64] = np.zeros((0, 5))
         self._numbers: list[int] = []
 
@@ -47,7 +47,7 @@ class MapNodes:
             if event.instance_index is not None and 0 <= event.instance_index < len(numbers):
                 on_tree(numbers[event.instance_index])
 
-    def show(self, frame: Frame, selected: int | None, ring: Ring, view: View) -> None:
+    def show(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
         """Show the map after a scan; what moved by less than a centimetre stays where it is."""
         if self.ground.show(frame.ground):
             self.show_truth(self._truth_trees)
@@ -61,7 +61,7 @@ class MapNodes:
             self._show_trees(place, np.isfinite(trees.dbh))
         self.repaint(frame, selected, ring, view)
 
-    def repaint(self, frame: Frame, selected: int | None, ring: Ring, view: View) -> None:
+    def repaint(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
         """Show the same map after a choice of layers, of a tree, or of a cluster that stands at `ring`: x, y
         and radius [m] in the frame of the map."""
         self.ground.visible = view.layers["ground"]
@@ -76,7 +76,7 @@ class MapNodes:
         )
 
     def show_truth(self, trees: TruthTrees | None) -> None:
-        """Rings where trees and others really stand; None takes them away."""
+        """Show rings at the objects of the ground truth; None removes them."""
         self._truth_trees = trees
         if trees is None:
             self._truth.show(np.zeros((0, 2, 3)), np.zeros((0, 3), dtype=np.uint8))
@@ -299,7 +299,7 @@ class MapCloud:
 
     def __init__(self, scene: viser.SceneApi, gathered: Accumulated) -> None:
         self._scene, self._gathered = scene, gathered
-        self._blocks: list[Cloud] = []
+        self._blocks: list[CloudNode] = []
         self._sent = np.zeros((0, 3), np.float32)
         self._visible = False
 
@@ -329,7 +329,7 @@ class MapCloud:
         for number in range(first // BLOCK, -(-len(points) // BLOCK)):
             if number == len(self._blocks):
                 name = f"/world/gathered/{number}"
-                self._blocks.append(Cloud(self._scene, name, 0.05, precision="float32"))
+                self._blocks.append(CloudNode(self._scene, name, 0.05, precision="float32"))
             part = points[number * BLOCK : (number + 1) * BLOCK]
             self._blocks[number].show(part, colours.ramp(part[:, 2], LOW, HIGH))
 

@@ -141,7 +141,7 @@ def _upright(count: int) -> NDArray[np.float32]:
     return np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (count, 1))
 
 
-class Cloud(LayerNode[viser.PointCloudHandle]):
+class CloudNode(LayerNode[viser.PointCloudHandle]):
     """One point cloud. While it is hidden nothing is sent; the newest points are sent when it is shown."""
 
     def __init__(
@@ -220,7 +220,7 @@ class Circles(Segments):
 CHUNK = 200  # segments per node, so that a long path is not sent again with each scan
 
 
-class Line:
+class LineNode:
     """A growing line in chunks; only the chunks that changed are sent."""
 
     def __init__(self, scene: viser.SceneApi, name: str, colour: Rgb, height: float) -> None:

@@ -199,7 +199,7 @@ class _Origin:
     client: viser.ClientHandle | None
 
 
-class Tuning:
+class PanelCommands:
     """Sends changes of the panel to the server, one at a time, on the loop of the server.
 
     Args:

@@ -7,8 +7,8 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene import colours, nodes
-from app.scene.layers import View
-from app.scene.nodes import Cloud, Float, GroundNode, Line, Segments
+from app.scene.layers import ViewSettings
+from app.scene.nodes import CloudNode, Float, GroundNode, LineNode, Segments
 from app.scene.viser_server import add_posed
 from pipeline.config.stages import Obstacles
 from pipeline.geometry.poses import Pose2
@@ -25,14 +25,14 @@ class RobotNodes:
     def __init__(self, scene: viser.SceneApi) -> None:
         self._frame = add_posed(scene, ROBOT)
         _add_body(scene)
-        self._particles = Cloud(scene, "/world/particles", 0.06, precision="float32")
-        self._path = Line(scene, "/world/path", colours.PATH, 0.05)
-        self._odometry = Line(scene, "/world/odometry", colours.ODOMETRY, 0.03)
+        self._particles = CloudNode(scene, "/world/particles", 0.06, precision="float32")
+        self._path = LineNode(scene, "/world/path", colours.PATH, 0.05)
+        self._odometry = LineNode(scene, "/world/odometry", colours.ODOMETRY, 0.03)
         self._dead_reckoning: list[tuple[int, float, float]] = []
         self._start = Pose2()
         self._ground: GroundNode | None = None
 
-    def show(self, frame: Frame, path: Float, view: View, ground: GroundNode) -> None:
+    def show(self, frame: Frame, path: Float, view: ViewSettings, ground: GroundNode) -> None:
         """Show a new pose.
 
         Args:
@@ -54,7 +54,7 @@ class RobotNodes:
         self._follow_odometry(frame)
         self.repaint(view)
 
-    def repaint(self, view: View) -> None:
+    def repaint(self, view: ViewSettings) -> None:
         """Update the same pose after a change of layers."""
         self._particles.visible = view.layers["particles"]
         self._path.visible = view.layers["path"]

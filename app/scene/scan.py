@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from app.scene import colours, nodes
 from app.scene.colours import Colours
-from app.scene.labels import Labels, cluster_labels, shown_height
-from app.scene.layers import View
-from app.scene.nodes import Batch, Cloud, Float
+from app.scene.labels import LabelNodes, cluster_labels, shown_height
+from app.scene.layers import ViewSettings
+from app.scene.nodes import Batch, CloudNode, Float
 from app.scene.viser_server import add_posed
 from pipeline.types.records import Frame
 
@@ -40,20 +40,20 @@ class ScanNodes:
 
     def __init__(self, scene: viser.SceneApi, robot: str, on_cluster: OnCluster) -> None:
         self._sensor = add_posed(scene, f"{robot}/scan")
-        self._raw = Cloud(scene, f"{robot}/scan/raw", 0.02)
-        self._filtered = Cloud(scene, f"{robot}/scan/filtered", 0.03)
-        self._clusters = Cloud(scene, f"{robot}/scan/clusters", 0.045)
+        self._raw = CloudNode(scene, f"{robot}/scan/raw", 0.02)
+        self._filtered = CloudNode(scene, f"{robot}/scan/filtered", 0.03)
+        self._clusters = CloudNode(scene, f"{robot}/scan/clusters", 0.045)
         self._fits = Batch(scene, f"{robot}/scan/fits", nodes.cylinder(), opacity=0.4, side="double")
         self._markers = Batch(scene, f"{robot}/scan/markers", nodes.cylinder(), opacity=0.14)
         self._axes: tuple[Float, Float, Float] = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-        self._labels = Labels(scene, "/world/labels")
+        self._labels = LabelNodes(scene, "/world/labels")
         self._cluster_numbers = ClusterNumbers()
         self._numbers: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
 
         for batch in (self._markers, self._fits):
             _report(batch, self._markers, on_cluster)
 
-    def show(self, frame: Frame, view: View) -> None:
+    def show(self, frame: Frame, view: ViewSettings) -> None:
         """Show a new scan."""
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
         self._numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
@@ -62,7 +62,7 @@ class ScanNodes:
         self._show_markers(frame)
         self.repaint(frame, view)
 
-    def repaint(self, frame: Frame, view: View) -> None:
+    def repaint(self, frame: Frame, view: ViewSettings) -> None:
         """Update the same scan after a change of colours, labels or layers."""
         self._raw.visible = view.layers["raw"]
         self._filtered.visible = view.layers["filtered"]
@@ -93,7 +93,9 @@ class ScanNodes:
         return self._labels.texts
 
     @staticmethod
-    def _ramp_or(points: NDArray[np.float32], view: View, plain: colours.Rgb) -> Colours | colours.Rgb:
+    def _ramp_or(
+        points: NDArray[np.float32], view: ViewSettings, plain: colours.Rgb
+    ) -> Colours | colours.Rgb:
         if view.colour_by == "height":
             return colours.ramp(points[:, 2], HEIGHT_LOW, HEIGHT_HIGH)
         return plain

@@ -13,9 +13,9 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from app.scene.layers import View
+from app.scene.layers import ViewSettings
 from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
-from app.scene.panel import SceneCommands, TunePanel, Tuning, Value
+from app.scene.panel import PanelCommands, SceneCommands, TunePanel, Value
 from app.scene.robot import ROBOT, RobotNodes, WayNode
 from app.scene.scan import ScanNodes, Vector, VoxelNode
 from app.scene.viser_server import add_posed, messages_sent, silenced, start_server
@@ -43,8 +43,8 @@ class Scene:
     def __init__(self, commands: SceneCommands, loop: asyncio.AbstractEventLoop) -> None:
         self.secret = secrets.token_urlsafe(32)
         self._commands, self._loop = commands, loop
-        self._view = View()
-        self._tuning = Tuning(commands, self._put_back)
+        self._view = ViewSettings()
+        self._tuning = PanelCommands(commands, self._put_back)
         self._parameters, self._preset = preset("forest"), "forest"
         self._frame: Frame | None = None
         self._path: Float = np.zeros((0, 2))

@@ -60,8 +60,8 @@ async def ask(
         TookTooLongError: There was no answer in time.
     """
     path = question.get("path", "")
-    async with _semaphores.setdefault(asyncio.get_running_loop(), asyncio.Semaphore(_MOST_AT_ONCE)):
-        child = await ChildProcess.start(command, line_limit=LARGEST_ANSWER)
+    free = _semaphores.setdefault(asyncio.get_running_loop(), asyncio.Semaphore(_MOST_AT_ONCE))
+    async with free, await ChildProcess.start(command, line_limit=LARGEST_ANSWER) as child:
         try:
             await child.send(question)
             answer = await child.receive(_Answer, patience_s)
@@ -69,8 +69,6 @@ async def ask(
             answer = None
         except TimeoutError:
             raise TookTooLongError("it takes too long to be read", where=path) from None
-        finally:
-            await child.end()
     if answer is None:
         raise SourceError(
             "it could not be read: the reader ended without an answer",

@@ -19,7 +19,7 @@ Method = Literal["source", "kiss-icp", "static", "file"]
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class ChosenOdometry:
     """Selected source of motion.
 
     Attributes:
@@ -38,7 +38,7 @@ class Chosen:
         return "static" if self.method == "static" else "auto"
 
 
-def choose_odometry(known: SourceDescription, choice: str) -> Chosen:
+def choose_odometry(known: SourceDescription, choice: str) -> ChosenOdometry:
     """Return the source of motion for a choice of the user.
 
     Args:
@@ -49,10 +49,10 @@ def choose_odometry(known: SourceDescription, choice: str) -> Chosen:
         SourceError: The choice is not available for this source.
     """
     if choice.startswith(FILE):
-        return Chosen("file", f"poses from {choice.removeprefix(FILE)}, as asked")
+        return ChosenOdometry("file", f"poses from {choice.removeprefix(FILE)}, as requested")
     if choice == "static":
-        asked = "the odometry is left aside (static): the robot is mapped as standing still"
-        return Chosen("static", "none, as asked: the robot is mapped as standing still", asked)
+        warning = "the odometry is ignored (static): the robot is mapped without motion"
+        return ChosenOdometry("static", "none, as requested: the robot is mapped without motion", warning)
     if choice == "wheels" and not known.has_odometry:
         raise SourceError(
             "the source has no odometry",
@@ -63,28 +63,32 @@ def choose_odometry(known: SourceDescription, choice: str) -> Chosen:
     if choice == "kiss-icp":
         if obstacle:
             raise SourceError(f"LiDAR odometry is not possible: {obstacle}", where=known.uri)
-        wheels = ", begun at the wheels' step" if known.has_odometry else ""
-        return Chosen("kiss-icp", f"scans laid over one another (kiss-icp){wheels}, as asked")
+        wheels = ", started from the wheel odometry" if known.has_odometry else ""
+        return ChosenOdometry("kiss-icp", f"registration of the scans (kiss-icp){wheels}, as requested")
     if known.has_odometry:
         gnss = f"; GNSS {known.gnss}" if known.gnss else ""
         gnss += f"; other SLAM: {known.other_slam}" if known.other_slam else ""
-        return Chosen("source", f"the source's own{', as asked' if choice == 'wheels' else ''}{gnss}")
+        return ChosenOdometry(
+            "source", f"the source's own{', as requested' if choice == 'wheels' else ''}{gnss}"
+        )
     if obstacle:
-        told = f"the source has no odometry, and {obstacle}: the robot is mapped as standing still"
-        return Chosen("static", f"none: {obstacle}", told)
-    return Chosen("kiss-icp", "scans laid over one another (kiss-icp), as the source has no odometry")
+        warning = f"the source has no odometry, and {obstacle}: the robot is mapped without motion"
+        return ChosenOdometry("static", f"none: {obstacle}", warning)
+    return ChosenOdometry(
+        "kiss-icp", "registration of the scans (kiss-icp), because the source has no odometry"
+    )
 
 
 def _no_matching(known: SourceDescription) -> str:
     """Return why LiDAR odometry is not available for a source, or ""."""
     if known.preset == "stems":
-        return "stems are no scans"
+        return "detected stems are not scans"
     if known.sensor.rings == 1:
-        return "a laser that sees in one plane alone is not laid over itself"
-    return "there is one scan alone" if known.scans == 1 else ""
+        return "scans of a planar laser cannot be registered"
+    return "there is only one scan" if known.scans == 1 else ""
 
 
-def motion_of(known: SourceDescription, choice: str, chosen: Chosen) -> OdometryEstimator | None:
+def motion_of(known: SourceDescription, choice: str, chosen: ChosenOdometry) -> OdometryEstimator | None:
     """Return the reader of the motion; None if the source provides it or there is none.
 
     Raises:
@@ -101,7 +105,7 @@ def motion_of(known: SourceDescription, choice: str, chosen: Chosen) -> Odometry
     return None
 
 
-def with_odometry(source: Source, choice: str) -> tuple[Source, Chosen]:
+def with_odometry(source: Source, choice: str) -> tuple[Source, ChosenOdometry]:
     """Return the source with the selected motion, and the selection.
 
     Raises:

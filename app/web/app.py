@@ -18,7 +18,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.common.settings import Settings
-from app.dashboard.broadcast import Live
+from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard, SceneLike, WorkerLike
 from app.dashboard.learning import Learning
 from app.dashboard.parameters import ParameterState
@@ -48,7 +48,7 @@ MakeWorker = Callable[[Dashboard], WorkerLike]
 
 
 @dataclass(frozen=True, slots=True)
-class OfFleet:
+class FleetLink:
     """The fleet that a dashboard belongs to.
 
     Attributes:
@@ -81,7 +81,7 @@ def build(
     parameter_state: ParameterState,
     make_scene: MakeScene | None = None,
     make_worker: MakeWorker | None = None,
-    fleet: OfFleet | None = None,
+    fleet: FleetLink | None = None,
 ) -> FastAPI:
     """Return the application of one dashboard.
 
@@ -95,7 +95,7 @@ def build(
         fleet: The fleet that the dashboard belongs to, if any.
     """
     parameter_state.check = Forests(settings.folder).check
-    dashboard = Dashboard(parameter_state, Live(), AsyncStore(settings.folder, settings.database))
+    dashboard = Dashboard(parameter_state, Broadcast(), AsyncStore(settings.folder, settings.database))
 
     learning = Learning(
         dashboard.keeper, settings.folder, lambda state: dashboard.live.tell("learning", state)

@@ -41,7 +41,7 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     """
     origin: object = source.source if isinstance(source, OdometryOverride) else source
     if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
-        raise StemmapError("this run has no camera", remedy="Record a camera's topic beside the LiDAR")
+        raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
     picture = origin.picture_near(stamp_ns, SHOWN_NS)
     if picture is None:
         raise StemmapError(

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from app.robot.source import LiveSource
-from app.sources.opening import Chosen
+from app.sources.opening import ChosenOdometry
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
 from pipeline.odometry.odometry_override import OdometryOverride
@@ -153,7 +153,7 @@ class Cursor:
         raise SourceError(
             "the source does not give the same scans again",
             where=self._source.description.uri,
-            remedy="Open it anew",
+            remedy="Open it again",
         )
 
 
@@ -182,7 +182,7 @@ class LiveCursor:
         moving: The robot with that motion.
     """
 
-    def __init__(self, source: LiveSource, chosen: Chosen, moving: Source) -> None:
+    def __init__(self, source: LiveSource, chosen: ChosenOdometry, moving: Source) -> None:
         self._source = source
         self.losses = Counter[str]()
         self._moving = moving if isinstance(moving, OdometryOverride) else None

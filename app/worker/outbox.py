@@ -23,7 +23,7 @@ _SHORTEST_PAUSE_S = 0.05
 MOST_MESSAGES = 500
 
 
-class Mailbox:
+class Outbox:
     """Writes messages to a stream in a separate thread, so that a slow reader never stops the mapping.
 
     A newer frame replaces a waiting frame. A newer status replaces a waiting status if source and state are

@@ -17,11 +17,12 @@ from functools import cache, partial
 from pathlib import Path
 from typing import BinaryIO
 
+from app.common.child_process import private_streams
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
 from app.worker.codec import WireError, to_worker
 from app.worker.loop import WorkerLoop
-from app.worker.outbox import Mailbox
+from app.worker.outbox import Outbox
 from app.worker.protocol import ToWorker
 from app.worker.run import caches_in, unnamed_caches
 from app.worker.session import Session
@@ -64,7 +65,7 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     reader = threading.Thread(target=_read, args=(incoming, commands, finished, session), daemon=True)
     reader.start()
     recent = RecentScans()
-    mailbox = Mailbox(outgoing, recent)
+    mailbox = Outbox(outgoing, recent)
     driver = WorkerLoop(session, commands, mailbox.put, recent=recent)
     with on_compiling(_notify_compilation), on_compiling(driver.compiling):
         driver.run()
@@ -93,21 +94,10 @@ def _read(
         os._exit(0)
 
 
-def _private_streams() -> tuple[BinaryIO, BinaryIO]:
-    """The pipes of this process, moved away from where a library may read or print."""
-    incoming = os.fdopen(os.dup(0), "rb")
-    outgoing = os.fdopen(os.dup(1), "wb")
-    nowhere = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nowhere, 0)
-    os.close(nowhere)
-    os.dup2(2, 1)
-    return incoming, outgoing
-
-
 def run_as_worker(session: Session) -> None:
     """Be the worker of the web process that started this one, until it closes our input."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
-    incoming, outgoing = _private_streams()
+    incoming, outgoing = private_streams()
     work(session, incoming, outgoing)
     sys.stderr.flush()
     os._exit(0)  # nothing is left to be saved, and waiting for the threads of libraries takes seconds

@@ -48,9 +48,9 @@ class Status:
         going_to: The sought time or scan in words while it is not reached yet, else empty.
         going_to_s: The sought time where it is known, else None.
         going_far: Whether the way there takes long enough to speak of it.
-        live: Whether the source is a robot that is heard live.
+        live: Whether the source is live.
         robot: Its namespace, empty for none.
-        robots: The namespaces of all robots that publish scans where it is heard.
+        robots: The namespaces of all robots on its network that publish scans.
         compiling_since_s: When this machine began to compile what it does now [Unix time], else None.
         remapped: How much of the run is mapped again (see `SetParameters`), from 0 to 1; None when it is not.
         camera: Whether there are pictures of a camera.
@@ -220,57 +220,56 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
     play: bool
 
 
-class AskCluster(msgspec.Struct, frozen=True, tag="ask_cluster"):
-    """Request the explanation of a cluster of a recently displayed scan.
+class _Question(msgspec.Struct, frozen=True):
+    """A question about the run.
 
     Attributes:
         ticket: Identifier that the answer repeats.
         run: Number of the run.
-        scan, cluster: Index of the scan, and of the cluster in it.
     """
 
     ticket: int
     run: int
+
+
+class AskCluster(_Question, frozen=True, tag="ask_cluster"):
+    """Request the explanation of a cluster of a recently displayed scan.
+
+    Attributes:
+        scan, cluster: Index of the scan, and of the cluster in it.
+    """
+
     scan: int
     cluster: int
 
 
-class AskTree(msgspec.Struct, frozen=True, tag="ask_tree"):
+class AskTree(_Question, frozen=True, tag="ask_tree"):
     """Request the explanation of a tree.
 
     Attributes:
-        ticket, run: As in `AskCluster`.
         tree: Number of the tree.
     """
 
-    ticket: int
-    run: int
     tree: int
 
 
-class AskCompare(msgspec.Struct, frozen=True, tag="ask_compare"):
+class AskCompare(_Question, frozen=True, tag="ask_compare"):
     """Request the current scan mapped with other parameter sets, without a change of the run.
 
     Attributes:
-        ticket, run: As in `AskCluster`.
         sets: Parameter sets as validated nested values.
     """
 
-    ticket: int
-    run: int
     sets: list[dict[str, Any]]
 
 
-class AskCamera(msgspec.Struct, frozen=True, tag="ask_camera"):
+class AskCamera(_Question, frozen=True, tag="ask_camera"):
     """Request the camera picture.
 
     Attributes:
-        ticket, run: As in `AskCluster`.
         stamp_ns: Approximate time of the picture [ns].
     """
 
-    ticket: int
-    run: int
     stamp_ns: int
 
 

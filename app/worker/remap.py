@@ -1,4 +1,4 @@
-"""The run mapped again with other parameters: a few scans at a time, while the run stands or goes on."""
+"""The run mapped again with other parameters: a few scans at a time, while the run is paused or plays."""
 
 from __future__ import annotations
 

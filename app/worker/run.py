@@ -223,7 +223,7 @@ class Run:
 
     @property
     def preview(self) -> Trees | None:
-        """Where trees would stand once the run is mapped again; None where it is not known."""
+        """Approximate trees of the map that is being computed; None where they are unknown."""
         return None if self._remapping is None else self._preview
 
     @property

@@ -39,7 +39,7 @@ class Session:
     """Owns the source and the mapper.
 
     After `SourceError` or any other exception out of `open` or `work`, call `fail`; another source
-    can be opened, and play begins anew.
+    can be opened, and `play` starts from the beginning.
 
     Args:
         open_source: From a URI, and what is chosen about it.
@@ -48,7 +48,7 @@ class Session:
         parameters: In force at the beginning.
         open_caches: Opens the scan caches of a source.
         compile_ahead: Compiles what is not compiled on this machine yet, faster than the first scan would.
-        warm_up: Loads the kernels, while a robot is already heard and recorded.
+        warm_up: Loads the kernels, while a robot is already received and recorded.
 
     Attributes:
         on_preview: Receives the preview of a rerun (see `Run.preview`) and the revision of its parameters,
@@ -130,12 +130,16 @@ class Session:
         publish: bool = False,
         options: SourceOptions | None = None,
     ) -> Opened | None:
-        """Leave the present run and stand, paused, before the first scan of another source, with the topics
-        and mounting of `options`. A robot is recorded to the file `record`, unless that is empty, and told of
-        its map if `publish` says so.
+        """Close the present run and open another source, paused before its first scan.
+
+        Args:
+            uri, odometry, seed: As in `SourceRequest`.
+            record: File to which a live run is recorded; empty for none.
+            publish: Whether the results of a live run are published on the network of the robot.
+            options: Topics and mounting.
 
         Returns:
-            What was opened; None of a robot that is still to be heard, see `listen`.
+            The opened run; None for a robot that has not sent scans yet, see `listen`.
 
         Raises:
             SourceError: It cannot be read.
@@ -222,7 +226,7 @@ class Session:
         """
         opened = None
         if self._run is None and self._robot is not None and self._state != "failed":
-            return None  # it plays when it is heard
+            return None  # it plays when scans arrive
         if self._run is None or self._state == "failed":
             opened = self._open_again()
         elif self._state == "finished":
@@ -256,12 +260,15 @@ class Session:
     def set_parameters(
         self, parameters: Parameters, revision: int, *, whole: bool = False, step: int | None = None
     ) -> Frame | None:
-        """Use other parameters: from the next scan on, or from the sought or the standing scan on; and if
-        `whole` says so, begin to map the run again with them from its first scan (see `remap`). What that
-        changes is told of all with the same `step` together.
+        """Use other parameters from the next scan onwards; if paused, from the sought or the current scan.
+
+        Args:
+            parameters, revision: The parameters.
+            whole: Whether to map the run again from its first scan (see `remap`).
+            step: Changes with the same step are compared with the map before the first of them.
 
         Returns:
-            The standing scan, mapped again, when the run stands still; else None.
+            The current scan, mapped again, if the run is paused; else None.
         """
         self._parameters, self._revision = parameters, revision
         self._comparison.begin(step)
@@ -272,15 +279,15 @@ class Session:
         if self._target.sought:  # see `_arrive`
             self._remaps_on_arrival = whole
             return None
-        stands = self._state != "playing" and run.standing >= 0
-        from_scan = run.standing + (0 if stands else 1)
+        paused = self._state != "playing" and run.standing >= 0
+        from_scan = run.standing + (0 if paused else 1)
         run.use(parameters, from_scan)
         if self._robot is not None:
             self._robot.use_parameters(revision, from_scan, parameters)
         if whole and run.standing >= 0:
             run.remap(parameters)
             self._send_preview(run)
-        return run.map_again() if stands and self._state != "failed" else None
+        return run.map_again() if paused and self._state != "failed" else None
 
     @property
     def is_remapping(self) -> bool:
@@ -357,15 +364,14 @@ class Session:
     def _is_live(self) -> bool:
         """Return whether the run is live and reports that seeking is not possible."""
         if self._robot is not None:
-            self._warn(["a live run goes on as it comes: to step and seek, open its recording"])
+            self._warn(["a live run cannot step or seek: open its recording"])
         return self._robot is not None
 
     def _settle(self) -> None:
         self._state, self._detail = "paused", ""
 
     def _arrive(self, run: Run) -> Frame | None:
-        """Stand at the sought scan. The map before it is as it was; the parameters in force now act
-        from this scan on, whenever on the way they came."""
+        """Stop at the sought scan. Parameters that were changed on the way apply from this scan onwards."""
         self._target.forget()
         changed = run.use(self._parameters, run.standing)
         if self._remaps_on_arrival:
@@ -397,7 +403,7 @@ class Session:
 
 def with_robot(status: Status, robot: LiveSource) -> Status:
     """Return the status with that of the robot of a live run."""
-    # While scans wait the robot was heard, whatever its link had no time to note while a machine compiled.
+    # While scans wait the robot is not silent, even if its link had no time to note it during a compilation.
     is_asked = status.state in ("playing", "waiting") and not robot.scans_waiting
     silent = robot.waiting_for() if is_asked else ""
     return replace(

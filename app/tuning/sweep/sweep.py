@@ -28,7 +28,7 @@ _LARGEST_FILE = 1 << 20
 _WAIT_S = 1.0
 
 
-class KeptAnswers:
+class AnswerStore:
     """Answers on disk by the key of their job, so that no job is computed twice.
 
     Args:
@@ -80,7 +80,7 @@ class KeptAnswers:
 
 
 @dataclass(slots=True, eq=False)
-class Outcome:
+class SweepResult:
     """The results of all jobs.
 
     Attributes:
@@ -99,10 +99,10 @@ class Outcome:
 def sweep(
     jobs: Sequence[Job],
     workers: Workers,
-    kept: KeptAnswers,
+    kept: AnswerStore,
     progress: Callable[[int], object] = lambda _jobs: None,
     nobody_s: float = NOBODY_S,
-) -> Outcome:
+) -> SweepResult:
     """Have all jobs computed.
 
     Args:
@@ -120,7 +120,7 @@ class _Sweep:
         self,
         jobs: Sequence[Job],
         workers: Workers,
-        kept: KeptAnswers,
+        kept: AnswerStore,
         progress: Callable[[int], object],
         nobody_s: float,
     ) -> None:
@@ -133,9 +133,9 @@ class _Sweep:
         self._groups: dict[str, bytes] = {}  # the last group of each worker
         self._losses = Counter[int]()
         self._unfit: dict[str, set[str]] = {}  # workers that lack a run, by the run's digest
-        self._outcome = Outcome([])
+        self._outcome = SweepResult([])
 
-    def run(self) -> Outcome:
+    def run(self) -> SweepResult:
         first = {key: number for number, key in reversed(list(enumerate(self._keys)))}
         for number in sorted(first.values()):  # equal jobs are computed once
             job = self._jobs[number]

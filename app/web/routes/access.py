@@ -26,7 +26,7 @@ class TooManyRequestsError(StemmapError):
     """Too many requests of this kind wait. The same request may succeed later."""
 
 
-class Places:
+class ConnectionLimit:
     """Counts the browsers that are connected to one kind of websocket."""
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class Places:
             self._taken[role] -= free
 
 
-class Turns:
+class RequestQueue:
     """Runs requests one after the other with a pause in between, and refuses those beyond a short queue.
 
     Args:
@@ -87,9 +87,9 @@ class Limits:
     """The limits of one dashboard."""
 
     def __init__(self) -> None:
-        self.pages, self.scenes = Places(), Places()
-        self.viewers = Turns()
-        self.comparisons = Turns(pause_s=0.0)
+        self.pages, self.scenes = ConnectionLimit(), ConnectionLimit()
+        self.viewers = RequestQueue()
+        self.comparisons = RequestQueue(pause_s=0.0)
 
 
 def _dashboard(connection: HTTPConnection) -> Dashboard:

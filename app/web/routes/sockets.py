@@ -13,7 +13,7 @@ from msgspec import Meta
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from app.common.user import current_user
-from app.dashboard.broadcast import Listener, Live
+from app.dashboard.broadcast import Broadcast, Listener
 from app.dashboard.dashboard import Dashboard
 from app.web.responses import LARGEST_NUMBER
 from app.web.routes.access import Bounds, CallerRole, Dash
@@ -82,7 +82,7 @@ async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: Calle
 
 
 @contextlib.asynccontextmanager
-async def telling(browser: WebSocket, live: Live) -> AsyncIterator[None]:
+async def telling(browser: WebSocket, live: Broadcast) -> AsyncIterator[None]:
     """Send all state changes to a browser while the context is active."""
     with live.listener() as listener:
         sending = asyncio.create_task(_send(browser, listener))

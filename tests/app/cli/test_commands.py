@@ -475,7 +475,7 @@ def test_standing_still_is_warned_of(tmp_path, capsys):
     told = stemmap(capsys, "map", RUN, "--out", tmp_path, "--odometry", "static")
     assert told.code == 0
     assert "warning:" in told.err
-    assert "standing still" in told.err
+    assert "without motion" in told.err
     assert json.loads((tmp_path / "run.json").read_text())["odometry"] == "static"
 
 

@@ -17,7 +17,7 @@ from websockets.asyncio.client import connect
 from websockets.typing import Origin
 
 from app.common.settings import Settings
-from app.dashboard.annotations import Annotating, contents_of, counted, laid_over, truth_of
+from app.dashboard.annotations import AnnotationEditor, contents_of, counted, laid_over, truth_of
 from app.dashboard.dashboard import Dashboard
 from app.store.async_store import AsyncStore
 from app.store.records import Annotation, Content
@@ -354,7 +354,7 @@ async def test_the_store_works_beside_the_event_loop() -> None:
     import threading
 
     keeper = AsyncStore(None)
-    annotating = Annotating(keeper)
+    annotating = AnnotationEditor(keeper)
     await annotating.begin("d", "u", None)
     assert annotating.run is not None
     name = await annotating.edit(annotating.run, lambda _: threading.current_thread().name)

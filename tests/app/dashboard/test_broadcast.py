@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.dashboard.broadcast import Live
+from app.dashboard.broadcast import Broadcast
 from app.dashboard.payload import clearance_payload, ellipses, first_difference
 from pipeline.types.clearance import Clearance, Zone
 
@@ -21,7 +21,7 @@ async def following(stream: Any, n: int) -> list[dict[str, Any]]:
 
 
 async def test_a_late_browser_is_told_all_states_once_in_order() -> None:
-    live = Live()
+    live = Broadcast()
     live.tell("status", {"state": "playing"})
     live.tell("truth", None)
     live.tell("status", {"state": "paused"})
@@ -31,7 +31,7 @@ async def test_a_late_browser_is_told_all_states_once_in_order() -> None:
 
 
 async def test_only_the_newest_map_is_sent_with_all_of_the_path() -> None:
-    live = Live()
+    live = Broadcast()
     with live.listener() as listener:
         stream = listener.messages()
         xy = np.zeros((0, 2))
@@ -50,7 +50,7 @@ async def test_only_the_newest_map_is_sent_with_all_of_the_path() -> None:
 
 
 async def test_what_did_not_change_is_not_told_again() -> None:
-    live = Live()
+    live = Broadcast()
     with live.listener() as listener:
         stream = listener.messages()
         live.tell("status", {"state": "paused"})
@@ -61,7 +61,7 @@ async def test_what_did_not_change_is_not_told_again() -> None:
 
 
 async def test_maps_wait_for_their_round_and_states_do_not() -> None:
-    live = Live()
+    live = Broadcast()
     with live.listener() as listener:
         stream = listener.messages()
         live.show({"type": "map", "index": 0}, np.zeros((0, 2)))

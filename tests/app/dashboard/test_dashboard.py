@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-from app.dashboard.broadcast import Live
+from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
 from app.worker.protocol import (
@@ -37,7 +37,7 @@ from tests.app.fakes import FakeScene, FakeWorker, frame, opened, path, truth_tr
 
 @pytest_asyncio.fixture
 async def dashboard() -> AsyncIterator[Dashboard]:
-    made = Dashboard(ParameterState(), Live())
+    made = Dashboard(ParameterState(), Broadcast())
     made.worker, made.scene = FakeWorker(), FakeScene()
     await made.start(Open("fake:"))
     yield made

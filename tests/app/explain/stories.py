@@ -6,9 +6,17 @@ from typing import Any
 
 import msgspec
 
-from app.explain.records import Check, Circle, ClusterStory, ColumnStory, FeatureEffect, History, TreeStory
+from app.explain.records import (
+    CheckResult,
+    Circle,
+    ClusterStory,
+    ColumnStory,
+    FeatureEffect,
+    History,
+    TreeStory,
+)
 
-TOO_LONG = Check(
+TOO_LONG = CheckResult(
     "eccentricity", "", 99.0, "at most", 60.0, "detection.e_max", "Eccentricity max", True, "too long"
 )
 GATHERED = ColumnStory(
@@ -32,7 +40,9 @@ def cluster_story(**fields: Any) -> ClusterStory:
         time_s=23.1,
         verdict="too long",
         checks=[
-            Check("eccentricity", "", 99.0, "at most", 60.0, "detection.e_max", "Eccentricity max", True, "x")
+            CheckResult(
+                "eccentricity", "", 99.0, "at most", 60.0, "detection.e_max", "Eccentricity max", True, "x"
+            )
         ],
         size=3,
         eccentricity=99.0,

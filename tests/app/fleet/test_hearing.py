@@ -9,7 +9,7 @@ from typing import cast
 
 import pytest
 
-from app.fleet.hearing import UNREADABLE, Hearing, Results
+from app.fleet.hearing import UNREADABLE, ResultReceiver, Results
 from app.robot.inbox import Inbox
 from app.robot.topics import Publisher
 from app.robot.zenoh import ZenohLink
@@ -54,7 +54,7 @@ def test_a_range_that_is_none_is_counted_and_the_last_one_stays(within: float):
 
 def test_results_that_cannot_be_reported_are_dropped_and_other_robots_are_not_affected():
     link, inbox = FakeLink(["/red/stemmap/odometry", "/blue/stemmap/odometry"]), Inbox()
-    hearing = Hearing(cast(ZenohLink, link), inbox)
+    hearing = ResultReceiver(cast(ZenohLink, link), inbox)
     hearing.subscribe_to_new()
     for number in link.numbers.values():
         inbox.put(Message(number, 0, published(3.0)[outputs.ODOMETRY]), is_scan=False)

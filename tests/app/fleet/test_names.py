@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from app.fleet.fleet import NAMELESS
-from app.fleet.server import Watching, address_of, recorded_apart
+from app.fleet.server import RobotWatch, address_of, recorded_apart
 from app.robot.address import ROOT, ZenohAddress, parse_address
 from app.robot.topics import Publisher, choose
 from app.worker.protocol import Open
@@ -43,7 +43,7 @@ def test_the_robot_without_a_namespace_is_no_other():
 async def test_robots_that_are_called_alike_are_all_shown_and_recorded_apart():
     assert isinstance(ROUTER, ZenohAddress)
     fleet = make(free_port())
-    watching = Watching(fleet, ROUTER, Open("", record="/nowhere/live.mcap"))
+    watching = RobotWatch(fleet, ROUTER, Open("", record="/nowhere/live.mcap"))
     robots = ["", "robot", "a/b", "a_b", "A_b", "a.b"]
     for _ in range(2):
         for robot in robots:

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 from app.cli import serve
-from app.fleet.server import Watching, robots_at
+from app.fleet.server import RobotWatch, robots_at
 from app.robot.address import ZenohAddress, parse_address
 from app.worker.protocol import Open
 from tests.app.fleet.test_fleet import make
@@ -27,7 +27,7 @@ async def come(fleet_names: Callable[[], list[str]], wanted: list[str]) -> None:
 
 async def test_robots_get_a_dashboard_as_they_come(router: int, robots: Callable[[str], Robot]):
     fleet = make(free_port())
-    watching = Watching(fleet, address_at(router), Open("", record="/nowhere/live.mcap", publish=True))
+    watching = RobotWatch(fleet, address_at(router), Open("", record="/nowhere/live.mcap", publish=True))
     watching.start()
     try:
         async with asyncio.timeout(60):

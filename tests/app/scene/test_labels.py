@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene import Scene
-from app.scene.labels import BEHIND, MOST_LABELS, Label, Labels, apart, cluster_labels, short
+from app.scene.labels import BEHIND, MOST_LABELS, Label, LabelNodes, apart, cluster_labels, short
 from tests.app.scene.frames import make_frame
 
 PATH = np.zeros((1, 2))
@@ -56,7 +56,7 @@ def test_no_label_lies_upon_another_and_none_is_left_out_without_one_that_covers
 
 
 async def test_a_label_that_says_the_same_costs_nothing(scene: Scene):
-    labels = Labels(scene._server.scene, "/some")
+    labels = LabelNodes(scene._server.scene, "/some")
     labels.show([Label(1, "a", (0.0, 0.0, 0.0)), Label(2, "b", (1.0, 0.0, 0.0))])
     before = scene.messages
     labels.show([Label(2, "b", (1.05, 0.0, 0.0)), Label(1, "a", (0.0, 0.05, 0.0))])

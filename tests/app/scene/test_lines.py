@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene import Scene, colours
-from app.scene.nodes import CHUNK, Line
+from app.scene.nodes import CHUNK, LineNode
 
 
-def drawn(line: Line) -> np.ndarray:
+def drawn(line: LineNode) -> np.ndarray:
     """The points of the line that are visible."""
     pieces = [chunk.points for chunk in line._chunks if chunk.visible]
     if not pieces:
@@ -22,7 +22,7 @@ def drawn(line: Line) -> np.ndarray:
 async def test_a_line_is_what_was_shown_last(scene: Scene):
     @given(st.lists(st.integers(0, 3 * CHUNK + 5), min_size=1, max_size=6), st.booleans())
     def law(lengths: list[int], bent: bool):
-        line = Line(scene._server.scene, "/law", (1, 2, 3), 0.0)
+        line = LineNode(scene._server.scene, "/law", (1, 2, 3), 0.0)
         points = np.zeros((0, 2))
         for turn, length in enumerate(lengths):
             along = np.arange(float(length))
@@ -37,7 +37,7 @@ async def test_a_line_is_what_was_shown_last(scene: Scene):
 
 
 async def test_a_step_forward_sends_only_the_last_piece(scene: Scene):
-    line = Line(scene._server.scene, "/step", (1, 2, 3), 0.0)
+    line = LineNode(scene._server.scene, "/step", (1, 2, 3), 0.0)
     points = np.column_stack([np.arange(1000.0), np.zeros(1000)])
     line.show(points[:700])
     before = scene.messages

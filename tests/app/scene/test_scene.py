@@ -10,7 +10,7 @@ import pytest
 
 from app.scene import Scene
 from app.scene import scene as scene_module
-from app.scene.nodes import Cloud
+from app.scene.nodes import CloudNode
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import TruthTrees
 from tests.app.scene.frames import make_frame, make_trees
@@ -156,7 +156,7 @@ def test_selection_is_marked_and_named(scene: Scene):
 def test_a_click_or_a_look_around_sends_no_points(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     scene.show(make_frame(0), PATH[:1])
     touched: list[str] = []
-    monkeypatch.setattr(Cloud, "show", lambda self, *_: touched.append(self.node.name))
+    monkeypatch.setattr(CloudNode, "show", lambda self, *_: touched.append(self.node.name))
     scene.select(7)
     assert touched == []
     monkeypatch.undo()

@@ -12,7 +12,7 @@ from websockets.exceptions import InvalidStatus
 
 from app.web.auth import Role, viewer_token
 from app.web.routes import access
-from app.web.routes.access import Places, Turns
+from app.web.routes.access import ConnectionLimit, RequestQueue
 from tests.app.server_for_tests import BEARER, TOKEN, served
 
 VIEWER = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
@@ -26,7 +26,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("few")
 def test_places_are_given_by_role_and_given_back() -> None:
-    room = Places()
+    room = ConnectionLimit()
     with ExitStack() as stack:
         assert [stack.enter_context(room.place("viewer")) for _ in range(3)] == [True, True, False]
         with room.place("owner") as free:
@@ -49,7 +49,7 @@ async def test_viewers_keep_nobody_out_who_works() -> None:
 
 
 async def test_turns_come_one_after_the_other_with_a_pause() -> None:
-    turns, inside, times = Turns(0.02), 0, []
+    turns, inside, times = RequestQueue(0.02), 0, []
     loop = asyncio.get_running_loop()
 
     async def work() -> None:

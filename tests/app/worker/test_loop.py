@@ -18,7 +18,7 @@ from app.common.text import COMPILING
 from app.explain.history import RecentScans
 from app.worker.codec import from_worker
 from app.worker.loop import WorkerLoop
-from app.worker.outbox import MOST_POINTS, Mailbox, joined, picture_of, rows_in_common
+from app.worker.outbox import MOST_POINTS, Outbox, joined, picture_of, rows_in_common
 from app.worker.protocol import (
     Advance,
     Answer,
@@ -272,7 +272,7 @@ def received(stream: io.BytesIO) -> list[FromWorker]:
 def test_the_newest_picture_wins_and_other_messages_are_all_sent() -> None:
     incoming, outgoing = os.pipe()
     with os.fdopen(incoming, "rb") as reading, os.fdopen(outgoing, "wb") as writing:
-        mailbox = Mailbox(writing)
+        mailbox = Outbox(writing)
         xs: list[float] = []
         for k in range(300):
             xs.append(float(k))
@@ -305,7 +305,7 @@ def test_a_status_replaces_an_unsent_status_of_the_same_state_only() -> None:
 
     begun, may_write = threading.Event(), threading.Event()
     stream = SlowStream()
-    mailbox = Mailbox(stream)
+    mailbox = Outbox(stream)
     mailbox.put(Answer(1))
     assert begun.wait(20.0)
     mailbox.put(Report(Status(state="starting", source="missing:")))
@@ -320,7 +320,7 @@ def test_a_status_replaces_an_unsent_status_of_the_same_state_only() -> None:
 @pytest.mark.parametrize("state", ["paused", "finished"])
 def test_a_standing_status_follows_the_frame_of_its_scan(state: State) -> None:
     stream = io.BytesIO()
-    mailbox = Mailbox(stream)
+    mailbox = Outbox(stream)
     for k in range(3):  # within the shortest pause between two frames
         mailbox.put(Shown(1, 0.1 * k, frame(k, k), 0, path([0.0])))
         mailbox.put(Report(Status(state=state, scan_index=k)))
@@ -333,7 +333,7 @@ def test_a_standing_status_follows_the_frame_of_its_scan(state: State) -> None:
 
 def test_no_picture_of_the_run_before_follows_an_opening() -> None:
     stream = io.BytesIO()
-    mailbox = Mailbox(stream)
+    mailbox = Outbox(stream)
     for k in range(5):
         mailbox.put(Shown(1, 0.0, frame(k, k), 0, path([1.0])))
     mailbox.put(opened())
@@ -360,7 +360,7 @@ def test_a_huge_scan_is_thinned_evenly_in_the_picture_and_only_there() -> None:
     labels = (np.arange(n) % 5).astype(np.int32)
     whole = replace(frame(0, 0), raw=x, filtered=x, labels=labels)
     stream = io.BytesIO()
-    mailbox = Mailbox(stream)
+    mailbox = Outbox(stream)
     mailbox.put(Shown(1, 0.0, whole, 0, path([0.0])))
     mailbox.close(20.0)
     (message,) = received(stream)
@@ -377,7 +377,7 @@ def test_a_huge_scan_is_thinned_evenly_in_the_picture_and_only_there() -> None:
 def test_a_picture_that_cannot_be_sent_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.worker.codec.LARGEST_MESSAGE", 100_000)
     stream = io.BytesIO()
-    mailbox = Mailbox(stream)
+    mailbox = Outbox(stream)
     first, second = path([0.0, 1.0]), path([0.0, 1.0, 2.0])
     huge = replace(frame(1, 1), raw=np.zeros((50_000, 3), np.float32))
     mailbox.put(Report(make_session(FakeSource(1)).status()))
@@ -401,7 +401,7 @@ def test_a_reader_that_is_gone_does_not_stop_the_loop() -> None:
     incoming, outgoing = os.pipe()
     os.close(incoming)
     writing = os.fdopen(outgoing, "wb", buffering=0)
-    mailbox = Mailbox(writing)
+    mailbox = Outbox(writing)
     mailbox.put(Shown(1, 0.0, frame(0, 0), 0, path([0.0])))
     mailbox.close(5.0)
     assert not mailbox._thread.is_alive()
@@ -433,7 +433,7 @@ def test_who_asks_is_answered_and_the_run_goes_on_as_it_did() -> None:
 
 def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     recent = RecentScans()
-    mailbox = Mailbox(io.BytesIO(), recent)
+    mailbox = Outbox(io.BytesIO(), recent)
     mailbox.put(Shown(1, 0.0, frame(0, 0), 0, path([0.0])))
     mailbox.close(timeout_s=5.0)
     waiting: queue.Queue[ToWorker | None] = queue.Queue()

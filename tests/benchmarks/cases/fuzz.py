@@ -31,7 +31,7 @@ _SILENT_S, _HANGS_S, _SLEEPS_S = 10.0, 20.0, 600.0
 
 
 @dataclass(slots=True)
-class Outcome:
+class MappingResult:
     """What came of the copies of one kind."""
 
     read: int = 0
@@ -79,9 +79,9 @@ def run() -> list[Table]:
     ]
 
 
-def attack(kind: str, copies: int) -> Outcome:
+def attack(kind: str, copies: int) -> MappingResult:
     """Read damaged copies in a child, and in another from the next on when that one dies or hangs."""
-    outcome, first = Outcome(), 0
+    outcome, first = MappingResult(), 0
     while first < copies and outcome.used_s < BUDGET_S:
         with tempfile.TemporaryDirectory() as folder:
             words = [sys.executable, "-m", "tests.benchmarks.fuzzing", kind, str(DATA), folder]
@@ -104,7 +104,7 @@ def _processor_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _follow(child: subprocess.Popen[str], outcome: Outcome, first: int) -> int:
+def _follow(child: subprocess.Popen[str], outcome: MappingResult, first: int) -> int:
     """Count what a child tells until it ends; the copy that it would read next."""
     assert child.stdout is not None
     before, used_s, before_s = first, 0.0, outcome.used_s

@@ -37,7 +37,7 @@ MATCH = 0.5  # m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class MappingResult:
     """Result in one scene.
 
     Attributes:
@@ -63,7 +63,7 @@ def run() -> list[Table]:
 
 def _detection() -> Table:
     examples, pasted = _training_examples()
-    rows, parks = list[tuple[Cell, ...]](), list[list[Outcome]]()
+    rows, parks = list[tuple[Cell, ...]](), list[list[MappingResult]]()
     groups = [[DATA / "park_trunks" / name for name in names] for names in PARKS]
     for group in [*groups, [STREET]]:
         fitted = [_fitted_without(group, examples, pasted, seed) for seed in TRAINING_SEEDS]
@@ -91,7 +91,7 @@ def _detection() -> Table:
     return Table("Trees in places left out of training, within 25 m", columns, tuple(rows), (note, intervals))
 
 
-def _row(name: str, scenes: Sequence[Sequence[Outcome]]) -> tuple[Cell, ...]:
+def _row(name: str, scenes: Sequence[Sequence[MappingResult]]) -> tuple[Cell, ...]:
     """One row of the table from the outcomes of scenes, of each with every training seed."""
     hit, of, false = (
         sum(float(value(o)) for outcomes in scenes for o in outcomes)
@@ -104,7 +104,7 @@ def _row(name: str, scenes: Sequence[Sequence[Outcome]]) -> tuple[Cell, ...]:
     )  # fmt: skip
 
 
-def _intervals(scenes: Sequence[Sequence[Outcome]]) -> tuple[str, str]:
+def _intervals(scenes: Sequence[Sequence[MappingResult]]) -> tuple[str, str]:
     """95 % bootstrap intervals of completeness and correctness: true trees are drawn with replacement, the
     number of false trees from a Poisson distribution."""
     import numpy as np
@@ -119,11 +119,11 @@ def _intervals(scenes: Sequence[Sequence[Outcome]]) -> tuple[str, str]:
     return complete, correct
 
 
-def _kinds(scenes: Sequence[Sequence[Outcome]]) -> Counter[str]:
+def _kinds(scenes: Sequence[Sequence[MappingResult]]) -> Counter[str]:
     return sum((o.kinds for outcomes in scenes for o in outcomes), Counter())
 
 
-def _outcome(scene: Path, forest: Forest) -> Outcome:
+def _outcome(scene: Path, forest: Forest) -> MappingResult:
     """One scene mapped by the whole mapper."""
     import numpy as np
 
@@ -143,7 +143,7 @@ def _outcome(scene: Path, forest: Forest) -> Outcome:
     found = np.isin(np.arange(len(truth)), truth_of).astype(np.float64)
     by_class = ByClass()
     by_class.add_labels(place[false], points, label)
-    return Outcome(found, int(false.sum()), by_class.taken)
+    return MappingResult(found, int(false.sum()), by_class.taken)
 
 
 def _training_examples() -> tuple[list[Examples], list[Examples]]:

@@ -18,7 +18,7 @@ DRIFT, WRONG = 0.3, 0.5  # m; more than the first the map may not lie off, and a
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class MappingResult:
     """Of one drive: error of the pose at its end [m], false trees, whether it was warned of within the scans
     that it may take, and the state in the end."""
 
@@ -70,7 +70,7 @@ def run() -> list[Table]:
 WORDS = ("good", "weak", "lost")
 
 
-def outcome(place: Place, seed: int, trouble: Trouble) -> Outcome:
+def outcome(place: Place, seed: int, trouble: Trouble) -> MappingResult:
     """Drive once."""
     from pipeline.geometry.poses import Pose3
     from pipeline.mapper import Mapper
@@ -85,7 +85,7 @@ def outcome(place: Place, seed: int, trouble: Trouble) -> Outcome:
     last = frames[-1]
     error = driven.error(len(driven.truth) - 1, last.estimate.T_map_base)
     trees = last.trees.position[last.trees.confirmed]
-    return Outcome(
+    return MappingResult(
         error,
         driven.false_trees(trees, min(error, DRIFT)),
         any(trouble.said in word for frame in soon for word in frame.warnings),

@@ -62,13 +62,13 @@ def path_error(source: Source, choice: str) -> tuple[float, str]:
 def test_scans_laid_over_one_another_tell_the_way():
     error, words = path_error(without_wheels(), "auto")
     assert error < 0.5
-    assert words == "scans laid over one another (kiss-icp), as the source has no odometry"
+    assert words == "registration of the scans (kiss-icp), because the source has no odometry"
 
 
 def test_wheels_say_where_the_search_begins():
     error, words = path_error(open_source(URI), "kiss-icp")
     assert error < 0.3
-    assert "begun at the wheels' step" in words
+    assert "started from the wheel odometry" in words
 
 
 def test_reading_again_gives_the_same_poses():
@@ -99,7 +99,9 @@ def test_the_map_without_wheels_is_close_to_the_map_with_them(tmp_path: Path):
         return record
 
     without, with_wheels = mapped(without_wheels(), "without"), mapped(open_source(URI), "with")
-    assert without["odometry_used"] == "scans laid over one another (kiss-icp), as the source has no odometry"
+    assert (
+        without["odometry_used"] == "registration of the scans (kiss-icp), because the source has no odometry"
+    )
     assert with_wheels["odometry_used"] == "the source's own"
     for record in (without, with_wheels):
         assert isinstance(record["path_error"], dict)
@@ -119,7 +121,7 @@ def test_what_auto_chooses():
     assert choose_odometry(alone, "auto").method == "kiss-icp"
     flat = replace(alone, sensor=Sensor(rings=1))
     assert choose_odometry(flat, "auto").method == "static"
-    assert "one plane" in choose_odometry(flat, "auto").warning
+    assert "planar laser" in choose_odometry(flat, "auto").warning
     assert choose_odometry(replace(alone, scans=1), "auto").method == "static"
     assert choose_odometry(replace(alone, preset="stems"), "auto").method == "static"
     with pytest.raises(SourceError, match="not possible"):
@@ -167,7 +169,7 @@ def test_what_was_chosen_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[s
         write(tmp_path / f"{k}.npy", k)
     assert main(["map", str(tmp_path), "--out", str(tmp_path / "out"), "--odometry", "file:"]) == 2
     assert main(["map", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
-    assert "odometry: scans laid over one another (kiss-icp)" in capsys.readouterr().out
+    assert "odometry: registration of the scans (kiss-icp)" in capsys.readouterr().out
 
 
 def test_points_are_moved_by_the_step_to_the_stamp():

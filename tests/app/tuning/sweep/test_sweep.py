@@ -12,10 +12,10 @@ import msgspec
 import pytest
 
 from app.tuning.sweep.jobs import Answer, Job, code_digest
-from app.tuning.sweep.sweep import MOST_LOSSES, Done, Event, KeptAnswers, Lost, Processes, sweep
+from app.tuning.sweep.sweep import MOST_LOSSES, AnswerStore, Done, Event, Lost, Processes, sweep
 from tests.app.tuning.sweep.jobs import job, scores
 
-NOTHING = KeptAnswers(None)
+NOTHING = AnswerStore(None)
 Does = Callable[[str, Job], Answer | str]
 
 
@@ -101,9 +101,9 @@ def test_what_a_killed_sweep_had_done_is_not_done_again(tmp_path):
         return fine(worker, asked)
 
     with pytest.raises(KeyboardInterrupt):
-        sweep(jobs, InMemory(["a"], stopped), KeptAnswers(tmp_path))
+        sweep(jobs, InMemory(["a"], stopped), AnswerStore(tmp_path))
     workers = InMemory(["a"], fine)
-    outcome = sweep(jobs, workers, KeptAnswers(tmp_path))
+    outcome = sweep(jobs, workers, AnswerStore(tmp_path))
     # Of the second no answer was heard: the program was killed before.
     assert outcome.known + len(workers.done) == len(jobs)
     assert outcome.known >= 1
@@ -113,15 +113,15 @@ def test_what_a_killed_sweep_had_done_is_not_done_again(tmp_path):
 def test_damaged_and_foreign_files_are_computed_again_and_failures_are_not_kept(tmp_path):
     jobs = [job(0.1), job(0.2)]
     fails = InMemory(["a"], lambda *_: Answer(None, error="no", fault="job"))
-    assert f1_of(sweep(jobs, fails, KeptAnswers(tmp_path)).answers) == [None, None]
-    sweep(jobs, InMemory(["a"], fine), KeptAnswers(tmp_path))
+    assert f1_of(sweep(jobs, fails, AnswerStore(tmp_path)).answers) == [None, None]
+    sweep(jobs, InMemory(["a"], fine), AnswerStore(tmp_path))
     files = sorted(tmp_path.rglob("*.json"))
     assert len(files) == 2
     files[0].write_bytes(files[0].read_bytes()[:-5])
-    outcome = sweep(jobs, InMemory(["a"], fine), KeptAnswers(tmp_path))
+    outcome = sweep(jobs, InMemory(["a"], fine), AnswerStore(tmp_path))
     assert outcome.known == 1
     assert any("1 stored result could not be read" in warning for warning in outcome.warnings)
-    assert sweep(jobs, InMemory(["a"], fine), KeptAnswers(tmp_path)).known == 2
+    assert sweep(jobs, InMemory(["a"], fine), AnswerStore(tmp_path)).known == 2
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_an_answer_without_the_figures_is_none_wherever_it_comes_from(harm, tmp_
     outcome = sweep([job(0.1)], InMemory(["a", "b"], odd), NOTHING)
     assert f1_of(outcome.answers) == [0.1]
     assert outcome.lost == {"it sent an invalid answer": 1}
-    kept = KeptAnswers(tmp_path)
+    kept = AnswerStore(tmp_path)
     kept.put(job(0.1).key(), odd("a", job(0.1)))
     outcome = sweep([job(0.1)], InMemory(["b"], fine), kept)
     assert (outcome.known, f1_of(outcome.answers)) == (0, [0.1])
@@ -144,7 +144,7 @@ def test_an_answer_without_the_figures_is_none_wherever_it_comes_from(harm, tmp_
 
 def test_where_nothing_can_be_written_the_results_come_all_the_same(tmp_path):
     (tmp_path / "file").touch()
-    outcome = sweep([job(0.1)], InMemory(["a"], fine), KeptAnswers(tmp_path / "file"))
+    outcome = sweep([job(0.1)], InMemory(["a"], fine), AnswerStore(tmp_path / "file"))
     assert f1_of(outcome.answers) == [0.1]
     assert any("not stored" in warning for warning in outcome.warnings)
 
