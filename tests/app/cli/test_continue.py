@@ -12,7 +12,7 @@ import pytest
 from app.cli import main
 
 PLAIN = "sim:paper?duration=4"
-STAND = "sim:stand?duration=25&seed=4"
+STAND = "sim:stand?duration=15&seed=4"
 FILES = ("trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json", "state.zip")
 
 
@@ -49,7 +49,7 @@ def test_into_its_own_folder_too(tmp_path):
 
 
 def test_a_second_run_finds_its_start_and_keeps_the_numbers(stand, tmp_path, capsys):
-    other = "sim:stand?duration=25&seed=4&sigma=0.03&drive=1"  # the same stand seen with another noise
+    other = "sim:stand?duration=15&seed=4&sigma=0.03&drive=1"  # the same stand seen with another noise
     assert main(["map", other, "--continue", str(stand), "--out", str(tmp_path)]) == 0
     assert "stems agree" in capsys.readouterr().out
     record = json.loads((tmp_path / "run.json").read_text())
