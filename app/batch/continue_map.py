@@ -20,7 +20,7 @@ from pipeline.config.model import validated
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import decode, encode, read_archive, write_archive
-from pipeline.io.checkpoints.archive import damaged
+from pipeline.io.checkpoints.codec import damaged
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.base import Source

@@ -24,8 +24,8 @@ from pipeline.config import Parameters
 from pipeline.evaluation import Evaluation, evaluate
 from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap, map_plot
-from pipeline.inventory.cloud import Cloud
-from pipeline.inventory.terrain_raster import HeightMap
+from pipeline.inventory.cloud import WholeCloud
+from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.io.result_files import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson
 from pipeline.types.records import Path, Trees, TruthTrees, Verdict
 
@@ -43,7 +43,7 @@ SLICE_COLUMNS = (
 
 
 def map_plot_run(
-    cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, folder: FilePath
+    cloud: WholeCloud, preset: str, parameters: Parameters, truth: TruthTrees | None, folder: FilePath
 ) -> MappingResult:
     """Map a whole cloud and write its files.
 
@@ -60,7 +60,7 @@ def map_plot_run(
 
 
 def _map(
-    cloud: Cloud, preset: str, parameters: Parameters, truth: TruthTrees | None, files: RunFiles
+    cloud: WholeCloud, preset: str, parameters: Parameters, truth: TruthTrees | None, files: RunFiles
 ) -> MappingResult:
     about = cloud.description
     plot = map_plot(cloud, parameters, kept_forests())
@@ -152,7 +152,7 @@ def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
                 ]
 
 
-def _terrain_rows(ground: HeightMap, offset: Float) -> Iterator[list[str]]:
+def _terrain_rows(ground: TerrainRaster, offset: Float) -> Iterator[list[str]]:
     """The centres of the cells with ground returns, from west to east, without interpolated cells. The number
     of views and the uncertainty of the heights are unknown for a cloud."""
     columns, rows = np.nonzero(ground.seen)
@@ -167,7 +167,7 @@ def _text(value: float, digits: int) -> str:
 
 
 def _run_record(
-    cloud: Cloud,
+    cloud: WholeCloud,
     plot: PlotMap,
     preset: str,
     parameters: Parameters,

@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Write the files."""
     from app.batch.run_folder import read_run
     from app.common.text import count
-    from pipeline.io.tree_manager_writer import write_tree_manager
+    from pipeline.io.readers.tree_manager import write_tree_manager
 
     finished = read_run(arguments.run)
     if finished.of_cloud:

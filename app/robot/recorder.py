@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.recording.live_writer import LiveWriter
+from pipeline.io.recording.mcap_writer import LiveWriter
 
 #: Bytes that wait for the disk at most: several seconds of a fast LiDAR.
 QUEUE_BYTES = 256 << 20

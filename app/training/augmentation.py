@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from app.training.examples import Examples, stored_or_computed
-from app.training.labelled_scenes import LABELS, columns_of, label_by_points, labelled_scans, trunks
+from app.training.labelled_scenes import LABELS, columns_of, examples_by_points, labelled_scans, trunks
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers import open_source
@@ -27,7 +27,7 @@ from pipeline.simulation.primitives import Solids
 from pipeline.simulation.ray_casting import first_along
 from pipeline.simulation.scene_objects import KINDS, SceneBuilder
 from pipeline.simulation.street_scenes import PERIOD_NS, add_any
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float, Float32, Int, Scan, Step
 
 FORMAT = 3  # raise it with every change of the copies
@@ -41,13 +41,15 @@ GROUND_REACH = 0.8  # m; radius in which the ground height is measured
 SAME_DIRECTION = float(np.radians(0.4))  # a real return this near in direction can hide an inserted one
 HIDDEN, BEHIND = 0.2, 0.1  # m
 POLES = {"lamp": 0.3, "sign": 0.25, "post": 0.15, "mast": 0.15, "person": 0.15}  # probabilities
-_NO_GROUND = Terrain(np.array([[0.0, 0.0, -1000.0, 0.0]]))  # far below: the real scans have their own ground
+_NO_GROUND = SimulatedTerrain(
+    np.array([[0.0, 0.0, -1000.0, 0.0]])
+)  # far below: the real scans have their own ground
 
 _Scans = list[tuple[Float32, Int]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Copy:
+class AugmentedScans:
     """Labelled scans with inserted objects.
 
     Attributes:
@@ -99,20 +101,17 @@ def pasted_examples(folder: Path, copy: int, parameters: Parameters, reach: floa
     run = [Step(k, Scan(k * PERIOD_NS, points), pose) for k, (points, _) in enumerate(made.scans)]
     points = _to_map(np.concatenate([points for points, _ in made.scans]), pose)
     label = np.concatenate([label for _, label in made.scans])
-    sure, any_trunk = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
+    of_trunks = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
     with closing(open_source(str(folder))) as source:
         about = source.description
-    for columns in columns_of(run, about.sensor, about.T_base_lidar, parameters):
-        near = np.hypot(columns.axis[:, 0] - pose.x, columns.axis[:, 1] - pose.y) < reach
-        axis, figures = columns.axis[near], columns.figures[near]
-        kind = label_by_points(axis, points, label, sure, any_trunk)
-        yield Examples(name_of_copy(str(folder), copy), True, False, axis, figures, kind)
+    found = columns_of(run, about.sensor, about.T_base_lidar, parameters)
+    named = (name_of_copy(str(folder), copy), True, False)
+    yield from examples_by_points(found, points, label, of_trunks, reach, named, (pose.x, pose.y))
 
 
-def paste(folder: Path, copy: int) -> Copy:
+def paste(folder: Path, copy: int) -> AugmentedScans:
     """Return a copy of labelled scans: some of the scans and returns, scaled, perhaps mirrored, with inserted
-    objects,
-    at another pose in the map, so that voxels contain other returns."""
+    objects, at another pose in the map, so that voxels contain other returns."""
     rng = np.random.default_rng([int(digest_of(folder), 16), copy])
     scans = _changed(_without_repeats(labelled_scans(folder)), rng)
     points, label = (np.concatenate(each) for each in zip(*scans, strict=True))
@@ -122,7 +121,7 @@ def paste(folder: Path, copy: int) -> Copy:
     solids, classes = _inserted(place, tree, rng)
     scans = [_seen_with(*scan, solids, classes, rng) for scan in scans]
     pose = Pose2(*(float(v) for v in rng.uniform([-2.0, -2.0, -np.pi], [2.0, 2.0, np.pi])))
-    return Copy(scans, pose, _to_map(place, pose)[:, :2], tree)
+    return AugmentedScans(scans, pose, _to_map(place, pose)[:, :2], tree)
 
 
 def _without_repeats(scans: _Scans) -> _Scans:
@@ -147,7 +146,7 @@ def _inserted(place: Float, tree: Bool, rng: np.random.Generator) -> tuple[Solid
     """Return objects at positions (M, 3) [m] in the sensor frame, and the label of each owner of solids."""
     scene = SceneBuilder(_NO_GROUND, rng)
     for (x, y, ground), is_tree in zip(place.tolist(), tree.tolist(), strict=True):
-        scene.terrain = Terrain(np.array([[0.0, 0.0, ground, 0.0]]))
+        scene.terrain = SimulatedTerrain(np.array([[0.0, 0.0, ground, 0.0]]))
         if is_tree:
             KINDS["young tree"](scene, x, y)
         else:
@@ -170,7 +169,7 @@ def _seen_with(
     new, kind = new[hit], classes[solids.owner[solid[hit]]]
     to_real, towards = _directions(points)
     key = int(rng.integers(0, 2**62))
-    kept = to_real < first_along(solids.kind, solids.shape, solids.capsule, towards, key) + BEHIND
+    kept = to_real < first_along(solids, towards, key) + BEHIND
     seen = ~_hidden(new, points)
     return np.concatenate([points[kept], new[seen]]), np.concatenate([label[kept], kind[seen]])
 

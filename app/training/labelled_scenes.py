@@ -12,7 +12,7 @@ import numpy as np
 
 from app.training.examples import UNKNOWN, Examples
 from pipeline.classification import ColumnClassifier, ScanView, depth_image, steepest_by_direction
-from pipeline.classification.forest import CLASSES, Forest
+from pipeline.classification.forest import CLASSES, DecisionTrees, Forest
 from pipeline.config import Parameters
 from pipeline.detection.free_space import clear_range
 from pipeline.geometry.poses import Pose2, Pose3
@@ -75,13 +75,6 @@ def columns_of(
         yield gathering.columns
 
 
-def _columns_from_place(folder: Path, parameters: Parameters) -> Iterator[Columns]:
-    with closing(open_source(str(folder))) as source:
-        about = source.description
-        run = steps(source.records(), odometry="static")
-        yield from columns_of(run, about.sensor, about.T_base_lidar, parameters)
-
-
 def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: float) -> Iterator[Examples]:
     """Yield the examples of a simulated street or park; see `simulate_street`."""
     street = simulate_street(seed, one_way=one_way)
@@ -89,19 +82,15 @@ def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: flo
     points, kinds = street.points, np.unique(street.kind)
     label = np.array([LABELS[kind] for kind in kinds.tolist()])[np.searchsorted(kinds, street.kind)]
     sure, any_trunk = street.trunk[street.returns >= LEAST_RETURNS], street.trunk[street.returns > 0]
-    for columns in columns_of(street.steps, street.sensor, street.T_base_lidar, parameters):
-        near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
-        axis, figures = columns.axis[near], columns.figures[near]
-        kind = label_by_points(axis, points, label, sure, any_trunk)
-        yield Examples(name, True, not one_way, axis, figures, kind)
+    found = columns_of(street.steps, street.sensor, street.T_base_lidar, parameters)
+    yield from examples_by_points(found, points, label, (sure, any_trunk), reach, (name, True, not one_way))
 
 
 def stand_examples(
     uri: str, parameters: Parameters, every: int, *, furnished: bool = False
 ) -> Iterator[Examples]:
     """Yield the examples of a simulated run; `furnished` adds objects that are not trees, and only every n-th
-    scan
-    is simulated."""
+    scan is simulated."""
     source = SimulatedSource(uri, open_run(replace(parse_uri(uri), furnished=furnished)))
     about, truth = source.description, source.run.scene.truth
     run = steps(source.records(every=every))
@@ -133,13 +122,37 @@ def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Ite
     """Yield the examples of scans from one place (`velodyne/*.bin`, `labels/*.label`), or of one pair of
     files."""
     points, label = labelled_points(folder)
-    all_around = looks_all_around(folder)
-    sure, any_trunk = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
-    for columns in _columns_from_place(folder, parameters):
-        near = np.hypot(columns.axis[:, 0], columns.axis[:, 1]) < reach
+    of_trunks = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
+    with closing(open_source(str(folder))) as source:
+        about = source.description
+        run = steps(source.records(), odometry="static")
+        found = columns_of(run, about.sensor, about.T_base_lidar, parameters)
+        named = (str(folder), False, about.sensor.rings > 0)
+        yield from examples_by_points(found, points, label, of_trunks, reach, named)
+
+
+def examples_by_points(
+    found: Iterable[Columns],
+    points: Float,
+    label: Int,
+    of_trunks: tuple[Float, Float],
+    reach: float,
+    named: tuple[str, bool, bool],
+    centre: tuple[float, float] = (0.0, 0.0),
+) -> Iterator[Examples]:
+    """Yield the examples of columns within a radius, with classes by labelled points.
+
+    Args:
+        found: Columns at several times.
+        points, label: See `labelled_points`.
+        of_trunks: Positions of trunks with LEAST_RETURNS returns, and of all trunks, see `label_by_points`.
+        reach, centre: Radius and centre of the circle [m].
+        named: `scene`, `simulated` and `all_around` of the examples.
+    """
+    for columns in found:
+        near = np.hypot(columns.axis[:, 0] - centre[0], columns.axis[:, 1] - centre[1]) < reach
         axis, figures = columns.axis[near], columns.figures[near]
-        kind = label_by_points(axis, points, label, sure, any_trunk)
-        yield Examples(str(folder), False, all_around, axis, figures, kind)
+        yield Examples(*named, axis, figures, label_by_points(axis, points, label, *of_trunks))
 
 
 def looks_all_around(folder: Path) -> bool:
@@ -224,6 +237,5 @@ def _no_forest(_name: str, _all_around: bool) -> Forest:
     """Return a forest of one leaf with equal shares, because features do not depend on the forest."""
     none = np.full(1, -1, np.int32)
     zero = np.zeros(1, np.int32)
-    return Forest(
-        zero, none, np.zeros(1), zero.copy(), zero.copy(), np.full((1, len(CLASSES)), 1.0 / len(CLASSES))
-    )
+    shares = np.full((1, len(CLASSES)), 1.0 / len(CLASSES))
+    return Forest(DecisionTrees(zero, none, np.zeros(1), zero.copy(), zero.copy(), shares))

@@ -1,6 +1,5 @@
 """Validation of forests on left-out data: scenes that are left out one by one, and cross-validation of
-forests
-that are trained with annotations."""
+forests that are trained with annotations."""
 
 from __future__ import annotations
 
@@ -136,8 +135,7 @@ APART = 0.5  # m; columns within this distance belong to one tree
 
 def leave_one_out(examples: list[Examples], augmented: list[Examples], share: float) -> Iterator[str]:
     """Yield a line per real scene: trees that are found, number of trees, and false ones, by trees fitted to
-    all
-    other scenes.
+    all other scenes.
 
     Args:
         examples: Examples of all scenes; the last set of a scene, which holds all its scans, is scored.
@@ -157,8 +155,7 @@ def leave_one_out(examples: list[Examples], augmented: list[Examples], share: fl
 
 def count(scene: Examples, votes: Float, share: float) -> tuple[int, int, int]:
     """Return the number of trees that are found, of all trees, and of false ones; columns of unknown class do
-    not
-    count."""
+    not count."""
     place = scene.axis[:, :2]
     accepted = np.argsort(-votes, kind="stable")
     kept = _apart(place, accepted[votes[accepted] >= share])

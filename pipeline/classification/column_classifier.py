@@ -33,8 +33,7 @@ LOW, HIGH = 0.6, 1.6  # m above the ground; voxels in this band decide when a co
 
 def bent(memory: VoxelMap, bend: Bend) -> VoxelMap:
     """Return the voxels after a correction of the path: each moves with the last scan that saw it, and voxels
-    in
-    the same cell are joined. Tiles that changed become due for classification."""
+    in the same cell are joined. Tiles that changed become due for classification."""
     n = memory.used
     mean = memory.mean[:n].copy()
     latest = memory.latest[:n].astype(np.int64)
@@ -101,8 +100,7 @@ _LOOKED, _RAYS = NAMES.index("looked at up to"), NAMES.index("rays up to")
 
 def seen_higher(columns: Columns) -> Int:
     """Return at most MOST_STALE tiles, shape (T, 2), with columns above which scans have looked since they
-    were
-    classified, largest increase of the visible height first.
+    were classified, largest increase of the visible height first.
 
     A person next to the robot at the start is seen from two metres, where no ring reaches above the head.
     Later views from a distance add few returns, so that the tile does not count as grown.

@@ -70,8 +70,7 @@ def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
 @compiled
 def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) -> Float:
     """Return the sum over the slices of the logarithm of the returns in a cell and its eight neighbours; 0
-    with returns
-    in fewer than `LEAST` slices."""
+    with returns in fewer than `LEAST` slices."""
     block = np.zeros((cells, cells, high - LOW), np.float32)
     for i in range(mean.shape[0]):
         a = int(np.floor((mean[i, 0] - low[0] + MARGIN) / SIDE))
@@ -174,8 +173,7 @@ def _is_known(axis: Float, found: Float, kept: int) -> bool:
 @compiled
 def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: float) -> None:
     """Refine an axis. The weight of a slice is the share of its returns that is at the axis, not their
-    number, so that
-    foliage does not shift the axis. A weak prior keeps it upright."""
+    number, so that foliage does not shift the axis. A weak prior keeps it upright."""
     w, x, y, around = np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES)
     for run in range(runs.shape[0]):
         for i in range(runs[run, 0], runs[run, 1]):

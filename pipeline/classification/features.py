@@ -135,9 +135,8 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
 @compiled
 def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None:
     """Fill in the features of rays: for each band the share of rays that ended at the column; the free height
-    above
-    the clean slices up to the next return, and above the highest return; the height up to which there are
-    rays; and the gap between the clean slices and the next return, as far as there are rays [m]."""
+    above the clean slices up to the next return, and above the highest return; the height up to which there
+    are rays; and the gap between the clean slices and the next return, as far as there are rays [m]."""
     n = BANDS.shape[0]
     for b in range(n):
         ended, went = 0.0, 0.0
@@ -178,8 +177,7 @@ def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
 @compiled
 def _shape(rows: Float, last: int, out: Float) -> None:
     """Of the slices up to `last`: mean standard deviation of the inside across and along its long side [m],
-    and the
-    relative variation of the width."""
+    and the relative variation of the width."""
     xx, xy, yy, n, total, squares = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for s in range(1, min(last + 1, SLICES)):
         if rows[s, 3] >= 2.0:
@@ -200,8 +198,7 @@ def _shape(rows: Float, last: int, out: Float) -> None:
 @compiled
 def _circle(rows: Float, last: int, out: Float) -> None:
     """Radius of the circle through all clean slices together, rms distance from it [m], and their ratio;
-    UNSEEN where
-    the fit fails (Kasa 1976: z + B x + C y + D = 0 by least squares)."""
+    UNSEEN where the fit fails (Kasa 1976: z + B x + C y + D = 0 by least squares)."""
     m = np.zeros(9)
     for s in range(1, min(last + 1, SLICES)):
         if rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2]):
@@ -231,8 +228,7 @@ def _circle(rows: Float, last: int, out: Float) -> None:
 @compiled
 def _above(rows: Float, last: int, out: Float) -> None:
     """Standard deviations of the returns above the clean slices, across and along their long side [m]: the
-    plate of a
-    sign is flat, foliage is not."""
+    plate of a sign is flat, foliage is not."""
     n, xx, xy, yy = 0.0, 0.0, 0.0, 0.0
     for s in range(last + 1, SLICES):
         if rows[s, 3] >= 2.0:

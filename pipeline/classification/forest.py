@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,16 +35,14 @@ TREE_IN_FREE_AIR = 0.5  # columns with a smaller share of `free_end` are poles
 _Row = tuple[int, float, int, int, list[float]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Forest:
-    """Nodes of all trees as columns of length N.
+class DecisionTrees(NamedTuple):
+    """Nodes of all trees of a forest as columns of length N.
 
     Attributes:
         root: First node of each tree, int32, shape (T,).
         feature: Index of the feature, -1 at a leaf, int32.
         threshold: Values up to it continue at `left`, others at `right` (int32, nodes).
         share: Class shares of the training examples of a leaf, shape (N, classes).
-        free_end: Forest that decides whether a tree with a free upper end is a pole; None without.
     """
 
     root: Int32
@@ -53,6 +51,18 @@ class Forest:
     left: Int32
     right: Int32
     share: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forest:
+    """A random forest.
+
+    Attributes:
+        trees: Its trees.
+        free_end: Forest that decides whether a tree with a free upper end is a pole; None without.
+    """
+
+    trees: DecisionTrees
     free_end: Forest | None = None
 
 
@@ -74,8 +84,7 @@ def package_alone(name: str, all_around: bool) -> Forest:
 @cache
 def standard_forest(all_around: bool) -> Forest:
     """Return the forest of the package for sensors that see all around, or for sensors that look one way:
-    their
-    views of a trunk differ too much for a common forest."""
+    their views of a trunk differ too much for a common forest."""
     return read_forest(FILE, ALL_AROUND if all_around else ONE_WAY)
 
 
@@ -115,8 +124,7 @@ def _damaged(path: Path, why: str) -> StemmapError:
 
 def forest_of(data: dict[str, Any], kind: str) -> Forest:
     """Return the forest of a JSON for a kind of sensor; for sensors that look one way with the forest of
-    FREE_END,
-    which earlier files do not have.
+    FREE_END, which earlier files do not have.
 
     Raises:
         ValueError, TypeError, KeyError: The JSON is not that of a forest.
@@ -128,15 +136,15 @@ def forest_of(data: dict[str, Any], kind: str) -> Forest:
     if not roots:
         raise ValueError("it has no trees")
     feature, threshold, left, right, share = zip(*rows, strict=True)
-    return Forest(
+    trees = DecisionTrees(
         np.array(roots, np.int32),
         np.array(feature, np.int32),
         np.array(threshold, np.float64),
         np.array(left, np.int32),
         np.array(right, np.int32),
         np.array(share, np.float64),
-        forest_of(data, FREE_END) if kind == ONE_WAY and FREE_END in data else None,
     )
+    return Forest(trees, forest_of(data, FREE_END) if kind == ONE_WAY and FREE_END in data else None)
 
 
 def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
@@ -163,8 +171,7 @@ def vote(figures: Float, forest: Forest) -> Float:
     For columns with a free upper end, votes for a tree count for a pole where `free_end` decides so, because
     among all other objects there are too few poles to learn from (docs/trunks.md).
     """
-    f = forest
-    votes = _vote(figures, f.root, f.feature, f.threshold, f.left, f.right, f.share)
+    votes = _vote(figures, forest.trees)
     poles = np.flatnonzero(tree_in_free_air(figures, forest) < TREE_IN_FREE_AIR)
     votes[poles, _POLE] += votes[poles, _TREE]
     votes[poles, _TREE] = 0.0
@@ -173,8 +180,7 @@ def vote(figures: Float, forest: Forest) -> Float:
 
 def tree_in_free_air(figures: Float, forest: Forest) -> Float:
     """Return the share of `free_end` for a tree, shape (K,); NaN for columns without a free end and without
-    such a
-    forest."""
+    such a forest."""
     share = np.full(len(figures), np.nan)
     if forest.free_end is not None:
         ends = ends_in_free_air(figures)
@@ -190,9 +196,8 @@ def ends_in_free_air(figures: Float) -> Bool:
 
 
 @compiled
-def _vote(
-    figures: Float, root: Int32, feature: Int32, threshold: Float, left: Int32, right: Int32, share: Float
-) -> Float:
+def _vote(figures: Float, trees: DecisionTrees) -> Float:
+    root, feature, threshold, left, right, share = trees
     votes = np.zeros((figures.shape[0], share.shape[1]))
     for k in range(figures.shape[0]):
         for t in range(root.shape[0]):
@@ -221,36 +226,23 @@ def feature_effects(figures: Float, forest: Forest, kind: Verdict) -> Float:
     Returns:
         Effects between -1 and 1, shape (F,); 0 for features that no tree uses for this column.
     """
-    f = forest
-    share = np.ascontiguousarray(f.share[:, CLASSES.index(kind)])
-    return _feature_effects(figures, f.root, f.feature, f.threshold, f.left, f.right, share)
+    return _feature_effects(figures, forest.trees, CLASSES.index(kind))
 
 
 @compiled
-def _feature_effects(
-    figures: Float, root: Int32, feature: Int32, threshold: Float, left: Int32, right: Int32, share: Float
-) -> Float:
-    told = np.zeros(figures.shape[0])
-    for t in range(root.shape[0]):
-        known = _share(figures, -2, root[t], feature, threshold, left, right, share)
+def _feature_effects(figures: Float, trees: DecisionTrees, kind: int) -> Float:
+    effects = np.zeros(figures.shape[0])
+    for root in trees.root:
+        known = _share(figures, -2, root, trees, kind)
         for f in range(figures.shape[0]):
-            unknown = _share(figures, f, root[t], feature, threshold, left, right, share)
-            told[f] += (known - unknown) / root.shape[0]
-    return told
+            effects[f] += (known - _share(figures, f, root, trees, kind)) / trees.root.shape[0]
+    return effects
 
 
 @compiled
-def _share(
-    figures: Float,
-    unknown: int,
-    root: int,
-    feature: Int32,
-    threshold: Float,
-    left: Int32,
-    right: Int32,
-    share: Float,
-) -> float:
+def _share(figures: Float, unknown: int, root: int | np.int32, trees: DecisionTrees, kind: int) -> float:
     """Return the share at the leaf, averaged over both branches of each split on the unknown feature."""
+    _, feature, threshold, left, right, share = trees
     waiting, weight = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)
     waiting[0], weight[0] = root, 1.0
     n, total = 1, 0.0
@@ -265,5 +257,5 @@ def _share(
                 node = left[node]
             else:
                 node = left[node] if figures[feature[node]] <= threshold[node] else right[node]
-        total += w * share[node]
+        total += w * share[node, kind]
     return total

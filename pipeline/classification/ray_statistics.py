@@ -1,6 +1,5 @@
 """Visibility of columns: how high scans looked at them, whether they were present, and how many rays ended at
-them
-or passed them."""
+them or passed them."""
 
 from __future__ import annotations
 
@@ -112,8 +111,7 @@ def update_visibility(
 @compiled
 def depth_image(points: Float32) -> UInt16:
     """Return the horizontal distance of the nearest return by direction and elevation [cm], 0 without a
-    return, uint16,
-    shape (BINS, ELEVATIONS).
+    return, uint16, shape (BINS, ELEVATIONS).
 
     Args:
         points: Points in the level sensor frame, shape (N, 3) [m].
@@ -144,8 +142,7 @@ def count_rays(
     range_max: float,
 ) -> None:
     """Count for each column and slice the rays that ended at it, and those that passed its axis and ended
-    behind it.
-    Rays that end before it, or have no return, do not count.
+    behind it. Rays that end before it, or have no return, do not count.
 
     Args:
         axis: Axes of the columns, shape (K, 5).

@@ -10,7 +10,7 @@ import math
 import mmap
 import sys
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -59,7 +59,23 @@ _FARTHEST = np.float32((_OFFSET - 2 * TILE_CELLS) * SIDE)
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 KEPT = ("key", "mean", "returns", "scans", "latest")  # columns from which all others follow
 
-_Tables = tuple[Int, Int32, Float32, Int32, Int32, Int32, Int32, Int32, Int, Int32, Int32, Int]
+
+class _Tables(NamedTuple):
+    """The columns of `VoxelMap` for the kernels."""
+
+    key: Int
+    slot: Int32
+    mean: Float32
+    returns: Int32
+    scans: Int32
+    latest: Int32
+    following: Int32
+    home: Int32
+    tile_key: Int
+    tile_slot: Int32
+    tile_first: Int32
+    tile_returns: Int
+    tile_judged: Int
 
 
 @dataclass(slots=True, eq=False)
@@ -142,7 +158,7 @@ class VoxelMap:
         begin = 0
         self.added += 1
         while True:
-            begin, self.used, self.tiles = _add(points, begin, scan, *self._tables(), self.used, self.tiles)
+            begin, self.used, self.tiles = _add(points, begin, scan, self._tables(), self.used, self.tiles)
             if begin == len(points):
                 return
             self._make_room(most)
@@ -152,27 +168,15 @@ class VoxelMap:
         classified, and mark them as classified. After the first scans at most the `MOST_TILES` with the
         largest growth are returned, which bounds the time of a scan."""
         most = MOST_TILES if self.added > FIRST_SCANS else self.tiles
-        return _select_due(self.tile_key, self.tile_returns, self.tile_judged, self.tiles, grown, most)
+        return _select_due(self._tables(), self.tiles, grown, most)
 
     def around(self, tile: Int, margin: float) -> tuple[Float32, Int32]:
         """Return mean (N, 3) and returns (N,) of the voxels of a tile and `margin` [m] around it."""
-        rows = _rows_around(
-            tile[0],
-            tile[1],
-            margin,
-            self.tile_key,
-            self.tile_slot,
-            self.tile_first,
-            self.following,
-            self.mean,
-        )
+        rows = _rows_around(tile[0], tile[1], margin, self._tables())
         return self.mean[rows], self.returns[rows]
 
     def _tables(self) -> _Tables:
-        return (
-            self.key, self.slot, self.mean, self.returns, self.scans, self.latest, self.following, self.home,
-            self.tile_key, self.tile_slot, self.tile_first, self.tile_returns,
-        )  # fmt: skip
+        return _Tables(*(getattr(self, name) for name in _Tables._fields))
 
     def _make_room(self, most: int) -> None:
         rows = np.arange(self.used)
@@ -193,9 +197,7 @@ class VoxelMap:
             np.take(getattr(self, name), rows, axis=0, out=getattr(fresh, name)[: len(rows)])
         fresh.added = self.added
         index(fresh, len(rows))
-        _keep_judged(
-            self.tile_key[: self.tiles], self.tile_judged, fresh.tile_key, fresh.tile_slot, fresh.tile_judged
-        )
+        _keep_judged(self._tables(), self.tiles, fresh._tables())
         return fresh
 
 
@@ -233,7 +235,7 @@ def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
 def index(memory: VoxelMap, rows: int) -> None:
     """Fill the tables of a map whose first rows are set."""
     memory.used = rows
-    memory.tiles = _index(rows, *memory._tables())
+    memory.tiles = _index(rows, memory._tables())
 
 
 @compiled
@@ -243,67 +245,47 @@ def _tile_of(key: int | np.int64) -> int:
 
 
 @compiled
-def _link(
-    row: int | np.int64,
-    key: int | np.int64,
-    following: Int32,
-    home: Int32,
-    tile_key: Int,
-    tile_slot: Int32,
-    tile_first: Int32,
-    tiles: int,
-) -> int:
+def _link(row: int | np.int64, tables: _Tables, tiles: int) -> int:
     """Add a voxel to the chain of its tile; return the number of tiles in use."""
-    tile = _tile_of(key)
-    at = _find(tile, tile_key, tile_slot)
-    if tile_slot[at] == 0:
-        tile_key[tiles] = tile
-        tile_first[tiles] = -1
+    tile = _tile_of(tables.key[row])
+    at = _find(tile, tables.tile_key, tables.tile_slot)
+    if tables.tile_slot[at] == 0:
+        tables.tile_key[tiles] = tile
+        tables.tile_first[tiles] = -1
         tiles += 1
-        tile_slot[at] = tiles
-    home[row] = tile_slot[at] - 1
-    following[row] = tile_first[home[row]]
-    tile_first[home[row]] = row
+        tables.tile_slot[at] = tiles
+    home = tables.tile_slot[at] - 1
+    tables.home[row] = home
+    tables.following[row] = tables.tile_first[home]
+    tables.tile_first[home] = row
     return tiles
 
 
 @compiled
-def _index(
-    used: int,
-    keys: Int,
-    slot: Int32,
-    mean: Float32,  # noqa: ARG001 - the tables come as one
-    returns: Int32,
-    scans: Int32,  # noqa: ARG001
-    latest: Int32,  # noqa: ARG001
-    following: Int32,
-    home: Int32,
-    tile_key: Int,
-    tile_slot: Int32,
-    tile_first: Int32,
-    tile_returns: Int,
-) -> int:
+def _index(used: int, tables: _Tables) -> int:
     """Fill the hash tables and chains of existing rows; return the number of tiles."""
     tiles = 0
     for row in range(used):
-        slot[_find(keys[row], keys, slot)] = row + 1
-        tiles = _link(row, keys[row], following, home, tile_key, tile_slot, tile_first, tiles)
-        tile_returns[home[row]] += returns[row]
+        tables.slot[_find(tables.key[row], tables.key, tables.slot)] = row + 1
+        tiles = _link(row, tables, tiles)
+        tables.tile_returns[tables.home[row]] += tables.returns[row]
     return tiles
 
 
 @compiled
-def _keep_judged(old_key: Int, old_judged: Int, key: Int, slot: Int32, judged: Int) -> None:
-    for t in range(old_key.shape[0]):
-        at = _find(old_key[t], key, slot)
-        if slot[at] > 0:
-            judged[slot[at] - 1] = old_judged[t]
+def _keep_judged(old: _Tables, tiles: int, fresh: _Tables) -> None:
+    """Copy the returns at the last classification to the tiles of another map that exist in both."""
+    for t in range(tiles):
+        at = _find(old.tile_key[t], fresh.tile_key, fresh.tile_slot)
+        if fresh.tile_slot[at] > 0:
+            fresh.tile_judged[fresh.tile_slot[at] - 1] = old.tile_judged[t]
 
 
 @compiled
-def _select_due(key: Int, returns: Int, judged: Int, tiles: int, grown: float, most: int) -> Int:
+def _select_due(tables: _Tables, tiles: int, grown: float, most: int) -> Int:
     """Return at most `most` tiles, shape (T, 2), that are due, in the order of the table, and mark them as
     classified."""
+    key, returns, judged = tables.tile_key, tables.tile_returns, tables.tile_judged
     growth = np.zeros(tiles)
     due = 0
     for t in range(tiles):
@@ -327,25 +309,11 @@ def _select_due(key: Int, returns: Int, judged: Int, tiles: int, grown: float, m
 
 @compiled
 def _add(
-    points: Float32,
-    begin: int,
-    scan: int,
-    keys: Int,
-    slot: Int32,
-    mean: Float32,
-    returns: Int32,
-    scans: Int32,
-    latest: Int32,
-    following: Int32,
-    home: Int32,
-    tile_key: Int,
-    tile_slot: Int32,
-    tile_first: Int32,
-    tile_returns: Int,
-    used: int,
-    tiles: int,
+    points: Float32, begin: int, scan: int, tables: _Tables, used: int, tiles: int
 ) -> tuple[int, int, int]:
     """Return the first point without room (the number of points when all fit), voxels and tiles in use."""
+    keys, slot, mean, latest = tables.key, tables.slot, tables.mean, tables.latest
+    returns, scans, home, tile_returns = tables.returns, tables.scans, tables.home, tables.tile_returns
     wanted, guess = _guess(points, begin, keys, slot)
     row, last = np.int64(-1), np.int64(-1)
     for i in range(begin, points.shape[0]):
@@ -358,13 +326,13 @@ def _add(
                 at = _find(key, keys, slot)
                 row = np.int64(slot[at]) - 1
                 if row < 0:
-                    if used == keys.shape[0] or tiles == tile_key.shape[0]:
+                    if used == keys.shape[0] or tiles == tables.tile_key.shape[0]:
                         return i, used, tiles
                     row = np.int64(used)
                     used += 1
                     slot[at] = used
                     keys[row], latest[row] = key, -1
-                    tiles = _link(row, key, following, home, tile_key, tile_slot, tile_first, tiles)
+                    tiles = _link(row, tables, tiles)
             last = key
         returns[row] += 1
         for a in range(3):
@@ -379,8 +347,7 @@ def _add(
 @compiled
 def _guess(points: Float32, begin: int, keys: Int, slot: Int32) -> tuple[Int, Int]:
     """Return the key of each point, -1 outside of the map, and the row of its voxel where the hash table
-    gives it at the
-    first position, else -1.
+    gives it at the first position, else -1.
 
     The table does not fit into the caches, so lookups take most of the time. Here no lookup depends on
     another one, so the processor overlaps them.
@@ -405,16 +372,8 @@ def _guess(points: Float32, begin: int, keys: Int, slot: Int32) -> tuple[Int, In
 
 
 @compiled
-def _rows_around(
-    tx: int,
-    ty: int,
-    margin: float,
-    tile_key: Int,
-    tile_slot: Int32,
-    tile_first: Int32,
-    following: Int32,
-    mean: Float32,
-) -> Int:
+def _rows_around(tx: int, ty: int, margin: float, tables: _Tables) -> Int:
+    tile_key, tile_slot, mean, following = tables.tile_key, tables.tile_slot, tables.mean, tables.following
     low_x, low_y = tx * TILE - margin, ty * TILE - margin
     high_x, high_y = (tx + 1) * TILE + margin, (ty + 1) * TILE + margin
     reach = int(np.ceil(margin / TILE))
@@ -427,7 +386,7 @@ def _rows_around(
             at = _find(key, tile_key, tile_slot)
             if tile_slot[at] == 0:
                 continue
-            row = np.int64(tile_first[tile_slot[at] - 1])
+            row = np.int64(tables.tile_first[tile_slot[at] - 1])
             while row >= 0:
                 if low_x <= mean[row, 0] < high_x and low_y <= mean[row, 1] < high_y:
                     if n == rows.shape[0]:
@@ -445,8 +404,7 @@ MASK = (1 << 31) - 1
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedVoxelMap:
     """An immutable copy of a voxel map: columns of the voxels and tiles in use, without the hash tables.
-    `room` and
-    `tile_room` are the sizes of the tables. See `VoxelMap`."""
+    `room` and `tile_room` are the sizes of the tables. See `VoxelMap`."""
 
     key: Int
     mean: Float32

@@ -92,8 +92,7 @@ def corrected(
     pose: Pose, ax: float, ay: float, S0: float, S1: float, S2: float, y0: float, y1: float
 ) -> Pose:
     """Return the Kalman update of a pose by one landmark with innovation y of covariance S (xx, xy, yy); J as
-    in
-    `expected_spread`."""
+    in `expected_spread`."""
     scale = 1.0 / (S0 * S2 - S1 * S1)
     a0, a1, a2 = pose.xx - ay * pose.xt, pose.xy - ay * pose.yt, pose.xt - ay * pose.tt
     b0, b1, b2 = pose.xy + ax * pose.xt, pose.yy + ax * pose.yt, pose.yt + ax * pose.tt

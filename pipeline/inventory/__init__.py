@@ -14,7 +14,7 @@ from pipeline.classification import ForestOf, package_alone
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.inventory.cloud import Cloud, Thinned, find_extent
+from pipeline.inventory.cloud import Thinned, WholeCloud, find_extent
 from pipeline.inventory.cross_sections import HIGHEST, LOWEST, Slices, cut, find_circles
 from pipeline.inventory.stem_model import (
     COVERAGE,
@@ -38,7 +38,7 @@ from pipeline.inventory.stem_model import (
     middles,
 )
 from pipeline.inventory.stem_tracing import CLASSES, chain, find_upright, follow
-from pipeline.inventory.terrain_raster import HeightMap, LowestReturns, heights_above
+from pipeline.inventory.terrain_raster import LowestReturns, TerrainRaster, heights_above
 from pipeline.types.records import Float32, Int32, Trees, Verdict
 
 MOST_RASTER = 96 << 20  # bytes
@@ -92,7 +92,7 @@ class PlotMap:
     slices: Float
     slice_height: Float
     candidates: Candidates
-    ground: HeightMap
+    ground: TerrainRaster
     points: Float32
     counts: dict[str, int]
     voxel_size: float
@@ -101,7 +101,7 @@ class PlotMap:
     warnings: tuple[str, ...]
 
 
-def map_plot(cloud: Cloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
+def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
     """Map the stems of a whole cloud.
 
     Raises:
@@ -139,8 +139,8 @@ def map_plot(cloud: Cloud, parameters: Parameters, forests: ForestOf = package_a
 
 
 def find_ground(
-    cloud: Cloud, slope_max: float, *, band: tuple[float, float] = (LOWEST, HIGHEST), most: int = 1 << 21
-) -> tuple[HeightMap, Thinned, dict[str, int]]:
+    cloud: WholeCloud, slope_max: float, *, band: tuple[float, float] = (LOWEST, HIGHEST), most: int = 1 << 21
+) -> tuple[TerrainRaster, Thinned, dict[str, int]]:
     """Return the ground below a cloud, its thinned points (x, y, z, height above the ground) in a band, and
     counts.
 
@@ -247,7 +247,7 @@ def _away_from(places: Float, others: Float) -> Float:
     return away
 
 
-def _warnings(cloud: Cloud, near: Thinned, slices: Slices, ground: HeightMap) -> tuple[str, ...]:
+def _warnings(cloud: WholeCloud, near: Thinned, slices: Slices, ground: TerrainRaster) -> tuple[str, ...]:
     warnings = list(cloud.description.warnings)
     if near.side > COARSE:
         warnings.append(

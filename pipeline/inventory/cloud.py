@@ -42,7 +42,7 @@ class CloudDescription:
     attributes: tuple[str, ...] = ()
 
 
-class Cloud(Protocol):
+class WholeCloud(Protocol):
     """A whole cloud of a plot, read in parts."""
 
     @property

@@ -1,6 +1,5 @@
 """Stems: circles of several slices above one another, traced upwards and downwards; and upright columns of
-voxels, which
-the random forest classifies."""
+voxels, which the random forest classifies."""
 
 from __future__ import annotations
 
@@ -221,8 +220,7 @@ def _fits(near: Float, row: Float, r_min: float, r_max: float, missed: int) -> b
 @compiled
 def lines(height: Float, value: Float, weight: Float) -> tuple[float, float, float, float]:
     """Fit a line through values over height robustly; return the value at breast height, its change per
-    metre, and
-    their standard deviations. A weak prior keeps the slope near 0."""
+    metre, and their standard deviations. A weak prior keeps the slope near 0."""
     n = height.shape[0]
     a, b, scale = np.median(value), 0.0, 1.0
     saa, sab, sbb = 1.0, 0.0, 1.0

@@ -28,7 +28,7 @@ WINDOW = 2  # cells to each side to which a plane is fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeightMap:
+class TerrainRaster:
     """Heights of the ground at the corners and centres of a raster.
 
     Attributes:
@@ -77,7 +77,7 @@ class LowestReturns:
         """Add points of shape (N, 3) [m]."""
         _keep_lowest(points, self._low, self._lowest, self._count, self._occupied)
 
-    def ground(self, slope_max: float) -> HeightMap:
+    def ground(self, slope_max: float) -> TerrainRaster:
         """Return the ground below all points so far.
 
         Args:
@@ -95,10 +95,10 @@ class LowestReturns:
         x = self._low[0] + (np.arange(height.shape[0]) + 0.5) * CELL
         y = self._low[1] + (np.arange(height.shape[1]) + 0.5) * CELL
         height += x[:, None] * trend[0] + y[None, :] * trend[1] + trend[2]
-        return HeightMap(self._low, CELL, height, seen)
+        return TerrainRaster(self._low, CELL, height, seen)
 
 
-def heights_above(points: Float32, ground: HeightMap) -> Float32:
+def heights_above(points: Float32, ground: TerrainRaster) -> Float32:
     """Return the height of each point (N, 3) above the ground, float32, shape (N,) [m]."""
     return _heights_above(points, ground.height, ground.low, ground.cell)
 
@@ -268,8 +268,7 @@ def _remove_overhanging(ground: Float, slope: float) -> None:
 @compiled
 def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
     """Return the height at the centre of each cell with ground, by a plane through the lowest returns around
-    it, NaN
-    elsewhere; and which cells have ground."""
+    it, NaN elsewhere; and which cells have ground."""
     columns, rows = ground.shape[0], ground.shape[1]
     height = np.full((columns, rows), np.nan)
     seen = np.zeros((columns, rows), np.bool_)

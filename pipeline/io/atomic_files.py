@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Atomic writing of files: a file is complete or does not exist."""
 
 from __future__ import annotations
 
@@ -15,20 +15,19 @@ from pipeline.errors import StemmapError
 if sys.platform != "win32":
     import fcntl
 
-# Begins the name of a folder in which files are written before all of them are whole.
+# Prefix of a folder in which files are written before all of them are complete.
 UNFINISHED = ".unfinished-"
 
 
 @contextmanager
 def write_beside(path: Path) -> Iterator[Path]:
-    """Write a file beside its place and move it there when it is whole.
+    """Write a temporary file and move it to its path when it is complete.
 
-    Yields a path in the same folder; write and close that file. When the block ends it is flushed to
-    the disk and takes the place of `path`, at once and in one step; when the block raises it is removed
-    and `path` stays as it was.
+    Yields a path in the same folder; write and close that file. At the end of the block it is flushed to the
+    disk and replaces `path` in one step; if the block raises, it is removed and `path` does not change.
 
     Raises:
-        StemmapError: The folder does not exist, `path` is a folder, or the disk refuses.
+        StemmapError: The folder does not exist, `path` is a folder, or writing fails.
     """
     if not path.parent.is_dir():
         raise StemmapError(
@@ -49,13 +48,13 @@ def write_beside(path: Path) -> Iterator[Path]:
 
 
 def hold(file: IO[Any]) -> None:
-    """Let others see that this process writes to an open file, until it closes it or ends in any way."""
-    if sys.platform != "win32":  # there nobody can take an open file away
+    """Lock an open file until it is closed or the process ends."""
+    if sys.platform != "win32":  # Windows locks open files
         fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_held(path: Path) -> bool:
-    """Whether a process holds a file (see `hold`)."""
+    """Return whether a process has locked a file, see `hold`."""
     if sys.platform != "win32":
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
             try:
@@ -66,7 +65,7 @@ def is_held(path: Path) -> bool:
 
 
 def _to_disk(path: Path) -> None:
-    """Wait until a file or folder is on the disk, so that a power cut leaves the old or the new one."""
+    """Wait until a file or folder is on the disk, so that a power cut leaves the old or the new file."""
     if path.is_dir() and os.name == "nt":
         return  # Windows cannot open folders
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)

@@ -1,18 +1,23 @@
-"""Ground truth trees from a CSV, with the headers that other tools write."""
+"""Ground truth: tables of trees (CSV) with the headers of other tools, and the JSON attachment of simulated
+recordings."""
 
 from __future__ import annotations
 
 import csv
+import json
 import math
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
 from pipeline.io.readers.base import COORDINATE_LIMIT
-from pipeline.types.records import TruthTrees
+from pipeline.types.records import Sensor, Truth, TruthPath, TruthTrees
 
 KINDS = ("tree", "pole", "person", "bush", "other")
 LARGEST_FILE = 64 << 20
@@ -31,30 +36,30 @@ _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
     """Read a table of trees.
 
-    Positions stand as x and y (or easting and northing) in metres, or as azimuth in degrees from
-    north (y), clockwise, with a distance in metres. A row's class is one of KINDS; without such a
-    column all rows are trees.
+    Positions are x and y (or easting and northing) in metres, or azimuth in degrees from north (y),
+    clockwise, with a distance in metres. The class of a row is one of KINDS; without such a column all rows
+    are trees.
 
     Args:
         path: A CSV with a header line; commas, semicolons or tabs.
-        dbh_unit: "m", "cm" or "mm" for a column `dbh` that does not say its unit.
+        dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit.
 
     Raises:
-        SourceError: It is no such table; the message names line and column.
+        SourceError: It is not such a table; the message names line and column.
     """
     return parse_truth_trees(_text_of(path), where=str(path), dbh_unit=dbh_unit)
 
 
 def parse_truth_trees(text: str, *, where: str, dbh_unit: str | None = None) -> TruthTrees:
-    """The same from the text of a table.
+    """Parse the text of a table, see `read_truth_trees`.
 
     Args:
-        text: Of the whole table.
-        where: What messages call it.
-        dbh_unit: As for `read_truth_trees`.
+        text: The text.
+        where: Name of the table in messages.
+        dbh_unit: See `read_truth_trees`.
 
     Raises:
-        SourceError: It is no such table; the message names line and column.
+        SourceError: It is not such a table; the message names line and column.
     """
     lines, rows = _rows_of(text, where)
     header = [name.strip().lower() for name in rows[0]] if rows else []
@@ -111,7 +116,7 @@ def _text_of(path: Path) -> str:
 
 
 def _rows_of(text: str, where: str) -> tuple[list[int], list[list[str]]]:
-    """The line number and the cells of every row that is not empty."""
+    """Return the line number and the cells of every row that is not empty."""
     first = text.partition("\n")[0]
     delimiter = max(",;\t", key=first.count)
     try:
@@ -157,7 +162,7 @@ def _diameters(table: _Table, dbh_unit: str | None) -> Float:
 
 
 def _measured(diameter: Float) -> Float:
-    """Other tools write 0 or a negative number for a diameter that was not measured."""
+    """Return diameters with NaN for 0 and negative numbers, which other tools write for unmeasured ones."""
     return np.where(diameter > 0.0, diameter, np.nan)
 
 
@@ -169,7 +174,109 @@ def _kinds(table: _Table) -> tuple[str, ...]:
     for row, kind in enumerate(kinds):
         if kind not in KINDS:
             raise SourceError(
-                f"line {table.lines[row]}: class {kind!r} is none of {', '.join(KINDS)}",
+                f"line {table.lines[row]}: class {kind!r} is not one of {', '.join(KINDS)}",
                 where=table.where,
             )
     return kinds
+
+
+ATTACHMENT = "stemmap_truth.json"
+SIZE_LIMIT = 64 << 20
+_LIMIT = COORDINATE_LIMIT
+Rows = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=-_LIMIT, le=_LIMIT)]], msgspec.Meta(max_length=2_000_000)
+]
+
+
+_UNKNOWN = Sensor()
+
+
+class _Sensor(msgspec.Struct, frozen=True):
+    name: str = _UNKNOWN.name
+    rings: Annotated[int, msgspec.Meta(ge=0, le=1024)] = _UNKNOWN.rings
+    ring_step: Annotated[float, msgspec.Meta(ge=0, le=3.2)] = _UNKNOWN.ring_step
+    azimuth_step: Annotated[float, msgspec.Meta(gt=0, le=3.2)] = _UNKNOWN.azimuth_step
+    range_sigma: Annotated[float, msgspec.Meta(gt=0, le=10)] = _UNKNOWN.range_sigma
+    range_max: Annotated[float, msgspec.Meta(gt=0, le=10_000)] = _UNKNOWN.range_max
+
+
+class _Trees(msgspec.Struct, frozen=True):
+    x: Rows
+    y: Rows
+    dbh: Annotated[list[float | None], msgspec.Meta(max_length=2_000_000)]
+    kind: Annotated[
+        list[Literal["tree", "pole", "person", "bush", "other"]], msgspec.Meta(max_length=2_000_000)
+    ]
+
+
+class _Path(msgspec.Struct, frozen=True):
+    stamp_ns: Annotated[
+        list[Annotated[int, msgspec.Meta(ge=0, lt=2**62)]], msgspec.Meta(max_length=2_000_000)
+    ]
+    x: Rows
+    y: Rows
+    yaw: Rows
+
+
+class _File(msgspec.Struct, frozen=True):
+    version: Literal[1]
+    sensor: _Sensor | None = None
+    trees: _Trees | None = None
+    path: _Path | None = None
+
+
+def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
+    """Decode the attachment into the ground truth, in the map frame, and the sensor (None if not named).
+
+    Raises:
+        SourceError: It is not JSON of this form, a number is beyond 1e8, or columns differ in length.
+    """
+    try:
+        file = msgspec.json.decode(content, type=_File)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise SourceError(f"the attached ground truth cannot be read: {error}", where=where) from error
+    for columns in (file.trees, file.path):
+        if columns is not None and len({len(column) for column in msgspec.structs.astuple(columns)}) != 1:
+            raise SourceError("the columns of the attached ground truth differ in length", where=where)
+    trees = None if file.trees is None else _trees(file.trees)
+    path = None if file.path is None else _path(file.path)
+    sensor = None if file.sensor is None else Sensor(**msgspec.structs.asdict(file.sensor))
+    return Truth(trees, path), sensor
+
+
+def _trees(columns: _Trees) -> TruthTrees:
+    dbh = [np.nan if diameter is None else diameter for diameter in columns.dbh]
+    return TruthTrees(np.array(columns.x), np.array(columns.y), np.array(dbh, float), tuple(columns.kind))
+
+
+def _path(columns: _Path) -> TruthPath:
+    stamp_ns = np.array(columns.stamp_ns, dtype=np.int64)
+    order = np.argsort(stamp_ns, kind="stable")
+    x, y, yaw = (np.array(column, dtype=np.float64)[order] for column in (columns.x, columns.y, columns.yaw))
+    return TruthPath(stamp_ns[order], x, y, yaw, same_frame=True)
+
+
+def truth_json(sensor: Sensor, truth: Truth | None) -> bytes:
+    """Return the attachment with sensor, trees (dbh null where unknown) and path, as columns.
+
+    A path in another frame than that of the map, or without yaw, is left out, because readers expect both.
+    """
+    content: dict[str, Any] = {"version": 1, "sensor": asdict(sensor)}
+    if truth is not None and truth.trees is not None:
+        trees = truth.trees
+        content["trees"] = {
+            "x": trees.x.tolist(),
+            "y": trees.y.tolist(),
+            "dbh": [float(dbh) if np.isfinite(dbh) else None for dbh in trees.dbh],
+            "kind": list(trees.kind),
+        }
+    if truth is not None and truth.path is not None:
+        path = truth.path
+        if path.same_frame and np.isfinite(path.yaw).all():
+            content["path"] = {
+                "stamp_ns": path.stamp_ns.tolist(),
+                "x": path.x.tolist(),
+                "y": path.y.tolist(),
+                "yaw": path.yaw.tolist(),
+            }
+    return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()

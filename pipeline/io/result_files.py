@@ -1,4 +1,4 @@
-"""The files of a mapped run. A value that is not known is empty, never 0."""
+"""Result files of a mapped run. Unknown values are empty, never 0."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED, hold
 from pipeline.types.records import Frame, HeightMap, Path, Trees, Verdict
 
-ROWS = "detections.csv"  # is written as the run goes
+ROWS = "detections.csv"  # written during the run
 TREE_COLUMNS = (
     "tree",
     "x_m",
@@ -53,8 +53,8 @@ DETECTION_COLUMNS = (
 
 
 def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
-    """The confirmed trees as rows of TREE_COLUMNS; seconds count from `start_ns`, and a stamp
-    below 0 is unknown."""
+    """Return the confirmed trees as rows of TREE_COLUMNS; seconds count from `start_ns`, and a stamp below 0
+    is unknown."""
     return [
         [
             str(trees.number[k]),
@@ -75,7 +75,7 @@ def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
 
 
 def path_rows(path: Path, start_ns: int) -> list[list[str]]:
-    """The path as rows of PATH_COLUMNS, one a scan."""
+    """Return the path as rows of PATH_COLUMNS, one per scan."""
     return [
         [
             _number(_seconds(stamp, start_ns), 3),
@@ -91,13 +91,13 @@ def path_rows(path: Path, start_ns: int) -> list[list[str]]:
 
 
 def terrain_text(ground: HeightMap) -> str:
-    """The file terrain.csv."""
+    """Return the text of terrain.csv."""
     return csv_text(TERRAIN_COLUMNS, terrain_rows(ground))
 
 
 def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
-    """The known cells of the height map as rows of TERRAIN_COLUMNS, from west to east; x and y are their
-    middles."""
+    """Yield the known cells of the height map as rows of TERRAIN_COLUMNS, from west to east; x and y are
+    their centres."""
     order = np.lexsort((ground.place[:, 1], ground.place[:, 0]))
     middle = (ground.place[order] + 0.5) * ground.cell
     columns = (middle, ground.height[order], ground.sigma[order], ground.views[order])
@@ -106,7 +106,8 @@ def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
 
 
 def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
-    """Every cluster of a scan with its verdict, in the frame of the map, as rows of DETECTION_COLUMNS."""
+    """Return the clusters of a scan with their verdicts, in the frame of the map, as rows of
+    DETECTION_COLUMNS."""
     c = frame.clusters
     centre = frame.estimate.T_map_base.apply(c.centre + frame.sensor_offset[:2])
     fitted = np.isfinite(c.radius)
@@ -139,16 +140,16 @@ def geojson(
     frame: Mapping[str, str] | None = None,
     lon_lat: Float | None = None,
 ) -> str:
-    """The confirmed trees as a FeatureCollection.
+    """Return the confirmed trees as a FeatureCollection.
 
-    RFC 7946 wants WGS84; a map without georeference says so by its `coordinateFrame` member.
+    RFC 7946 requires WGS84; a map without georeference has a member `coordinateFrame`.
 
     Args:
         trees: The map.
-        start_ns: Seconds count from here.
-        frame: What the coordinates of `trees` are; None means ROBOTS_FRAME.
-        lon_lat: Longitude and latitude of each confirmed tree, shape (T, 2) [degrees], where they are known:
-            they become the geometry, and x and y properties.
+        start_ns: Origin of the seconds.
+        frame: Description of the coordinates of `trees`; None means ROBOTS_FRAME.
+        lon_lat: Longitude and latitude of each confirmed tree, shape (T, 2) [degrees], if known. They become
+            the geometry, and x and y become properties.
     """
     features = []
     for k, row in enumerate(tree_rows(trees, start_ns)):
@@ -176,7 +177,7 @@ def geojson(
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Rows below a header, comma-separated, lines ended by a single line feed."""
+    """Return a header and rows, separated by commas and line feeds."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -185,22 +186,22 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 class RunFiles:
-    """The folder that `stemmap map` fills. Rows of detections are written as they come, everything
-    else at the end; the files appear under their names all together, in `finish`.
+    """The output folder of `stemmap map`. Detections are written during the run, all else at its end; all
+    files appear under their names in `finish`.
 
     Args:
-        folder: Made when it is not there; files of an earlier run are replaced.
+        folder: The folder, which is created if necessary; files of an earlier run are replaced.
         earlier: Folder of the run that this one continues; its detections come first.
 
     Raises:
-        OSError: The folder cannot be made or written.
+        OSError: The folder cannot be created or written.
     """
 
     def __init__(self, folder: FilePath, earlier: FilePath | None = None) -> None:
         self._folder = folder
         self._made_folder = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        # A folder of its own, so that two runs into one place do not mix their halves.
+        # A separate folder, so that two runs into the same folder do not mix their files.
         self._staging = FilePath(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder))
         rows = self._staging / ROWS
         if earlier is not None and (earlier / rows.name).is_file():
@@ -208,11 +209,11 @@ class RunFiles:
         else:
             rows.write_text(csv_text(DETECTION_COLUMNS, []), encoding="utf-8", newline="")
         self._detections = rows.open("a", encoding="utf-8", newline="")
-        with contextlib.suppress(OSError):  # a disk of a network may know no locks
+        with contextlib.suppress(OSError):  # a network disk may not support locks
             hold(self._detections)
 
     def add(self, frame: Frame, start_ns: int) -> None:
-        """Write the clusters of one scan."""
+        """Write the clusters of a scan."""
         writer = csv.writer(self._detections, lineterminator="\n")
         writer.writerows(detection_rows(frame, start_ns))
 
@@ -229,12 +230,12 @@ class RunFiles:
         state: bytes | None,
         further: Mapping[str, str] | None = None,
     ) -> None:
-        """Write the other files and give all of them their names.
+        """Write the other files and move all files to their names.
 
         Args:
-            trees, path, start_ns, run: What was found.
-            state: What the run goes on from; None where nothing goes on.
-            further: Texts of files beside the others, or in their place, by name.
+            trees, path, start_ns, run: Results.
+            state: State for a continuation; None without.
+            further: Texts of additional files, or of files to replace, by name.
         """
         self._detections.close()
         texts = {
@@ -251,13 +252,13 @@ class RunFiles:
             (self._folder / "state.zip").unlink(missing_ok=True)  # of an earlier run
         else:
             (self._staging / "state.zip").write_bytes(state)
-        # run.json last: where it stands, the others do too
+        # run.json last: if it exists, so do the others
         for name in (ROWS, *states, *texts):
             (self._staging / name).replace(self._folder / name)
         self._staging.rmdir()
 
     def abandon(self) -> None:
-        """Remove what was begun; what an earlier run left stays as it was."""
+        """Remove the incomplete files; those of an earlier run do not change."""
         self._detections.close()
         for file in self._staging.iterdir():
             file.unlink()
@@ -271,7 +272,7 @@ def _seconds(stamp_ns: int, start_ns: int) -> float:
 
 
 def _number(value: float, digits: int) -> str:
-    """Decimal text without an exponent; empty where the value is not finite; no minus zero."""
+    """Return a decimal text without exponent and without minus zero; empty for values that are not finite."""
     if not math.isfinite(value):
         return ""
     text = f"{value:.{digits}f}"

@@ -14,8 +14,8 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.inventory import find_ground
-from pipeline.inventory.cloud import Cloud
-from pipeline.inventory.terrain_raster import HeightMap
+from pipeline.inventory.cloud import WholeCloud
+from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.simulation import run as simulated
 from pipeline.simulation.lidar import SpinningLidar, Sweep, scan_of_returns
 from pipeline.simulation.motion_sensors import inertial_readings
@@ -23,9 +23,9 @@ from pipeline.simulation.primitives import SolidsBuilder
 from pipeline.simulation.robot_motion import drive_course, lap_time, lay_course, lay_on_terrain
 from pipeline.simulation.run import MOUNTING, SimulatedRun, odometry_of, random_stream
 from pipeline.simulation.scenarios import RunRequest
-from pipeline.simulation.scene import Scene
+from pipeline.simulation.scene import SimulatedScene
 from pipeline.simulation.surfels import Surfels, first_surfels, lay_surfels
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees
 
 # Raise it with every change that only changes the bytes of runs through clouds.
@@ -40,9 +40,9 @@ REFLECTANCE = 60.0  # of all returns: intensities of clouds have other scales
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlotGround:
-    """The ground of a plot in the frame of the first pose of the robot (see `Terrain.evaluate`)."""
+    """The ground of a plot in the frame of the first pose of the robot (see `SimulatedTerrain.evaluate`)."""
 
-    height: HeightMap
+    height: TerrainRaster
     start: Float
     yaw: float
 
@@ -72,18 +72,7 @@ class CloudRun(SimulatedRun):
         """Simulate scan k (from 0); the result does not depend on other scans."""
         lidar = self.lidar
         _, R, o = self.sensor_poses(k)
-        ranges = first_surfels(
-            self.surfels.points,
-            self.surfels.normals,
-            self.surfels.radius,
-            self.surfels.blocks,
-            R,
-            o,
-            lidar.beams(),
-            lidar.lowest,
-            lidar.ring_step,
-            lidar.range_max,
-        )
+        ranges = first_surfels(self.surfels, R, o, lidar.beams(), lidar.optics)
         noise = random_stream(simulated.SCAN, self.request, k).standard_normal(ranges.shape)
         reported = ranges + lidar.range_sigma * noise
         reported[~((reported >= lidar.range_min) & (reported <= lidar.range_max))] = 0.0
@@ -100,13 +89,13 @@ class CloudRun(SimulatedRun):
 
 
 def open_cloud_run(
-    request: RunRequest, cloud: Cloud, trees: TruthTrees | None, T_base_lidar: Pose3 | None = None
+    request: RunRequest, cloud: WholeCloud, trees: TruthTrees | None, T_base_lidar: Pose3 | None = None
 ) -> CloudRun:
     """Plan a path through a cloud and drive it; no scan is simulated yet.
 
     Args:
         request: Requested options; a duration of 0 means one loop.
-        cloud: Cloud of the plot.
+        cloud: WholeCloud of the plot.
         trees: Trees of the plot in the coordinates of the cloud.
         T_base_lidar: Extrinsics of the LiDAR; None uses those of simulated robots.
 
@@ -163,7 +152,7 @@ def _from(points: Float32, start: Float, yaw: float) -> Float32:
     return seen
 
 
-def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> Scene:
+def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> SimulatedScene:
     """Return a scene that only has a ground truth: its objects are the surfels."""
     none = np.zeros(0)
     truth = TruthTrees(none, none, none, ())
@@ -171,8 +160,8 @@ def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> Scene:
         c, s = np.cos(yaw), np.sin(yaw)
         x, y = trees.x - start[0], trees.y - start[1]
         truth = TruthTrees(c * x + s * y, c * y - s * x, trees.dbh, trees.kind)
-    return Scene(
-        terrain=Terrain(np.zeros((1, 4))),
+    return SimulatedScene(
+        terrain=SimulatedTerrain(np.zeros((1, 4))),
         still=SolidsBuilder().build(),
         persons=(),
         truth=truth,
@@ -194,7 +183,7 @@ SIDE = 0.2  # m; cells of the path search
 SPACING = 0.8  # m; between waypoints
 
 
-def loop_through(points: Float32, ground: HeightMap, where: str) -> Float:
+def loop_through(points: Float32, ground: TerrainRaster, where: str) -> Float:
     """Return waypoints of a closed loop, shape (N, 2) [m]; the same cloud gives the same loop.
 
     Args:
@@ -216,7 +205,7 @@ def loop_through(points: Float32, ground: HeightMap, where: str) -> Float:
     raise SourceError("there is no free way for a robot through the plot", where=where)
 
 
-def _obstacles(points: Float32, ground: HeightMap) -> Int:
+def _obstacles(points: Float32, ground: TerrainRaster) -> Int:
     """Return the number of points that are obstacles in each cell of CELL."""
     times = round(ground.cell / CELL)
     shape = (ground.seen.shape[0] * times, ground.seen.shape[1] * times)
@@ -228,7 +217,7 @@ def _obstacles(points: Float32, ground: HeightMap) -> Int:
     return count
 
 
-def _clearance(free: Bool, ground: HeightMap) -> Float:
+def _clearance(free: Bool, ground: TerrainRaster) -> Float:
     """Return the distance to obstacles of cells of SIDE [m]; cells without visible ground are obstacles."""
     from scipy.ndimage import binary_dilation, distance_transform_edt
 

@@ -18,6 +18,7 @@ from pipeline.simulation.primitives import Solids
 from pipeline.simulation.ray_casting import (
     GROUND,
     NOTHING,
+    Optics,
     first_returns,
     ground_incidence,
     meet_solid,
@@ -25,8 +26,10 @@ from pipeline.simulation.ray_casting import (
     ray_directions,
     solid_incidence,
 )
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float, Float32, Int32, Scan, Sensor
+
+GROUND_REFLECTIVITY = 0.25
 
 
 @compiled
@@ -59,18 +62,15 @@ def echo(
     k: int,
     ranges: Float,
     hit: Int32,
-    kind: Int32,
-    shape: Float,
-    surface: Float,
+    solids: Solids,
     o: Float,
     directions: Float,
-    divergence: float,
-    pulse: float,
+    optics: Optics,
 ) -> tuple[float, int]:
-    """Return range and shape that the receiver reports for a beam of width `divergence` [rad].
+    """Return range and shape that the receiver reports for beam k of column c.
 
     At the edge of a shape a part of the beam passes and meets the shape behind. Echoes nearer to one another
-    than `pulse` [m] are reported as one range in between; else the stronger one is reported.
+    than `Optics.pulse` are reported as one range in between; else the stronger one is reported.
     """
     columns = ranges.shape[0]
     before, after = max(c - 1, 0), min(c + 1, columns - 1)
@@ -83,6 +83,7 @@ def echo(
         front = before
     if ranges[after, k] < ranges[front, k]:
         front = after
+    kind, shape, surface = solids.kind, solids.shape, solids.surface
     edge = hit[front, k]
     if edge < 0 or (kind[edge] == 1 and shape[edge, 8] > 0.0):
         return t, n
@@ -94,7 +95,7 @@ def echo(
         return t, n
     neighbour = after if after != c else before
     count, total = count_echoes(
-        kind[edge], shape[edge], o[c], directions[c, k], directions[neighbour, k], divergence * columns
+        kind[edge], shape[edge], o[c], directions[c, k], directions[neighbour, k], optics.divergence * columns
     )
     if count == 0 or count == 8:
         return t, n
@@ -102,8 +103,12 @@ def echo(
     strong = part * surface[edge, 0] / (near * near)
     weak = 0.0
     if behind < np.inf:
-        weak = (1.0 - part) * (surface[behind_hit, 0] if behind_hit >= 0 else 0.25) / (behind * behind)
-    if behind - near < pulse:
+        weak = (
+            (1.0 - part)
+            * (surface[behind_hit, 0] if behind_hit >= 0 else GROUND_REFLECTIVITY)
+            / (behind * behind)
+        )
+    if behind - near < optics.pulse:
         return (strong * near + weak * behind) / (strong + weak), edge
     if strong >= weak:
         return near, edge
@@ -114,18 +119,11 @@ def echo(
 def measure(
     ranges: Float,
     hit: Int32,
-    kind: Int32,
-    shape: Float,
-    surface: Float,
+    solids: Solids,
     terrain: Float,
     o: Float,
     directions: Float,
-    divergence: float,
-    pulse: float,
-    ground_reflectivity: float,
-    strength: float,
-    range_min: float,
-    range_max: float,
+    optics: Optics,
     noise: Float,
     key: int,
 ) -> tuple[Float, Float, Int32]:
@@ -133,21 +131,22 @@ def measure(
     each.
 
     Args:
+        ranges, hit: Result of `first_returns`.
+        solids, terrain, o, directions, optics, key: See `first_returns`.
         noise: Error of each range [m], shape (C, K).
-        strength: Range [m] at which a perpendicular surface of reflectivity 1 gives a return in 63 % of the
-            shots.
     """
+    kind, shape, surface = solids.kind, solids.shape, solids.surface
     columns, rings = ranges.shape
     reported = np.zeros((columns, rings))
     reflectance = np.zeros((columns, rings))
     source = np.full((columns, rings), NOTHING, dtype=np.int32)
     for c in range(columns):
         for k in range(rings):
-            t, n = echo(c, k, ranges, hit, kind, shape, surface, o, directions, divergence, pulse)
-            if n == NOTHING or t > range_max:
+            t, n = echo(c, k, ranges, hit, solids, o, directions, optics)
+            if n == NOTHING or t > optics.range_max:
                 continue
             if n == GROUND:
-                reflectivity = ground_reflectivity
+                reflectivity = GROUND_REFLECTIVITY
                 incidence = ground_incidence(terrain, o[c], directions[c, k], t)
             else:
                 reflectivity = surface[n, 0]
@@ -157,11 +156,11 @@ def measure(
                     incidence = max(incidence, 0.05)
                 if surface[n, 1] > 0.0:
                     t += surface[n, 1] * (2.0 * random_unit(n, c // 2, k) - 1.0)
-            power = reflectivity * incidence * (strength / t) ** 2
+            power = reflectivity * incidence * (optics.strength / t) ** 2
             if power < 10.0 and random_unit(key, c * rings + k, -2) > 1.0 - np.exp(-power):
                 continue
             t += noise[c, k]
-            if t < range_min or t > range_max:
+            if t < optics.range_min or t > optics.range_max:
                 continue
             reported[c, k] = t
             shade = 100.0 * reflectivity * (0.4 + 0.6 * incidence)
@@ -235,6 +234,11 @@ class SpinningLidar:
             range_sigma=max(self.range_sigma, 0.001),
             range_max=self.range_max,
         )
+
+    @property
+    def optics(self) -> Optics:
+        """Beams and receiver for the kernels."""
+        return Optics(**{name: getattr(self, name) for name in Optics._fields})
 
     def column_offsets_ns(self) -> Int32:
         """Return the time of each column after the start of the sweep [ns], shape (C,)."""
@@ -318,7 +322,7 @@ class Sweep:
 def sweep_scene(
     lidar: SpinningLidar,
     solids: Solids,
-    terrain: Terrain,
+    terrain: SimulatedTerrain,
     R: Float,
     o: Float,
     stamp_ns: int,
@@ -338,36 +342,7 @@ def sweep_scene(
     noise = lidar.range_sigma * rng.standard_normal((lidar.columns, lidar.rings))
     directions = ray_directions(R, lidar.beams())
     away = np.hypot(*(solids.capsule[:, :2] - o[lidar.columns // 2, :2]).T)
-    ranges, hit = first_returns(
-        solids.kind,
-        solids.shape,
-        solids.capsule,
-        terrain.packed,
-        R,
-        o,
-        directions,
-        lidar.lowest,
-        lidar.ring_step,
-        lidar.range_max,
-        key,
-        np.argsort(away, kind="stable"),
-    )
-    reported, reflectance, source = measure(
-        ranges,
-        hit,
-        solids.kind,
-        solids.shape,
-        solids.surface,
-        terrain.packed,
-        o,
-        directions,
-        lidar.divergence,
-        lidar.pulse,
-        0.25,
-        lidar.strength,
-        lidar.range_min,
-        lidar.range_max,
-        noise,
-        key,
-    )
-    return scan_of_returns(lidar, stamp_ns, reported, reflectance, source)
+    optics, order = lidar.optics, np.argsort(away, kind="stable")
+    ranges, hit = first_returns(solids, terrain.packed, R, o, directions, optics, key, order)
+    returns = measure(ranges, hit, solids, terrain.packed, o, directions, optics, noise, key)
+    return scan_of_returns(lidar, stamp_ns, *returns)

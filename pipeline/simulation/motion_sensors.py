@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.poses import Pose3
-from pipeline.simulation.robot_motion import RATE_HZ, Motion
+from pipeline.simulation.robot_motion import RATE_HZ, TrueMotion
 from pipeline.simulation.scenarios import WheelQuality
 from pipeline.types.records import Float
 
 ODOMETRY_HZ = 50
 
 
-def wheel_odometry(motion: Motion, quality: WheelQuality, rng: np.random.Generator) -> Float:
+def wheel_odometry(motion: TrueMotion, quality: WheelQuality, rng: np.random.Generator) -> Float:
     """Return x, y [m] and yaw [rad] by the wheels at 50 Hz, shape (N, 3); the first row is zero.
 
     The distance is measured along the ground. On a slope it is longer than its projection on the map, so
@@ -77,7 +77,7 @@ class Inertial:
         return Pose3.from_euler(np.zeros(3), roll, pitch, yaw).quaternion()
 
 
-def inertial_readings(motion: Motion, rng: np.random.Generator) -> Inertial:
+def inertial_readings(motion: TrueMotion, rng: np.random.Generator) -> Inertial:
     """Return the readings of the IMU for a motion."""
     step, dt = RATE_HZ // IMU_HZ, 1.0 / RATE_HZ
     d = motion.drive

@@ -12,7 +12,7 @@ from pipeline.ground.terrain import shows_ground
 from pipeline.preprocessing.acquisition import acquire, acquire_near
 from pipeline.simulation.lidar import SpinningLidar, sweep_scene
 from pipeline.simulation.robot_motion import RATE_HZ, Course, Drive, lay_on_terrain, on_course, speed_limit
-from pipeline.simulation.scene import Scene
+from pipeline.simulation.scene import SimulatedScene
 from pipeline.types.clearance import Clearance, Zone
 from pipeline.types.records import Step
 
@@ -25,7 +25,7 @@ _TICKS = RATE_HZ * _LIDAR.period_ns // 1_000_000_000  # per sweep
 
 
 def obstacle_aware_drive(
-    course: Course, speed: float, scene: Scene, T_base_lidar: Pose3, seed: int, duration_s: float
+    course: Course, speed: float, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, duration_s: float
 ) -> tuple[Drive, list[Clearance]]:
     """Drive a course one sweep at a time; the clearance after a sweep decides the speed of the next one.
 
@@ -66,7 +66,7 @@ def _drive(course: Course, along: list[float], speeds: list[float], first: int) 
     return on_course(course, t, np.array(along[first:]), np.array(speeds[first:]))
 
 
-def _clearance(drive: Drive, scene: Scene, T_base_lidar: Pose3, seed: int, k: int) -> Clearance:
+def _clearance(drive: Drive, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, k: int) -> Clearance:
     """Return the clearance after sweep k, which was made during a drive."""
     # The same phases in each sweep, so that the pieces belong to one vibration.
     motion = lay_on_terrain(drive, scene.terrain, np.random.default_rng(seed))

@@ -6,7 +6,7 @@ porous (foliage), and upright boxes. Each row also has a capsule that encloses t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,8 +16,7 @@ from pipeline.types.records import Float, Int32
 CONE, ELLIPSOID, BOX = 0, 1, 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Solids:
+class Solids(NamedTuple):
     """N shapes as columns.
 
     Attributes:
@@ -35,9 +34,6 @@ class Solids:
     capsule: Float
     surface: Float
     owner: Int32
-
-    def __len__(self) -> int:
-        return int(self.kind.shape[0])
 
     def join(self, other: Solids) -> Solids:
         """Return these shapes followed by others."""
@@ -111,9 +107,7 @@ class SolidsBuilder:
 
     def extend(self, solids: Solids) -> None:
         """Add all shapes of a table."""
-        s = solids
-        columns = (s.kind, s.shape, s.capsule, s.surface, s.owner)
-        self._rows += zip(*(column.tolist() for column in columns), strict=True)
+        self._rows += zip(*(column.tolist() for column in solids), strict=True)
 
     def build(self) -> Solids:
         """Return all shapes so far as columns."""

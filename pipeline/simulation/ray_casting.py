@@ -6,13 +6,37 @@ time. Only these rays are tested (see `window_of_capsule`); the intervals are wi
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.jit import compiled
+from pipeline.simulation.primitives import Solids
 from pipeline.simulation.terrain import gradient_at, sine_of_turns
 from pipeline.types.records import Float, Int, Int32
 
 MISS = np.inf
+
+
+class Optics(NamedTuple):
+    """Beams and receiver of a LiDAR.
+
+    Attributes:
+        lowest, ring_step: Elevation of ring 0 and between rings [rad].
+        range_min, range_max: Measured ranges [m].
+        divergence: Full width of a beam [rad].
+        pulse: Echoes nearer to one another than this are reported as one [m].
+        strength: Range at which a perpendicular surface of reflectivity 1 gives a return in 63 % of the shots
+            [m].
+    """
+
+    lowest: float
+    ring_step: float
+    range_min: float
+    range_max: float
+    divergence: float
+    pulse: float
+    strength: float
 
 
 @compiled
@@ -80,8 +104,7 @@ def meet_box(shape: Float, o: Float, d: Float) -> float:
 @compiled
 def waves_at(terrain: Float, o: Float, waves: Float) -> None:
     """Fill `waves`, shape (W, 3), with what all rays from one origin share: for each row of the terrain its
-    phase in
-    turns, sine and cosine at the origin; in row 0 the height above the plane."""
+    phase in turns, sine and cosine at the origin; in row 0 the height above the plane."""
     waves[0, 0] = o[2] - terrain[0, 0] * o[0] - terrain[0, 1] * o[1] - terrain[0, 2]
     for i in range(1, terrain.shape[0]):
         turns = terrain[i, 1] * o[0] + terrain[i, 2] * o[1] + terrain[i, 3]
@@ -327,16 +350,12 @@ def meet_solid(kind: int, shape: Float, o: Float, d: Float, chance: float) -> fl
 
 @compiled
 def first_returns(
-    kind: Int32,
-    shape: Float,
-    capsule: Float,
+    solids: Solids,
     terrain: Float,
     R: Float,
     o: Float,
     directions: Float,
-    lowest: float,
-    ring_step: float,
-    farthest: float,
+    optics: Optics,
     key: int,
     order: Int,
 ) -> tuple[Float, Int32]:
@@ -346,12 +365,13 @@ def first_returns(
 
     Column c looks along the azimuth pi - c 2 pi / C from the pose R[c], o[c].
     """
+    kind, shape, capsule, farthest = solids.kind, solids.shape, solids.capsule, optics.range_max
     columns, rings = directions.shape[0], directions.shape[1]
     ranges = np.full((columns, rings), np.inf)
     owner = np.full((columns, rings), NOTHING, dtype=np.int32)
     for n in order:
         first, last, ring_first, ring_last, nearest = window_of_capsule(
-            capsule[n], R, o, lowest, ring_step, rings
+            capsule[n], R, o, optics.lowest, optics.ring_step, rings
         )
         if nearest > farthest:
             continue
@@ -379,15 +399,16 @@ def first_returns(
 
 
 @compiled
-def first_along(kind: Int32, shape: Float, capsule: Float, directions: Float, key: int) -> Float:
+def first_along(solids: Solids, directions: Float, key: int) -> Float:
     """Return the range [m] at which each ray from the origin first meets a shape, infinite without, shape
     (N,).
 
     Args:
-        kind, shape, capsule: See `Solids`; no shape contains the origin.
+        solids: Solids; none contains the origin.
         directions: Unit vectors, shape (N, 3).
         key: Seed of the depths at which foliage stops light.
     """
+    kind, shape, capsule = solids.kind, solids.shape, solids.capsule
     ranges = np.full(directions.shape[0], np.inf)
     middle = np.zeros(3)
     origin = np.zeros(3)

@@ -1,6 +1,5 @@
 """True motion of the robot: a smooth course through waypoints, driven with limits on speed, turn rate and
-their
-changes, and the pose of the base on the terrain with a little vibration."""
+their changes, and the pose of the base on the terrain with a little vibration."""
 
 from __future__ import annotations
 
@@ -221,8 +220,7 @@ def lap_time(course: Course, speed: float) -> float:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Timetable:
     """Distance [m], speed [m/s] and time [s] between turns on the spot, these turns, and the course without
-    their
-    curvature."""
+    their curvature."""
 
     s: Float
     v: Float
@@ -277,7 +275,7 @@ _VIBRATION_HZ = np.array([1.3, 2.9, 5.3, 8.7])
 _VIBRATION_ANGLE = np.radians(np.array([0.20, 0.10, 0.06, 0.03]))
 
 
-class Ground(Protocol):
+class TerrainModel(Protocol):
     """The ground below the robot."""
 
     def evaluate(self, x: Float, y: Float) -> Float:
@@ -285,7 +283,7 @@ class Ground(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class TrueMotion:
     """True pose of the base at 200 Hz, as columns of length T. The base is on the ground.
 
     Attributes:
@@ -316,14 +314,14 @@ class Motion:
         return np.ascontiguousarray(R @ T_base_lidar.R), p + R @ T_base_lidar.t
 
 
-def lay_on_terrain(drive: Drive, terrain: Ground, rng: np.random.Generator) -> Motion:
+def lay_on_terrain(drive: Drive, terrain: TerrainModel, rng: np.random.Generator) -> TrueMotion:
     """Place the base on the ground, perpendicular to it, with vibration while it moves."""
     z, gx, gy = terrain.evaluate(drive.x, drive.y).T
     c, s = np.cos(drive.yaw), np.sin(drive.yaw)
     ahead, left = gx * c + gy * s, gy * c - gx * s
     moving = np.clip(drive.speed / 0.5, 0.0, 1.0)
     shake = [_vibration(drive.t, rng) * moving for _ in range(2)]
-    return Motion(
+    return TrueMotion(
         drive=drive,
         z=z,
         roll=np.arcsin(left / np.sqrt(1.0 + ahead**2 + left**2)) + shake[0],

@@ -18,9 +18,9 @@ from pipeline.simulation.motion_sensors import (
     wheel_odometry,
 )
 from pipeline.simulation.obstacle_aware_driver import obstacle_aware_drive
-from pipeline.simulation.robot_motion import RATE_HZ, Motion, drive_course, lay_course, lay_on_terrain
+from pipeline.simulation.robot_motion import RATE_HZ, TrueMotion, drive_course, lay_course, lay_on_terrain
 from pipeline.simulation.scenarios import EXACT, QUALITIES, RunRequest
-from pipeline.simulation.scene import Scene, build_scene
+from pipeline.simulation.scene import SimulatedScene, build_scene
 from pipeline.types.records import Float, Imu, Int, Odometry, TruthPath
 
 # Raise it with every change that changes the bytes of a run.
@@ -38,7 +38,7 @@ class SimulatedRun:
         request: Requested scenario and options.
         T_base_lidar: Extrinsics of the LiDAR; the base is on the ground.
         lidar: The sensor.
-        scene: Scene through which the robot drives.
+        scene: SimulatedScene through which the robot drives.
         motion: True motion of the robot.
         odometry: x, y [m], yaw [rad] by the wheels at 50 Hz, shape (N, 3).
         inertial: Readings of the IMU at 100 Hz.
@@ -48,8 +48,8 @@ class SimulatedRun:
     request: RunRequest
     T_base_lidar: Pose3
     lidar: SpinningLidar
-    scene: Scene
-    motion: Motion
+    scene: SimulatedScene
+    motion: TrueMotion
     odometry: Float
     inertial: Inertial
     scans: int
@@ -135,7 +135,7 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
     )
 
 
-def odometry_of(motion: Motion, request: RunRequest) -> Float:
+def odometry_of(motion: TrueMotion, request: RunRequest) -> Float:
     """Return x, y [m] and yaw [rad] by wheels of the requested quality at 50 Hz, shape (N, 3)."""
     if request.odometry == EXACT:
         drive = motion.drive

@@ -21,7 +21,7 @@ from pipeline.simulation.scene_objects import (
     add_undergrowth,
     person,
 )
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Float, TruthTrees
 
 _STEP_HZ, _STRIDE = 0.9, 0.42  # of a walking person; [rad]
@@ -60,7 +60,7 @@ class Person:
         position = self.start + way * ((2.0 * length - gone if back else gone) / length)
         return position, float(np.arctan2(way[1], way[0])) + (np.pi if back else 0.0)
 
-    def solids(self, t: float, terrain: Terrain) -> Solids:
+    def solids(self, t: float, terrain: SimulatedTerrain) -> Solids:
         """Return the body in the world at time t [s]."""
         at, heading = self.place(t)
         ground = float(terrain.height(at[:1], at[1:])[0])
@@ -69,7 +69,7 @@ class Person:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class SimulatedScene:
     """A simulated scene.
 
     Attributes:
@@ -81,7 +81,7 @@ class Scene:
         kinds: Kind of each object by its number (`Solids.owner`), with "walker" and "undergrowth".
     """
 
-    terrain: Terrain
+    terrain: SimulatedTerrain
     still: Solids
     persons: tuple[Person, ...]
     truth: TruthTrees
@@ -172,14 +172,14 @@ class Plot:
         )
 
 
-def build_scene(scenario: Scenario, course: Course, rng: np.random.Generator) -> Scene:
+def build_scene(scenario: Scenario, course: Course, rng: np.random.Generator) -> SimulatedScene:
     """Build the scene of a scenario.
 
     Raises:
         SourceError: There is no position left for an object.
     """
     slope = float(np.tan(np.radians(scenario.slope)))
-    terrain = Terrain.grow(slope, scenario.waves[0], scenario.waves[1], rng)
+    terrain = SimulatedTerrain.grow(slope, scenario.waves[0], scenario.waves[1], rng)
     planter = _Planter(scenario, SceneBuilder(terrain, rng), Plot(course, scenario.half_side))
     trees = [placed for placed in scenario.placed if placed.kind == "tree"][: scenario.trees]
     for placed in [*trees, *(placed for placed in scenario.placed if placed.kind != "tree")]:
@@ -240,11 +240,11 @@ class _Planter:
             if self._plot.from_course(place[None])[0] > 1.0:
                 add_undergrowth(scene, float(place[0]), float(place[1]))
 
-    def built(self) -> Scene:
+    def built(self) -> SimulatedScene:
         """Return the scene."""
         truth = self._scene.truth
         x, y, dbh, kind = zip(*truth, strict=True) if truth else ((), (), (), ())
-        return Scene(
+        return SimulatedScene(
             terrain=self._scene.terrain,
             still=self._scene.solids.build(),
             persons=tuple(self._persons),

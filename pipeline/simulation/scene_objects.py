@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from pipeline.simulation.primitives import Solids, SolidsBuilder
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Float
 
 BREAST_HEIGHT = 1.3  # m
@@ -37,7 +37,7 @@ class SceneBuilder:
         trunks: Number, x and y [m] of each trunk.
     """
 
-    def __init__(self, terrain: Terrain, rng: np.random.Generator) -> None:
+    def __init__(self, terrain: SimulatedTerrain, rng: np.random.Generator) -> None:
         self.terrain, self.rng = terrain, rng
         self.solids = SolidsBuilder()
         self.kinds: list[str] = []

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.simulation.lidar import SolidStateLidar, SpinningLidar, sweep_scene
 from pipeline.simulation.scene_objects import KINDS, SceneBuilder, add_car, add_fence, add_hedge, add_wall
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Float, Scan, Sensor, Step
 
 PERIOD_NS = 100_000_000
@@ -70,7 +70,7 @@ def simulate_street(seed: int, *, one_way: bool) -> StreetScans:
     """
     rng = np.random.default_rng([seed, int(one_way), 0x57AEE7])
     slope = float(rng.choice([0.0, rng.uniform(-0.12, 0.12)]))
-    terrain = Terrain.grow(slope, float(rng.uniform(0.0, 0.25)), float(rng.uniform(8.0, 25.0)), rng)
+    terrain = SimulatedTerrain.grow(slope, float(rng.uniform(0.0, 0.25)), float(rng.uniform(8.0, 25.0)), rng)
     scene = SceneBuilder(terrain, rng)
     is_park = rng.random() < (PARKS_ONE_WAY if one_way else PARKS_ALL_AROUND)
     (_add_park if is_park else _add_street)(scene)

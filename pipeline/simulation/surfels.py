@@ -8,11 +8,12 @@ no beam passes through the gaps of a trunk to the bark on its far side.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.jit import compiled
+from pipeline.simulation.ray_casting import Optics
 from pipeline.types.records import Float, Float32, Int
 
 NEIGHBOURS = 10
@@ -26,8 +27,7 @@ MELT = 0.04  # m; hits this close together are measured as one
 _PART = 1 << 17
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Surfels:
+class Surfels(NamedTuple):
     """Discs and balls as columns of length N, float32, in the frame of the world.
 
     Attributes:
@@ -86,18 +86,7 @@ def _lay(
 
 
 @compiled
-def first_surfels(
-    points: Float32,
-    normals: Float32,
-    radius: Float32,
-    blocks: Float32,
-    R: Float,
-    o: Float,
-    beams: Float,
-    lowest: float,
-    ring_step: float,
-    farthest: float,
-) -> Float:
+def first_surfels(surfels: Surfels, R: Float, o: Float, beams: Float, optics: Optics) -> Float:
     """Return the range [m] of each beam of a sweep, infinite when it meets nothing, shape (C, K).
 
     Each surfel is seen from the pose of the sensor when the beam passes it, and only the beams within its
@@ -105,12 +94,13 @@ def first_surfels(
     towards the middle of the discs.
 
     Args:
-        points, normals, radius, blocks: See `Surfels`.
+        surfels: The surfels.
         R, o: Pose of the sensor at each column, shapes (C, 3, 3) and (C, 3) [m].
         beams: In the sensor's frame, shape (C, K, 3); column c looks along the azimuth pi - c 2 pi / C.
-        lowest, ring_step: Elevation of ring 0 and between rings [rad].
-        farthest: [m].
+        optics: Beams of the sensor.
     """
+    points, normals, radius, blocks = surfels.points, surfels.normals, surfels.radius, surfels.blocks
+    lowest, ring_step, farthest = optics.lowest, optics.ring_step, optics.range_max
     columns, rings = beams.shape[0], beams.shape[1]
     nearest, hidden = np.full((columns, rings), np.inf), np.full((columns, rings), np.inf)
     beam, met, weight = np.empty(1 << 16, np.int64), np.empty(1 << 16), np.empty(1 << 16)

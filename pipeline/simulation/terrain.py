@@ -9,14 +9,11 @@ import numpy as np
 from pipeline.jit import compiled
 from pipeline.types.records import Float
 
-TWO_PI = 2.0 * np.pi
-
 
 @compiled
 def sine_of_turns(turns: float) -> float:
     """Return sin(2 pi turns) with an error of 4e-6. The polynomial has no branch: it is several times faster
-    than
-    the C library and gives the same bits on every machine."""
+    than the C library and gives the same bits on every machine."""
     u = turns - np.floor(turns + 0.5)
     x = 6.283185307179586 * (0.25 - abs(abs(u) - 0.25))
     q = x * x
@@ -27,7 +24,7 @@ def sine_of_turns(turns: float) -> float:
 
 @compiled
 def height_at(terrain: Float, x: float, y: float) -> float:
-    """Return the height [m] of the terrain (see `Terrain.packed`) at one position."""
+    """Return the height [m] of the terrain (see `SimulatedTerrain.packed`) at one position."""
     z: float = terrain[0, 0] * x + terrain[0, 1] * y + terrain[0, 2]
     for i in range(1, terrain.shape[0]):
         z += terrain[i, 0] * sine_of_turns(terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3])
@@ -56,7 +53,7 @@ def _evaluate(terrain: Float, x: Float, y: Float) -> Float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Terrain:
+class SimulatedTerrain:
     """A plane with waves.
 
     Attributes:
@@ -67,7 +64,9 @@ class Terrain:
     packed: Float
 
     @classmethod
-    def grow(cls, slope: float, amplitude: float, shortest: float, rng: np.random.Generator) -> Terrain:
+    def grow(
+        cls, slope: float, amplitude: float, shortest: float, rng: np.random.Generator
+    ) -> SimulatedTerrain:
         """Return a random terrain with height 0 at the origin.
 
         Args:

@@ -32,7 +32,7 @@ def main() -> None:
     told = validate(
         scenes, base, kind, standard_forest(not asked.one_way), p.classification.tree_share, seed=0
     )
-    print(f"{told.folds} parts, no {told.by} in two of them; {len(old.root)} decision trees")
+    print(f"{told.folds} parts, no {told.by} in two of them; {len(old.trees.root)} decision trees")
     print(f"old: {_words(told.old)}\nnew: {_words(told.new)}")
 
 

@@ -1,6 +1,5 @@
-"""Saving: records of the pipeline in a file, without a pickle, with every size checked."""
+"""Checkpoints: records of the pipeline in files, without pickle, and with all sizes checked."""
 
-from pipeline.io.checkpoints.archive import read_archive, write_archive
-from pipeline.io.checkpoints.codec import decode, encode
+from pipeline.io.checkpoints.codec import decode, encode, read_archive, write_archive
 
 __all__ = ["decode", "encode", "read_archive", "write_archive"]

@@ -5,15 +5,21 @@ The file does not choose what is built: the reader names the type of the record,
 
 from __future__ import annotations
 
+import io
+import json
 import math
 import types
 import typing
+import zipfile
+import zlib
 from collections import Counter
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
+
+from pipeline.errors import StemmapError
 
 R = TypeVar("R")
 NOT_SAVED = "not saved"  # in the metadata of a field that is not saved and gets its default
@@ -179,3 +185,64 @@ def _array(scalar: Any, tree: Any, blob: _Block, name: str) -> np.ndarray[Any, A
     else:
         flat = np.frombuffer(blob.raw, dtype.newbyteorder("<"), count, at)
     return flat.reshape(shape).astype(dtype)
+
+
+TREE, ARRAYS = "tree.json", "arrays.bin"
+LARGEST_TREE, LARGEST_ARRAYS = 64 << 20, 4 << 30  # bytes
+MOST_RATIO, FREE = (
+    100,
+    64 << 20,
+)  # compression ratio and bytes that are accepted; a real state has a ratio of 2
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+
+def write_archive(tree: Any, blob: bytes) -> bytes:  # noqa: ANN401 - any JSON
+    """Return the bytes of a zip with `tree.json` and `arrays.bin`; the same state gives the same bytes.
+
+    Args:
+        tree: JSON without NaN.
+        blob: The arrays to which it refers.
+    """
+    text = json.dumps(tree, allow_nan=False, separators=(",", ":")).encode()
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in ((TREE, text), (ARRAYS, blob)):
+            entry = zipfile.ZipInfo(name, _EPOCH)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, data, compresslevel=1)
+    return file.getvalue()
+
+
+def read_archive(data: bytes, where: str) -> tuple[Any, bytes]:
+    """Return the tree and the arrays of a file; sizes are checked before memory is allocated.
+
+    Raises:
+        StemmapError: It is damaged, is another file, or declares too large sizes.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            text = _entry(archive, TREE, LARGEST_TREE)
+            blob = _entry(archive, ARRAYS, LARGEST_ARRAYS)
+        return json.loads(text), blob
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, KeyError, ValueError, EOFError, OSError,
+            NotImplementedError, RuntimeError, RecursionError, MemoryError, zlib.error) as error:  # fmt: skip
+        raise damaged(where, str(error) or type(error).__name__) from None
+
+
+def damaged(where: str, why: str) -> StemmapError:
+    """Return the error for a saved state that cannot be used."""
+    return StemmapError(f"the saved state is damaged: {why}", where=where, remedy="Map the run again")
+
+
+def _entry(archive: zipfile.ZipFile, name: str, largest: int) -> bytes:
+    entry = archive.getinfo(name)
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is compressed in another way")
+    declared = entry.file_size
+    if declared > min(largest, FREE + MOST_RATIO * entry.compress_size):
+        raise ValueError(f"{name} declares {declared} bytes")
+    with archive.open(name) as file:
+        data = file.read(declared + 1)
+    if len(data) != declared:
+        raise ValueError(f"{name} does not have its declared size")
+    return data

@@ -1,4 +1,4 @@
-"""Two maps of one stand made one: the first keeps its frame and its numbers."""
+"""Merging of two maps of one stand; the first keeps its frame and its numbers."""
 
 from __future__ import annotations
 
@@ -21,19 +21,20 @@ from pipeline.tracking.observation import SECTORS
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import Bool, Columns, Int, Verdict
 
-GATE = 5.0  # sigma; beyond it two trees are two
+GATE = 5.0  # sigma; largest distance of observations of one tree
 SAME_COLUMN = 0.35  # m
-MOST_RETURNS = 20  # of a voxel of the second map; more say nothing new
+MOST_RETURNS = 20  # of a voxel of the second map
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergedMap:
-    """What came of a merging.
+    """Result of merging.
 
     Attributes:
-        map: The trees, landmarks and paths of both.
-        number_of: The number of each tree of the second map in the merged one, int64, shape (T,).
-        distance: How far apart the two trees stood that became one, NaN for a tree of its own, (T,) [m].
+        map: Trees, landmarks and paths of both maps.
+        number_of: Number of each tree of the second map in the merged map, shape (T,).
+        distance: Distance of each tree of the second map from the tree that it was joined with, NaN without
+            one, shape (T,) [m].
     """
 
     map: SavedMap
@@ -44,13 +45,14 @@ class MergedMap:
 def merge_maps(
     a: SavedMap, b: SavedMap, T_a_b: Pose2, covariance: Float, stamp_shift_ns: int, parameters: Parameters
 ) -> MergedMap:
-    """Bring map b into map a.
+    """Merge map b into map a.
 
     Args:
         a, b: The maps.
-        T_a_b: Where the frame of b stands in that of a; covariance: of it, shape (3, 3).
-        stamp_shift_ns: Added to the times of b, which must then come after those of a.
-        parameters: Of all stages.
+        T_a_b: Pose of the frame of b in that of a.
+        covariance: Its covariance, shape (3, 3).
+        stamp_shift_ns: Added to the times of b, which must then be after those of a.
+        parameters: Parameters of all stages.
     """
     moved = _moved_tracks(b.tracks, T_a_b, covariance, stamp_shift_ns)
     slack = parameters.relocalisation.slack**2
@@ -71,7 +73,7 @@ def merge_maps(
     matched = row_of[~fresh]
     shown = (moved.verdict[~fresh] < 0) & (moved.hits[~fresh] >= parameters.tracking.hits_to_confirm)
     hidden = ((a.tracks.verdict[matched] < 0) | shown) & (both.verdict[matched] != Verdict.TREE)
-    both.verdict[matched[hidden]] = -1  # a tree that one of the runs shows by its hits stays shown
+    both.verdict[matched[hidden]] = -1  # a tree that one of the runs confirmed by its hits stays confirmed
     both.number[len(a.tracks) :] = number_of
     tracks = both.take(np.concatenate([np.ones(len(a.tracks), np.bool_), fresh]))
     path = np.concatenate([a.slam.genealogy.path(a.slam.best), _moved_path(b, T_a_b)])
@@ -83,7 +85,7 @@ def merge_maps(
         tracks=tracks,
         next_number=a.next_number + int(np.count_nonzero(fresh)),
         odometry=None,
-        search=None,  # a robot that was lost at the end of a stands at the end of b now
+        search=None,  # a robot lost at the end of a is at the end of b
         stamp_ns=np.concatenate([a.stamp_ns, b.stamp_ns + stamp_shift_ns]),
         sigma_xy=np.concatenate(
             [a.sigma_xy, np.hypot(b.sigma_xy, np.sqrt(np.trace(covariance[:2, :2]) / 2))]
@@ -118,8 +120,8 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
 
 
 def _of_the_frame(place: Float, T: Pose2, covariance: Float) -> Float:
-    """What the error of a frame's pose, covariance of shape (3, 3), adds to places in it, shape (N, 2) and
-    already moved: J S J^T with J = d place / d (x, y, yaw), shape (N, 2, 2)."""
+    """Return the covariance that the pose of a frame, with covariance S of shape (3, 3), adds to positions
+    (N, 2) in it after the transformation: J S J^T with J = d position / d (x, y, yaw), shape (N, 2, 2)."""
     J = np.zeros((len(place), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0
     J[:, 0, 2], J[:, 1, 2] = T.y - place[:, 1], place[:, 0] - T.x
@@ -133,7 +135,7 @@ def _moved_path(b: SavedMap, T: Pose2) -> Float:
 
 
 def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, reach: float) -> SlamState:
-    """The best map of each in every particle, which stand where the second run ended."""
+    """Return particles with the best maps of both, at the end of the second run."""
     P = len(a.pose)
     known, other = a.map_of(a.best), b.map_of(b.best)
     C = T.rotation()
@@ -156,7 +158,7 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
 
 
 def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemory:
-    """The marks of both, those of b as well known as its own frame allows and T besides."""
+    """Return the marks of both; the uncertainty of T is added to those of b."""
     own, other = a.frame.forgotten(), b.frame
     if not len(other.serial):
         return own
@@ -177,19 +179,19 @@ def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemo
 
 
 def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int) -> PackedVoxelMap:
-    """The voxels of a, and the means of those of b as often as they were seen, up to a bound."""
+    """Return the voxels of a with the means of those of b, each as often as it was seen, up to a limit."""
     memory = a.unpacked()
     points = b.mean.copy()
     points[:, :2] = T.apply(b.mean[:, :2].astype(np.float64))
     memory.add(np.repeat(points, np.minimum(b.returns, MOST_RETURNS), axis=0), scan, most)
     memory.added += b.added - 1
-    while len(memory.due_tiles(1.0)):  # the columns of both stand until more is seen
+    while len(memory.due_tiles(1.0)):  # the columns of both are kept until there are new returns
         pass
     return PackedVoxelMap.of(memory)
 
 
 def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
-    """The columns of a, and those of b at places where a has none."""
+    """Return the columns of a, and those of b at positions where a has none."""
     axis = b.axis.copy()
     axis[:, :2] = T.apply(b.axis[:, :2])
     axis[:, 2:4] = b.axis[:, 2:4] @ T.rotation().T

@@ -1,7 +1,7 @@
-"""A map as it is saved: all that the mapper knows, so that it goes on from there to the same bytes.
+"""Saved maps: the state of the mapper, from which a run continues with the same bytes.
 
-What is kept to take back wrong scans is left out: a robot that is carried away shortly after a run goes on
-takes back no scan from before. A search that goes on keeps nothing more, and is saved.
+The state to revert scans after a kidnapping is not saved, so scans before the checkpoint are not reverted. A
+search for the lost robot is saved.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from pipeline.types.records import Columns, Int, Trees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Search:
-    """Of a robot that is lost: see RelocaliserState."""
+class SavedSearch:
+    """Search for a lost robot, see RelocaliserState."""
 
     local: SlamState
     driven: float
@@ -36,7 +36,8 @@ class Search:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedMap:
-    """See MapperState; `stamp_ns`, `sigma_xy` and `motion` are those of the path, one a scan."""
+    """State of a mapper, see MapperState; `stamp_ns`, `sigma_xy` and `motion` are those of the path, one per
+    scan."""
 
     slam: SlamState
     memory: PackedVoxelMap
@@ -50,11 +51,11 @@ class SavedMap:
     motion: Float
     placed: int
     closed: int
-    search: Search | None = None
+    search: SavedSearch | None = None
 
     @classmethod
     def of(cls, mapper: Mapper) -> SavedMap:
-        """What a mapper knows now; a pose graph is saved as the particles that would go on from it."""
+        """Return the state of a mapper; a pose graph is saved as particles."""
         state, path = mapper.snapshot(), mapper.path
         slam, lost = state.slam, state.recovery
         if isinstance(slam, GraphState):
@@ -72,14 +73,14 @@ class SavedMap:
             mapper.motion,
             state.placed,
             state.closed,
-            None if lost.local is None else Search(lost.local, lost.driven, lost.since),
+            None if lost.local is None else SavedSearch(lost.local, lost.driven, lost.since),
         )
 
     def state(self) -> MapperState:
-        """As the mapper takes it.
+        """Return the state for a mapper.
 
         Raises:
-            ValueError: Its parts do not fit one another; they come from a file.
+            ValueError: Its parts, which come from a file, contradict each other.
         """
         _check_slam(self.slam)
         n = len(self.slam.genealogy)
@@ -114,7 +115,7 @@ class SavedMap:
         return RelocaliserState(local=local, driven=driven, since=since)
 
     def trees(self, parameters: Parameters) -> Trees:
-        """The trees of the map, by these parameters."""
+        """Return the trees of the map by some parameters."""
         tracker = Tracker(parameters.tracking)
         tracker.tracks, tracker.next_number = self.tracks, self.next_number
         return tracker.trees()
@@ -159,7 +160,7 @@ def _check_frame(frame: FrameMemory, scans: int) -> None:
 
 
 def _check_finite(*columns: Float) -> None:
-    """Compiled code turns places into rows of its tables, and what is no number into any row."""
+    """Check numbers that compiled code converts to rows of tables."""
     if not all(np.isfinite(column).all() for column in columns):
         raise ValueError("a place or a covariance is not finite")
 
@@ -169,7 +170,7 @@ def _within(rows: Int, size: int) -> bool:
 
 
 def _check_rows(table: TrackTable | Columns, empty: TrackTable | Columns) -> None:
-    """All columns as long as the first, each row shaped as in an empty table."""
+    """Check that all columns have the length of the first, and the shapes of an empty table."""
     n = None
     for f in fields(table):
         column, wanted = getattr(table, f.name), getattr(empty, f.name)

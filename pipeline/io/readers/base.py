@@ -138,6 +138,33 @@ class Source(Protocol):
         """Close files and sockets; safe to call twice."""
 
 
+class FileSource:
+    """Parts that sources of files share: description, losses, no ground truth, nothing to close."""
+
+    _description: SourceDescription
+
+    def __init__(self) -> None:
+        self._damage: dict[str, int] = {}
+        self._losses: dict[str, int] = {}
+
+    @property
+    def description(self) -> SourceDescription:
+        """Description that is known before reading."""
+        return self._description
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Records left out on opening and in the latest reading, by reason."""
+        return {**self._damage, **self._losses}
+
+    def truth(self) -> Truth | None:
+        """Return None: there is no ground truth."""
+        return None
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
 def count_loss(losses: dict[str, int], reason: str, number: int = 1) -> None:
     """Add a number of left-out records to the losses of one reason."""
     losses[reason] = losses.get(reason, 0) + number

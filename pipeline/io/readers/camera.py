@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose3
-from pipeline.io.readers import ros_messages
 from pipeline.io.readers.container import Channel, Container, Message, plain_message
 from pipeline.io.readers.message_time import header_stamp
 from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, MessageDecoder
 from pipeline.io.readers.transforms import TransformTree, frame_name
 from pipeline.types.records import Bool, Int
+
+if TYPE_CHECKING:
+    from rosbags.typesys.stores import ros2_jazzy as ros2
 
 #: Larger pictures are refused: bytes as recorded, and pixels.
 BYTES_LIMIT, PIXEL_LIMIT = 64 << 20, 40_000_000
@@ -92,7 +94,7 @@ def find_camera(
     for message in islice(container.messages({near[0].number}, None, {}), 20):
         try:
             plain = plain_message(message.payload)
-            info = cast(ros_messages.CameraInfo, decoder.decode(channels[message.channel], plain))
+            info = decoder.decode(channels[message.channel], plain)
             K = np.asarray(info.k if hasattr(info, "k") else info.K, dtype=np.float64).reshape(3, 3)
             width, height = int(info.width), int(info.height)
         except Exception:  # noqa: S112 - whatever the generated decoders of rosbags raise
@@ -124,8 +126,8 @@ def picture_of(
     try:
         decoded = decoder.decode(channel, message.payload)
         if channel.msgtype == COMPRESSED_IMAGE:
-            return Picture(stamp_ns, "", 0, 0, 0, cast(ros_messages.CompressedImage, decoded).data.tobytes())
-        image = cast(ros_messages.Image, decoded)
+            return Picture(stamp_ns, "", 0, 0, 0, decoded.data.tobytes())
+        image: ros2.sensor_msgs__msg__Image = decoded
         width, height, step = int(image.width), int(image.height), int(image.step)
         if not (0 < width * height <= PIXEL_LIMIT and width <= step and step * height <= len(image.data)):
             return None

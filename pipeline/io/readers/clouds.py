@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
-from pipeline.inventory.cloud import Cloud, CloudDescription
+from pipeline.inventory.cloud import CloudDescription, WholeCloud
 from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss, digest_of
 from pipeline.io.readers.point_files import (
     MAGIC,
@@ -46,7 +46,7 @@ def is_cloud(uri: str) -> bool:
     return head.startswith((LAS, E57, *MAGIC[".ply"], *MAGIC[".npy"])) or path.suffix.lower() in SUFFIXES
 
 
-def open_cloud(uri: str) -> Cloud:
+def open_cloud(uri: str) -> WholeCloud:
     """Open a whole cloud.
 
     Raises:
@@ -84,7 +84,7 @@ def offset_for(middle: Float) -> Float:
 
 
 class TableCloud:
-    """A PLY, NumPy or PCD file as a cloud (see `pipeline.inventory.cloud.Cloud`).
+    """A PLY, NumPy or PCD file as a cloud (see `pipeline.inventory.cloud.WholeCloud`).
 
     Raises:
         SourceError: It has another format, or is damaged.
@@ -155,7 +155,7 @@ _LASZIP, _ITEMS, _ITEM = 22204, 34, struct.Struct("<HHH")
 
 
 class LasCloud:
-    """A .las or .laz file (see `pipeline.inventory.cloud.Cloud`).
+    """A .las or .laz file (see `pipeline.inventory.cloud.WholeCloud`).
 
     Raises:
         SourceError: It has another format, or is damaged.
@@ -379,7 +379,8 @@ _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 
 class E57Cloud:
-    """An E57 file (ASTM E2807) as a cloud (see `pipeline.inventory.cloud.Cloud`): all stations in one frame.
+    """An E57 file (ASTM E2807) as a cloud (see `pipeline.inventory.cloud.WholeCloud`): all stations in one
+    frame.
 
     Raises:
         SourceError: It has another format, is damaged, or pye57 is not installed.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from pipeline.io.readers.base import Source, SourceOptions
@@ -11,77 +12,22 @@ from pipeline.io.readers.base import Source, SourceOptions
 Opener = Callable[[str, Path, SourceOptions], Source]
 
 
-def _mcap(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.live import open_live_recording
-    from pipeline.io.readers.mcap_file import McapFile
-    from pipeline.io.readers.ros import open_ros
+def _opener(module: str, function: str) -> Opener:
+    """Return an opener of a module of this package, which is imported when a file is opened."""
 
-    live = open_live_recording(uri, path, options)
-    return live or open_ros(uri, lambda: McapFile(path), [path], options)
+    def opened(uri: str, path: Path, options: SourceOptions) -> Source:
+        found: Opener = getattr(import_module(f"pipeline.io.readers.{module}"), function)
+        return found(uri, path, options)
 
-
-def _db3(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.ros import open_ros
-    from pipeline.io.readers.rosbag2 import Db3File
-
-    return open_ros(uri, lambda: Db3File(path), [path], options)
+    return opened
 
 
-def _bag(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.ros import open_ros
-    from pipeline.io.readers.rosbag1 import BagFile
-
-    return open_ros(uri, lambda: BagFile(path), [path], options)
-
-
-def _bag_folder(uri: str, folder: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.ros import open_ros
-    from pipeline.io.readers.rosbag2 import BagFolder, bag_files
-
-    files = bag_files(folder)
-    return open_ros(uri, lambda: BagFolder(files), files, options)
-
-
-def _pcap(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.pcap import PcapSource
-
-    return PcapSource(uri, path, options)
-
-
-def _victoria(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.victoria_park import VictoriaParkSource
-
-    return VictoriaParkSource(uri, path, options)
-
-
-def _kitti(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.scan_folder import open_kitti
-
-    return open_kitti(uri, path, options)
-
-
-def _tree_manager(uri: str, folder: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.tree_manager import TreeManagerSource
-
-    return TreeManagerSource(uri, folder, options)
-
-
-def _pcd(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.scan_folder import open_pcd
-
-    return open_pcd(uri, path, options)
-
-
-def _scan_tables(uri: str, folder: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.scan_folder import open_table_scans
-
-    return open_table_scans(uri, folder, options)
-
-
-def _cloud(uri: str, path: Path, options: SourceOptions) -> Source:
-    from pipeline.io.readers.simulated import drive_through
-
-    return drive_through(uri, path, options)
+_bag_folder = _opener("ros", "open_bag_folder")
+_kitti = _opener("scan_folder", "open_kitti")
+_pcd = _opener("scan_folder", "open_pcd")
+_scan_tables = _opener("scan_folder", "open_table_scans")
+_cloud = _opener("simulated", "open_cloud_drive")
+_tree_manager = _opener("tree_manager", "TreeManagerSource")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +48,9 @@ class Format:
 
 
 FILES = (
-    Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _mcap),
-    Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _db3),
-    Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _bag),
+    Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _opener("live", "open_mcap")),
+    Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _opener("ros", "open_db3")),
+    Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _opener("ros", "open_bag")),
     Format(
         "Velodyne .pcap",
         (
@@ -115,9 +61,14 @@ FILES = (
             b"\x0a\x0d\x0d\x0a",
         ),
         (".pcap",),
-        _pcap,
+        _opener("velodyne", "PcapSource"),
     ),
-    Format("Victoria Park .zip (LASER.txt, DRS.txt)", (b"PK\x03\x04",), (".zip",), _victoria),
+    Format(
+        "Victoria Park .zip (LASER.txt, DRS.txt)",
+        (b"PK\x03\x04",),
+        (".zip",),
+        _opener("victoria_park", "VictoriaParkSource"),
+    ),
     Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _pcd),
     Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud),
     Format("whole cloud .e57", (b"ASTM-E57",), (".e57",), _cloud),

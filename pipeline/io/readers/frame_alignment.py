@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose3
-from pipeline.io.readers import gnss, other_slam
 from pipeline.io.readers.base import SourceDescription
 from pipeline.io.readers.container import Container, Message
+from pipeline.io.readers.measured_poses import FIX_STRETCH, POSE_STRETCH, align_fixes, align_poses
 from pipeline.io.readers.message_time import Stamped
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.topics import Topics
@@ -194,10 +194,10 @@ class FrameAlignments:
             (kind, topic.numbers)
             for kind, topic in (
                 (_Kind("gnss", "gnss", "GNSS", "GNSS fixes", "fixes", "the direction of north", decoder.fix,
-                       gnss.align_fixes, gnss.SHORTEST, gnss.LONGEST, early=False), topics.gnss),
+                       align_fixes, *FIX_STRETCH, early=False), topics.gnss),
                 (_Kind("pose", "other_slam", "other SLAM", "Poses of another SLAM", "poses",
-                       "the pose of their frame", decoder.other_pose, other_slam.align_poses,
-                       other_slam.SHORTEST, other_slam.LONGEST, early=True), topics.pose),
+                       "the pose of their frame", decoder.other_pose, align_poses,
+                       *POSE_STRETCH, early=True), topics.pose),
             )
             if topic is not None
         ]  # fmt: skip

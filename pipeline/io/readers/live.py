@@ -14,6 +14,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers.base import (
     RecordedTopic,
     Revision,
+    Source,
     SourceDescription,
     SourceOptions,
     count_loss,
@@ -31,7 +32,7 @@ from pipeline.io.readers.camera import (
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.message_time import SECOND_NS, ClockStepFilter, header_stamp
-from pipeline.io.readers.ros import RosSource
+from pipeline.io.readers.ros import RosSource, open_ros
 from pipeline.io.readers.ros_messages import CAMERA_INFO, MessageDecoder, standard_types
 from pipeline.io.readers.topics import TYPES_BY_ROLE, Topic
 from pipeline.io.readers.transforms import Extrinsics
@@ -553,3 +554,13 @@ def open_live_recording(uri: str, path: Path, options: SourceOptions) -> LiveRec
         raise
     container.close()
     return None
+
+
+def open_mcap(uri: str, path: Path, options: SourceOptions) -> Source:
+    """Open an MCAP file: the recording of a live run, or any other recording of ROS messages.
+
+    Raises:
+        SourceError: See RosSource.
+    """
+    live = open_live_recording(uri, path, options)
+    return live or open_ros(uri, lambda: McapFile(path), [path], options)

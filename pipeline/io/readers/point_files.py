@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io.readers.base import count_loss
-from pipeline.io.readers.number_text import read_rows
+from pipeline.io.readers.pose_files import read_rows
 from pipeline.io.readers.scan_columns import POINT_LIMIT
 from pipeline.jit import compiled
 

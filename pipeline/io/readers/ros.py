@@ -6,24 +6,23 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import ros_messages
+from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture, RecordedPictures, find_camera
 from pipeline.io.readers.container import Channel, Container, Message, plain_message
 from pipeline.io.readers.frame_alignment import FrameAlignments
 from pipeline.io.readers.message_time import WINDOW_NS, Clock, Stamped, by_stamp, header_stamp
+from pipeline.io.readers.ros_bags import BagFile, BagFolder, Db3File, bag_files
 from pipeline.io.readers.ros_messages import LASER_SCAN, MessageDecoder
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.scan_columns import rings_descend, sensor_of
 from pipeline.io.readers.topics import Topic, choose_topics
 from pipeline.io.readers.transforms import Extrinsics, frame_name
-from pipeline.io.readers.truth_file import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.velodyne import SENSORS
 from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
 
@@ -274,8 +273,7 @@ class RosSource:
         for message in islice(self._container.messages(numbers, None, {}), 1 if numbers else 0):
             try:
                 plain = replace(message, payload=plain_message(message.payload))
-                message_of_odometry = cast(ros_messages.Odometry, self._records.message(plain))
-                return frame_name(message_of_odometry.child_frame_id)
+                return frame_name(self._records.message(plain).child_frame_id)
             except Exception:  # as in RecordDecoder.record
                 return ""
         return ""
@@ -336,3 +334,31 @@ def open_ros(
     except BaseException:
         container.close()
         raise
+
+
+def open_db3(uri: str, path: Path, options: SourceOptions) -> RosSource:
+    """Open a ROS 2 bag in SQLite.
+
+    Raises:
+        SourceError: See RosSource.
+    """
+    return open_ros(uri, lambda: Db3File(path), [path], options)
+
+
+def open_bag(uri: str, path: Path, options: SourceOptions) -> RosSource:
+    """Open a ROS 1 bag.
+
+    Raises:
+        SourceError: See RosSource.
+    """
+    return open_ros(uri, lambda: BagFile(path), [path], options)
+
+
+def open_bag_folder(uri: str, folder: Path, options: SourceOptions) -> RosSource:
+    """Open a folder that a ROS 2 recorder wrote.
+
+    Raises:
+        SourceError: See RosSource.
+    """
+    files = bag_files(folder)
+    return open_ros(uri, lambda: BagFolder(files), files, options)

@@ -3,197 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from pipeline.io.readers.container import Channel
-
-
-class Stamp(Protocol):
-    """builtin_interfaces/Time."""
-
-    sec: int
-    nanosec: int
-
-
-class Header(Protocol):
-    """std_msgs/Header."""
-
-    stamp: Stamp
-    frame_id: str
-
-
-class Stamped(Protocol):
-    """Any message that begins with a header."""
-
-    header: Header
-
-
-class Vector(Protocol):
-    """geometry_msgs/Vector3 or Point."""
-
-    x: float
-    y: float
-    z: float
-
-
-class Quaternion(Vector, Protocol):
-    """geometry_msgs/Quaternion."""
-
-    w: float
-
-
-class PointField(Protocol):
-    """One column of a cloud, as its message describes it."""
-
-    name: str
-    offset: int
-    datatype: int
-    count: int
-
-
-class PointCloud2(Stamped, Protocol):
-    """sensor_msgs/PointCloud2."""
-
-    height: int
-    width: int
-    fields: Sequence[PointField]
-    is_bigendian: bool
-    point_step: int
-    row_step: int
-    data: NDArray[np.uint8]
-
-
-class LaserScan(Stamped, Protocol):
-    """sensor_msgs/LaserScan."""
-
-    angle_min: float
-    angle_increment: float
-    time_increment: float
-    range_min: float
-    range_max: float
-    ranges: NDArray[np.float32]
-    intensities: NDArray[np.float32]
-
-
-class NavSatStatus(Protocol):
-    """sensor_msgs/NavSatStatus."""
-
-    status: int
-
-
-class NavSatFix(Stamped, Protocol):
-    """sensor_msgs/NavSatFix."""
-
-    status: NavSatStatus
-    latitude: float
-    longitude: float
-    altitude: float
-    position_covariance: NDArray[np.float64]
-    position_covariance_type: int
-
-
-class CameraInfo(Stamped, Protocol):
-    """sensor_msgs/CameraInfo; the matrix is `k` in ROS 2 and `K` in ROS 1."""
-
-    width: int
-    height: int
-    k: NDArray[np.float64]
-    K: NDArray[np.float64]
-
-
-class CompressedImage(Stamped, Protocol):
-    """sensor_msgs/CompressedImage."""
-
-    format: str
-    data: NDArray[np.uint8]
-
-
-class Image(Stamped, Protocol):
-    """sensor_msgs/Image."""
-
-    height: int
-    width: int
-    encoding: str
-    step: int
-    data: NDArray[np.uint8]
-
-
-class Packet(Protocol):
-    """velodyne_msgs/VelodynePacket."""
-
-    stamp: Stamp
-    data: NDArray[np.uint8]
-
-
-class VelodyneScan(Stamped, Protocol):
-    """velodyne_msgs/VelodyneScan."""
-
-    packets: Sequence[Packet]
-
-
-class Pose(Protocol):
-    """geometry_msgs/Pose."""
-
-    position: Vector
-    orientation: Quaternion
-
-
-class PoseWithCovariance(Protocol):
-    """geometry_msgs/PoseWithCovariance; about x, y, z and turns about them, row by row."""
-
-    pose: Pose
-    covariance: NDArray[np.float64]
-
-
-class PoseWithCovarianceStamped(Stamped, Protocol):
-    """geometry_msgs/PoseWithCovarianceStamped."""
-
-    pose: PoseWithCovariance
-
-
-class Odometry(Stamped, Protocol):
-    """nav_msgs/Odometry."""
-
-    child_frame_id: str
-    pose: PoseWithCovariance
-
-
-class Imu(Stamped, Protocol):
-    """sensor_msgs/Imu."""
-
-    orientation: Quaternion
-    orientation_covariance: NDArray[np.float64]
-    angular_velocity: Vector
-    linear_acceleration: Vector
-
-
-class Transform(Protocol):
-    """geometry_msgs/Transform."""
-
-    translation: Vector
-    rotation: Quaternion
-
-
-class TransformStamped(Stamped, Protocol):
-    """geometry_msgs/TransformStamped."""
-
-    child_frame_id: str
-    transform: Transform
-
-
-class Transforms(Protocol):
-    """tf2_msgs/TFMessage."""
-
-    transforms: Sequence[TransformStamped]
-
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 VELODYNE_SCAN = "velodyne_msgs/msg/VelodyneScan"
@@ -257,8 +75,8 @@ class MessageDecoder:
             if channel.msgtype in READ_TYPES and channel.definition:
                 self._adopt(channel)
 
-    def decode(self, channel: Channel, payload: bytes) -> object:
-        """Decode one message.
+    def decode(self, channel: Channel, payload: bytes) -> Any:  # noqa: ANN401
+        """Decode one message; `rosbags.typesys.stores.ros2_jazzy` declares the fields.
 
         Raises:
             Exception: Of many kinds, when the bytes do not match the type. Callers count a loss.

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import ros_messages
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.gnss import Fix, GnssFrame
+from pipeline.io.readers.measured_poses import Fix, GnssFrame, NoPoseError, OtherFrame, OtherPose
 from pipeline.io.readers.message_time import SECOND_NS
-from pipeline.io.readers.other_slam import NoPoseError, OtherFrame, OtherPose
 from pipeline.io.readers.ros_messages import (
     IMU,
     LASER_SCAN,
     NAV_SAT_FIX,
     ODOMETRY,
     POINT_CLOUD,
-    LaserScan,
     MessageDecoder,
-    PointCloud2,
 )
 from pipeline.io.readers.scan_columns import (
     OFFSET_LIMIT_NS,
@@ -32,13 +28,14 @@ from pipeline.io.readers.scan_columns import (
     RING,
     TIME,
     clean_scan,
-    first_of,
-    is_ring,
-    point_offsets,
+    scan_of,
 )
 from pipeline.io.readers.transforms import TransformTree, frame_name, pose_of
 from pipeline.io.readers.velodyne import PacketDecoder, is_data_packet
 from pipeline.types.records import Imu, Odometry, Record, Scan
+
+if TYPE_CHECKING:
+    from rosbags.typesys.stores import ros2_jazzy as ros2
 
 STEP_LIMIT = 64 << 10
 #: NumPy's code by the number of a PointField's datatype.
@@ -49,7 +46,7 @@ class LayoutError(Exception):
     """The header of a cloud or laser scan contradicts itself or its data."""
 
 
-def decode_cloud(cloud: PointCloud2, stamp_ns: int) -> Scan:
+def decode_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2, stamp_ns: int) -> Scan:
     """Decode a PointCloud2 message of any layout.
 
     The time of a point is read from a field named t, time, timestamp, time_offset or offset_time: integers
@@ -60,18 +57,10 @@ def decode_cloud(cloud: PointCloud2, stamp_ns: int) -> Scan:
         LayoutError: Width, height, steps, fields and length of the data do not fit together.
     """
     table = _table(cloud)
-    points = np.empty((len(table), 3), dtype=np.float64 if table["x"].dtype.itemsize > 4 else np.float32)
-    for axis, name in enumerate("xyz"):
-        points[:, axis] = table[name]
-    columns = {name: table[name] for name in table.dtype.names or ()}
-    reflectance, ring, time = (first_of(columns, names) for names in (REFLECTANCE, RING, TIME))
-    if ring is not None and not is_ring(ring):
-        ring = None
-    offset_ns = None if time is None else point_offsets(time, stamp_ns)
-    return clean_scan(stamp_ns, points, reflectance=reflectance, ring=ring, offset_ns=offset_ns)
+    return scan_of(stamp_ns, {name: table[name] for name in table.dtype.names or ()})
 
 
-def _table(cloud: PointCloud2) -> NDArray[np.void]:
+def _table(cloud: ros2.sensor_msgs__msg__PointCloud2) -> NDArray[np.void]:
     """Return the points as a structured array of shape (N,), after a check of its size."""
     width, height = int(cloud.width), int(cloud.height)
     step, row_step, length = int(cloud.point_step), int(cloud.row_step), len(cloud.data)
@@ -92,7 +81,7 @@ def _table(cloud: PointCloud2) -> NDArray[np.void]:
     return np.concatenate(rows)
 
 
-def _dtype(cloud: PointCloud2, step: int) -> np.dtype[np.void]:
+def _dtype(cloud: ros2.sensor_msgs__msg__PointCloud2, step: int) -> np.dtype[np.void]:
     order = ">" if cloud.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for field in cloud.fields:
@@ -112,7 +101,7 @@ def _dtype(cloud: PointCloud2, step: int) -> np.dtype[np.void]:
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
 
 
-def decode_laser_scan(laser: LaserScan, stamp_ns: int) -> Scan:
+def decode_laser_scan(laser: ros2.sensor_msgs__msg__LaserScan, stamp_ns: int) -> Scan:
     """Decode a LaserScan into a planar scan (z = 0, ring 0); the stamp is the time of its first beam.
 
     Beams outside of range_min and range_max of the message are no returns.
@@ -202,12 +191,12 @@ class RecordDecoder:
         """
         msgtype = self._channels[message.channel].msgtype
         if msgtype == LASER_SCAN:
-            laser = cast(ros_messages.LaserScan, self.message(message))
+            laser: ros2.sensor_msgs__msg__LaserScan = self.message(message)
             return decode_laser_scan(laser, stamp_ns), frame_name(laser.header.frame_id), 0
         if msgtype == POINT_CLOUD:
-            cloud = cast(ros_messages.PointCloud2, self.message(message))
+            cloud: ros2.sensor_msgs__msg__PointCloud2 = self.message(message)
             return decode_cloud(cloud, stamp_ns), frame_name(cloud.header.frame_id), 0
-        decoded = cast(ros_messages.VelodyneScan, self.message(message))
+        decoded = self.message(message)
         packets = [(_time_ns(p.stamp), p.data.tobytes()) for p in decoded.packets]
         good = [packet for packet in packets if is_data_packet(packet[1])]
         if len(good) < len(packets):
@@ -216,7 +205,7 @@ class RecordDecoder:
         scan = self._packets.decode(stamp_ns, [t + shift for t, _ in good], [p for _, p in good])
         return scan, frame_name(decoded.header.frame_id), good[0][1][-1]
 
-    def message(self, message: Message) -> object:
+    def message(self, message: Message) -> Any:  # noqa: ANN401
         """Decode a message as the type of its channel.
 
         Raises:
@@ -230,7 +219,7 @@ class RecordDecoder:
         Raises:
             Exception: Of many kinds, when the message is damaged.
         """
-        decoded = cast(ros_messages.NavSatFix, self.message(message))
+        decoded: ros2.sensor_msgs__msg__NavSatFix = self.message(message)
         frame = frame_name(decoded.header.frame_id)
         if decoded.status.status < 0:
             return None, frame
@@ -245,7 +234,7 @@ class RecordDecoder:
             NoPoseError: Its covariance is invalid.
             Exception: Of many kinds, when the message is damaged.
         """
-        decoded = cast(ros_messages.Odometry, self.message(message))  # the other type has the same parts
+        decoded: ros2.nav_msgs__msg__Odometry = self.message(message)  # the other type has the same fields
         frame = frame_name(decoded.header.frame_id)
         child = frame_name(getattr(decoded, "child_frame_id", ""))
         linked = self._tree.find(child, self.base) if child and child != self.base else None
@@ -277,12 +266,12 @@ class RecordDecoder:
         return frame.measurement(pose) if isinstance(frame, OtherFrame) else None
 
     def _odometry(self, message: Message, stamp_ns: int) -> Odometry:
-        pose = cast(ros_messages.Odometry, self.message(message)).pose.pose
+        pose = self.message(message).pose.pose
         return Odometry(stamp_ns, pose_of(pose.position, pose.orientation))
 
     def _imu(self, message: Message, stamp_ns: int) -> Imu:
         """Decode an IMU reading, rotated into the base frame when the pose of the IMU is known."""
-        decoded = cast(ros_messages.Imu, self.message(message))
+        decoded: ros2.sensor_msgs__msg__Imu = self.message(message)
         linked = self._tree.find(self.base, frame_name(decoded.header.frame_id))
         R_base_imu = np.eye(3) if linked is None else linked.R
         turn, pull, q = decoded.angular_velocity, decoded.linear_acceleration, decoded.orientation
@@ -297,5 +286,5 @@ class RecordDecoder:
         return Imu(stamp_ns, rates[0], rates[1], orientation)
 
 
-def _time_ns(stamp: ros_messages.Stamp) -> int:
+def _time_ns(stamp: ros2.builtin_interfaces__msg__Time) -> int:
     return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)

@@ -123,6 +123,21 @@ def _unit(largest: float) -> float | None:
     return None
 
 
+def scan_of(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> Scan:
+    """Make a Scan of the columns of a table by their usual names; x, y and z [m] are among them."""
+    kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
+    with np.errstate(invalid="ignore", over="ignore"):
+        points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)
+    ring, time = first_of(columns, RING), first_of(columns, TIME)
+    return clean_scan(
+        stamp_ns,
+        points,
+        reflectance=first_of(columns, REFLECTANCE),
+        ring=ring if ring is not None and is_ring(ring) else None,
+        offset_ns=None if time is None else point_offsets(time, stamp_ns),
+    )
+
+
 #: Fewest points of a ring for its elevation.
 _RING_POINTS = 8
 VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.03, 100.0)

@@ -11,23 +11,12 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
+from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.format_detection import named, recordings_in
-from pipeline.io.readers.point_files import Columns, ScanFileError, read_columns
+from pipeline.io.readers.point_files import ScanFileError, read_columns
 from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns
-from pipeline.io.readers.scan_columns import (
-    POINT_LIMIT,
-    RANGE_LIMIT,
-    REFLECTANCE,
-    RING,
-    TIME,
-    clean_scan,
-    first_of,
-    is_ring,
-    point_offsets,
-    sensor_of,
-)
-from pipeline.types.records import Int, Odometry, Record, Scan, Sensor, Truth
+from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT, clean_scan, scan_of, sensor_of
+from pipeline.types.records import Int, Odometry, Record, Scan, Sensor
 
 #: Period of scans without times: 10 Hz.
 STEP_NS = 100_000_000
@@ -59,7 +48,7 @@ class ScanFormat:
     sensor: Callable[[Scan], Sensor]
 
 
-class ScanFolder:
+class ScanFolder(FileSource):
     """Source of scans from files, in the order of the numbers in their names.
 
     Poses (odometry; `poses.txt` and the other names of POSES, in KITTI or TUM format) and `times.txt` or
@@ -80,10 +69,10 @@ class ScanFolder:
     """
 
     def __init__(self, uri: str, path: Path, form: ScanFormat, options: SourceOptions) -> None:
+        super().__init__()
         self._form = form
         self._warnings: list[str] = []
         self._texts: list[Path] = []
-        self._losses: dict[str, int] = {}
         self._files = _scan_files(path, form.suffix)
         if not self._files:
             raise SourceError(f"the folder has no {form.suffix} files", where=uri)
@@ -115,16 +104,6 @@ class ScanFolder:
             warnings=tuple(self._warnings),
         )
 
-    @property
-    def description(self) -> SourceDescription:
-        """Description that is known before reading."""
-        return self._description
-
-    @property
-    def losses(self) -> dict[str, int]:
-        """Records left out in the latest reading, by reason."""
-        return dict(self._losses)
-
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield odometry and scans from `start_ns` on; earlier files are not opened."""
         self._losses = losses = dict[str, int]()
@@ -143,13 +122,6 @@ class ScanFolder:
                 yield scan
             else:
                 count_loss(losses, "scans without points")
-
-    def truth(self) -> Truth | None:
-        """A folder of scans has none."""
-        return None
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
     def _first_scan(self, uri: str) -> Scan:
         reason = ""
@@ -338,7 +310,7 @@ def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
         ScanFileError: See `read_columns`.
         OSError: It cannot be read.
     """
-    return scan_of(read_columns(path, losses), stamp_ns)
+    return scan_of(stamp_ns, read_columns(path, losses))
 
 
 def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
@@ -363,21 +335,6 @@ def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
         count_loss(losses, reason, number)
     points = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
     return clean_scan(stamp_ns, points + cloud.description.offset)
-
-
-def scan_of(columns: Columns, stamp_ns: int) -> Scan:
-    """Make a scan of the columns of a table; x, y and z [m] are among them."""
-    kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
-    with np.errstate(invalid="ignore", over="ignore"):
-        points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)
-    ring, time = first_of(columns, RING), first_of(columns, TIME)
-    return clean_scan(
-        stamp_ns,
-        points,
-        reflectance=first_of(columns, REFLECTANCE),
-        ring=ring if ring is not None and is_ring(ring) else None,
-        offset_ns=None if time is None else point_offsets(time, stamp_ns),
-    )
 
 
 def _kitti_sensor(scan: Scan) -> Sensor:

@@ -104,7 +104,7 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
     return SimulatedSource(uri, run, knows_trees=trees is not None, warnings=run.warnings)
 
 
-def drive_through(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
+def open_cloud_drive(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
     """Open a whole cloud as a run: a simulated robot drives through it (`sim:cloud?file=`).
 
     Raises:

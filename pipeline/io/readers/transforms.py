@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from itertools import islice
-from typing import cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import Channel, Container, Message, plain_message
-from pipeline.io.readers.ros_messages import MessageDecoder, Quaternion, Transforms, TransformStamped, Vector
+from pipeline.io.readers.ros_messages import MessageDecoder
 from pipeline.io.readers.topics import Topic
+
+if TYPE_CHECKING:
+    from rosbags.typesys.stores import ros2_jazzy as ros2
 
 #: Positions in any frame of the Earth are smaller [m].
 FARTHEST = 1e9
@@ -52,7 +55,10 @@ def frame_name(name: object) -> str:
     return str(name).lstrip("/")
 
 
-def pose_of(position: Vector, orientation: Quaternion) -> Pose3:
+def pose_of(
+    position: ros2.geometry_msgs__msg__Point | ros2.geometry_msgs__msg__Vector3,
+    orientation: ros2.geometry_msgs__msg__Quaternion,
+) -> Pose3:
     """Make a Pose3 of the position and the quaternion of a message.
 
     Raises:
@@ -133,14 +139,16 @@ class Extrinsics:
         """Decode the finite transforms of a message; [] when it is damaged."""
         try:
             payload = plain_message(message.payload)
-            decoded = cast(Transforms, self._decoder.decode(self._channels[message.channel], payload))
+            decoded: ros2.tf2_msgs__msg__TFMessage = self._decoder.decode(
+                self._channels[message.channel], payload
+            )
         except Exception:  # the generated decoders of rosbags raise many kinds
             return []
         with np.errstate(all="ignore"):
             return [link for link in map(_link, decoded.transforms) if link is not None]
 
 
-def _link(stamped: TransformStamped) -> Link | None:
+def _link(stamped: ros2.geometry_msgs__msg__TransformStamped) -> Link | None:
     try:
         pose = pose_of(stamped.transform.translation, stamped.transform.rotation)
     except ValueError:

@@ -1,22 +1,139 @@
-"""Folders of `TreeManagerState_<i>.csv` with `trajectory.txt` as a source (see `tree_manager_writer`): stems
-that another program found, and its trajectory as odometry. Of the columns only the place is needed."""
+"""Folders of `TreeManagerState_<i>.csv` with `trajectory.txt`, the format of programs for relocalisation
+among stems.
+
+`TreeManagerState_<i>.csv` has the stems of frame i in the sensor frame: a rotation whose third column is
+along the stem, a position and a diameter in metres. Row i of `trajectory.txt`, counted from 0, is the pose of
+the sensor: time [s], x y z [m], quaternion qx qy qz qw. An empty field is unknown. The reader needs only the
+columns of the position, and uses the trajectory as odometry.
+"""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import SourceError
-from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.number_text import parse_table
-from pipeline.io.readers.pose_files import TextError, read_table
-from pipeline.io.tree_manager_writer import AXIS, DBH, PLACE, TRAJECTORY
-from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Stems, Truth
+from pipeline.errors import SourceError, StemmapError
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.io.atomic_files import UNFINISHED
+from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
+from pipeline.io.readers.pose_files import TextError, parse_table, read_table
+from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Stems, Trees
+from pipeline.types.records import Path as MapPath
+
+TRAJECTORY = "trajectory.txt"
+AXIS = tuple(f"axis_{row}{column}" for row in range(3) for column in range(3))
+PLACE = ("location_x", "location_y", "location_z")
+DBH = "dbh"
+COLUMNS = (*AXIS, *PLACE, DBH, "dbh_approximation", "score", "reconstructed", "number_clusters")
+
+
+def state_name(frame: int) -> str:
+    """Return the name of the file of a frame."""
+    return f"TreeManagerState_{frame}.csv"
+
+
+def state_text(rows: Iterable[Sequence[float | bool]]) -> str:
+    """Return the text of the file of a frame.
+
+    Args:
+        rows: One row per stem, in the order of COLUMNS; NaN is written as an empty field.
+    """
+    lines = [",".join(_field(value) for value in row) for row in rows]
+    return "\n".join([",".join(COLUMNS), *lines]) + "\n"
+
+
+def trajectory_text(stamp_ns: Int, poses: Iterable[Pose3]) -> str:
+    """Return the text of the file of poses; times in nanoseconds, shape (N,)."""
+    lines = []
+    for stamp, pose in zip(stamp_ns.tolist(), poses, strict=True):
+        w, x, y, z = pose.quaternion().tolist()
+        lines.append(" ".join([f"{stamp * 1e-9:.9f}", *(f"{v:.9f}" for v in (*pose.t.tolist(), x, y, z, w))]))
+    return "\n".join(lines) + "\n"
+
+
+def write_tree_manager(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
+    """Write a mapped run to a folder, which appears when it is complete.
+
+    A frame has the trees that were seen until then and are within `reach` of its pose, at their positions in
+    the final map. The map is planar: poses have no tilt, and stems are vertical at height 0.
+
+    Args:
+        folder: The folder, which must be new or empty.
+        path: Poses and times.
+        trees: The map; only confirmed trees are written.
+        reach: Radius of a frame [m].
+
+    Returns:
+        Number of confirmed trees that are in no frame.
+
+    Raises:
+        StemmapError: The folder is not empty, or cannot be written.
+    """
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise StemmapError("it is not empty", where=str(folder), remedy="Name a new folder")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder.parent))
+        try:
+            left_out = _write(staging, path, trees, reach)
+            staging.chmod(0o755)  # like other new folders; only the owner may read a temporary one
+            if folder.exists():
+                folder.rmdir()
+            staging.rename(folder)
+        except BaseException:
+            shutil.rmtree(staging, ignore_errors=True)
+            raise
+    except OSError as error:
+        raise StemmapError(f"cannot write: {error.strerror}", where=str(folder)) from error
+    return left_out
+
+
+def _write(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
+    poses = [Pose2(x, y, yaw) for x, y, yaw in zip(path.x, path.y, path.yaw, strict=True)]
+    known = np.flatnonzero(trees.confirmed)
+    position, first_ns = trees.position[known], trees.first_seen_ns[known]
+    written = np.zeros(len(known), np.bool_)
+    for frame, (pose, stamp_ns) in enumerate(zip(poses, path.stamp_ns.tolist(), strict=True)):
+        place = pose.inverse().apply(position)
+        here = (np.hypot(place[:, 0], place[:, 1]) <= reach) & (first_ns <= stamp_ns)
+        written |= here
+        rows = [_row(trees, known[k], place[k]) for k in np.flatnonzero(here)]
+        (folder / state_name(frame)).write_text(state_text(rows), encoding="utf-8", newline="")
+    full = [Pose3.from_euler(np.array([p.x, p.y, 0.0]), 0.0, 0.0, p.yaw) for p in poses]
+    text = trajectory_text(path.stamp_ns, full)
+    (folder / TRAJECTORY).write_text(text, encoding="utf-8", newline="")
+    return int(np.count_nonzero(~written))
+
+
+def _row(trees: Trees, k: int, place: Float) -> list[float | bool]:
+    dbh = float(trees.dbh[k])
+    upright = np.eye(3).ravel().tolist()
+    fitted = math.isfinite(dbh)
+    return [
+        *upright,
+        float(place[0]),
+        float(place[1]),
+        0.0,
+        dbh,
+        dbh,
+        1.0,
+        fitted,
+        int(trees.observations[k]),
+    ]
+
+
+def _field(value: float | bool) -> str:
+    if isinstance(value, bool):
+        return str(value)
+    return f"{value:.9g}" if math.isfinite(value) else ""
+
 
 NAME = re.compile(r"TreeManagerState_(\d{1,9})\.csv")
 #: Along the stem: the third column of its rotation.
@@ -28,7 +145,7 @@ _TIME_LIMIT = 9e9  # s; what nanoseconds since 1970 hold in 64 bits
 STEM_FINDER = Sensor("stems of another program", 0, 0.0, 0.0035, 0.1, 100.0)
 
 
-class TreeManagerSource:
+class TreeManagerSource(FileSource):
     """The folder as a source of scans with stems, and of odometry.
 
     Args:
@@ -42,6 +159,7 @@ class TreeManagerSource:
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
+        super().__init__()
         numbered = sorted(
             (int(match.group(1)), file) for file in path.iterdir() if (match := NAME.fullmatch(file.name))
         )
@@ -49,7 +167,6 @@ class TreeManagerSource:
             raise SourceError("no file in the folder is named TreeManagerState_<i>.csv", where=uri)
         self._uri = uri
         self._files = [file for _, file in numbered]
-        self._losses: dict[str, int] = {}
         self._T_base_lidar = options.T_base_lidar or Pose3.identity()
         self._stamp, self._poses = _read_trajectory(path / TRAJECTORY, uri)
         number = np.array([n for n, _ in numbered], dtype=np.int64)
@@ -71,16 +188,6 @@ class TreeManagerSource:
             warnings=warnings,
         )
 
-    @property
-    def description(self) -> SourceDescription:
-        """Description that is known before reading."""
-        return self._description
-
-    @property
-    def losses(self) -> dict[str, int]:
-        """Records left out in the latest reading, by reason."""
-        return dict(self._losses)
-
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield odometry and scans from `start_ns` on; earlier files are not opened."""
         self._losses = losses = dict[str, int]()
@@ -93,13 +200,6 @@ class TreeManagerSource:
                 scan = self._scan(file_of[row], stamp_ns, losses)
                 if scan is not None:
                     yield scan
-
-    def truth(self) -> Truth | None:
-        """Return None: the trajectory is odometry, and the ground truth is unknown."""
-        return None
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
     def _scan(self, file: Path, stamp_ns: int, losses: dict[str, int]) -> Scan | None:
         """Return the scan of a frame, which may have no stems; None when the file cannot be read."""
@@ -227,7 +327,7 @@ def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
 
 
 def _rows(number: Int, count: int, uri: str) -> tuple[Int, tuple[str, ...]]:
-    """The row of each file in a trajectory of `count` rows."""
+    """Return the row of each file in a trajectory of `count` rows, and warnings."""
     files = len(number)
     if int(number[-1]) < count and len(np.unique(number)) == files:
         unseen = count - files

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import velodyne_decoder
 from numpy.typing import NDArray
 
+from pipeline.errors import SourceError
+from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.scan_columns import clean_scan
-from pipeline.types.records import Bool, Int, Scan, Sensor
+from pipeline.types.records import Bool, Int, Record, Scan, Sensor
 
 PACKET_BYTES = 1206
 BLOCK_BYTES, BLOCKS = 100, 12
@@ -102,3 +108,257 @@ class PacketDecoder:
         return clean_scan(
             stamp_ns, points, reflectance=table["intensity"], ring=table["ring"], offset_ns=offset
         )
+
+
+DATA_PORT = 2368
+#: A longer silence between packets ends a sweep.
+_GAP_NS = 50_000_000
+#: A packet whose time differs more from that of its neighbours has a damaged time.
+_JUMP_NS = 1_000_000_000
+#: Bytes before the IP header by link type: Ethernet, raw IP, Linux cooked capture.
+_LINKS = {1: 14, 101: 0, 113: 16}
+_ETHERNET = 14
+_BLOCK = 8 << 20  # bytes
+#: Longer packets do not occur: the length is damaged.
+_PACKET_LIMIT = 1 << 18
+_RECORD = 16  # bytes of the header of a packet
+_CUT = "bytes at the end of a capture that was cut"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Packets:
+    """The data packets of a capture as columns of length N, in the order of the file.
+
+    Attributes:
+        offset: Position of the 1206 bytes in the file.
+        stamp_ns: Time of arrival.
+        azimuth: Azimuth of the first block [0.01 degrees].
+        product: Product number of the sensor.
+        sender: Address and destination port.
+    """
+
+    offset: Int
+    stamp_ns: Int
+    azimuth: Int
+    product: Int
+    sender: Int
+
+    def only(self, keep: Bool) -> Packets:
+        """Return the packets of some rows."""
+        return Packets(
+            self.offset[keep], self.stamp_ns[keep], self.azimuth[keep], self.product[keep], self.sender[keep]
+        )
+
+
+class PcapSource(FileSource):
+    """Source of the scans of a .pcap file. A scan is one rotation, stamped with its last packet's arrival.
+
+    Args:
+        uri: As the user wrote it.
+        path: The file.
+        options: Extrinsics.
+
+    Raises:
+        SourceError: It is not a capture, or has no packets of a known sensor.
+        OSError: It cannot be read.
+    """
+
+    def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
+        super().__init__()
+        self._path = path
+        packets, self._damage = find_packets(path)
+        self._packets = packets = self._one_sensor(packets, uri)
+        self._first = _sweep_starts(packets.azimuth, packets.stamp_ns)
+        self._last = np.append(self._first[1:], len(packets.offset)) - 1
+        self._stamp = packets.stamp_ns[self._last]
+        self._file = path.open("rb", buffering=0)
+        self._description = SourceDescription(
+            uri=uri,
+            kind="Velodyne capture (pcap)",
+            sensor=SENSORS[int(packets.product[0])],
+            T_base_lidar=options.T_base_lidar or Pose3.identity(),
+            has_odometry=False,
+            has_imu=False,
+            scans=len(self._first),
+            start_ns=int(self._stamp[0]),
+            end_ns=int(self._stamp[-1]),
+            digest=digest_of([path]),
+        )
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """Yield the scans from `start_ns` on; earlier packets are not decoded."""
+        self._losses = losses = dict[str, int]()
+        decoder = PacketDecoder()
+        begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
+        for sweep in range(begin, len(self._first)):
+            rows = range(int(self._first[sweep]), int(self._last[sweep]) + 1)
+            stamps = self._packets.stamp_ns[rows.start : rows.stop].tolist()
+            try:
+                scan = decoder.decode(int(self._stamp[sweep]), stamps, self._read(rows))
+            except PacketError:
+                count_loss(losses, "scans that cannot be decoded")
+                continue
+            if len(scan.points):
+                yield scan
+            else:
+                count_loss(losses, "scans without points")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _read(self, rows: range) -> list[bytes]:
+        """Read the packets of one sweep."""
+        offsets = self._packets.offset[rows.start : rows.stop]
+        start = int(offsets[0])
+        try:
+            self._file.seek(start)
+            block = self._file.read(int(offsets[-1]) + PACKET_BYTES - start)
+        except OSError as error:
+            raise SourceError(f"cannot read on: {error.strerror}", where=str(self._path)) from error
+        return [block[at : at + PACKET_BYTES] for at in (offsets - start).tolist()]
+
+    def _one_sensor(self, packets: Packets, uri: str) -> Packets:
+        """Return the packets of the sensor that sent most, without those with impossible times."""
+        if not len(packets.offset):
+            raise SourceError(
+                f"the capture has no data packets of a known Velodyne sensor to port {DATA_PORT}",
+                where=uri,
+                remedy="HDL-32E, VLP-16, VLP-32, Puck Hi-Res and VLS-128 can be read.",
+            )
+        for name, reason in (("sender", "packets of other senders"), ("product", "packets of other sensors")):
+            column: Int = getattr(packets, name)
+            numbers, counts = np.unique(column, return_counts=True)
+            packets = self._keep(packets, column == numbers[int(np.argmax(counts))], reason)
+        if len(packets.offset) >= 3:
+            stamp = packets.stamp_ns
+            middle = np.median(np.stack([stamp[:-2], stamp[1:-1], stamp[2:]]).astype(np.float64), axis=0)
+            middle = np.concatenate([middle[:1], middle, middle[-1:]])
+            steady = np.abs(stamp - middle) <= _JUMP_NS
+            packets = self._keep(packets, steady, "packets with an impossible time")
+        ahead = packets.stamp_ns >= np.maximum.accumulate(packets.stamp_ns)
+        return self._keep(packets, ahead, "packets that came before their predecessor")
+
+    def _keep(self, packets: Packets, keep: Bool, reason: str) -> Packets:
+        refused = len(keep) - int(np.count_nonzero(keep))
+        if refused:
+            count_loss(self._damage, reason, refused)
+        return packets.only(keep) if refused else packets
+
+
+def find_packets(path: Path) -> tuple[Packets, dict[str, int]]:
+    """Find the data packets of a capture; count other packets to the LiDAR's port by reason.
+
+    Raises:
+        SourceError: The file is not a capture that can be read.
+        OSError: It cannot be read.
+    """
+    losses: dict[str, int] = {}
+    tables = [np.zeros((0, 5), dtype=np.int64)]
+    with path.open("rb", buffering=0) as file:
+        order, unit_ns, link = _file_header(file.read(24), path)
+        record = struct.Struct(order + "III4x")
+        start, rest, broken = 24, b"", False
+        while not broken and (block := file.read(_BLOCK)):
+            buffer, at = rest + block, 0
+            found: list[tuple[int, int, int]] = []
+            while at + _RECORD <= len(buffer):
+                seconds, fraction, length = record.unpack_from(buffer, at)
+                broken = length > _PACKET_LIMIT
+                if broken or at + _RECORD + length > len(buffer):
+                    break
+                found.append((at + _RECORD, length, seconds * 1_000_000_000 + fraction * unit_ns))
+                at += _RECORD + length
+            table = _data_packets(buffer, np.array(found, np.int64).reshape(-1, 3), link, losses)
+            table[:, 0] += start
+            tables.append(table)
+            start, rest = start + at, buffer[at:]
+        cut = path.stat().st_size - start
+    if cut > 0:
+        count_loss(losses, _CUT, cut)
+    table = np.concatenate(tables)
+    return Packets(*(np.ascontiguousarray(table[:, column]) for column in range(5))), losses
+
+
+def _file_header(header: bytes, path: Path) -> tuple[str, int, int]:
+    """Return the byte order, the nanoseconds per unit of fractions, and the bytes before the IP header."""
+    if header.startswith(b"\x0a\x0d\x0d\x0a"):
+        raise SourceError(
+            "a capture of the newer kind pcapng",
+            where=str(path),
+            remedy="Convert it: editcap -F pcap IN OUT.",
+        )
+    if len(header) < 24:
+        raise SourceError("the capture has no whole header", where=str(path), remedy="Record it again.")
+    order = ">" if header[0] == 0xA1 else "<"
+    magic, link = struct.unpack(order + "I16xI", header)
+    if magic not in (0xA1B2C3D4, 0xA1B23C4D):
+        raise SourceError("not a capture in the pcap format", where=str(path))
+    if link & 0xFFFF not in _LINKS:
+        raise SourceError(
+            f"the capture's link type {link & 0xFFFF} cannot be read", where=str(path), remedy="Use Ethernet."
+        )
+    return order, 1 if magic == 0xA1B23C4D else 1000, _LINKS[link & 0xFFFF]
+
+
+def _data_packets(block: bytes, found: Int, link: int, losses: dict[str, int]) -> Int:
+    """Return the data packets among the packets of a block.
+
+    Args:
+        block: Bytes of the file.
+        found: First byte, length, and time [ns] of each packet, shape (N, 3).
+        link: Bytes before the IP header.
+        losses: Counts other packets to the LiDAR's port.
+
+    Returns:
+        Columns of `Packets`, shape (M, 5); offsets are relative to the block.
+    """
+    buffer = np.frombuffer(block, np.uint8)
+    start, end, stamp_ns = found[:, 0], found[:, 0] + found[:, 1], found[:, 2]
+
+    def number(at: Int, size: int) -> Int:
+        """Big-endian numbers; bytes beyond the block repeat its last one and are refused by their place."""
+        places = np.minimum(at[:, None] + np.arange(size), len(buffer) - 1)
+        value: Int = buffer[places].astype(np.int64) @ (1 << 8 * np.arange(size)[::-1])
+        return value
+
+    ip = start + link
+    if link == _ETHERNET:
+        ip = ip + np.where(number(start + 12, 2) == 0x8100, 4, 0)  # a VLAN tag
+    is_udp = (ip + 20 <= end) & (number(ip, 1) >> 4 == 4) & (number(ip + 9, 1) == 17)
+    is_udp &= number(ip + 6, 2) & 0x1FFF == 0  # a first fragment
+    if link:
+        is_udp &= number(ip - 2, 2) == 0x0800
+    udp = ip + 4 * (number(ip, 1) & 15)
+    is_udp &= udp + 8 <= end
+    first, port, length = udp + 8, number(udp + 2, 2), number(udp + 4, 2) - 8
+    is_cut = is_udp & (length == PACKET_BYTES) & (first + PACKET_BYTES > end)
+    candidate = np.flatnonzero(is_udp & (length == PACKET_BYTES) & ~is_cut)
+    is_data = are_data_packets(buffer, first[candidate])
+    to_lidar = port == DATA_PORT
+    for reason, n in (
+        ("packets to the LiDAR's port of another length", is_udp & to_lidar & (length != PACKET_BYTES)),
+        ("packets that are no data packets of a known sensor", to_lidar[candidate] & ~is_data),
+        ("packets that the capture has cut", is_cut),
+    ):
+        if n.any():
+            count_loss(losses, reason, int(np.count_nonzero(n)))
+    rows = candidate[is_data]
+    at = first[rows]
+    azimuth = buffer[at + 2] + 256 * buffer[at + 3].astype(np.int64)
+    sender = (number(ip[rows] + 12, 4) << 16) | port[rows]
+    return np.stack([at, stamp_ns[rows], azimuth, buffer[at + PRODUCT].astype(np.int64), sender], axis=1)
+
+
+def _sweep_starts(azimuth: Int, stamp_ns: Int) -> Int:
+    """Return the rows at which a sweep begins: after a full rotation, or after a silence."""
+    step = np.diff(azimuth) % 36000
+    step[step >= 18000] = 0  # a small step back is jitter of the motor
+    silent = np.diff(stamp_ns) > _GAP_NS
+    starts, turned = [0], 0
+    for row, (angle, gap) in enumerate(zip(step.tolist(), silent.tolist(), strict=True), 1):
+        turned += angle
+        if turned >= 36000 or gap:
+            starts.append(row)
+            turned = 0
+    return np.array(starts, np.int64)

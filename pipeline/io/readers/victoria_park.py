@@ -1,7 +1,7 @@
 """The Victoria Park recording: a zip with LASER.txt, DRS.txt (encoders) and GPS.txt.
 
-The base frame is the laser's: x ahead, y left. Dead reckoning starts at the origin with heading 0;
-GPS (x east, y north) is the ground truth, in a different frame.
+The base frame is the laser's: x ahead, y left. Dead reckoning starts at the origin with heading 0; GPS (x
+east, y north) is the ground truth, in a different frame.
 """
 
 from __future__ import annotations
@@ -19,8 +19,15 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.base import COORDINATE_LIMIT, SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.number_text import parse_numbers, parse_table
+from pipeline.io.readers.base import (
+    COORDINATE_LIMIT,
+    FileSource,
+    SourceDescription,
+    SourceOptions,
+    count_loss,
+    digest_of,
+)
+from pipeline.io.readers.pose_files import parse_numbers, parse_table
 from pipeline.io.readers.scan_columns import clean_scan
 from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Truth, TruthPath
 
@@ -78,7 +85,7 @@ LASER = Sensor("SICK LMS 221", 1, 0.0, float(np.radians(0.5)), 0.05, RANGE_MAX)
 _STEEPEST, _FASTEST, _LONGEST_S = 1.0, 50.0, 10_000_000.0
 
 
-class VictoriaParkSource:
+class VictoriaParkSource(FileSource):
     """Source of planar scans (z = 0) and odometry from the Victoria Park zip.
 
     Args:
@@ -92,8 +99,7 @@ class VictoriaParkSource:
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
-        self._damage: dict[str, int] = {}
-        self._losses: dict[str, int] = {}
+        super().__init__()
         members = _unpack(path, uri)
         self._scan_ns, self._ranges = self._read_laser(members["laser.txt"], uri)
         self._odometry_ns, self._poses = self._read_encoders(members["drs.txt"], uri)
@@ -114,16 +120,6 @@ class VictoriaParkSource:
             preset="laser2d",
         )
 
-    @property
-    def description(self) -> SourceDescription:
-        """Description that is known before reading."""
-        return self._description
-
-    @property
-    def losses(self) -> dict[str, int]:
-        """Records left out on opening and in the latest reading, by reason."""
-        return {**self._damage, **self._losses}
-
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield odometry and scans in the order of time, from `start_ns` on."""
         self._losses = losses = dict[str, int]()
@@ -133,9 +129,6 @@ class VictoriaParkSource:
     def truth(self) -> Truth | None:
         """Path by GPS, None when the zip has none."""
         return None if self._gps is None else Truth(path=self._gps)
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
     def _odometry(self, start_ns: int | None) -> Iterator[Record]:
         begin = 0 if start_ns is None else int(np.searchsorted(self._odometry_ns, start_ns))

@@ -1,4 +1,4 @@
-"""Recordings of our own: records in, an MCAP of standard ROS 2 messages out."""
+"""Recordings: MCAP files of standard ROS 2 messages."""
 
 from pipeline.io.recording.mcap_writer import write_recording
 

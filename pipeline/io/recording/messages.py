@@ -1,12 +1,15 @@
-"""From records to standard ROS 2 messages in CDR, as Foxglove and ROS 2 read them."""
+"""Records as standard ROS 2 messages in CDR, as Foxglove and ROS 2 read them, and the parts of such
+messages."""
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose3
@@ -14,29 +17,102 @@ from pipeline.types.records import Imu, Odometry, Scan
 
 ODOM, BASE, LIDAR, CAMERA = "odom", "base_link", "velodyne", "camera"
 
-_STORE = get_typestore(Stores.ROS2_HUMBLE)
-_TYPES = _STORE.types
 _SECOND = 1_000_000_000
 _FLOAT32, _UINT16, _INT32 = 7, 4, 5
+_VISION = {
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
+    ),
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "vision_msgs/msg/Detection3D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox3D bbox\nstring id\n"
+    ),
+    "vision_msgs/msg/Detection3DArray": ("std_msgs/Header header\nvision_msgs/Detection3D[] detections\n"),
+}
 
 Message = Any  # rosbags makes its message classes at run time
 
 
+@cache
+def store() -> Typestore:
+    """Return the definitions of ROS 2 with those of vision_msgs 4."""
+    types = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in _VISION.items():
+        types.register({name: get_types_from_msg(text, name)[name]})
+    return types
+
+
+def make(name: str, /, **fields: Any) -> Message:  # noqa: ANN401
+    """Return a message of a type, e.g. "std_msgs/Header"."""
+    package, short = name.split("/")
+    return store().types[f"{package}/msg/{short}"](**fields)
+
+
 def encode(message: Message) -> bytes:
-    """A message in CDR, as it is stored."""
-    return bytes(_STORE.serialize_cdr(message, message.__msgtype__))
+    """Return a message in CDR."""
+    return bytes(store().serialize_cdr(message, message.__msgtype__))
 
 
 def definition(type_name: str) -> str:
-    """The definition of a type with those of all types in it, as `ros2msg` schemas hold it."""
-    return str(_STORE.generate_msgdef(type_name, ros_version=2)[0])
+    """Return the definition of a type with those of all types in it, as in `ros2msg` schemas."""
+    return str(store().generate_msgdef(type_name, ros_version=2)[0])
+
+
+def header(stamp_ns: int, frame: str) -> Message:
+    """Return a std_msgs/Header.
+
+    Raises:
+        StemmapError: ROS cannot represent the time.
+    """
+    seconds, rest = divmod(int(stamp_ns), _SECOND)
+    if not 0 <= seconds < 2**31:
+        raise StemmapError(
+            "a record's time cannot be written as a ROS time",
+            where=f"stamp {stamp_ns} ns",
+            remedy="ROS times are between 1970 and 2038",
+        )
+    return make(
+        "std_msgs/Header", stamp=make("builtin_interfaces/Time", sec=seconds, nanosec=rest), frame_id=frame
+    )
+
+
+def vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Message:
+    """Return a geometry_msgs/Vector3."""
+    return make("geometry_msgs/Vector3", x=float(x), y=float(y), z=float(z))
+
+
+def quaternion(wxyz: NDArray[np.float64]) -> Message:
+    """Return a geometry_msgs/Quaternion."""
+    w, x, y, z = (float(value) for value in wxyz)
+    return make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def pose(t: NDArray[np.float64], wxyz: NDArray[np.float64]) -> Message:
+    """Return a geometry_msgs/Pose of a position (3,) and a quaternion (4,)."""
+    x, y, z = (float(value) for value in t)
+    point = make("geometry_msgs/Point", x=x, y=y, z=z)
+    return make("geometry_msgs/Pose", position=point, orientation=quaternion(wxyz))
+
+
+def odometry_of(head: Message, child: str, at: Message, covariance: NDArray[np.float64]) -> Message:
+    """Return a nav_msgs/Odometry of a pose with its covariance (36,); the twist is unknown and zero."""
+    twist = make("geometry_msgs/Twist", linear=vector(), angular=vector())
+    return make(
+        "nav_msgs/Odometry",
+        header=head,
+        child_frame_id=child,
+        pose=make("geometry_msgs/PoseWithCovariance", pose=at, covariance=covariance),
+        twist=make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+    )
 
 
 def point_cloud(scan: Scan) -> Message:
-    """sensor_msgs/PointCloud2 in the layout of Velodyne's driver: x, y, z, intensity, ring, time.
+    """Return a sensor_msgs/PointCloud2 in the layout of the Velodyne driver: x, y, z, intensity, ring, time.
 
-    `time` [s after the stamp] is a float32, as the driver has it, and too coarse for nanoseconds; so
-    `t` (int32) follows it, which is `offset_ns` itself. Columns that the scan lacks are left out.
+    `time` [s after the stamp] is a float32, as in the driver, and too coarse for nanoseconds; so `t` (int32)
+    follows it, which is `offset_ns`. Columns that the scan does not have are left out.
     """
     columns: list[tuple[str, str, int, NDArray[Any]]] = [
         (name, "<f4", _FLOAT32, scan.points[:, axis]) for axis, name in enumerate("xyz")
@@ -52,13 +128,14 @@ def point_cloud(scan: Scan) -> Message:
     table = np.empty(len(scan.points), dtype=dtype)
     for name, _, _, column in columns:
         table[name] = column
-    field_type = _TYPES["sensor_msgs/msg/PointField"]
-    return _TYPES["sensor_msgs/msg/PointCloud2"](
-        header=_header(scan.stamp_ns, LIDAR),
+    offsets = {name: int(place[1]) for name, place in (dtype.fields or {}).items()}
+    return make(
+        "sensor_msgs/PointCloud2",
+        header=header(scan.stamp_ns, LIDAR),
         height=1,
         width=len(table),
         fields=[
-            field_type(name=name, offset=dtype.fields[name][1], datatype=number, count=1)  # type: ignore[index]
+            make("sensor_msgs/PointField", name=name, offset=offsets[name], datatype=number, count=1)
             for name, _, number, _ in columns
         ],
         is_bigendian=False,
@@ -70,56 +147,40 @@ def point_cloud(scan: Scan) -> Message:
 
 
 def odometry(record: Odometry) -> Message:
-    """nav_msgs/Odometry: the pose of base_link in odom; the twist is not known and zero."""
-    zero = _vector(np.zeros(3))
-    pose_type, twist_type = (
-        _TYPES[f"geometry_msgs/msg/{name}"] for name in ("PoseWithCovariance", "TwistWithCovariance")
-    )
-    pose = _TYPES["geometry_msgs/msg/Pose"](
-        position=_point(record.T_odom_base.t), orientation=_quaternion(record.T_odom_base.quaternion())
-    )
-    return _TYPES["nav_msgs/msg/Odometry"](
-        header=_header(record.stamp_ns, ODOM),
-        child_frame_id=BASE,
-        pose=pose_type(pose=pose, covariance=np.zeros(36)),
-        twist=twist_type(
-            twist=_TYPES["geometry_msgs/msg/Twist"](linear=zero, angular=zero), covariance=np.zeros(36)
-        ),
-    )
+    """Return a nav_msgs/Odometry: the pose of base_link in odom."""
+    T = record.T_odom_base
+    return odometry_of(header(record.stamp_ns, ODOM), BASE, pose(T.t, T.quaternion()), np.zeros(36))
 
 
 def imu(record: Imu) -> Message:
-    """sensor_msgs/Imu in base_link; without an orientation its covariance begins with -1."""
+    """Return a sensor_msgs/Imu in base_link; without an orientation its covariance begins with -1."""
     unknown = np.zeros(9)
     if record.orientation is None:
         unknown[0] = -1.0
     wxyz = np.array([1.0, 0.0, 0.0, 0.0]) if record.orientation is None else record.orientation
-    return _TYPES["sensor_msgs/msg/Imu"](
-        header=_header(record.stamp_ns, BASE),
-        orientation=_quaternion(wxyz),
+    return make(
+        "sensor_msgs/Imu",
+        header=header(record.stamp_ns, BASE),
+        orientation=quaternion(wxyz),
         orientation_covariance=unknown,
-        angular_velocity=_vector(record.angular_velocity),
+        angular_velocity=vector(*record.angular_velocity),
         angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=_vector(record.linear_acceleration),
+        linear_acceleration=vector(*record.linear_acceleration),
         linear_acceleration_covariance=np.zeros(9),
     )
 
 
 def compressed_image(stamp_ns: int, data: bytes) -> Message:
-    """sensor_msgs/CompressedImage of a JPEG."""
+    """Return a sensor_msgs/CompressedImage of a JPEG."""
     pixels = np.frombuffer(data, np.uint8)
-    return _TYPES["sensor_msgs/msg/CompressedImage"](
-        header=_header(stamp_ns, CAMERA), format="jpeg", data=pixels
-    )
+    return make("sensor_msgs/CompressedImage", header=header(stamp_ns, CAMERA), format="jpeg", data=pixels)
 
 
 def camera_info(stamp_ns: int, width: int, height: int, K: NDArray[np.float64]) -> Message:
-    """sensor_msgs/CameraInfo of a pinhole camera without distortion."""
-    region = _TYPES["sensor_msgs/msg/RegionOfInterest"](
-        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-    )
-    return _TYPES["sensor_msgs/msg/CameraInfo"](
-        header=_header(stamp_ns, CAMERA),
+    """Return a sensor_msgs/CameraInfo of a pinhole camera without distortion."""
+    return make(
+        "sensor_msgs/CameraInfo",
+        header=header(stamp_ns, CAMERA),
         height=height,
         width=width,
         distortion_model="plumb_bob",
@@ -129,46 +190,26 @@ def camera_info(stamp_ns: int, width: int, height: int, K: NDArray[np.float64]) 
         p=np.hstack([K, np.zeros((3, 1))]).ravel(),
         binning_x=0,
         binning_y=0,
-        roi=region,
+        roi=make("sensor_msgs/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
     )
 
 
 def text(content: str) -> bytes:
-    """std_msgs/String in CDR."""
-    return encode(_TYPES["std_msgs/msg/String"](data=content))
+    """Return a std_msgs/String in CDR."""
+    return encode(make("std_msgs/String", data=content))
 
 
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Pose3) -> Message:
-    """tf2_msgs/TFMessage with one transform."""
-    moved = _TYPES["geometry_msgs/msg/Transform"](
-        translation=_vector(T_parent_child.t), rotation=_quaternion(T_parent_child.quaternion())
+    """Return a tf2_msgs/TFMessage with one transform."""
+    moved = make(
+        "geometry_msgs/Transform",
+        translation=vector(*T_parent_child.t),
+        rotation=quaternion(T_parent_child.quaternion()),
     )
-    stamped = _TYPES["geometry_msgs/msg/TransformStamped"](
-        header=_header(stamp_ns, parent), child_frame_id=child, transform=moved
+    stamped = make(
+        "geometry_msgs/TransformStamped",
+        header=header(stamp_ns, parent),
+        child_frame_id=child,
+        transform=moved,
     )
-    return _TYPES["tf2_msgs/msg/TFMessage"](transforms=[stamped])
-
-
-def _header(stamp_ns: int, frame: str) -> Message:
-    seconds, rest = divmod(int(stamp_ns), _SECOND)
-    if not 0 <= seconds < 2**31:
-        raise StemmapError(
-            "a record's time cannot be written as a ROS time",
-            where=f"stamp {stamp_ns} ns",
-            remedy="ROS times lie between 1970 and 2038",
-        )
-    stamp = _TYPES["builtin_interfaces/msg/Time"](sec=seconds, nanosec=rest)
-    return _TYPES["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
-
-
-def _point(t: NDArray[np.float64]) -> Message:
-    return _TYPES["geometry_msgs/msg/Point"](x=float(t[0]), y=float(t[1]), z=float(t[2]))
-
-
-def _vector(t: NDArray[np.float64]) -> Message:
-    return _TYPES["geometry_msgs/msg/Vector3"](x=float(t[0]), y=float(t[1]), z=float(t[2]))
-
-
-def _quaternion(wxyz: NDArray[np.float64]) -> Message:
-    w, x, y, z = (float(value) for value in wxyz)
-    return _TYPES["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
+    return make("tf2_msgs/TFMessage", transforms=[stamped])

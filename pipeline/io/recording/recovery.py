@@ -1,4 +1,5 @@
-"""Mends a recording that was cut or damaged: all that is whole, in a new MCAP with an index."""
+"""Repairs a recording that was cut or damaged: writes all complete messages to a new MCAP file with an
+index."""
 
 from __future__ import annotations
 
@@ -24,11 +25,11 @@ _DAMAGED = (McapError, struct.error, ValueError, EOFError, OverflowError, Memory
 
 @dataclass(slots=True)
 class Mended:
-    """What came of it.
+    """Result of a repair.
 
     Attributes:
-        messages: How many are in the new file.
-        losses: What could not be kept, by reason.
+        messages: Number of messages in the new file.
+        losses: Parts that are lost, by reason.
     """
 
     messages: int = 0
@@ -36,14 +37,14 @@ class Mended:
 
 
 def mend(path: Path, out: Path) -> Mended:
-    """Write what is whole of a recording to a new file, which is there whole or not at all.
+    """Write all complete messages of a recording to a new file, which appears when it is complete.
 
     Args:
-        path: The recording; never changed.
+        path: The recording, which does not change.
         out: The new file.
 
     Raises:
-        SourceError: It cannot be read, is no MCAP, or nothing in it is whole.
+        SourceError: It cannot be read, is not an MCAP file, or has no complete message.
         StemmapError: The new file cannot be written.
     """
     try:
@@ -64,7 +65,7 @@ def mend(path: Path, out: Path) -> Mended:
 
 
 def _end_of_whole_records(stream: BinaryIO, size: int) -> int:
-    """Where the last record ends that is there to its end: the library takes half ones for whole."""
+    """Return the end of the last complete record; the library does not notice incomplete ones."""
     at = len(MAGIC)
     while at + _RECORD.size <= size:
         stream.seek(at)
@@ -76,23 +77,23 @@ def _end_of_whole_records(stream: BinaryIO, size: int) -> int:
 
 
 class _Until:
-    """A stream that ends earlier."""
+    """A stream that ends at a given position."""
 
     def __init__(self, stream: BinaryIO, end: int) -> None:
         self._stream, self._end = stream, end
 
     def read(self, size: int = -1) -> bytes:
-        """As much as is there."""
+        """Read at most `size` bytes before the end."""
         left = max(0, self._end - self._stream.tell())
         return self._stream.read(left if size < 0 else min(size, left))
 
     def tell(self) -> int:
-        """Where it stands."""
+        """Return the position."""
         return self._stream.tell()
 
 
 class _Work:
-    """One mending."""
+    """A repair."""
 
     def __init__(self, target: BinaryIO) -> None:
         self.mended = Mended()
@@ -117,7 +118,7 @@ class _Work:
                 else:
                     self._take(record)
         except _DAMAGED:
-            return  # what follows cannot be told apart any more; `finish` counts it
+            return  # the rest has no record boundaries; `finish` counts it
 
     def finish(self, size: int) -> None:
         """Write the index and count what is missing at the end."""

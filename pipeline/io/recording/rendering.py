@@ -1,4 +1,4 @@
-"""Simple pictures of a simulated stand, to try cameras without one: stems before ground and sky."""
+"""Simple pictures of a simulated stand: stems before ground and sky."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.types.records import Record, Scan, TruthPath, TruthTrees
 
 TOPIC = "/camera/image/compressed"
 WIDTH, HEIGHT, FOCAL = 640, 400, 320.0
-#: On the robot: ahead, up, looking ahead; the optical axes are x right, y down, z ahead.
+#: Extrinsics of the camera, which looks ahead; its axes are x right, y down, z ahead.
 T_BASE_CAMERA = Pose3(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, 0.0, 0.9])
 )
@@ -24,7 +24,7 @@ CAMERA = Camera(
     np.array([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]]),
     T_BASE_CAMERA,
 )
-#: Of so many scans one has a picture.
+#: Number of scans per picture.
 EVERY = 5
 _HEIGHT = {"tree": 12.0, "pole": 4.0, "person": 1.8, "bush": 1.0, "other": 1.5}
 _COLOUR = {"tree": (104, 78, 52), "pole": (150, 150, 155), "person": (190, 70, 60), "bush": (60, 110, 50)}
@@ -34,7 +34,7 @@ _THIN, _SIDE, _NEAR = 0.06, 0.8, 0.4  # m
 def with_pictures(
     records: Iterator[Record], trees: TruthTrees, path: TruthPath
 ) -> Iterator[Record | Picture]:
-    """The records of a simulated run, and a picture beside one scan in EVERY."""
+    """Yield the records of a simulated run, and a picture after every EVERY-th scan."""
     count = 0
     yaw = np.unwrap(path.yaw)
     for record in records:
@@ -49,7 +49,7 @@ def with_pictures(
 
 
 def rendered(trees: TruthTrees, pose: tuple[float, float, float]) -> bytes:
-    """A JPEG of what stands there, seen from a pose x, y [m], yaw [rad]; the far before the near."""
+    """Return a JPEG of the objects seen from a pose x, y [m], yaw [rad]."""
     from PIL import Image, ImageDraw
 
     picture = Image.new("RGB", (WIDTH, HEIGHT), (168, 196, 214))

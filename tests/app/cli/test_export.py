@@ -9,7 +9,7 @@ import pytest
 
 from app.batch.run_folder import read_run
 from pipeline.errors import StemmapError
-from pipeline.io.tree_manager_writer import write_tree_manager
+from pipeline.io.readers.tree_manager import write_tree_manager
 from tests.app.cli.test_commands import stemmap
 
 RUN = "sim:stand?duration=12"

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.poses import Pose2
-from pipeline.io.recording import outputs
+from pipeline.io.recording import messages, outputs
 from pipeline.types.clearance import Clearance, Zone
 from tests.app.fakes import START_NS, frame, path, trees
 
@@ -21,7 +21,7 @@ from tests.app.fakes import START_NS, frame, path, trees
 def decoded(topic: str, payload: bytes) -> Any:
     """A message by its own definition alone."""
     store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(outputs.definition(topic), outputs.TYPES[topic]))
+    store.register(get_types_from_msg(messages.definition(outputs.TYPES[topic]), outputs.TYPES[topic]))
     return store.deserialize_cdr(payload, outputs.TYPES[topic])
 
 

@@ -317,4 +317,4 @@ def true_things(uri: str) -> tuple[str, list[Content]]:
 def test_the_package_forest_is_one_that_can_be_kept(tmp_path):
     package = json.loads(FILE.read_text())
     forests = Forests(tmp_path)
-    assert len(forests(forests.keep(package), False).root) == SETTINGS[ONE_WAY].trees
+    assert len(forests(forests.keep(package), False).trees.root) == SETTINGS[ONE_WAY].trees

@@ -77,7 +77,7 @@ def mapped_folder(
     from pipeline.config import preset
     from pipeline.evaluation import path_error
     from pipeline.io.readers import open_source
-    from pipeline.io.tree_manager_writer import TRAJECTORY, trajectory_text
+    from pipeline.io.readers.tree_manager import TRAJECTORY, trajectory_text
     from pipeline.mapper import Mapper
     from pipeline.odometry.synchroniser import steps
     from tests.benchmarks.tree_manager_folder import perturbed

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from pipeline.classification import ColumnClassifier, Forest, ScanView, depth_image, no_columns
-from pipeline.classification.column_classifier import FOLD
+from pipeline.classification.column_classifier import FOLD, HIGHER, MOST_STALE, bent, seen_higher
 from pipeline.classification.decision_rule import GONE_SCANS
-from pipeline.classification.forest import CLASSES
+from pipeline.classification.features import NAMES
+from pipeline.classification.forest import CLASSES, DecisionTrees
+from pipeline.classification.voxel_map import TILE, VoxelMap, keys_of, tiles_of
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground.terrain import SECTORS
+from pipeline.loop_closure.map_correction import Bend
 from pipeline.mapper import Mapper
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_classification import DUE_NS
@@ -80,7 +83,7 @@ def test_another_forest_votes_on_all_columns_from_the_next_scan_on():
     def sure(name: str, _all_around: bool) -> Forest:
         one, none = np.zeros(1, np.int32), np.full(1, -1, np.int32)
         kind = 0 if name == "package" else 1
-        return Forest(one, none, np.zeros(1), one, one, np.eye(len(CLASSES))[kind : kind + 1])
+        return Forest(DecisionTrees(one, none, np.zeros(1), one, one, np.eye(len(CLASSES))[kind : kind + 1]))
 
     gathering = ColumnClassifier(FOREST.classification, all_around=True, forests=sure)
     points = trunk(5.0, 1.0, 0.15, top=5.9)
@@ -251,3 +254,90 @@ POOR = {
 def test_a_poor_cloud_gives_a_frame_and_no_tree(kind):
     frame = mapped("forest", POOR[kind])
     assert not frame.trees.confirmed.any()
+
+
+def filled(side: int, room: int) -> VoxelMap:
+    """A square of tiles with a voxel in each corner and in the middle of every one."""
+    memory = VoxelMap.empty(1 << 14, room)
+    corners = np.array([[0.2, 0.2], [3.8, 0.2], [0.2, 3.8], [3.8, 3.8], [2.0, 2.0]])
+    origin = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 1, 2) * TILE
+    places = (origin + corners).reshape(-1, 2)
+    points = np.column_stack([places, np.full(len(places), 1.3)]).astype(np.float32)
+    memory.add(points, 5, 1 << 14)
+    return memory
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.4, np.pi / 4])
+@pytest.mark.parametrize("side", [3, 15])  # 15: as many tiles as there is room for, but a few
+def test_a_map_that_is_turned_over_more_tiles_stays_whole(side, turn):
+    memory = filled(side, 256)
+    assert memory.tiles == side**2
+    before = np.array([[0.0, 0.0, 0.0], [30.0, 30.0, 0.0]])
+    bend = Bend(before, before + np.array([0.9, 0.7, turn]), 0, 1)
+    fresh = bent(memory, bend)
+    assert len(fresh.tile_key) > fresh.tiles >= memory.tiles
+    assert int(fresh.returns[: fresh.used].sum()) == int(memory.returns[: memory.used].sum())
+    keys = fresh.key[: fresh.used]
+    np.testing.assert_array_equal(keys_of(fresh.mean[: fresh.used]), keys)
+    np.testing.assert_array_equal(fresh.tile_key[fresh.home[: fresh.used]], tiles_of(keys))
+    assert int(fresh.tile_returns[: fresh.tiles].sum()) == int(memory.tile_returns[: memory.tiles].sum())
+    # Each tile's chain holds its voxels, each once.
+    seen = 0
+    for tile in range(fresh.tiles):
+        row = int(fresh.tile_first[tile])
+        while row >= 0:
+            assert fresh.home[row] == tile
+            row, seen = int(fresh.following[row]), seen + 1
+    assert seen == fresh.used
+
+
+HIGHEST, FREE = NAMES.index("looked at up to"), NAMES.index("free above the highest return")
+LEVEL = np.full((SECTORS, 200), -1.0)
+
+
+def far_view(behind, steepest, x=0.0):
+    """From 1 m above level ground, before returns 20 m away up to a steepness."""
+    return ScanView(Pose2(x, 0.0, 0.0), np.zeros(3), np.zeros(BINS), np.full(BINS, steepest), behind, LEVEL)
+
+
+def person_then_from_afar(steepest):
+    """Somebody 1.7 m tall at (3, 0), seen ten times from 3 m and then with few returns from 15 m, with what
+    stands 20 m behind them as high as that."""
+    gathering = ColumnClassifier(preset("forest").classification, all_around=True)
+    body = trunk(3.0, 0.0, 0.15, top=1.7)
+    nothing = depth_image(np.zeros((0, 3), np.float32))
+    for k in range(10):
+        gathering.add(body, body[:, 2].copy(), k, far_view(nothing, 0.2))
+    turn, up = np.meshgrid(np.linspace(-0.05, 0.05, 30), np.linspace(0.0, steepest, 60))
+    far = np.stack([35.0 * np.cos(turn), 35.0 * np.sin(turn), 35.0 * up], axis=-1).reshape(-1, 3)
+    few = body[::200].copy()
+    few[:, 0] += 12.0  # 15 m before a robot that now stands at -12 m
+    for k in range(10, 14):
+        gathering.add(
+            few, few[:, 2].copy(), k, far_view(depth_image(far.astype(np.float32)), steepest, -12.0)
+        )
+    c = gathering.columns
+    return c.figures[np.hypot(c.axis[:, 0] - 3.0, c.axis[:, 1]).argmin()]
+
+
+def test_few_returns_from_afar_tell_that_a_person_ends():
+    low, high = person_then_from_afar(0.02), person_then_from_afar(0.2)
+    assert low[HIGHEST] < 2.0
+    assert low[FREE] == 0.0
+    assert high[HIGHEST] > 3.5
+    assert high[FREE] > 1.0
+
+
+def test_a_column_asks_once_and_few_at_a_time():
+    gathering = ColumnClassifier(preset("forest").classification, all_around=True)
+    nothing = depth_image(np.zeros((0, 3), np.float32))
+    places = [(-6.0, 2.0), (2.0, 2.0), (6.0, -6.0), (10.0, 2.0)]
+    points = np.concatenate([trunk(x, y, 0.15, top=1.7) for x, y in places])
+    gathering.add(points, points[:, 2].copy(), 0, far_view(nothing, 0.0))
+    assert len(seen_higher(gathering.columns)) == 0, "they know how high it was looked"
+    c = gathering.columns
+    higher = replace(c, viewed=c.figures[:, HIGHEST] + HIGHER + 0.1 * np.arange(1, len(c.viewed) + 1))
+    tiles = seen_higher(higher)
+    assert tiles.shape == (MOST_STALE, 2)
+    np.testing.assert_array_equal(tiles[0], c.tile[-1], "where was looked highest comes first")
+    assert len(np.unique(tiles, axis=0)) == MOST_STALE

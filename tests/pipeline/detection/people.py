@@ -10,7 +10,7 @@ from pipeline.simulation.run import SimulatedRun, open_run
 from pipeline.simulation.scenarios import EXACT, RunRequest, Scenario
 from pipeline.simulation.scene import Person
 from pipeline.simulation.scene_objects import person
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Float
 
 STRIDE, STEP_HZ = 0.42, 0.9
@@ -60,7 +60,7 @@ class Somebody(Person):
         sway = np.array([np.sin(0.9 * (t + self.phase)), np.cos(0.7 * (t - self.phase))])
         return self.places[leg] + 0.012 * sway, self.heading
 
-    def solids(self, t: float, terrain: Terrain):
+    def solids(self, t: float, terrain: SimulatedTerrain):
         """Their body in the world at time t [s]."""
         at, heading = self.place(t)
         leg = self._leg(t)

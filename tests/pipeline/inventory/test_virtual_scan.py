@@ -94,8 +94,7 @@ def test_beams_meet_a_trunk_where_it_is_and_not_its_far_side():
     lidar = SpinningLidar()
     R, o = np.broadcast_to(np.eye(3), (lidar.columns, 3, 3)).copy(), np.zeros((lidar.columns, 3))
     beams = lidar.beams()
-    laid = (s.points, s.normals, s.radius, s.blocks)
-    ranges = first_surfels(*laid, R, o, beams, lidar.lowest, lidar.ring_step, lidar.range_max)
+    ranges = first_surfels(s, R, o, beams, lidar.optics)
     met = np.isfinite(ranges)
     place = beams[met] * ranges[met][:, None]
     off = np.hypot(place[:, 0] - 5.0, place[:, 1]) - 0.15

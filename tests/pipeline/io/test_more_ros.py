@@ -15,7 +15,7 @@ from pyproj import Geod
 from app.cli import main
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers import SourceOptions
-from pipeline.io.readers.gnss import BEST_SIGMA, UNKNOWN_SIGMA, Fix, align_fixes
+from pipeline.io.readers.measured_poses import BEST_SIGMA, UNKNOWN_SIGMA, Fix, align_fixes
 from pipeline.types.records import PoseMeasurement, Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, STEP_NS, Author, Write, points_of, write_recording

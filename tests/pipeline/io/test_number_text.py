@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.io.readers.number_text import parse_numbers, parse_table, read_rows
+from pipeline.io.readers.pose_files import parse_numbers, parse_table, read_rows
 
 
 @given(

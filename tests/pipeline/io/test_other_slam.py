@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers import SourceOptions
-from pipeline.io.readers.other_slam import GATE, NoPoseError, OtherPose, align_poses
+from pipeline.io.readers.measured_poses import GATE, NoPoseError, OtherPose, align_poses
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import FastSlam, Motion
 from pipeline.slam.motion import noise_of

@@ -11,9 +11,9 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from pipeline.errors import SourceError
+from pipeline.io.ground_truth import ATTACHMENT, read_truth
 from pipeline.io.readers import Source, open_source
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.truth_file import ATTACHMENT, read_truth
 from pipeline.io.recording import write_recording
 from pipeline.types.records import Imu, Odometry, Scan
 from tests.pipeline.io.conftest import Opened

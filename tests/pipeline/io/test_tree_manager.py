@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import Source, tree_manager
-from pipeline.io.readers.tree_manager import _numbers
-from pipeline.io.tree_manager_writer import COLUMNS, state_name, state_text, trajectory_text
+from pipeline.io.readers.tree_manager import COLUMNS, _numbers, state_name, state_text, trajectory_text
 from pipeline.types.records import Odometry, Record, Scan, Stems
 from tests.pipeline.io.conftest import Opened
 

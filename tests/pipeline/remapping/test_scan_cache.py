@@ -16,8 +16,7 @@ from pipeline.front_end import SegmentedScan
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import encode
 from pipeline.remapping import Rerun, ScanCache, ScanCaches, scan_cache
-from pipeline.remapping.packing import HIGHEST, unpack
-from pipeline.remapping.scan_cache import SUFFIX
+from pipeline.remapping.scan_cache import HIGHEST, SUFFIX, unpack
 from pipeline.types.records import PoseMeasurement, Scan, Step, Turn
 from tests.pipeline.remapping.mapped import BASE, fill, frames, mapper, run
 
@@ -192,7 +191,7 @@ def test_a_full_disk_refuses_scans_and_keeps_the_others(folder):
 
 def test_a_scan_that_is_too_large_is_not_stored(cache, monkeypatch):
     fill(cache, BASE, run()[0][:2])
-    monkeypatch.setattr("pipeline.remapping.packing.LARGEST", 1 << 10)
+    monkeypatch.setattr("pipeline.remapping.scan_cache.LARGEST", 1 << 10)
     fill(cache, BASE, run()[0][2:4])
     assert len(cache) == 2
     assert "takes more than" in cache.refusal

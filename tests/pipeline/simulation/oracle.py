@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.simulation.primitives import BOX, CONE, Solids
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 
 Float = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ def first_ranges(solids: Solids, o: Float, d: Float) -> Float:
     return best
 
 
-def ground_ranges(terrain: Terrain, o: Float, d: Float, farthest: float) -> Float:
+def ground_ranges(terrain: SimulatedTerrain, o: Float, d: Float, farthest: float) -> Float:
     """Range at which rays go under the terrain: steps of 2 cm, then halving."""
     out = np.full(len(o), np.inf)
     steps = np.arange(0.0, farthest, 0.02)

@@ -10,7 +10,7 @@ from pipeline.io.readers.simulated import open_simulated
 from pipeline.simulation.primitives import CONE
 from pipeline.simulation.scenarios import SCENARIOS, scenarios
 from pipeline.simulation.scene import Person
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
@@ -97,7 +97,7 @@ def test_one_may_ask_for_more_trees_until_the_plot_is_full():
 
 
 def test_walkers_go_at_their_pace_and_stay_on_the_ground():
-    terrain = Terrain.grow(0.1, 0.3, 9.0, np.random.default_rng(1))
+    terrain = SimulatedTerrain.grow(0.1, 0.3, 9.0, np.random.default_rng(1))
     walker = Person(7, np.array([1.0, 2.0]), np.array([7.0, 2.0]), 0.0, 1.1, 3.0)
     places = np.array([walker.place(t)[0] for t in np.arange(0.0, 30.0, 0.1)])
     steps = np.hypot(*np.diff(places, axis=0).T)

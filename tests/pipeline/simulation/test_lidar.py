@@ -9,30 +9,25 @@ from pipeline.io.readers.simulated import open_simulated
 from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
 from pipeline.simulation.primitives import ELLIPSOID, Solids, SolidsBuilder
 from pipeline.simulation.ray_casting import GROUND, first_returns, ray_directions
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float
 from tests.pipeline.simulation import oracle
 
-DEEP = Terrain(np.array([[0.0, 0.0, -500.0, 0.0]]))
+DEEP = SimulatedTerrain(np.array([[0.0, 0.0, -500.0, 0.0]]))
 
 
 def still_pose(lidar: SpinningLidar) -> tuple[Float, Float]:
     return np.tile(np.eye(3), (lidar.columns, 1, 1)), np.zeros((lidar.columns, 3))
 
 
-def sweep(lidar: SpinningLidar, builder: SolidsBuilder, terrain: Terrain = DEEP) -> Sweep:
+def sweep(lidar: SpinningLidar, builder: SolidsBuilder, terrain: SimulatedTerrain = DEEP) -> Sweep:
     R, o = still_pose(lidar)
     return sweep_scene(lidar, builder.build(), terrain, R, o, 0, np.random.default_rng(0))
 
 
 def only(solids: Solids, keep: Bool) -> Solids:
-    return Solids(
-        solids.kind[keep],
-        solids.shape[keep],
-        solids.capsule[keep],
-        solids.surface[keep],
-        solids.owner[keep],
-    )
+    s = solids
+    return Solids(s.kind[keep], s.shape[keep], s.capsule[keep], s.surface[keep], s.owner[keep])
 
 
 @pytest.mark.parametrize(("uri", "k"), [("sim:stand", 333), ("sim:slope?seed=1", 500), ("sim:dense", 77)])
@@ -46,20 +41,8 @@ def test_every_ray_of_a_moving_sweep_agrees_with_testing_all_shapes(uri, k):
         solids = solids.join(body)
     solids = only(solids, (solids.kind != ELLIPSOID) | (solids.shape[:, 8] == 0.0))
     directions = ray_directions(R, lidar.beams())
-    ranges, hit = first_returns(
-        solids.kind,
-        solids.shape,
-        solids.capsule,
-        terrain.packed,
-        R,
-        o,
-        directions,
-        lidar.lowest,
-        lidar.ring_step,
-        lidar.range_max,
-        1,
-        np.arange(len(solids)),
-    )
+    order = np.arange(len(solids.kind))
+    ranges, hit = first_returns(solids, terrain.packed, R, o, directions, lidar.optics, 1, order)
     # Each third column, so that the slow way takes a second and not three.
     rays, origins = directions[::3].reshape(-1, 3), np.repeat(o[::3], lidar.rings, axis=0)
     slow = oracle.first_ranges(solids, origins, rays)
@@ -111,7 +94,7 @@ def test_a_cylinder_from_afar_has_the_eccentricity_of_the_closed_form():
 
 
 def test_flat_ground_drops_out_where_it_is_grazed():
-    flat = Terrain(np.array([[0.0, 0.0, -0.8, 0.0]]))
+    flat = SimulatedTerrain(np.array([[0.0, 0.0, -0.8, 0.0]]))
     ring = sweep(SpinningLidar(), SolidsBuilder(), terrain=flat).scan.ring
     assert ring is not None
     seen = np.bincount(ring, minlength=16) / 1800.0

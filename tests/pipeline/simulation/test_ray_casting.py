@@ -17,7 +17,7 @@ from pipeline.simulation.ray_casting import (
     solid_incidence,
     waves_at,
 )
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Float
 from tests.pipeline.simulation import oracle
 
@@ -31,7 +31,7 @@ def random_rays(rng: np.random.Generator, count: int = 400) -> tuple[Float, Floa
     return origin, d / np.linalg.norm(d, axis=1)[:, None]
 
 
-def ground_range(terrain: Terrain, o: Float, d: Float, farthest: float = 100.0) -> float:
+def ground_range(terrain: SimulatedTerrain, o: Float, d: Float, farthest: float = 100.0) -> float:
     waves, space = np.empty((terrain.packed.shape[0], 3)), np.empty(terrain.packed.shape[0])
     waves_at(terrain.packed, o, waves)
     return meet_ground(terrain.packed, waves, d, farthest, space)
@@ -93,7 +93,7 @@ def test_ellipsoids_and_boxes_agree_with_the_oracle(seed):
 
 
 def test_flat_ground_is_met_at_height_over_sine():
-    terrain = Terrain(np.zeros((1, 4)))
+    terrain = SimulatedTerrain(np.zeros((1, 4)))
     for degrees in (1.0, 5.0, 15.0, 89.0):
         down = np.radians(degrees)
         d = np.array([np.cos(down), 0.0, -np.sin(down)])
@@ -106,7 +106,7 @@ def test_flat_ground_is_met_at_height_over_sine():
 
 def test_plane_of_ten_degrees_is_met_uphill():
     slope = np.tan(np.radians(10.0))
-    terrain = Terrain(np.array([[slope, 0.0, 0.0, 0.0]]))
+    terrain = SimulatedTerrain(np.array([[slope, 0.0, 0.0, 0.0]]))
     got = ground_range(terrain, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
     assert got == pytest.approx(1.0 / slope)
 
@@ -114,7 +114,7 @@ def test_plane_of_ten_degrees_is_met_uphill():
 @pytest.mark.parametrize("seed", range(4))
 def test_rolling_ground_agrees_with_fine_steps(seed):
     rng = np.random.default_rng(seed)
-    terrain = Terrain.grow(float(rng.uniform(0.0, 0.3)), 0.35, 8.0, rng)
+    terrain = SimulatedTerrain.grow(float(rng.uniform(0.0, 0.3)), 0.35, 8.0, rng)
     o = rng.uniform(-20.0, 20.0, (150, 3))
     o[:, 2] = terrain.height(o[:, 0], o[:, 1]) + rng.uniform(0.4, 2.0, 150)
     azimuth, up = rng.uniform(0.0, 2.0 * np.pi, 150), np.radians(rng.uniform(-18.0, 18.0, 150))
@@ -132,7 +132,7 @@ def test_rolling_ground_agrees_with_fine_steps(seed):
 
 def test_terrain_gradient_is_that_of_its_height():
     rng = np.random.default_rng(3)
-    terrain = Terrain.grow(0.2, 0.3, 9.0, rng)
+    terrain = SimulatedTerrain.grow(0.2, 0.3, 9.0, rng)
     x, y = rng.uniform(-30.0, 30.0, (2, 200))
     z, gx, gy = terrain.evaluate(x, y).T
     step = 1e-4

@@ -11,7 +11,7 @@ from pipeline.config import preset
 from pipeline.simulation.lidar import CONE
 from pipeline.simulation.scene_objects import SceneBuilder, add_sign
 from pipeline.simulation.street_scenes import simulate_street
-from pipeline.simulation.terrain import Terrain
+from pipeline.simulation.terrain import SimulatedTerrain
 
 
 @pytest.fixture(scope="module", params=[False, True], ids=["all around", "one way"])
@@ -52,11 +52,11 @@ def test_trunks_stand_where_their_returns_are():
 
 
 def test_a_sign_is_a_pole_and_its_plate():
-    scene = SceneBuilder(Terrain(np.zeros((1, 4))), np.random.default_rng(1))
+    scene = SceneBuilder(SimulatedTerrain(np.zeros((1, 4))), np.random.default_rng(1))
     add_sign(scene, 3.0, 1.0)
     solids = scene.solids.build()
     assert scene.kinds[solids.owner[0]] == "pole"
-    assert len(solids) >= 2
+    assert len(solids.kind) >= 2
     assert not scene.trunks
 
 
