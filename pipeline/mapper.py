@@ -285,22 +285,14 @@ class Mapper:
     def _update_trees(
         self, stamp_ns: int, scan: SegmentedScan, found: DetectionResult, estimate: PoseEstimate
     ) -> None:
-        tracker, view_range = self._tracker, self._parameters.slam.view_range
+        """Update the Kalman filters. The scan that finds a lost robot again has no data association."""
+        tracker = self._tracker
         with self._timer("tracking"):
-            tracker.process(
-                stamp_ns,
-                estimate.T_map_base,
-                estimate.covariance,
-                found.detections,
-                scan.free,
-                view_range,
-                found.heights,
-                estimate.relative,
-            )
-            tracker.anchor(*self._slam.landmarks(), estimate.T_map_base, view_range)
+            if len(estimate.landmark_of) == len(found.detections.cluster):
+                tracker.process(stamp_ns, estimate, found.detections, self._slam.landmarks(), found.heights)
             # A scan that updates the columns classifies all tracks by them afterwards.
             if scan.column_input is None and self._parameters.classification.method == "columns":
-                tracker.learn_between(self._columns.columns)
+                tracker.classify_new(self._columns.columns)
 
     def _update_columns(self, step: Step, scan: SegmentedScan, estimate: PoseEstimate) -> None:
         """Integrate the scan into the voxel columns, and classify columns and trees."""
@@ -312,7 +304,7 @@ class Mapper:
             pose, offset = estimate.T_map_base, scan.sensor_offset
             view = ScanView(pose, offset, scan.free, given.steepest, given.depth, given.terrain)
             self._columns.add(given.points, given.height, step.index, view)
-            self._columns.columns = self._tracker.judge(
+            self._columns.columns = self._tracker.classify(
                 step.scan.stamp_ns, self._columns.columns, self._parameters.classification
             )
 
@@ -393,26 +385,26 @@ class Mapper:
                 self._placed = index + 1
                 estimate = slam.estimate(estimate)
             case LoopClosure(loop=loop):
-                self._close_loop(index, loop)
-                estimate = slam.estimate(estimate)
+                estimate = self._close_loop(index, loop, estimate)
         self._relocaliser.reset()
         return estimate
 
-    def _close_loop(self, index: int, loop: Loop) -> None:
-        """Bend the path, and move the map with it."""
+    def _close_loop(self, index: int, loop: Loop, estimate: PoseEstimate) -> PoseEstimate:
+        """Bend the path, and move the map with it; returns the corrected pose."""
         bend = self._slam.close(index, loop)
-        self._tracker.bend(bend, self._path.stamp_ns)
-        self._tracker.hold_to(self._slam.known(), bend, self._path.stamp_ns)
+        estimate = self._slam.estimate(estimate)
+        self._tracker.bend(bend, self._path.stamp_ns, estimate, self._slam.landmarks())
         self._columns.bend(bend)
         self._terrain.bend(bend)
         self._closed = index
+        return estimate
 
     def _restore_map(self, before: MapperState) -> None:
         """Return to the map of an earlier state; path, odometry and the numbers of trees go on."""
         self._slam.state = before.slam.copy()
         self._columns.restore(before.gathering)
         self._terrain.state = before.ground
-        self._tracker.tracks = before.tracks
+        self._tracker.tracks = before.tracks.copy()
 
     # --- result ---------------------------------------------------------------------------------------
 

@@ -92,7 +92,7 @@ def cluster_of_frame(
     offset = points[:, :2] - clusters.centre[row] if fit is None else fit.offset
     some = _evenly(len(points), _MOST_POINTS)
     place = pose.apply(clusters.centre[row] + frame.sensor_offset[:2])
-    tree, tree_distance = _nearest_tree(frame, place, parameters.tracking.distance_max)
+    tree, tree_distance = _nearest_tree(frame, place, parameters.slam.distance_max)
     return ClusterStory(
         scan=frame.index,
         cluster=row,
@@ -142,7 +142,7 @@ def tree_of_frame(
         observations=int(trees.observations[row]),
         first_seen_s=(int(trees.first_seen_ns[row]) - start_ns) / _NS,
         last_seen_s=(int(trees.last_seen_ns[row]) - start_ns) / _NS,
-        cluster=_cluster_of(frame, trees.position[row], parameters.tracking.distance_max),
+        cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
         gathered=column_story(frame, trees.position[row], parameters, sensor),
         history=history.of(int(trees.number[row])),
     )

@@ -45,9 +45,9 @@ def compile_ahead() -> None:
 def is_compiled() -> bool:
     """Return whether the kernels of both halves are cached for the current sources."""
     from pipeline.jit import is_kept
-    from pipeline.tracking.track_classification import judge, nearest_other
+    from pipeline.tracking.track_classification import classify, nearest_other
 
-    return is_kept(nearest_other) and is_kept(judge)
+    return is_kept(nearest_other) and is_kept(classify)
 
 
 def _cores() -> int:
@@ -174,7 +174,7 @@ def warm_tree_map() -> None:
         clusters.record(mapper.process(step))
     known = KnownMap(stems, clusters, mapper.path, None)
     preview_trees(known, stems.replace({"tracking.hits_to_confirm": 4}))
-    tree_columns(Tracker(stems.tracking).judge(0, no_columns(), stems.classification))
+    tree_columns(Tracker(stems.tracking).classify(0, no_columns(), stems.classification))
 
 
 def _stems() -> Iterator[Step]:

@@ -23,7 +23,7 @@ RENAMED = {
     "shape.slices": "shape.split_slices",
 }
 # Parameters of earlier versions that no longer exist; their values are ignored.
-REMOVED: frozenset[str] = frozenset()
+REMOVED = frozenset({"tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"})
 
 
 class RenamedParameterWarning(FutureWarning):

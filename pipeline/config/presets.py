@@ -53,7 +53,6 @@ _PAPER: dict[str, object] = {
     "tracking.velocity_sigma": 0.1,
     "tracking.acceleration_sigma": 0.001,
     "tracking.proximity_radius": 1.0,
-    "tracking.distance_max": 1.0,
 }
 
 # A planar laser on a car in a park: trunks have one to ten beams, large distances between each other and a
@@ -95,7 +94,6 @@ _LASER2D: dict[str, object] = {
     "obstacles.height_max": 10.0,
     "obstacles.width": 2.0,
     "tracking.dbh_arc_min": 0.0,
-    "tracking.distance_max": 3.0,
     "tracking.proximity_radius": 1.5,
 }
 

@@ -448,7 +448,7 @@ class Classification(Stage):
 
 
 class Tracking(Stage):
-    """Tracking: a Kalman filter per tree (Eq. 10) and merging."""
+    """Tracking: a Kalman filter per tree (Eq. 10) on the data association of SLAM."""
 
     engine: Literal["compiled", "filterpy"] = choice(
         "compiled", "Kalman engine", "The compiled filter of stemmap or filterpy; both give the same numbers."
@@ -465,26 +465,14 @@ class Tracking(Stage):
     acceleration_sigma: float = number(
         0.0, "Acceleration sigma", "m/s²", 0.0, 5.0, 0.001, "Process noise of a tree's velocity."
     )
-    gate: float = number(
-        4.0,
-        "Association gate",
-        "sigma",
-        0.5,
-        20.0,
-        0.1,
-        "Maximum Mahalanobis distance between a detection and its tree.",
-    )
-    distance_max: float = number(
-        0.6,
-        "Association distance",
+    proximity_radius: float = number(
+        0.4,
+        "Proximity radius",
         "m",
-        0.05,
+        0.0,
         10.0,
         0.05,
-        "Maximum Euclidean distance between a detection and its tree.",
-    )
-    proximity_radius: float = number(
-        0.4, "Proximity radius", "m", 0.0, 10.0, 0.05, "Trees closer to each other than this are merged."
+        "Trees closer to each other than this are merged; a new landmark this close to a tree begins none.",
     )
     hits_to_confirm: int = count(
         3,
@@ -493,14 +481,6 @@ class Tracking(Stage):
         1,
         200,
         "Detections after which a tree is shown and exported, unless its voxel column confirms it earlier.",
-    )
-    misses_per_hit: int = count(
-        1,
-        "Misses per hit",
-        "",
-        1,
-        100,
-        "Misses in free view that cancel one hit; a tree without hits is removed.",
     )
     dbh_arc_min: float = number(
         180.0,

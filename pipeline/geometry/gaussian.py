@@ -87,6 +87,63 @@ def expected_spread(
     )
 
 
+@compiled
+def in_map(
+    centre: Float, covariance: Float, pose: Float, pose_covariance: Float
+) -> tuple[Float, Float, Float]:
+    """Return detections in the frame of the map: positions, shape (D, 2) [m], their own covariances C R C^T,
+    and the covariances that the pose adds, J Sigma J^T, both of shape (D, 2, 2).
+
+    Args:
+        centre: Positions in the base frame, shape (D, 2) [m].
+        covariance: Their covariances R in the base frame, shape (D, 2, 2).
+        pose: x, y [m], yaw [rad] of the base in the map, shape (3,).
+        pose_covariance: Covariance Sigma of the pose, shape (3, 3).
+    """
+    D = centre.shape[0]
+    place, own, added = np.empty((D, 2)), np.empty((D, 2, 2)), np.empty((D, 2, 2))
+    _put_in_map(centre, covariance, pose, pose_covariance, place, own, added)
+    return place, own, added
+
+
+@compiled_borrowing
+def _put_in_map(
+    centre: Float, covariance: Float, pose: Float, Sigma: Float, place: Float, own: Float, added: Float
+) -> None:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    for d in range(centre.shape[0]):
+        x, y = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
+        place[d, 0], place[d, 1] = pose[0] + x, pose[1] + y
+        a, b, e = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
+        own[d, 0, 0] = c * c * a - 2.0 * c * s * b + s * s * e
+        own[d, 0, 1] = own[d, 1, 0] = c * s * (a - e) + (c * c - s * s) * b
+        own[d, 1, 1] = s * s * a + 2.0 * c * s * b + c * c * e
+        added[d, 0, 0], added[d, 0, 1], added[d, 1, 1] = by_pose(x, y, Sigma)
+        added[d, 1, 0] = added[d, 0, 1]
+
+
+@compiled
+def spread_by_pose(position: Float, pose: Float, Sigma: Float) -> Float:
+    """Return what the covariance Sigma of a pose, shape (3, 3), adds to positions along the axes of the map,
+    shape (N, 2) [m]: J Sigma J^T, shape (N, 2, 2) [m^2]."""
+    added = np.empty((position.shape[0], 2, 2))
+    for k in range(position.shape[0]):
+        xx, xy, yy = by_pose(position[k, 0] - pose[0], position[k, 1] - pose[1], Sigma)
+        added[k, 0, 0], added[k, 0, 1], added[k, 1, 0], added[k, 1, 1] = xx, xy, xy, yy
+    return added
+
+
+@compiled_borrowing
+def by_pose(x: float, y: float, Sigma: Float) -> tuple[float, float, float]:
+    """Return J Sigma J^T as xx, xy, yy [m^2]: what the covariance of a pose adds to a position x, y [m] away
+    from it along the axes of the map."""
+    return (
+        Sigma[0, 0] - 2.0 * y * Sigma[0, 2] + y * y * Sigma[2, 2],
+        Sigma[0, 1] + x * Sigma[0, 2] - y * Sigma[1, 2] - x * y * Sigma[2, 2],
+        Sigma[1, 1] + 2.0 * x * Sigma[1, 2] + x * x * Sigma[2, 2],
+    )
+
+
 @compiled_within
 def corrected(
     pose: Pose, ax: float, ay: float, S0: float, S1: float, S2: float, y0: float, y1: float

@@ -249,7 +249,7 @@ def _has_same_columns(before: Parameters, now: Parameters) -> bool:
 
 
 def _reach(p: Parameters) -> float:
-    return max(p.tracking.proximity_radius, min(p.tracking.distance_max, REACH))
+    return max(p.tracking.proximity_radius, min(p.slam.distance_max, REACH))
 
 
 def _columns(known: KnownMap, p: Parameters) -> Columns | None:

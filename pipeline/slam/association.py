@@ -1,4 +1,4 @@
-"""Which detection is which tree: by likelihood, one to one."""
+"""Data association of positions with landmarks: by likelihood, one to one."""
 
 from __future__ import annotations
 
@@ -6,10 +6,36 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.geometry.gaussian import in_map, rows_of
 from pipeline.geometry.hash_grid import Cells, cell_of, cells_for, fill, first_of_four, per_metre
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
-from pipeline.types.records import Int
+from pipeline.slam.particle_update import SCORE_MAX
+from pipeline.types.records import Detections, Float32, Int, Int32, Landmarks, PoseEstimate
+
+
+def hits_less_misses(hits: Int32, score: Float32 | Float, misses_per_hit: int) -> Float:
+    """Return the hits less the misses of landmarks, shape (L,), from their scores.
+
+    A score is hits - misses / misses_per_hit, and counts no more than SCORE_MAX hits.
+    """
+    counted = np.minimum(hits, SCORE_MAX)
+    return np.subtract(counted, misses_per_hit * (counted - score), dtype=np.float64)
+
+
+def births_of(detections: Detections, estimate: PoseEstimate, landmarks: Landmarks) -> Int:
+    """Return the birth of the landmark of each detection at an estimated pose, int64, shape (D,); -1 for a
+    detection without landmark. The map stays unchanged."""
+    relative = estimate.covariance if estimate.relative is None else estimate.relative
+    pose = estimate.T_map_base.as_array()
+    position, own, added = in_map(detections.centre, detections.covariance, pose, relative)
+    row, _ = associate(
+        position, rows_of(own + added), landmarks.position, landmarks.covariance, landmarks.gate,
+        landmarks.distance_max,
+    )  # fmt: skip
+    births = np.full(len(row), -1, np.int64)
+    births[row >= 0] = landmarks.birth[row[row >= 0]]
+    return births
 
 
 class _Pairs(NamedTuple):

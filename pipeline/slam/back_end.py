@@ -95,12 +95,8 @@ class BackEnd:
         """See FastSlam.begun_since."""
         return self._slam.begun_since(scan)
 
-    def known(self) -> Landmarks:
-        """See FastSlam.known."""
-        return self._slam.known()
-
-    def landmarks(self) -> tuple[Float, Float]:
-        """Positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""
+    def landmarks(self) -> Landmarks:
+        """Return all landmarks: of the best particle, or of the pose graph."""
         return self._slam.landmarks()
 
 

@@ -18,6 +18,7 @@ from pipeline.geometry.gaussian import rows_of
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.loop_closure.map_correction import Bend
 from pipeline.slam import slip_detection
+from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.best_particle import are_apart, heir, leader
 from pipeline.slam.frame_uncertainty import NOISE, FrameMemory, at_least
 from pipeline.slam.loop_correction import Loop, bent_landmarks, bent_path
@@ -35,7 +36,7 @@ from pipeline.slam.shared_errors import SharedErrors
 from pipeline.slam.slip_detection import ByTrees
 from pipeline.slam.state import SlamState
 from pipeline.types.pose_health import Health
-from pipeline.types.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
+from pipeline.types.records import Detections, Int, Landmarks, PoseEstimate, PoseMeasurement
 
 PLACED = 1  # tells the draws of a placing from those of a scan
 
@@ -72,11 +73,11 @@ class FastSlam:
         doubted = Doubted(bool(doubt), slipped)
         doubt = doubt or slip_detection.why(state.motion, slipped, trees.unsure)
         if used:
-            state, scan, weights = self._observed(
+            state, scan, weights, births = self._observed(
                 state, trees, detections.centre, R, clear_range, noise, motion.measured, doubted, rules
             )
         else:
-            scan, weights = ScanTold(), normalised(state.log_weight)
+            scan, weights, births = ScanTold(), normalised(state.log_weight), None
         estimate, frame, by_trees = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
         if used:
             at = estimate.T_map_base.as_array()
@@ -97,7 +98,11 @@ class FastSlam:
         health = judged(
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
         )
-        return replace(estimate, resampled=ancestors is not None, health=health)
+        # A survivor of the resampling keeps its row, so that row `best` is still that of the best particle.
+        landmark_of = (
+            births_of(detections, estimate, self.landmarks()) if births is None else births[state.best]
+        )
+        return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
 
     def as_seen(self, pose: PoseMeasurement) -> PoseMeasurement:
         """A measured pose without what all poses of its source are known by now to err by."""
@@ -145,10 +150,10 @@ class FastSlam:
         return is_astray(self.state.recent)
 
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
-        """After `place`: the pose, with the health of an estimate before it."""
+        """Return the pose after `place`, with the health and the associations of an estimate before it."""
         weights = normalised(self.state.log_weight)
         estimate, _, _ = _estimate(self.state, weights, self.parameters, 0.0)
-        return replace(estimate, health=before.health)
+        return replace(estimate, health=before.health, landmark_of=before.landmark_of)
 
     def lost(self, estimate: PoseEstimate) -> Health:
         """The health of an estimate that no tree has told anything of."""
@@ -163,20 +168,11 @@ class FastSlam:
         """x, y [m], yaw [rad] at every scan as the best particle has it behind it, shape (N, 3)."""
         return self.state.genealogy.path(self.state.best)
 
-    def landmarks(self) -> tuple[Float, Float]:
-        """All landmarks of the best particle: positions, shape (L, 2) [m], and covariances xx, xy, yy,
-        shape (L, 3) [m^2]."""
-        landmarks = self.state.map_of(self.state.best)
-        return landmarks.mean, landmarks.covariance
-
-    def known(self) -> Landmarks:
-        """The well known landmarks of the best particle."""
-        known, frame = self.state.map_of(self.state.best), self.state.frame
-        rows = known.hits >= self.parameters.hits_to_weigh
-        birth, mean = known.birth[rows], known.mean[rows]
-        own = known.covariance[rows][:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        hits = known.hits[rows].astype(np.int64)
-        return Landmarks(mean, own, frame.at_places(birth, mean), hits, frame.scan_of(birth))
+    def landmarks(self) -> Landmarks:
+        """Return all landmarks of the best particle."""
+        known, p = self.state.map_of(self.state.best), self.parameters
+        score = hits_less_misses(known.hits, known.score, p.misses_per_hit)
+        return Landmarks(known.birth, known.mean, known.covariance, score, p.gate, p.distance_max)
 
     def begun_since(self, scan: int) -> tuple[Float, Float]:
         """The well known landmarks of the best particle that were begun at a scan or later: positions, shape
@@ -210,14 +206,15 @@ class FastSlam:
         measured: PoseMeasurement | None,
         doubted: Doubted,
         rules: Rules,
-    ) -> tuple[SlamState, ScanTold, Float]:
-        """The state after a scan, what it told, and the weights."""
+    ) -> tuple[SlamState, ScanTold, Float, Int]:
+        """Return the state after a scan, the statistics of the scan, the weights, and the births of the
+        landmarks that each particle associates with the detections, shape (P, D)."""
         found = len(centre)
         motion, covariance, recent = trees.motion, trees.covariance, state.recent
         if trees.slipped:
             recent = replace(recent, distrust=1.0)
         shared = self._shared(state, motion, covariance, measured)
-        maps, weights, mean, odometry = use_scan(
+        maps, weights, mean, odometry, births = use_scan(
             state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
             state.detections, rules, shared.for_particles(measured),
         )  # fmt: skip
@@ -235,7 +232,7 @@ class FastSlam:
             recent=remembered(recent, scan, state.since_update, doubted),
             shared=shared,
         )
-        return state, scan, weights
+        return state, scan, weights, births
 
     def _by_trees(self, state: SlamState, centre: Float, R: Float, rules: Rules) -> ByTrees:
         return against_slip(

@@ -15,6 +15,7 @@ from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
 from pipeline.slam.scan_statistics import TOLD, mean_told
 from pipeline.slam.shared_errors import Measured
 from pipeline.slam.slip_detection import SEARCH, ByTrees, motion_by_trees
+from pipeline.types.records import Int
 
 
 @compiled
@@ -34,7 +35,7 @@ def against_slip(
 
     Args:
         pose: shape (P, 3) before the motion; maps: of the particles; best: which one is asked.
-        motion, motion_covariance, centre, R, rules: See `update.observe`.
+        motion, motion_covariance, centre, R, rules: See `particle_update.observe`.
         driven, wheels: How far the odometry may be wrong, see away_from_trees.
     """
     if centre.shape[0] < FEWEST_PAIRS:
@@ -61,11 +62,12 @@ def use_scan(
     first_birth: int,
     rules: Rules,
     measured: Measured,
-) -> tuple[Maps, Float, Float, float]:
-    """Update every particle in place; the arguments are those of `update.observe`.
+) -> tuple[Maps, Float, Float, float, Int]:
+    """Update every particle in place; the arguments are those of `particle_update.observe`.
 
     Returns:
-        The maps, in which room was made; the weights, shape (P,); and what `mean_told` gives.
+        The maps, in which room was made; the weights, shape (P,); what `mean_told` gives; and the births of
+        the associated landmarks, shape (P, D).
     """
     found = centre.shape[0]
     reach = 0.0
@@ -78,14 +80,16 @@ def use_scan(
     landmarks = lengths.max() * ROOM + found
     near, room = near_for(landmarks), room_for(found, landmarks)
     told = np.zeros((pose.shape[0], TOLD))
+    births = np.empty((pose.shape[0], found), np.int64)
     observe(
         pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
-        clear_range, reach, first_birth, rules, near, room, told, measured, np.empty(3), np.zeros((3, 3)),
+        clear_range, reach, first_birth, rules, near, room, told, measured, births, np.empty(3),
+        np.zeros((3, 3)),
     )  # fmt: skip
     log_weight -= log_weight.max()
     weights = normalised(log_weight)
     mean, odometry = mean_told(told, weights, motion_covariance)
-    return maps, weights, mean, odometry
+    return maps, weights, mean, odometry, births
 
 
 @compiled

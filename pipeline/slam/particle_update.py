@@ -133,6 +133,7 @@ def observe(
     room: Room,
     told: Float,
     measured: Measured,
+    births: Int,
     mu: Float,
     P: Float,
 ) -> None:
@@ -150,6 +151,7 @@ def observe(
         near, room: Memory for the landmarks in reach and for pairs.
         told: shape (P, TOLD), filled: what each particle tells of the scan (see health).
         measured: The pose by another source; what its poses err by alike is learned.
+        births: shape (P, D), filled: birth of the landmark that each particle associates with each detection.
         mu, P: Memory for a pose, shape (3,), and its covariance, shape (3, 3), zeros.
     """
     scale = per_metre(rules.distance_max)
@@ -185,6 +187,9 @@ def observe(
             near.mean, near.covariance, near.hits, near.score, near.birth, known, near.seen,
             rules.merge_gate, near.cells, scale,
         )  # fmt: skip
+        for d in range(centre.shape[0]):
+            j = room.landmark_of[d]
+            births[p, d] = near.birth[j] if j >= 0 else first_birth + d
         clear(near.cells, known)
         _write_back(maps, p, near, all_near)
 

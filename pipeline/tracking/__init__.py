@@ -1,4 +1,4 @@
-"""Tracking: a Kalman filter per tree (Eq. 10), what was gathered of it, and merging."""
+"""Tracking: a Kalman filter per tree (Eq. 10) on the data association of SLAM, and attributes of trees."""
 
 from pipeline.tracking.tracker import Tracker
 

@@ -1,4 +1,4 @@
-"""Judging: which column is which track, and what that makes of it."""
+"""Classification of the trees by the voxel columns at their positions."""
 
 from __future__ import annotations
 
@@ -16,87 +16,127 @@ from pipeline.geometry.hash_grid import (
 )
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
-from pipeline.tracking.assignment import by_pose
-from pipeline.tracking.round_fit_override import back
-from pipeline.tracking.track_table import Rows, begin
-from pipeline.tracking.tracking_inputs import Sight
-from pipeline.types.records import Bool, Columns, Int, Int32, Verdict
+from pipeline.tracking.observation import SECTORS, sides_of
+from pipeline.tracking.track_table import Rows, ScanPose
+from pipeline.types.records import AT_ROUND, CLASSES, Bool, Columns, Int, Int32, Verdict
 
 TREE, OTHER = int(Verdict.TREE), int(Verdict.OTHER)
-ONE_TREE = 0.5  # m; tree columns nearer to one another than this are one tree
-REACH = 0.45  # m; a track farther from a column than this is something else
-# m; how near to the axis of its column a trunk's track lies: of those alone in reach 95 of 100 within 16 cm
-# in sim:stand and within 12 cm in sim:dense.
+ONE_TREE = 0.5  # m; tree columns nearer to each other are one tree
+REACH = 0.45  # m; maximum distance between a track and its column
+# m; scale of the distance between a trunk's track and the axis of its column: of the tracks that are the only
+# one in reach, 95 of 100 are within 0.16 m in sim:stand and within 0.12 m in sim:dense.
 OWN = 0.15
-BESIDE = 0.7  # m; a tree whose own column is gone is what the column so near is: a person fits no circle well
-SCORE_STANDING = 5.0  # at least, of a tree that what was gathered stands for
-GATHERED_SIGMA = 0.1  # m; the middle of the returns of one side lies so far before the axis
-DUE_NS = 5_000_000_000  # after its first sight a trunk so near has a column: a dozen scans were gathered
+NEIGHBOUR = 0.7  # m; a tree without a column of its own takes the class of a column this near
+DUE_NS = 5_000_000_000  # ns after the first observation, when a trunk within DUE_REACH has a column
 DUE_REACH = 10.0  # m
-DUE_SHARE = 0.4  # of how far away returns are gathered: what stands farther may have been seen by few scans
-GLIMPSE_NS, FORMER_NS = 1_000_000_000, 60_000_000_000  # bounds of being out of sight, see `_is_out_of_sight`
+DUE_SHARE = 0.4  # of the range of the columns; trees farther away may have few scans with returns
+GLIMPSE_NS, FORMER_NS = 1_000_000_000, 60_000_000_000  # bounds of the time in `_is_out_of_sight`
+ROUND_REACH = 0.25  # m; maximum distance between a round track and the axis of its column
+ROUND_FITS = 20  # circles of single scans
+ROUND_SIDES = SECTORS // 2  # sectors
+TREE_VOTES = CLASSES.index(Verdict.TREE)
+_KINDS, _AT_ROUND = np.array(CLASSES, np.int64), np.array(AT_ROUND)
 
 
 @compiled
-def judge(
-    rows: Rows,
-    count: int,
-    number: int,
-    sight: Sight,
-    place: Float,
+def classify(
+    tracks: Rows,
+    scan: ScanPose,
+    axis: Float,
     votes: Float,
     verdict: Int32,
     tree_share: float,
     range_max: float,
-    velocity_sigma: float,
-) -> tuple[int, int]:
-    """Take the verdicts of what was gathered: a track is confirmed by them alone, and a tree that no single
-    scan showed begins its track here.
+) -> Int:
+    """Give the tracks the classes of the columns at their positions.
 
     Args:
-        rows: The first `count` are tracks, in place, with room for one more a column.
-        number: Of the next new tree.
-        sight: Of the scan.
-        place: Of the columns, x, y first, shape (C, 2 or more) [m]; votes: shape (C, 6); verdict: of the
-            votes and the rules, shape (C,): those that the tracks back become trees in place (see `backing`).
-        tree_share, range_max: See `ColumnClassifier`.
+        tracks: The tracks, changed in place.
+        scan: Pose of the robot.
+        axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
+        votes: Shares of the votes, shape (C, 6).
+        verdict: Classes by votes and rules, shape (C,), changed in place by `confirm_round`.
+        tree_share, range_max: See `Classification`.
 
     Returns:
-        The number of tracks, and that of the next new one.
+        Rows of the tree columns without a track, where new tracks begin.
     """
     columns = verdict.shape[0]
-    cells, scale = cells_for(columns), per_metre(BESIDE)
-    fill(cells, place, columns, scale)
-    back(rows, count, cells, scale, place, votes, verdict, tree_share)
-    trees = _best_first(place, votes, verdict)
-    _learn(rows, count, sight, cells, scale, place, verdict, min(DUE_REACH, DUE_SHARE * range_max))
-    fresh = _with_tree(rows, count, place, trees)
-    _begin_at(rows, count, number, sight, place, trees[fresh], velocity_sigma)
-    count += fresh.shape[0]
-    for t in range(count):
-        if rows.verdict[t] == TREE:
-            rows.score[t] = max(rows.score[t], SCORE_STANDING)
-    return count, number + fresh.shape[0]
+    cells, scale = cells_for(columns), per_metre(NEIGHBOUR)
+    fill(cells, axis, columns, scale)
+    confirm_round(tracks, cells, scale, axis, votes, verdict, tree_share)
+    trees = _best_first(axis, votes, verdict)
+    _take_classes(tracks, scan, cells, scale, axis, verdict, min(DUE_REACH, DUE_SHARE * range_max))
+    return _assign_trees(tracks, axis, trees)
+
+
+@compiled_borrowing
+def confirm_round(
+    tracks: Rows,
+    cells: Cells,
+    scale: float,
+    axis: Float,
+    votes: Float,
+    verdict: Int32,
+    tree_share: float,
+) -> None:
+    """Make trees of columns whose track was fitted as a circle from most sides, in place.
+
+    Such an object is round and upright, so that the votes for bush, wall and other count little:
+    v_tree / (v_round + 0.1 v_else) must be at least `tree_share`, with the shares v of the votes, and neither
+    pole nor person may have more votes than tree.
+
+    Args:
+        tracks: The tracks.
+        cells, scale: Grid of the columns, for searches within ROUND_REACH at least.
+        axis, votes, verdict, tree_share: See `classify`. Moving columns and those with too few voxels keep
+            their class.
+    """
+    for t in range(tracks.radii.shape[0]):
+        if tracks.radii[t] < ROUND_FITS or sides_of(tracks.sides[t]) < ROUND_SIDES:
+            continue
+        x, y = tracks.x[t, 0], tracks.x[t, 1]
+        u, v = first_of_four(x, y, scale)
+        for quarter in range(4):
+            c = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+            while c >= 0:
+                dx, dy = axis[c, 0] - x, axis[c, 1] - y
+                is_near = dx * dx + dy * dy < ROUND_REACH * ROUND_REACH
+                if is_near and _is_tree_if_round(votes[c], verdict[c], tree_share):
+                    verdict[c] = TREE
+                c = cells.following[c]
+
+
+@compiled_within
+def _is_tree_if_round(votes: Float, verdict: int, tree_share: float) -> bool:
+    """Return whether only the votes reject a column that is a tree if it is round."""
+    voted, below, most = False, 0.0, 0.0
+    for k in range(_KINDS.shape[0]):
+        voted = voted or (verdict == _KINDS[k] and k != TREE_VOTES)
+        below += votes[k] * _AT_ROUND[k]
+        if _AT_ROUND[k] == 1.0:
+            most = max(most, votes[k])
+    return voted and votes[TREE_VOTES] >= most and votes[TREE_VOTES] / max(below, 1e-9) >= tree_share
 
 
 def tree_columns(columns: Columns) -> Int:
-    """Rows of the columns that are trees; of those that are one tree the one with most votes."""
+    """Return the rows of the tree columns; of columns that are one tree, the one with most votes."""
     return _best_first(columns.axis, columns.share, columns.verdict)
 
 
 @compiled
-def _best_first(place: Float, votes: Float, verdict: Int32) -> Int:
+def _best_first(axis: Float, votes: Float, verdict: Int32) -> Int:
     rows, fewest, n = np.empty(verdict.shape[0], np.int64), np.empty(verdict.shape[0]), 0
     for c in range(verdict.shape[0]):
         if verdict[c] == TREE:
             rows[n], fewest[n] = c, -votes[c, 0]
             n += 1
     rows = rows[np.argsort(fewest[:n], kind="mergesort")]
-    cells, scale, apart = cells_for(place.shape[0]), per_metre(ONE_TREE), 0
+    cells, scale, apart = cells_for(axis.shape[0]), per_metre(ONE_TREE), 0
     for k in range(n):
         c = rows[k]
-        if nearest_in(cells, place, place[c, 0], place[c, 1], ONE_TREE, scale) < 0:
-            put_in(cells, place, c, scale)
+        if nearest_in(cells, axis, axis[c, 0], axis[c, 1], ONE_TREE, scale) < 0:
+            put_in(cells, axis, c, scale)
             rows[apart] = c
             apart += 1
     best: Int = rows[:apart].copy()
@@ -104,124 +144,131 @@ def _best_first(place: Float, votes: Float, verdict: Int32) -> Int:
 
 
 @compiled_borrowing
-def _learn(
-    rows: Rows,
-    count: int,
-    sight: Sight,
+def _take_classes(
+    tracks: Rows,
+    scan: ScanPose,
     cells: Cells,
     scale: float,
-    place: Float,
+    axis: Float,
     verdict: Int32,
     due_reach: float,
 ) -> None:
-    """Give every track the verdict of what stands at its place.
+    """Give each track the class of the nearest column, except for trees, see `_assign_trees`.
 
-    A track that no column is near to keeps what it was, but a tree does not beside a column of something
-    else; where its column is overdue, or it is out of sight, nothing upright stands there, and its hits alone
-    make it no tree.
+    A track without a column keeps its class. A tree near a column of another class takes that class. A track
+    without class whose column is overdue, or which is out of sight, is no tree: its hits do not confirm it.
     """
-    for t in range(count):
-        x, y, known = rows.x[t, 0], rows.x[t, 1], rows.verdict[t]
-        near = nearest_in(cells, place, x, y, BESIDE, scale)
-        told = np.int64(verdict[near]) if near >= 0 else known
-        if near >= 0 and (place[near, 0] - x) ** 2 + (place[near, 1] - y) ** 2 < REACH * REACH:
-            rows.verdict[t] = OTHER if told == TREE else told  # another track is that tree, unless told below
-        elif known == TREE and near >= 0 and told != TREE:
-            rows.verdict[t] = told
+    for t in range(tracks.verdict.shape[0]):
+        x, y, known = tracks.x[t, 0], tracks.x[t, 1], tracks.verdict[t]
+        near = nearest_in(cells, axis, x, y, NEIGHBOUR, scale)
+        found = np.int64(verdict[near]) if near >= 0 else known
+        if near >= 0 and (axis[near, 0] - x) ** 2 + (axis[near, 1] - y) ** 2 < REACH * REACH:
+            tracks.verdict[t] = OTHER if found == TREE else found
+        elif known == TREE and near >= 0 and found != TREE:
+            tracks.verdict[t] = found
         elif known < 0 and (
-            _is_due(rows, t, sight, due_reach)
-            or _is_out_of_sight(rows.first_ns[t], rows.stamp_ns[t], sight.stamp_ns)
+            _is_due(tracks, t, scan, due_reach)
+            or _is_out_of_sight(tracks.first_ns[t], tracks.stamp_ns[t], scan.stamp_ns)
         ):
-            rows.verdict[t] = OTHER
+            tracks.verdict[t] = OTHER
 
 
 @compiled
-def learn_between(rows: Rows, count: int, place: Float, verdict: Int32) -> None:
-    """Give tracks that nothing was told of yet the verdict of the column that is known at their place:
-    between two scans that are gathered their hits alone would make trees of them, beside a column of none.
+def classify_new(tracks: Rows, axis: Float, verdict: Int32) -> None:
+    """Give tracks without class the class of the column at their positions, in place.
+
+    Between two scans that update the columns, the hits would confirm a track next to a column of no tree.
 
     Args:
-        rows: The first `count` are tracks, in place.
-        place: Of the columns, x, y first, shape (C, 2 or more) [m]; verdict: shape (C,), as `judge` left it.
+        tracks: The tracks.
+        axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
+        verdict: Classes of the columns after `classify`, shape (C,).
     """
-    for t in range(count):
-        if rows.verdict[t] >= 0 or rows.hits[t] == 0:
+    for t in range(tracks.verdict.shape[0]):
+        if tracks.verdict[t] >= 0 or tracks.hits[t] == 0:
             continue
         nearest, least = -1, REACH * REACH
         for c in range(verdict.shape[0]):
-            dx, dy = place[c, 0] - rows.x[t, 0], place[c, 1] - rows.x[t, 1]
+            dx, dy = axis[c, 0] - tracks.x[t, 0], axis[c, 1] - tracks.x[t, 1]
             if dx * dx + dy * dy < least:
                 nearest, least = c, dx * dx + dy * dy
         if nearest >= 0:
-            told = np.int64(verdict[nearest])
-            rows.verdict[t] = OTHER if told == TREE else told  # another track is that tree
+            found = np.int64(verdict[nearest])
+            tracks.verdict[t] = OTHER if found == TREE else found  # another track is that tree
 
 
 @compiled_within
-def _is_due(rows: Rows, t: int, sight: Sight, reach: float) -> bool:
-    """Whether a track would have a column by now if it were a tree."""
-    dx, dy = rows.x[t, 0] - sight.pose[0], rows.x[t, 1] - sight.pose[1]
-    return bool(dx * dx + dy * dy < reach * reach and sight.stamp_ns - rows.first_ns[t] >= DUE_NS)
+def _is_due(tracks: Rows, t: int, scan: ScanPose, reach: float) -> bool:
+    """Return whether a tree at the position of a track would have a column by now."""
+    dx, dy = tracks.x[t, 0] - scan.pose[0], tracks.x[t, 1] - scan.pose[1]
+    return bool(dx * dx + dy * dy < reach * reach and scan.stamp_ns - tracks.first_ns[t] >= DUE_NS)
 
 
 @compiled_within
 def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
-    """Whether a track has not been seen for longer than it had been seen, as who walked on has not. At least
-    a second and at most as long as a column takes; what was last seen long ago is of another drive, or was
-    put back by a loop, and nobody walked there."""
+    """Return whether a track has been unseen for longer than it was seen, like a person who walked on.
+
+    The limit is at least GLIMPSE_NS and at most DUE_NS. A track that was last seen long ago is of another
+    drive, or a loop closure moved it.
+    """
     unseen = now_ns - last_ns
     return min(max(last_ns - first_ns, GLIMPSE_NS), DUE_NS) < unseen < FORMER_NS
 
 
 @compiled
-def _with_tree(rows: Rows, count: int, place: Float, trees: Int) -> Int:
-    """Make one track of each tree column a tree, the likeliest free one in reach; the best columns choose
-    first.
+def _assign_trees(tracks: Rows, axis: Float, trees: Int) -> Int:
+    """Make a tree of one track of each tree column, the likeliest free one in reach, best columns first.
+
+    Args:
+        tracks: The tracks, changed in place.
+        axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
+        trees: Rows of the tree columns, best first.
 
     Returns:
-        Places in `trees` of those without a track.
+        Rows of the columns without a track.
     """
-    taken, fresh, n = np.zeros(count, np.bool_), np.empty(trees.shape[0], np.int64), 0
+    count = tracks.verdict.shape[0]
+    taken, new, n = np.zeros(count, np.bool_), np.empty(trees.shape[0], np.int64), 0
     cells, scale = cells_for(count), per_metre(REACH)
-    fill(cells, rows.x, count, scale)
+    fill(cells, tracks.x, count, scale)
     at = np.empty(trees.shape[0], np.int64)
     for k in range(trees.shape[0]):
         c = trees[k]
-        at[k] = _likeliest(rows, taken, cells, scale, place[c, 0], place[c, 1])
+        at[k] = _likeliest(tracks, taken, cells, scale, axis[c, 0], axis[c, 1])
         if at[k] >= 0:
             taken[at[k]] = True
         else:
-            fresh[n] = k
+            new[n] = c
             n += 1
     for k in range(trees.shape[0]):
         t, c = at[k], trees[k]
         if t < 0:
             continue
-        rows.verdict[t] = TREE
-        if rows.hits[t] == 0:  # what no scan has measured stands where what was gathered stands
-            rows.x[t, 0], rows.x[t, 1] = place[c, 0], place[c, 1]
-    found: Int = fresh[:n].copy()
+        tracks.verdict[t] = TREE
+        if tracks.hits[t] == 0:  # a tree without detections is at its column
+            tracks.x[t, 0], tracks.x[t, 1] = axis[c, 0], axis[c, 1]
+    found: Int = new[:n].copy()
     return found
 
 
 @compiled_within
-def _likeliest(rows: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
-    """The free track in reach of a column's axis that is its likeliest, by hits and distance d, the first row
-    of equals, -1 for none:
+def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
+    """Return the free track in reach of an axis with the largest likelihood by hits and distance d, the first
+    row of equals, -1 for none:
 
     (1 + ln(1 + hits)) exp(-d^2 / (2 OWN^2))
 
-    Hits alone would give a stem in undergrowth the branches beside it, seen before it and as often.
+    Hits without distance would prefer branches near a stem, which were seen earlier and as often.
     """
     u, v = first_of_four(x, y, scale)
     most, best = 0.0, np.int64(-1)
     for quarter in range(4):
         t = np.int64(cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))])
         while t >= 0:
-            dx, dy = x - rows.x[t, 0], y - rows.x[t, 1]
+            dx, dy = x - tracks.x[t, 0], y - tracks.x[t, 1]
             square = dx * dx + dy * dy
             if not taken[t] and square < REACH * REACH:
-                likely = (1.0 + np.log(1.0 + rows.hits[t])) * np.exp(-0.5 * square / (OWN * OWN))
+                likely = (1.0 + np.log(1.0 + tracks.hits[t])) * np.exp(-0.5 * square / (OWN * OWN))
                 if likely > most or (likely == most and t < best):
                     most, best = likely, t
             t = np.int64(cells.following[t])
@@ -229,25 +276,9 @@ def _likeliest(rows: Rows, taken: Bool, cells: Cells, scale: float, x: float, y:
 
 
 @compiled
-def _begin_at(
-    rows: Rows, count: int, number: int, sight: Sight, place: Float, trees: Int, velocity_sigma: float
-) -> None:
-    """Begin the tracks of tree columns, by their rows."""
-    z, R = np.empty((trees.shape[0], 2)), np.zeros((trees.shape[0], 2, 2))
-    B = np.empty((trees.shape[0], 2, 2))
-    for k in range(trees.shape[0]):
-        z[k, 0], z[k, 1] = place[trees[k], 0], place[trees[k], 1]
-        R[k, 0, 0] = R[k, 1, 1] = GATHERED_SIGMA * GATHERED_SIGMA
-        xx, xy, yy = by_pose(z[k, 0] - sight.pose[0], z[k, 1] - sight.pose[1], sight.covariance)
-        B[k, 0, 0], B[k, 0, 1], B[k, 1, 0], B[k, 1, 1] = xx, xy, xy, yy
-    begin(rows, count, number, sight.stamp_ns, z, R, B, velocity_sigma)
-    for k in range(trees.shape[0]):
-        rows.verdict[count + k] = TREE
-
-
-@compiled
 def nearest_other(place: Float, other: Float, reach: float) -> Int:
-    """The nearest other place to each, the first of equals; -1 where none is in reach; shape (N,)."""
+    """Return the row of the nearest other position to each position, the first of equals, shape (N,); -1 for
+    none within reach."""
     nearest = np.empty(place.shape[0], np.int64)
     cells, scale = cells_for(other.shape[0]), per_metre(reach)
     fill(cells, other, other.shape[0], scale)

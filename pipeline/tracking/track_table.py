@@ -1,15 +1,40 @@
-"""What is kept of each tree: columns that grow, and what one more observation adds to them."""
+"""The table of tracks: one row per tree."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled_borrowing
-from pipeline.types.records import Bool, Int
+from pipeline.io.checkpoints.codec import ADDED
+from pipeline.jit import compiled, compiled_borrowing
+from pipeline.tracking.split_covariance_intersection import split
+from pipeline.types.records import Bool, Int, Verdict
+
+NO_LANDMARK = -1
+
+
+class ScanPose(NamedTuple):
+    """Pose of the robot at a scan.
+
+    Attributes:
+        stamp_ns: Time of the scan.
+        pose: x, y [m], yaw [rad] in the frame of the map, shape (3,).
+        covariance: Covariance of the pose in the frame of the map, shape (3, 3).
+        relative: Covariance of the pose relative to the landmarks around, shape (3, 3).
+    """
+
+    stamp_ns: int
+    pose: Float
+    covariance: Float
+    relative: Float
+
+
+def _no_landmarks(columns: dict[str, Int]) -> Int:
+    """The landmarks of a table that was saved without them; the next scan assigns the nearest ones."""
+    return np.full(len(columns["number"]), NO_LANDMARK)
 
 
 @dataclass(slots=True, eq=False)
@@ -17,20 +42,29 @@ class TrackTable:
     """Columns of length T.
 
     Attributes:
-        number: int64, in the order of first sight, never used twice.
-        x: shape (T, 4): x, y [m], vx, vy [m/s]; P: its covariance, shape (T, 4, 4).
-        shared: What of P the poses have done that the tree was seen from, shape (T, 2, 2) [m^2].
-        stamp_ns: int64, of `x` and of the last observation; first_ns: of the first.
-        hits: int64, observations, see `Trees`; score: hits less misses.
-        eccentricity: Sum over the observations with a finite one; eccentricities: their number.
-        radius: Sum of weights times radii; radius_weight: sum of weights (see `add_observations`) [1/m^4];
-            radius_reach: sum of weights times distances; radius_above: of weights times how far
-            above or below breast height [m]; radii: number of them.
-        sides: int64: bit k is set when the sector k around the trunk was seen.
-        verdict: int64: what was gathered says of it, see Verdict; -1 for nothing.
+        number: int64, ascending; a number is never used twice.
+        landmark: int64, birth of the landmark of the tree in SLAM's map; -1 for a tree that only a voxel
+            column supports.
+        x: State x, y [m], vx, vy [m/s], shape (T, 4).
+        P: Covariance of the state, shape (T, 4, 4).
+        shared: Part of P that comes from the poses of the robot, shape (T, 2, 2) [m^2].
+        stamp_ns: int64, time of the last observation.
+        first_ns: int64, time of the first observation.
+        hits: int64, number of observations, see `Trees`.
+        score: Score of the landmark: hits less misses, see `Landmarks`.
+        eccentricity: Sum of the finite eccentricities of the observations.
+        eccentricities: int64, number of them.
+        radius: Sum of weights times radii.
+        radius_weight: Sum of weights (see `add_observations`) [1/m^4].
+        radius_reach: Sum of weights times distances.
+        radius_above: Sum of weights times distances from breast height [m].
+        radii: int64, number of radii.
+        sides: int64, bit k is set when sector k around the trunk was seen.
+        verdict: int64, class of the voxel column of the tree, see Verdict; -1 for unknown.
     """
 
     number: Int
+    landmark: Int = field(metadata={ADDED: _no_landmarks})
     x: Float
     P: Float
     shared: Float
@@ -50,17 +84,18 @@ class TrackTable:
 
     @classmethod
     def empty(cls, rows: int = 0) -> TrackTable:
-        """Rows of zeros."""
+        """Return rows of zeros, without landmark and class."""
         floats, ints = np.zeros(rows), np.zeros(rows, np.int64)
         return cls(
             number=ints.copy(),
+            landmark=np.full(rows, NO_LANDMARK),
             x=np.zeros((rows, 4)),
             P=np.zeros((rows, 4, 4)),
             shared=np.zeros((rows, 2, 2)),
             stamp_ns=ints.copy(),
             first_ns=ints.copy(),
             hits=ints.copy(),
-            score=floats.copy(),
+            score=np.ones(rows),
             eccentricity=floats.copy(),
             eccentricities=ints.copy(),
             radius=floats.copy(),
@@ -72,40 +107,62 @@ class TrackTable:
             verdict=np.full(rows, -1, np.int64),
         )
 
+    @classmethod
+    def begun(
+        cls,
+        number: int,
+        stamp_ns: int,
+        position: Float,
+        own: Float,
+        shared: Float,
+        velocity_sigma: float,
+    ) -> TrackTable:
+        """Return new tracks without observations.
+
+        Args:
+            number: Number of the first one.
+            stamp_ns: Time of the scan.
+            position: Positions, shape (K, 2) [m].
+            own: Covariances of the measurements, shape (K, 2, 2).
+            shared: Covariances that the pose adds, shape (K, 2, 2).
+            velocity_sigma: Standard deviation of the velocities [m/s].
+        """
+        t = cls.empty(len(position))
+        t.number[:] = number + np.arange(len(t))
+        t.x[:, :2] = position
+        t.P[:, :2, :2] = own + shared
+        t.P[:, 2, 2] = t.P[:, 3, 3] = velocity_sigma**2
+        t.shared[:] = shared
+        t.stamp_ns[:] = t.first_ns[:] = stamp_ns
+        return t
+
     def __len__(self) -> int:
         return len(self.number)
 
     def copy(self) -> TrackTable:
-        """An independent copy."""
+        """Return an independent copy."""
         return TrackTable(*(getattr(self, f.name).copy() for f in fields(self)))
 
     def take(self, rows: Bool) -> TrackTable:
-        """The rows where the mask holds."""
+        """Return the rows where the mask is true."""
         return TrackTable(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def extended(self, more: TrackTable) -> TrackTable:
-        """These rows and then the others."""
+        """Return these rows, followed by others."""
         return TrackTable(
             *(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self))
         )
 
     def as_rows(self) -> Rows:
-        """The same columns."""
+        """Return the same columns for compiled code."""
         return Rows(*(getattr(self, f.name) for f in fields(self)))
-
-    def with_room(self, room: int) -> Rows:
-        """A copy with room for so many rows, at least as many as there are."""
-        rows = self.as_rows()
-        wide = Rows(*(np.empty((room, *column.shape[1:]), column.dtype) for column in rows))
-        for into, column in zip(wide, rows, strict=True):
-            into[: len(self)] = column
-        return wide
 
 
 class Rows(NamedTuple):
-    """The columns of a `TrackTable`, of which the first rows are trees and the others room for more."""
+    """The columns of a `TrackTable` for compiled code."""
 
     number: Int
+    landmark: Int
     x: Float
     P: Float
     shared: Float
@@ -123,70 +180,66 @@ class Rows(NamedTuple):
     sides: Int
     verdict: Int
 
-    def first(self, count: int) -> TrackTable:
-        """So many rows, which are not copied."""
-        return TrackTable(**{name: column[:count] for name, column in self._asdict().items()})
+
+@compiled
+def join(rows: Rows, old: int, young: int) -> None:
+    """Add the track of one row to another row, in place. The row `young` stays unchanged; the caller removes
+    it."""
+    x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
+    hits, sides, verdict = rows.hits, rows.sides, rows.verdict
+    # Two halves of one trunk in one scan count once. Earlier scans that showed both halves count twice.
+    if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
+        hits[old] -= 1
+    row, own, common = np.array([old]), np.empty((1, 2, 2)), np.empty((1, 2, 2))
+    for a in range(2):
+        for b in range(2):
+            own[0, a, b], common[0, a, b] = P[young, a, b] - shared[young, a, b], shared[young, a, b]
+    other = split(P, shared, row, own, common, np.zeros(1), 0.0)[0]
+    state, covariance = fuse(x[old], P[old], x[young], other)
+    for a in range(4):
+        x[old, a] = state[a]
+        for b in range(4):
+            P[old, a, b] = covariance[a, b]
+    stamp_ns[old] = max(stamp_ns[old], stamp_ns[young])
+    first_ns[old] = min(first_ns[old], first_ns[young])
+    sides[old] |= sides[young]
+    # A new track has no class yet, which does not change the class of the older one.
+    if verdict[young] == Verdict.TREE or verdict[old] < 0:
+        verdict[old] = verdict[young]
+    hits[old] += hits[young]
+    rows.score[old] = max(rows.score[old], rows.score[young])
+    for total in (rows.eccentricity, rows.radius, rows.radius_weight, rows.radius_reach, rows.radius_above):
+        total[old] += total[young]
+    for number in (rows.eccentricities, rows.radii):
+        number[old] += number[young]
 
 
 @compiled_borrowing
-def begin(
-    rows: Rows,
-    count: int,
-    number: int,
-    stamp_ns: int,
-    z: Float,
-    R: Float,
-    B: Float,
-    velocity_sigma: float,
+def _fill_fused(
+    x: Float, P: Float, other_x: Float, Q: Float, state: Float, K: Float, M: Float, joined: Float
 ) -> None:
-    """New trees behind the first rows, for which there is room, none of them seen yet.
-
-    Args:
-        number: Of the first one.
-        z: Places, shape (K, 2) [m]; R: their own covariances, shape (K, 2, 2); B: what the pose adds.
-    """
-    for k in range(z.shape[0]):
-        t = count + k
-        rows.number[t] = number + k
-        rows.x[t, 0], rows.x[t, 1], rows.x[t, 2], rows.x[t, 3] = z[k, 0], z[k, 1], 0.0, 0.0
-        for a in range(4):
-            for b in range(4):
-                rows.P[t, a, b] = 0.0
-        for a in range(2):
-            for b in range(2):
-                rows.P[t, a, b] = R[k, a, b] + B[k, a, b]
-                rows.shared[t, a, b] = B[k, a, b]
-        rows.P[t, 2, 2] = rows.P[t, 3, 3] = velocity_sigma**2
-        rows.stamp_ns[t] = rows.first_ns[t] = stamp_ns
-        rows.hits[t], rows.score[t] = 0, 1.0
-        rows.eccentricity[t], rows.eccentricities[t] = 0.0, 0
-        rows.radius[t], rows.radius_weight[t], rows.radius_reach[t] = 0.0, 0.0, 0.0
-        rows.radius_above[t], rows.radii[t] = 0.0, 0
-        rows.sides[t], rows.verdict[t] = 0, -1
+    S00, S01 = P[0, 0] + Q[0, 0], P[0, 1] + Q[0, 1]
+    S10, S11 = P[1, 0] + Q[1, 0], P[1, 1] + Q[1, 1]
+    det = S00 * S11 - S01 * S10
+    y0, y1 = other_x[0] - x[0], other_x[1] - x[1]
+    for a in range(4):
+        K[a, 0] = (P[a, 0] * S11 - P[a, 1] * S10) / det
+        K[a, 1] = (P[a, 1] * S00 - P[a, 0] * S01) / det
+        state[a] = x[a] + K[a, 0] * y0 + K[a, 1] * y1
+    for a in range(4):
+        for b in range(4):
+            M[a, b] = P[a, b] - K[a, 0] * P[0, b] - K[a, 1] * P[1, b]
+    for a in range(4):
+        for b in range(a, 4):
+            KQ0, KQ1 = K[a, 0] * Q[0, 0] + K[a, 1] * Q[1, 0], K[a, 0] * Q[0, 1] + K[a, 1] * Q[1, 1]
+            joined[a, b] = M[a, b] - M[a, 0] * K[b, 0] - M[a, 1] * K[b, 1] + KQ0 * K[b, 0] + KQ1 * K[b, 1]
+            joined[b, a] = joined[a, b]
 
 
-@compiled_borrowing
-def keep(rows: Rows, kept: Bool) -> int:
-    """Let the kept ones of the first rows, shape (T,), move together in their order; returns their number."""
-    n = 0
-    for t in range(kept.shape[0]):
-        if not kept[t]:
-            continue
-        if n < t:
-            rows.number[n] = rows.number[t]
-            for a in range(4):
-                rows.x[n, a] = rows.x[t, a]
-                for b in range(4):
-                    rows.P[n, a, b] = rows.P[t, a, b]
-            for a in range(2):
-                for b in range(2):
-                    rows.shared[n, a, b] = rows.shared[t, a, b]
-            rows.stamp_ns[n], rows.first_ns[n] = rows.stamp_ns[t], rows.first_ns[t]
-            rows.hits[n], rows.score[n] = rows.hits[t], rows.score[t]
-            rows.eccentricity[n], rows.eccentricities[n] = rows.eccentricity[t], rows.eccentricities[t]
-            rows.radius[n], rows.radius_weight[n] = rows.radius[t], rows.radius_weight[t]
-            rows.radius_reach[n], rows.radius_above[n] = rows.radius_reach[t], rows.radius_above[t]
-            rows.radii[n], rows.sides[n] = rows.radii[t], rows.sides[t]
-            rows.verdict[n] = rows.verdict[t]
-        n += 1
-    return n
+@compiled
+def fuse(x: Float, P: Float, other_x: Float, other_P: Float) -> tuple[Float, Float]:
+    """Return state, shape (4,), and covariance, shape (4, 4), of the first of two independent estimates, with
+    its position corrected by that of the second."""
+    state, joined = np.empty(4), np.empty((4, 4))
+    _fill_fused(x, P, other_x, other_P, state, np.empty((4, 2)), np.empty((4, 4)), joined)
+    return state, joined

@@ -1,4 +1,4 @@
-"""The tracker: which detection belongs to which tree, and what becomes of the trees (Eq. 10, 12)."""
+"""The tracker: a Kalman filter per tree (Eq. 10), on the data association of SLAM."""
 
 from __future__ import annotations
 
@@ -7,153 +7,208 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.config.stages import Classification, Tracking
-from pipeline.geometry.poses import Float, Pose2
+from pipeline.geometry.gaussian import in_map, spread_by_pose
+from pipeline.geometry.poses import Float
 from pipeline.loop_closure.map_correction import Bend
+from pipeline.tracking.identity import follow, merge_near, stand_apart, tracks_of
 from pipeline.tracking.kalman import ENGINES
-from pipeline.tracking.map_correction import bent, held
-from pipeline.tracking.track_classification import SCORE_STANDING, judge, learn_between
-from pipeline.tracking.track_table import Rows, TrackTable, begin
-from pipeline.tracking.track_update import hold, recognise, take
-from pipeline.tracking.tracking_inputs import Found, Limits, Sight
-from pipeline.tracking.tree_records import trees_of
-from pipeline.types.records import Columns, Detections, Int, Landmarks, Trees
+from pipeline.tracking.observation import FigureLimits, add_observations, table_figures
+from pipeline.tracking.split_covariance_intersection import split
+from pipeline.tracking.track_classification import classify, classify_new
+from pipeline.tracking.track_table import NO_LANDMARK, ScanPose, TrackTable
+from pipeline.types.records import Columns, Detections, Int, Landmarks, PoseEstimate, Trees, Verdict
 
-_ROOM = 64  # rows more than are needed, at least
+NANOSECONDS = 1e-9
+SHARED_SIGMA = 0.01  # m; error that all views of a trunk share, by its bark and its taper
+SHARED_COVARIANCE = SHARED_SIGMA**2 * np.eye(2)
+COLUMN_SIGMA = 0.1  # m; of the axis of a voxel column that was seen from one side
+LOOP_DISTANCE = 1.0  # m; trees of before and after a loop that are nearer are one
 
 
 class Tracker:
-    """The trees of the map. A tree's number is given once and never used again."""
+    """The trees of the map.
+
+    Attributes:
+        parameters: Parameters of the stage.
+        next_number: Number of the next new tree; a number is given once.
+        tracks: State of each tree; the next scan changes it in place.
+    """
 
     def __init__(self, parameters: Tracking) -> None:
         self.parameters = parameters
         self.next_number = 1
         self.tracks = TrackTable.empty()
         nothing = np.zeros((3, 3))
-        self._sight = Sight(
-            0, np.zeros(3), nothing, nothing, np.zeros(0), 0.0
-        )  # of the scan that is processed
-
-    @property
-    def tracks(self) -> TrackTable:
-        """What is known of each tree, as it stands: the columns change with the next scan."""
-        return self._rows.first(self._count)
-
-    @tracks.setter
-    def tracks(self, tracks: TrackTable) -> None:
-        self._rows: Rows = tracks.with_room(len(tracks) + _ROOM)
-        self._count = len(tracks)
+        self._scan = ScanPose(0, np.zeros(3), nothing, nothing)  # of the last scan
 
     def process(
         self,
         stamp_ns: int,
-        T_map_base: Pose2,
-        pose_covariance: Float,
+        estimate: PoseEstimate,
         detections: Detections,
-        clear_range: Float,
-        view_range: float,
+        landmarks: Landmarks,
         heights: Float | None = None,
-        relative: Float | None = None,
     ) -> None:
-        """Take the detections of one scan.
+        """Update the trees with the detections of one scan.
 
         Args:
-            stamp_ns: Of the scan.
-            T_map_base: The pose that SLAM found (Eq. 9); pose_covariance: its covariance, (3, 3).
-            detections: In the base frame.
-            clear_range: How far the view was free by direction.
-            view_range: A tree nearer than this can be missed [m].
-            heights: Mean height above the ground at which each detection was seen, shape (D,) [m], NaN
-                where it is not known; None where none is.
-            relative: Covariance of the pose with respect to the trees around, which decides how far from a
-                tree its detection may lie, shape (3, 3); None takes that in the frame of the map.
+            stamp_ns: Time of the scan.
+            estimate: Pose by SLAM (Eq. 9), with the landmark of each detection.
+            detections: Detections in the base frame.
+            landmarks: Landmarks of SLAM after the scan.
+            heights: Mean height above the ground of each detection, shape (D,) [m], NaN where unknown; None
+                where all are unknown.
         """
-        p, limits = self.parameters, limits_of(self.parameters)
-        near = pose_covariance if relative is None else relative
-        self._sight = Sight(
-            stamp_ns, T_map_base.as_array(), pose_covariance, near, clear_range, float(view_range)
-        )
-        found = found_of(detections, heights, p.breast_height)
-        self._make_room(len(detections.cluster))
-        rows, sight = self._rows, self._sight
-        of = recognise(rows, self._count, sight, found, limits)
-        ENGINES[p.engine](rows.x, rows.P, of.seen, of.dt, p.acceleration_sigma, of.z, of.R)
-        self._count, self.next_number = take(rows, self._count, self.next_number, sight, found, of, limits)
+        p, d = self.parameters, detections
+        scan = self._follow(stamp_ns, estimate, landmarks, landmarks.gate, landmarks.distance_max)
+        births = estimate.landmark_of
+        row = tracks_of(self.tracks.landmark, births)
+        position, own, added = in_map(d.centre, d.covariance, scan.pose, scan.covariance)
 
-    def anchor(self, landmarks: Float, covariance: Float, T_map_base: Pose2, reach: float) -> None:
-        """Hold the trees in reach to SLAM's landmarks (see `pipeline.tracking.landmark_anchoring`)."""
-        sight = self._sight._replace(pose=T_map_base.as_array(), view_range=float(reach))
-        limits = limits_of(self.parameters)
-        self._count = hold(self._rows, self._count, sight, landmarks, covariance, limits)
+        # Trees that are seen again: one update of the Kalman filter.
+        t, seen = self.tracks, np.flatnonzero(row >= 0)
+        rows = row[seen]
+        self._restart(rows, position[seen], own[seen], landmarks)
+        dt = np.multiply(stamp_ns - t.stamp_ns[rows], NANOSECONDS, dtype=np.float64)
+        R = split(t.P, t.shared, rows, own[seen], added[seen], dt, p.acceleration_sigma)
+        ENGINES[p.engine](t.x, t.P, rows, dt, p.acceleration_sigma, position[seen], R)
+        t.stamp_ns[rows] = stamp_ns
 
-    def bend(self, bend: Bend, stamps_ns: Int) -> None:
-        """Move the trees with a path that was bent; `stamps_ns`: of its scans, ascending."""
-        self.tracks = bent(self.tracks, np.searchsorted(stamps_ns, self.tracks.first_ns), bend)
+        # New landmarks: new trees. A landmark next to a tree is another part of its trunk.
+        new = np.flatnonzero((row < 0) & (births != NO_LANDMARK))
+        new = new[stand_apart(position[new], t.x, p.proximity_radius)] if len(new) else new
+        if len(new):
+            row[new] = len(t) + np.arange(len(new))
+            self._begin(stamp_ns, births[new], position[new], own[new], added[new])
 
-    def hold_to(self, known: Landmarks, bend: Bend, stamps_ns: Int) -> None:
-        """After `bend`: trees that were put on the map from a doubtful place stand where SLAM's landmarks do
-        or nowhere, and a landmark without a tree, for it was given up meanwhile, begins one.
-
-        Args:
-            known: The well known landmarks, after the bend; bend, stamps_ns: as in `bend`.
-        """
-        first = np.searchsorted(stamps_ns, self.tracks.first_ns)
-        self.tracks, left = held(self.tracks, first > bend.first, known, self.parameters.distance_max)
-        self._make_room(len(left))
-        begin(
-            self._rows, self._count, self.next_number, 0, known.position[left], known.covariance[left],
-            known.shared[left], self.parameters.velocity_sigma,
+        known = np.flatnonzero(row >= 0)
+        above = np.full(len(row), np.nan) if heights is None else heights - p.breast_height
+        add_observations(
+            self.tracks.as_rows(), row[known], position[known], scan.pose, d.eccentricity[known],
+            d.radius[known], d.radius_sigma[known], d.arc[known], above[known],
         )  # fmt: skip
-        rows = slice(self._count, self._count + len(left))
-        self._count, self.next_number = rows.stop, self.next_number + len(left)
-        t = self.tracks
-        t.first_ns[rows] = t.stamp_ns[rows] = stamps_ns[known.scan[left]]
-        t.hits[rows] = known.hits[left]
-        t.score[rows] = np.minimum(known.hits[left], SCORE_STANDING)
+        kept = merge_near(self.tracks.as_rows(), rows, p.proximity_radius)
+        if not kept.all():
+            self.tracks = self.tracks.take(kept)
 
-    def judge(self, stamp_ns: int, columns: Columns, parameters: Classification) -> Columns:
-        """Take the verdicts of what was gathered (see `pipeline.tracking.track_classification`).
+    def bend(self, bend: Bend, stamps_ns: Int, estimate: PoseEstimate, landmarks: Landmarks) -> None:
+        """Move the trees after a loop closure.
 
         Args:
-            stamp_ns: Of the scan.
-            columns: As the votes and rules have them.
-            parameters: Of the votes, how many a tree needs; and how far away returns were gathered.
+            bend: The correction of the path.
+            stamps_ns: Time of each scan of the path.
+            estimate: Pose after the correction.
+            landmarks: Landmarks after the correction.
+        """
+        t = self.tracks
+        t.x[:, :2], turn = bend.of_trees(t.x[:, :2], np.searchsorted(stamps_ns, t.first_ns))
+        c, s = np.cos(turn), np.sin(turn)
+        C = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+        t.x[:, 2:] = np.einsum("nij,nj->ni", C, t.x[:, 2:])
+        for a in (slice(0, 2), slice(2, 4)):
+            for b in (slice(0, 2), slice(2, 4)):
+                t.P[:, a, b] = C @ t.P[:, a, b] @ C.transpose(0, 2, 1)
+        t.shared[:] = C @ t.shared @ C.transpose(0, 2, 1)
+        self._follow(self._scan.stamp_ns, estimate, landmarks, np.inf, LOOP_DISTANCE)
+
+    def classify(self, stamp_ns: int, columns: Columns, parameters: Classification) -> Columns:
+        """Classify the trees by the voxel columns, and begin a tree at each tree column without one.
+
+        Args:
+            stamp_ns: Time of the scan.
+            columns: Columns with the verdicts of votes and rules.
+            parameters: Parameters of the classification.
 
         Returns:
-            The columns with those as trees too that the tracks back (see `round_fit_override`).
+            The columns, of which those that `confirm_round` changes are trees.
         """
         verdict = columns.verdict.copy()
-        self._make_room(len(verdict))
-        self._count, self.next_number = judge(
-            self._rows, self._count, self.next_number, self._sight._replace(stamp_ns=stamp_ns), columns.axis,
-            columns.share, verdict, parameters.tree_share, parameters.range_max,
-            self.parameters.velocity_sigma,
+        scan = self._scan._replace(stamp_ns=stamp_ns)
+        new = classify(
+            self.tracks.as_rows(), scan, columns.axis, columns.share, verdict, parameters.tree_share,
+            parameters.range_max,
         )  # fmt: skip
+        if len(new):
+            position = columns.axis[new, :2]
+            own = np.tile(COLUMN_SIGMA**2 * np.eye(2), (len(new), 1, 1))
+            added = spread_by_pose(position, scan.pose, scan.covariance)
+            self._begin(stamp_ns, np.full(len(new), NO_LANDMARK), position, own, added)
+            self.tracks.verdict[-len(new) :] = Verdict.TREE
         return replace(columns, verdict=verdict)
 
-    def learn_between(self, columns: Columns) -> None:
-        """Take the verdicts of columns as `judge` left them, for tracks that came since."""
-        learn_between(self._rows, self._count, columns.axis, columns.verdict)
+    def classify_new(self, columns: Columns) -> None:
+        """Classify trees that have no class yet by columns that `classify` returned."""
+        classify_new(self.tracks.as_rows(), columns.axis, columns.verdict)
 
     def trees(self) -> Trees:
-        """The map as it stands (Table 2)."""
-        return trees_of(self.tracks, self.parameters)
+        """Return the map (Table 2); its columns are copies."""
+        t, p = self.tracks, self.parameters
+        limits = FigureLimits(p.hits_to_confirm, np.radians(p.dbh_arc_min), p.out_of_round, p.taper_sigma)
+        coverage, dbh, dbh_sigma, eccentricity, confirmed = table_figures(t.as_rows(), limits)
+        return Trees(
+            number=t.number.copy(),
+            position=t.x[:, :2].copy(),
+            covariance=t.P[:, :2, :2] + SHARED_COVARIANCE,
+            velocity=t.x[:, 2:].copy(),
+            dbh=dbh,
+            dbh_sigma=dbh_sigma,
+            eccentricity=eccentricity,
+            observations=t.hits.copy(),
+            coverage=coverage,
+            first_seen_ns=t.first_ns.copy(),
+            last_seen_ns=t.stamp_ns.copy(),
+            confirmed=confirmed,
+            sides=t.sides.copy(),
+        )
 
-    def _make_room(self, more: int) -> None:
-        if self._count + more > len(self._rows.number):
-            self._rows = self.tracks.with_room(2 * (self._count + more) + _ROOM)
+    def _follow(
+        self, stamp_ns: int, estimate: PoseEstimate, landmarks: Landmarks, gate: float, distance_max: float
+    ) -> ScanPose:
+        """Let the trees follow the landmarks, and remove trees without landmark and column."""
+        relative = estimate.covariance if estimate.relative is None else estimate.relative
+        self._scan = ScanPose(stamp_ns, estimate.T_map_base.as_array(), estimate.covariance, relative)
+        kept = follow(
+            self.tracks.as_rows(), self._scan, landmarks.birth, landmarks.position, landmarks.covariance,
+            landmarks.score, float(gate), float(distance_max),
+        )  # fmt: skip
+        if not kept.all():
+            self.tracks = self.tracks.take(kept)
+        return self._scan
 
+    def _restart(self, rows: Int, position: Float, own: Float, landmarks: Landmarks) -> None:
+        """Restart the filters of trees at their landmarks where their detections are beyond the gate.
 
-def limits_of(parameters: Tracking) -> Limits:
-    """What compiled loops ask of the parameters."""
-    p = parameters
-    return Limits(
-        p.acceleration_sigma, p.velocity_sigma, p.gate, p.distance_max, p.proximity_radius,
-        1.0 / p.misses_per_hit,
-    )  # fmt: skip
+        That happens when SLAM corrects its map, or when another particle with another map is the best one.
 
+        Args:
+            rows: Rows of trees with a detection, shape (K,).
+            position: Positions of the detections in the map, shape (K, 2) [m].
+            own: Their own covariances, shape (K, 2, 2).
+            landmarks: The landmarks.
+        """
+        t, scan = self.tracks, self._scan
+        y = position - t.x[rows, :2]
+        S = t.P[rows, :2, :2] - t.shared[rows] + spread_by_pose(t.x[rows, :2], scan.pose, scan.relative) + own
+        # d^2 > gate^2, for d^2 = y^T S^-1 y written with the adjugate of S
+        squared = S[:, 1, 1] * y[:, 0] ** 2 - 2.0 * S[:, 0, 1] * y[:, 0] * y[:, 1] + S[:, 0, 0] * y[:, 1] ** 2
+        determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
+        rows = rows[squared > landmarks.gate**2 * determinant]
+        if not len(rows):
+            return
+        order = np.argsort(landmarks.birth)
+        at = order[np.searchsorted(landmarks.birth[order], t.landmark[rows])]
+        added = spread_by_pose(landmarks.position[at], scan.pose, scan.covariance)
+        t.x[rows, :2] = landmarks.position[at]
+        t.shared[rows] = added
+        t.P[rows, :2, :2] = landmarks.covariance[at][:, [0, 1, 1, 2]].reshape(-1, 2, 2) + added
+        t.P[rows, :2, 2:] = 0.0  # the position of the landmark is not correlated with the velocity
+        t.P[rows, 2:, :2] = 0.0
 
-def found_of(detections: Detections, heights: Float | None, breast_height: float) -> Found:
-    """The detections as compiled loops take them; heights: see `Tracker.process`."""
-    d = detections
-    above = np.full(len(d.cluster), np.nan) if heights is None else heights - breast_height
-    return Found(d.centre, d.covariance, d.eccentricity, d.radius, d.radius_sigma, d.arc, above)
+    def _begin(self, stamp_ns: int, landmark: Int, position: Float, own: Float, added: Float) -> None:
+        """Begin trees, see `TrackTable.begun`."""
+        new = TrackTable.begun(
+            self.next_number, stamp_ns, position, own, added, self.parameters.velocity_sigma
+        )
+        new.landmark[:] = landmark
+        self.tracks = self.tracks.extended(new)
+        self.next_number += len(new)

@@ -271,19 +271,22 @@ class HeightMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Trees as SLAM has them, in the frame of the map; columns of length L.
+    """The landmarks of SLAM, in the frame of the map; columns of length L.
 
     Attributes:
+        birth: int64, serial number of the detection that began the landmark: its identity.
         position: shape (L, 2) [m].
-        covariance: Of the views, shape (L, 2, 2); shared: of the poses that they were begun from.
-        hits: int64, how often each was recognised; scan: int64, that each was begun at.
+        covariance: xx, xy, yy, shape (L, 3) [m^2], given the path.
+        score: Hits less misses in free view, of the last hits; below 0 it was missed more often than seen.
+        gate, distance_max: Limits of the data association [sigma], [m].
     """
 
+    birth: Int
     position: Float
     covariance: Float
-    shared: Float
-    hits: Int
-    scan: Int
+    score: Float
+    gate: float
+    distance_max: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -300,6 +303,8 @@ class PoseEstimate:
         resampled: Whether the particles were resampled at this scan.
         health: How far it can be trusted.
         relative: Covariance with respect to the landmarks around, shape (3, 3); None: `covariance`.
+        landmark_of: Birth of the landmark that SLAM associates with each detection, int64, shape (D,); -1 for
+            a detection without landmark.
     """
 
     T_map_base: Pose2
@@ -311,6 +316,7 @@ class PoseEstimate:
     resampled: bool
     health: Health = field(default_factory=Health)
     relative: Float | None = None
+    landmark_of: Int = field(default_factory=lambda: np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -86,15 +86,13 @@ def seen_in(uri: str, parameters: Parameters | None = None) -> tuple[list[Seen],
 def mapped(rows: Sequence[Seen], truth: Truth, parameters: Parameters, seed: int) -> Mapped:
     """SLAM and tracking over a run."""
     slam, tracker = BackEnd(parameters.slam, seed), Tracker(parameters.tracking)
-    reach = parameters.slam.view_range
     before: Pose2 | None = None
     sigma = np.zeros(len(rows))
     for k, seen in enumerate(rows):
         motion = Pose2() if before is None else before.inverse() @ seen.odometry
         before = seen.odometry
         at = slam.process(k, motion, seen.detections, seen.clear)
-        tracker.process(seen.stamp_ns, at.T_map_base, at.covariance, seen.detections, seen.clear, reach)
-        tracker.anchor(*slam.landmarks(), at.T_map_base, reach)
+        tracker.process(seen.stamp_ns, at, seen.detections, slam.landmarks())
         sigma[k] = np.sqrt(0.5 * (at.covariance[0, 0] + at.covariance[1, 1]))
     poses = slam.path()
     path = Path(np.array([s.stamp_ns for s in rows]), poses[:, 0], poses[:, 1], poses[:, 2], sigma)

@@ -16,6 +16,8 @@ from pipeline.types.records import (
     Clusters,
     Detections,
     Labels,
+    Landmarks,
+    PoseEstimate,
     Scan,
     Sensor,
     Step,
@@ -88,6 +90,37 @@ def detections(centre, *, sigma=0.03, radius=0.15, arc=1.0):
         arc=np.full(n, arc),
         eccentricity=np.full(n, 5.0),
     )
+
+
+def track(tracker, stamp_ns, pose, covariance, found, *, births=None, gone=(), heights=None):
+    """Update a tracker with a scan, as SLAM would associate it.
+
+    Args:
+        tracker: The tracker.
+        stamp_ns: Time of the scan.
+        pose, covariance: Pose of the base and its covariance.
+        found: Detections.
+        births: Landmark of each detection; by default the row.
+        gone: Landmarks of trees that the map of SLAM no longer holds.
+        heights: See `Tracker.process`.
+    """
+    births = np.arange(len(found.cluster)) if births is None else np.asarray(births, np.int64)
+    old = tracker.tracks.landmark
+    old = np.flatnonzero((old >= 0) & ~np.isin(old, births) & ~np.isin(old, gone))
+    mine = births >= 0
+    position = np.concatenate([pose.apply(found.centre[mine]), tracker.tracks.x[old, :2]])
+    landmarks = Landmarks(
+        np.concatenate([births[mine], tracker.tracks.landmark[old]]),
+        position,
+        np.tile([1e-4, 0.0, 1e-4], (len(position), 1)),
+        np.ones(len(position)),
+        gate=3.5,
+        distance_max=1.0,
+    )
+    estimate = PoseEstimate(
+        pose, covariance, pose.as_array()[None], np.ones(1), 1.0, position, False, landmark_of=births
+    )
+    tracker.process(stamp_ns, estimate, found, landmarks, heights)
 
 
 def clusters(**columns: Any):

@@ -23,6 +23,8 @@ from pipeline.errors import StemmapError
 
 R = TypeVar("R")
 NOT_SAVED = "not saved"  # in the metadata of a field that is not saved and gets its default
+# In the metadata of a field that files of an earlier version lack: a function that makes it from the others.
+ADDED = "added"
 _ALIGN = 8
 _hints = cache(typing.get_type_hints)
 
@@ -139,10 +141,22 @@ def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN
 
 def _record(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN401
     wanted = _saved(kind)
-    if not isinstance(tree, dict) or set(tree) != set(wanted):
+    if not isinstance(tree, dict):
         raise ValueError(f"{name} does not have the fields of this version")
+    added: dict[str, Any] = {}
+    if set(tree) != set(wanted):
+        added = {
+            f.name: f.metadata[ADDED] for f in fields(kind) if ADDED in f.metadata and f.name not in tree
+        }
+        if set(tree) != set(wanted) - set(added):
+            raise ValueError(f"{name} does not have the fields of this version")
     kinds = _hints(kind)
-    return kind(**{part: _decoded(kinds[part], tree[part], blob, f"{name}.{part}") for part in wanted})
+    parts = {
+        part: _decoded(kinds[part], tree[part], blob, f"{name}.{part}")
+        for part in wanted
+        if part not in added
+    }
+    return kind(**parts, **{part: make(parts) for part, make in added.items()})
 
 
 def _tuple(of: tuple[Any, ...], tree: Any, blob: _Block, name: str) -> tuple[Any, ...]:  # noqa: ANN401

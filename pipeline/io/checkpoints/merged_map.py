@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.classification import PackedVoxelMap
 from pipeline.classification.voxel_map import TILE
 from pipeline.config import Parameters
+from pipeline.geometry.gaussian import spread_by_pose
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.slam import SlamState
@@ -16,9 +17,8 @@ from pipeline.slam.association import associate
 from pipeline.slam.frame_uncertainty import FrameMemory, carried
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import MapColumns, shared_map
-from pipeline.tracking.merge import join
 from pipeline.tracking.observation import SECTORS
-from pipeline.tracking.track_table import TrackTable
+from pipeline.tracking.track_table import NO_LANDMARK, TrackTable, join
 from pipeline.types.records import Bool, Columns, Int, Verdict
 
 GATE = 5.0  # sigma; largest distance of observations of one tree
@@ -55,10 +55,11 @@ def merge_maps(
         parameters: Parameters of all stages.
     """
     moved = _moved_tracks(b.tracks, T_a_b, covariance, stamp_shift_ns)
+    moved.landmark[moved.landmark != NO_LANDMARK] += a.slam.detections
     slack = parameters.relocalisation.slack**2
     row_of, _ = associate(
         moved.x[:, :2], _flat(moved.P) + np.array([slack, 0.0, slack]), a.tracks.x[:, :2], _flat(a.tracks.P),
-        GATE, parameters.tracking.distance_max,
+        GATE, parameters.slam.distance_max,
     )  # fmt: skip
     fresh = row_of < 0
     number_of = np.zeros(len(moved), np.int64)
@@ -69,7 +70,7 @@ def merge_maps(
     distance[~fresh] = np.hypot(gap[:, 0], gap[:, 1])
     both = a.tracks.extended(moved)
     for k in np.flatnonzero(~fresh):
-        join(both, int(row_of[k]), len(a.tracks) + int(k))
+        join(both.as_rows(), int(row_of[k]), len(a.tracks) + int(k))
     matched = row_of[~fresh]
     shown = (moved.verdict[~fresh] < 0) & (moved.hits[~fresh] >= parameters.tracking.hits_to_confirm)
     hidden = ((a.tracks.verdict[matched] < 0) | shown) & (both.verdict[matched] != Verdict.TREE)
@@ -79,7 +80,7 @@ def merge_maps(
     path = np.concatenate([a.slam.genealogy.path(a.slam.best), _moved_path(b, T_a_b)])
     merged = replace(
         a,
-        slam=_slam(a.slam, b.slam, T_a_b, covariance, path, parameters.tracking.distance_max),
+        slam=_slam(a.slam, b.slam, T_a_b, covariance, path, parameters.slam.distance_max),
         memory=_memory(a.memory, b.memory, T_a_b, len(path), 1 << parameters.classification.voxels_log2),
         columns=_columns(a.columns, b.columns, T_a_b),
         tracks=tracks,
@@ -108,7 +109,7 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
     moved.x[:] = tracks.x @ C.T
     moved.x[:, :2] += [T.x, T.y]
     moved.P[:] = C @ tracks.P @ C.T
-    of_the_frame = _of_the_frame(moved.x[:, :2], T, covariance)
+    of_the_frame = spread_by_pose(moved.x[:, :2].copy(), T.as_array(), covariance)
     moved.P[:, :2, :2] += of_the_frame
     moved.shared[:] = C[:2, :2] @ tracks.shared @ C[:2, :2].T + of_the_frame
     moved.stamp_ns[:] += shift_ns
@@ -117,16 +118,6 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
     all_sides = (1 << SECTORS) - 1
     moved.sides[:] = ((tracks.sides << turn) | (tracks.sides >> (SECTORS - turn))) & all_sides
     return moved
-
-
-def _of_the_frame(place: Float, T: Pose2, covariance: Float) -> Float:
-    """Return the covariance that the pose of a frame, with covariance S of shape (3, 3), adds to positions
-    (N, 2) in it after the transformation: J S J^T with J = d position / d (x, y, yaw), shape (N, 2, 2)."""
-    J = np.zeros((len(place), 2, 3))
-    J[:, 0, 0] = J[:, 1, 1] = 1.0
-    J[:, 0, 2], J[:, 1, 2] = T.y - place[:, 1], place[:, 0] - T.x
-    spread: Float = J @ covariance @ J.transpose(0, 2, 1)
-    return spread
 
 
 def _moved_path(b: SavedMap, T: Pose2) -> Float:
@@ -141,7 +132,7 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
     C = T.rotation()
     full = other.covariance[:, [[0, 1], [1, 2]]]
     mean = T.apply(other.mean)
-    R = _flat(C @ full @ C.T + _of_the_frame(mean, T, covariance))
+    R = _flat(C @ full @ C.T + spread_by_pose(mean, T.as_array(), covariance))
     row_of, _ = associate(mean, R, known.mean, known.covariance, np.inf, reach)
     new = row_of < 0
     moved = MapColumns(mean, R, other.hits, other.score, other.birth + a.detections)

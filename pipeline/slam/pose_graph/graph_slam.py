@@ -17,6 +17,7 @@ from pipeline.geometry.gaussian import rows_of
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.loop_closure.map_correction import Bend
 from pipeline.slam import slip_detection
+from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.loop_correction import Loop
 from pipeline.slam.motion import Motion, accumulated, compound, moved_pose, noise_of
 from pipeline.slam.pose_graph.keyframe import observe, placed
@@ -27,7 +28,7 @@ from pipeline.slam.running_statistics import Doubted, Recent, remembered
 from pipeline.slam.scan_statistics import ScanTold, disagreement
 from pipeline.slam.state import SlamState
 from pipeline.types.pose_health import Health
-from pipeline.types.records import Detections, Landmarks, PoseEstimate, PoseMeasurement
+from pipeline.types.records import Detections, Int, Landmarks, PoseEstimate, PoseMeasurement
 
 KEYFRAME = 0.25  # m; views from nearer places share their errors and cost as much
 
@@ -45,6 +46,7 @@ class GraphSlam:
         """See FastSlam.process."""
         motion = Motion(motion) if isinstance(motion, Pose2) else motion
         state, p, scan, doubt = self.state, self.parameters, ScanTold(), motion.doubt
+        births: Int | None = None
         self._move(motion)
         due = state.since_update >= max(KEYFRAME, p.update_distance)
         due = due or motion.measured is not None or motion.slack != (0.0, 0.0)  # news that must not wait
@@ -58,7 +60,7 @@ class GraphSlam:
             state.motion, state.motion_covariance = by_trees.motion, by_trees.covariance
             if by_trees.slipped:
                 state.recent = replace(state.recent, distrust=1.0)
-            scan = observe(state, p, motion, detections, clear_range)
+            scan, births = observe(state, p, motion, detections, clear_range)
             if by_trees.slipped:
                 scan = replace(scan, odometry=away)
             state.recent = remembered(state.recent, scan, driven, doubted)
@@ -66,7 +68,8 @@ class GraphSlam:
         state.since.append(state.motion)
         estimate = self._estimate()
         health = judged(state.recent, scan, 1.0, 1, estimate.covariance, doubt)
-        return replace(estimate, health=health)
+        landmark_of = births_of(detections, estimate, self.landmarks()) if births is None else births
+        return replace(estimate, health=health, landmark_of=landmark_of)
 
     def as_seen(self, pose: PoseMeasurement) -> PoseMeasurement:
         """See FastSlam.as_seen: the graph does not tell what poses of one source err by alike."""
@@ -119,8 +122,8 @@ class GraphSlam:
         return is_astray(self.state.recent)
 
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
-        """After `place`: the pose, with the health of an estimate before it."""
-        return replace(self._estimate(), health=before.health)
+        """See FastSlam.estimate."""
+        return replace(self._estimate(), health=before.health, landmark_of=before.landmark_of)
 
     def lost(self, estimate: PoseEstimate) -> Health:
         """The health of an estimate that no tree has told anything of."""
@@ -134,20 +137,12 @@ class GraphSlam:
         """x, y [m], yaw [rad] at every scan as the graph has it now, shape (N, 3)."""
         return self.state.path()
 
-    def landmarks(self) -> tuple[Float, Float]:
-        """All landmarks: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""
-        known = self.state.landmarks
-        return known.mean, known.covariance.reshape(-1, 4)[:, [0, 1, 3]]
-
-    def known(self) -> Landmarks:
-        """See FastSlam.known; what landmarks share with the frame is taken as that of the newest pose."""
-        s = self.state
-        rows = s.landmarks.hits >= self.parameters.hits_to_weigh
-        known = s.landmarks.take(rows)
-        scan = np.minimum(np.searchsorted(s.keyframe_of, known.begun), len(s.keyframe_of) - 1)
-        shared = np.tile(s.covariance[:2, :2], (len(known.hits), 1, 1))
-        hits = known.hits.astype(np.int64)
-        return Landmarks(known.mean, known.covariance, shared, hits, (len(s.past) + scan).astype(np.int64))
+    def landmarks(self) -> Landmarks:
+        """Return all landmarks."""
+        known, p = self.state.landmarks, self.parameters
+        covariance = known.covariance.reshape(-1, 4)[:, [0, 1, 3]]
+        score = hits_less_misses(known.hits, known.score, p.misses_per_hit)
+        return Landmarks(known.birth, known.mean, covariance, score, p.gate, p.distance_max)
 
     def begun_since(self, scan: int) -> tuple[Float, Float]:
         """See FastSlam.begun_since."""

@@ -19,8 +19,14 @@ from pipeline.slam.scan_statistics import MISSED, MOST_HITS, SHIFT, TOLD, ScanTo
 from pipeline.types.records import Bool, Detections, Int
 
 
-def observe(s: GraphState, p: Slam, motion: Motion, detections: Detections, clear_range: Float) -> ScanTold:
-    """One keyframe more: recognise, add what was seen to the graph, solve it, and judge the map."""
+def observe(
+    s: GraphState, p: Slam, motion: Motion, detections: Detections, clear_range: Float
+) -> tuple[ScanTold, Int]:
+    """Add a keyframe: associate, extend the graph, solve it, and remove landmarks without score.
+
+    Returns:
+        The statistics of the scan, and the birth of the landmark of each detection, shape (D,).
+    """
     centre, R = detections.centre, detections.covariance
     near = _near(s, p, centre)
     m, Sigma = _joint(s, p, near)
@@ -38,11 +44,11 @@ def observe(s: GraphState, p: Slam, motion: Motion, detections: Detections, clea
     seen[row_of[row_of >= 0]] = True
     told[MISSED] = _miss(s, p, m[:3], seen, clear_range)
     scan_covariance = s.motion_covariance
-    _extend(s, p, motion, m[:3], row_of, centre, R, _one_tree(s, p, m, Sigma, near, seen))
+    births = _extend(s, p, motion, m[:3], row_of, centre, R, _one_tree(s, p, m, Sigma, near, seen))
     s.covariance = Sigma[:3, :3]
     scan = scan_told(told[None], np.ones(1), len(centre), scan_covariance)
     s.motion, s.motion_covariance, s.since_update = np.zeros(3), np.zeros((3, 3)), 0.0
-    return scan
+    return scan, births
 
 
 def _near(s: GraphState, p: Slam, centre: Float) -> Int:
@@ -130,8 +136,12 @@ def _extend(
     centre: Float,
     R: Float,
     one_tree: Int,
-) -> None:
-    """Add the keyframe, what was seen from it and the landmarks that are well known now; solve."""
+) -> Int:
+    """Add the keyframe, its detections and the landmarks that are well known now, and solve the graph.
+
+    Returns:
+        The birth of the landmark of each detection, shape (D,).
+    """
     k = s.keyframes
     additions = Additions()
     additions.pose(k, pose)
@@ -163,9 +173,13 @@ def _extend(
     s.pose = poses[-1]
     alive = known.score > 0.0
     alive[one_tree[:, 1]] = False
+    stays = np.arange(len(known.birth))
+    stays[one_tree[:, 1]] = one_tree[:, 0]
+    births: Int = known.birth[stays[row_of]]
     s.landmarks = placed(replace(known, node=node), poses, points).take(alive)
     waiting = s.landmarks.birth[s.landmarks.node < 0]
     s.sightings = s.sightings.take(np.isin(s.sightings.birth, waiting))
+    return births
 
 
 def _count(

@@ -123,8 +123,7 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
         found = _detections(truth, trees_there, random)
         at = slam.process(k, told, found, free)
         stamp_ns = k * 100_000_000
-        tracker.process(stamp_ns, at.T_map_base, at.covariance, found, free, 0.0, relative=at.relative)
-        tracker.anchor(*slam.landmarks(), at.T_map_base, parameters.slam.view_range)
+        tracker.process(stamp_ns, at, found, slam.landmarks())
         if k >= WARM:
             error = at.T_map_base.as_array() - truth.as_array()
             error[2] = wrap_angle(error[2])

@@ -28,7 +28,7 @@ CACHED_KB = 25.0  # kB a scan asked
 CACHED = (
     ("detection.e_max", 40.0),
     ("classification.tree_share", 0.7),
-    ("tracking.gate", 2.5),
+    ("tracking.proximity_radius", 0.3),
     ("slam.particles", 50),
 )
 SEGMENTED = (("clustering.eps", 0.2), ("filters.voxel_size", 0.02))

@@ -53,9 +53,9 @@ class TreeMap:
             y = z - tree.filter.x[:2]
             S = tree.filter.P[:2, :2] + R
             d2 = float(y @ np.linalg.inv(S) @ y)
-            near = math.hypot(y[0], y[1]) <= self.p["tracking.distance_max"]
+            near = math.hypot(y[0], y[1]) <= self.p["slam.distance_max"]
             cost = d2 + math.log(np.linalg.det(S))
-            if k not in taken and near and d2 <= self.p["tracking.gate"] ** 2 and cost < best_cost:
+            if k not in taken and near and d2 <= self.p["slam.gate"] ** 2 and cost < best_cost:
                 best, best_cost = k, cost
         return best
 

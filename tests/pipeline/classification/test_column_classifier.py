@@ -23,7 +23,7 @@ from pipeline.tracking import Tracker
 from pipeline.tracking.track_classification import DUE_NS
 from pipeline.types.records import Columns, Float32, Scan, Sensor, Step, Verdict
 from tests.pipeline.classification.clouds import bush, trunk
-from tests.pipeline.strategies import detections
+from tests.pipeline.strategies import detections, track
 
 FOREST = preset("forest")
 NOWHERE_FREE = np.zeros(BINS)
@@ -128,7 +128,7 @@ def test_a_tree_that_no_scan_showed_begins_a_track_and_keeps_its_number():
     columns = gathered(trunk(5.0, 1.0, 0.15, top=5.9), scans=3).columns
     tracker = Tracker(FOREST.tracking)
     for _ in range(3):
-        tracker.judge(1, columns, FOREST.classification)
+        tracker.classify(1, columns, FOREST.classification)
     trees = tracker.trees()
     assert trees.number.tolist() == [1]
     assert trees.confirmed.tolist() == [True]
@@ -146,14 +146,14 @@ def test_hits_make_no_tree_where_a_column_is_overdue(x, stays):
     shown = []
     for k in range(6):
         found = detections([[5.0, 1.0], [x, -3.0]])
-        tracker.process(k * second, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+        track(tracker, k * second, Pose2(), np.eye(3) * 1e-6, found)
         if k >= 4:
-            tracker.judge(k * second, columns, FOREST.classification)
+            tracker.classify(k * second, columns, FOREST.classification)
             shown.append(tracker.trees().confirmed.tolist())
     assert 5 * second == DUE_NS
     assert shown == [[True, True], [True, stays]]
     late = gathered(trunk(x, -3.0, 0.15, top=5.9), scans=3).columns
-    tracker.judge(2 * DUE_NS, late, FOREST.classification)
+    tracker.classify(2 * DUE_NS, late, FOREST.classification)
     assert tracker.trees().confirmed.tolist() == [True, True], "a column that comes late counts"
 
 
@@ -164,8 +164,8 @@ def test_hits_count_where_returns_are_gathered_only_from_nearer():
         tracker = Tracker(FOREST.tracking)
         for stamp_ns in (0, DUE_NS // 2, DUE_NS):
             far = detections([[6.0, -3.0]])
-            tracker.process(stamp_ns, Pose2(), np.eye(3) * 1e-6, far, NOWHERE_FREE, 15.0)
-        tracker.judge(DUE_NS, nothing, parameters)
+            track(tracker, stamp_ns, Pose2(), np.eye(3) * 1e-6, far)
+        tracker.classify(DUE_NS, nothing, parameters)
         assert tracker.trees().confirmed.tolist() == [stays]
 
 
@@ -187,9 +187,9 @@ def test_hits_make_no_tree_of_who_walked_on(seen_s, unseen_s, stays):
     for k in range(scans):
         stamp_ns = round(1e9 * seen_s * k / (scans - 1))
         found = detections([[20.0, -3.0]])
-        tracker.process(stamp_ns, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+        track(tracker, stamp_ns, Pose2(), np.eye(3) * 1e-6, found)
     assert tracker.trees().confirmed.tolist() == [True]
-    tracker.judge(round(1e9 * (seen_s + unseen_s)), no_columns(), FOREST.classification)
+    tracker.classify(round(1e9 * (seen_s + unseen_s)), no_columns(), FOREST.classification)
     assert tracker.trees().confirmed.tolist() == [stays]
 
 
@@ -202,12 +202,12 @@ def test_a_tree_does_not_outlive_its_column_beside_something_else():
         (Verdict.BUSH, 0.75, True),
     ):
         tracker = Tracker(FOREST.tracking)
-        tracker.judge(0, columns, FOREST.classification)
+        tracker.classify(0, columns, FOREST.classification)
         assert tracker.trees().confirmed.tolist() == [True]
         place = tracker.trees().position[0]
         moved = replace(columns, axis=columns.axis.copy(), verdict=np.full_like(columns.verdict, kind))
         moved.axis[:, :2] = place + np.array([0.0, off])
-        tracker.judge(1, moved, FOREST.classification)
+        tracker.classify(1, moved, FOREST.classification)
         assert tracker.trees().confirmed.tolist() == [stays], kind.label
 
 
@@ -218,9 +218,9 @@ def test_a_piece_that_is_joined_does_not_take_the_verdict_away():
     tracker = Tracker(FOREST.tracking)
     for k in range(5):
         found = detections([[5.0, 1.0]] if k < 4 else [[5.0, 1.0], [5.0, 1.3]])
-        tracker.process(k, Pose2(), np.eye(3) * 1e-6, found, NOWHERE_FREE, 15.0)
+        track(tracker, k, Pose2(), np.eye(3) * 1e-6, found)
         if k == 3:
-            tracker.judge(k, columns, FOREST.classification)
+            tracker.classify(k, columns, FOREST.classification)
             assert tracker.trees().confirmed.tolist() == [False]
     assert tracker.trees().confirmed.tolist() == [False]
 

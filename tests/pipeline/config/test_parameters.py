@@ -299,6 +299,12 @@ def test_values_are_plain_python_numbers():
         assert type(value) in (int, float, bool, str)
 
 
+def test_a_removed_parameter_is_ignored_with_one_warning():
+    with pytest.warns(RenamedParameterWarning, match=r"tracking.gate no longer exists") as warned:
+        assert preset("paper").replace({"tracking.gate": 2.0}) == preset("paper")
+    assert len(warned) == 1
+
+
 def test_names_of_earlier_versions_are_accepted_with_one_warning_each():
     with pytest.warns(RenamedParameterWarning, match=r"slam.looks is now called slam.independent_views_max"):
         by_name = Parameters().replace({"slam.looks": 50.0})

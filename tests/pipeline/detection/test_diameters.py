@@ -11,9 +11,9 @@ from pipeline.config import preset
 from pipeline.detection.cylinder_fit import BEAM, fit_stems
 from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
-from pipeline.tracking.merge import join
 from pipeline.tracking.observation import BUTT, TAPER
-from tests.pipeline.strategies import NOTHING_SEEN, SENSOR, detections
+from pipeline.tracking.track_table import join
+from tests.pipeline.strategies import SENSOR, detections, track
 
 SIGMA, RING_STEP, LOW, HIGH = 0.02, np.radians(2.0), 0.3, 2.0
 VIEWS, TREES = 60, 60
@@ -33,7 +33,7 @@ def show(t, k, distance, radius, sigma, height=BREAST):
     pose = Pose2(-distance * np.cos(bearing), -distance * np.sin(bearing), bearing)
     seen = detections([[distance, 0.0]], radius=radius, arc=np.radians(120.0))
     seen.radius_sigma[:] = sigma
-    t.process(k, pose, np.zeros((3, 3)), seen, NOTHING_SEEN, 0.0, np.array([height]))
+    track(t, k, pose, np.zeros((3, 3)), seen, heights=np.array([height]))
 
 
 def test_a_radius_weighs_by_its_variance_and_the_square_of_its_distance():
@@ -87,7 +87,7 @@ def test_two_halves_of_a_tree_know_their_diameter_as_one_tree_does():
         for t in (whole, low if height < 1.0 else high):
             show(t, k, 4.0, 0.15, 0.02, height)
     halves = low.tracks.extended(high.tracks)
-    join(halves, 0, 1)
+    join(halves.as_rows(), 0, 1)
     low.tracks = halves.take(np.array([True, False]))
     assert low.trees().dbh == pytest.approx(whole.trees().dbh)
     assert low.trees().dbh_sigma == pytest.approx(whole.trees().dbh_sigma)

@@ -24,8 +24,9 @@ from pipeline.slam import BackEnd, Loop
 from pipeline.slam.loop_correction import bent_path, drift_of
 from pipeline.slam.motion import Noise, compounded
 from pipeline.slam.poses import composed, inverse
-from pipeline.tracking.map_correction import bent as bent_tracks
+from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
+from pipeline.types.records import Landmarks, PoseEstimate
 from tests.benchmarks.wide_ring import REACH, SENSOR, WideRing, mapped
 from tests.pipeline.strategies import NOTHING_SEEN, detections, first_of, seeds
 from tests.pipeline.test_mapper import as_bytes
@@ -144,13 +145,22 @@ def test_of_two_trees_that_were_one_the_older_number_stays_and_two_beside_it_sta
     table.number[:] = [3, 4, 8, 9, 12]
     table.x[:, :2] = [[5.0, 1.0], [5.0, 1.5], [8.05, 1.0], [8.0, 1.5], [14.0, 2.0]]
     table.P[:] = 1e-3 * np.eye(4)
-    table.hits[:], table.score[:], table.stamp_ns[:] = 5, 5.0, [1, 2, 3, 4, 5]
-    first = np.array([2, 2, 40, 40, 40])
-    bent = bent_tracks(table, first, shifted(dx=-3.0, first=10))
-    assert bent.number.tolist() == [3, 4, 12]
+    table.hits[:], table.stamp_ns[:], table.landmark[:] = 5, [1, 2, 3, 4, 5], [3, 4, 8, 9, 12]
+    table.first_ns[:] = [2, 2, 40, 40, 40]
+    tracker = Tracker(STEMS.tracking)
+    tracker.tracks = table
+    # The landmarks of trees 8 and 9 were joined with those of 3 and 4.
+    place = np.array([[5.0, 1.5], [5.0, 1.0], [11.0, 2.0]])
+    landmarks = Landmarks(
+        np.array([4, 3, 12]), place, np.tile([1e-4, 0.0, 1e-4], (3, 1)), np.ones(3), 3.5, 1.0
+    )
+    pose = Pose2(11.0, 0.0, 0.0)
+    estimate = PoseEstimate(pose, SURE, pose.as_array()[None], np.ones(1), 1.0, place, False)
+    tracker.bend(shifted(dx=-3.0, first=10), np.arange(60), estimate, landmarks)
+    bent = tracker.tracks
+    assert bent.number.tolist() == bent.landmark.tolist() == [3, 4, 12]
     assert bent.hits.tolist() == [10, 10, 5]
     np.testing.assert_allclose(bent.x[:, :2], [[5.0, 1.0], [5.0, 1.5], [11.0, 2.0]], atol=0.05)
-    assert table.number.tolist() == [3, 4, 8, 9, 12], "the state itself is left alone"
 
 
 @given(seeds)
@@ -292,6 +302,6 @@ def test_the_pose_graph_closes_it_too():
     assert np.hypot(*(bend.after - true)[-1, :2]) < 0.15
     assert np.hypot(*(bend.after - true)[:, :2].T).max() < 0.5 * np.hypot(*(before - true)[:, :2].T).max()
     np.testing.assert_allclose(bend.after[:8], before[:8], atol=0.05)
-    place, _ = slam.landmarks()
+    place = slam.landmarks().position
     assert np.hypot(*(place[:, None] - trees).transpose(2, 0, 1)).min(axis=1).max() < 0.2
     assert len(slam.begun_since(30)[0]) == 0 < len(slam.begun_since(0)[0])

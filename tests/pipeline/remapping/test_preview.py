@@ -47,7 +47,7 @@ def test_a_column_without_enough_votes_is_not_a_tree(known):
 
 
 def test_hits_are_the_clusters_that_are_trees(known):
-    parameters = BASE.replace({"tracking.hits_to_confirm": 1, "tracking.distance_max": 0.4})
+    parameters = BASE.replace({"tracking.hits_to_confirm": 1, "tracking.proximity_radius": 0.3})
     before = replace(known[1], columns=None)
     preview = preview_trees(before, parameters)
     assert preview is not None

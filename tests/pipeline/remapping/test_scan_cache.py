@@ -102,7 +102,7 @@ def test_an_empty_scan_is_stored_too(cache):
 def test_each_set_of_segmentation_parameters_has_its_cache_and_the_last_few_are_open():
     with closing(ScanCaches()) as caches:
         first = caches.of(BASE)
-        assert caches.of(BASE.replace({"tracking.gate": 2.0})) is first
+        assert caches.of(BASE.replace({"tracking.proximity_radius": 0.3})) is first
         assert caches.of(WIDER) is not first
         fill(first, BASE, run()[0][5:7])
         assert [first.has_all(1), len(first)] == [False, 2]

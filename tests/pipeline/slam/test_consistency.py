@@ -13,7 +13,7 @@ from pipeline.tracking import Tracker
 from pipeline.tracking.split_covariance_intersection import split, weight
 from tests.benchmarks.cases.consistency import Errors, one_run
 from tests.benchmarks.stands import STRAIGHT
-from tests.pipeline.strategies import NOTHING_SEEN, detections, seeds
+from tests.pipeline.strategies import detections, seeds, track
 
 POSE = np.diag([0.1, 0.1, 0.0]) ** 2
 MANY = 1e12  # particles, of which no sampling noise is left
@@ -74,7 +74,7 @@ def test_the_weight_makes_the_variance_least(own, shared, R, B):
 def test_many_views_from_one_doubtful_pose_average_out_their_noise_alone():
     t = Tracker(preset("forest").tracking)
     for k in range(400):
-        t.process(k, Pose2(), POSE, detections([[5.0, 0.0]], sigma=0.05), NOTHING_SEEN, 0.0)
+        track(t, k, Pose2(), POSE, detections([[5.0, 0.0]], sigma=0.05))
     P = t.tracks.P[0, :2, :2]
     np.testing.assert_allclose(P, np.eye(2) * (0.1**2 + 0.05**2 / 400), rtol=1e-6, atol=1e-9)
 
@@ -82,10 +82,10 @@ def test_many_views_from_one_doubtful_pose_average_out_their_noise_alone():
 def test_a_view_from_a_sure_pose_takes_over_from_doubtful_ones():
     t = Tracker(preset("forest").tracking)
     for k in range(50):
-        t.process(k, Pose2(0.1, 0.0, 0.0), POSE, detections([[5.0, 0.0]], sigma=0.02), NOTHING_SEEN, 0.0)
+        track(t, k, Pose2(0.1, 0.0, 0.0), POSE, detections([[5.0, 0.0]], sigma=0.02))
     sure = POSE / 100.0
     for k in range(50, 60):
-        t.process(k, Pose2(), sure, detections([[5.0, 0.0]], sigma=0.02), NOTHING_SEEN, 0.0)
+        track(t, k, Pose2(), sure, detections([[5.0, 0.0]], sigma=0.02))
     assert abs(t.tracks.x[0, 0] - 5.0) < 0.02
     assert np.sqrt(t.tracks.P[0, 0, 0]) < 0.03
 

@@ -71,7 +71,7 @@ def test_a_loop_without_noise_is_exact():
     estimates = driven(slam, poses)
     assert np.abs([e.T_map_base.x for e in estimates] - as_rows(poses)[:, 0]).max() < 1e-6
     assert off(slam, poses).max() < 1e-6
-    mean, _ = slam.landmarks()
+    mean = slam.landmarks().position
     away = np.hypot(*(mean[:, None] - WORLD[None]).transpose(2, 0, 1))
     assert away.min(axis=1).max() < 1e-6
     assert len(mean) == len(set(away.argmin(axis=1)))  # no tree twice
@@ -122,7 +122,7 @@ def test_a_state_goes_on_to_the_same_bytes():
         for k in range(60, 100):
             step = poses[k - 1].inverse() @ poses[k]
             slam.process(k, step, seen(poses[k], rng=rng), ALL_FREE)
-        return slam.path().tobytes(), slam.landmarks()[0].tobytes()
+        return slam.path().tobytes(), slam.landmarks().position.tobytes()
 
     driven(slam, poses[:60], rng=np.random.default_rng(0))
     kept = slam.state.copy()
@@ -141,7 +141,7 @@ def test_what_is_seen_once_never_enters_the_graph_and_what_is_gone_vanishes():
     for k in range(1, 30):
         pose = Pose2(0.3 * k)
         slam.process(k, Pose2(0.3), seen(pose), ALL_FREE)
-    mean, _ = slam.landmarks()
+    mean = slam.landmarks().position
     assert np.hypot(*(mean - ghost).T).min() > 0.5
     assert slam.state.smoother.landmarks <= len(WORLD)
 
@@ -152,7 +152,7 @@ def test_two_trees_of_one_scan_stay_two():
     for k in range(12):
         centre = Pose2(0.26 * k).inverse().apply(pair)
         slam.process(k, Pose2(0.26 if k else 0.0), detections(centre, sigma=SIGMA), NOTHING_SEEN)
-    assert len(slam.landmarks()[0]) == 4
+    assert len(slam.landmarks().position) == 4
 
 
 def test_a_measured_pose_is_taken_and_a_placing_moves_the_robot():
@@ -172,11 +172,11 @@ def test_a_measured_pose_is_taken_and_a_placing_moves_the_robot():
 def test_particles_and_graph_take_over_from_one_another():
     slam, poses = graph(), [circle(k) for k in range(90)]
     driven(slam, poses[:60])
-    mean, path = slam.landmarks()[0], slam.path()
+    mean, path = slam.landmarks().position, slam.path()
     slam.parameters = FOREST
     taken_over: object = slam.state
     assert isinstance(taken_over, SlamState)
-    np.testing.assert_allclose(slam.landmarks()[0], mean)
+    np.testing.assert_allclose(slam.landmarks().position, mean)
     np.testing.assert_allclose(slam.path(), path, atol=1e-5)
     for k in range(60, 75):
         slam.process(k, poses[k - 1].inverse() @ poses[k], seen(poses[k]), NOTHING_SEEN)
@@ -186,7 +186,7 @@ def test_particles_and_graph_take_over_from_one_another():
     for k in range(75, 90):
         slam.process(k, poses[k - 1].inverse() @ poses[k], seen(poses[k]), NOTHING_SEEN)
     assert off(slam, poses).max() < 0.1
-    assert len(slam.landmarks()[0]) <= len(WORLD)
+    assert len(slam.landmarks().position) <= len(WORLD)
 
 
 def test_without_gtsam_the_choice_names_the_extra(monkeypatch):

@@ -23,9 +23,9 @@ def told(*tracks: tuple[float, int]):
     table = TrackTable.empty(len(tracks))
     for k, (away, hits) in enumerate(tracks):
         table.x[k, :2] = PLACE + away * np.array([np.cos(2.0 * k), np.sin(2.0 * k)])
-        table.number[k], table.hits[k], table.score[k] = k + 1, hits, 5.0
+        table.number[k], table.hits[k] = k + 1, hits
     tracker.tracks, tracker.next_number = table, len(tracks) + 1
-    tracker.judge(1, column(Verdict.TREE, tree=0.8), FOREST.classification)
+    tracker.classify(1, column(Verdict.TREE, tree=0.8), FOREST.classification)
     return [Verdict(int(v)) if v >= 0 else None for v in tracker.tracks.verdict]
 
 
@@ -59,10 +59,10 @@ def between(verdict: Verdict, away: float, hits: int = 3):
     """The verdict of a track that came since its column was judged, and whether it is a tree of the map."""
     tracker = Tracker(FOREST.tracking)
     table = TrackTable.empty(1)
-    table.number[0], table.hits[0], table.score[0] = 1, hits, 3.0
+    table.number[0], table.hits[0] = 1, hits
     table.x[0, :2] = PLACE + np.array([away, 0.0])
     tracker.tracks, tracker.next_number = table, 2
-    tracker.learn_between(column(verdict))
+    tracker.classify_new(column(verdict))
     return int(tracker.tracks.verdict[0]), bool(tracker.trees().confirmed[0])
 
 

@@ -15,7 +15,9 @@ from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES
 from pipeline.config import preset
 from pipeline.tracking import Tracker
-from pipeline.tracking.round_fit_override import FITS, REACH, SIDES
+from pipeline.tracking.track_classification import ROUND_FITS as FITS
+from pipeline.tracking.track_classification import ROUND_REACH as REACH
+from pipeline.tracking.track_classification import ROUND_SIDES as SIDES
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import Verdict
 
@@ -41,14 +43,14 @@ def track(*, sides=SIDES, fits=FITS, off=0.0):
     """One track beside PLACE, fitted so often and seen on so many sides."""
     table = TrackTable.empty(1)
     table.x[0, :2] = PLACE + np.array([off, 0.0])
-    table.radii[0], table.sides[0], table.hits[0], table.score[0] = fits, (1 << sides) - 1, fits, 1.0
+    table.radii[0], table.sides[0], table.hits[0] = fits, (1 << sides) - 1, fits
     return table
 
 
 def verdict(columns, tracks, share=0.4):
     tracker = Tracker(FOREST.tracking)
     tracker.tracks = tracks
-    judged = tracker.judge(1, columns, FOREST.classification.model_copy(update={"tree_share": share}))
+    judged = tracker.classify(1, columns, FOREST.classification.model_copy(update={"tree_share": share}))
     return Verdict(int(judged.verdict[0]))
 
 
@@ -113,6 +115,6 @@ def test_no_tree_is_lost_and_more_votes_for_a_tree_never_harm(tree, more, needed
 def test_the_tracker_shows_the_tree_and_says_so_of_the_column():
     tracker = Tracker(FOREST.tracking)
     tracker.tracks = track()
-    columns = tracker.judge(1, column(tree=0.3), FOREST.classification)
+    columns = tracker.classify(1, column(tree=0.3), FOREST.classification)
     assert columns.verdict.tolist() == [Verdict.TREE]
     assert tracker.trees().confirmed.tolist() == [True]

@@ -1,4 +1,4 @@
-"""Trees: one Kalman filter each, numbers that stay, merging, vanishing, and what was seen of a trunk."""
+"""Trees: one Kalman filter each, numbers that stay, identity by landmarks, and what was seen of a trunk."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
 from pipeline.tracking.kalman import ENGINES, process_noise, transition
-from pipeline.tracking.merge import fuse
 from pipeline.tracking.observation import SECTORS, seen_sides
-from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
+from pipeline.tracking.track_table import fuse
+from tests.pipeline.strategies import detections, seeds, track
 
 FOREST = preset("forest").tracking
 PAPER = preset("paper").tracking
@@ -27,9 +27,10 @@ def tracker(**changes: Any):
     return Tracker(FOREST.model_copy(update=changes))
 
 
-def show(t, k, centre, *, pose=None, free=NOTHING_SEEN, view_range=15.0, pose_covariance=SURE, **rest: Any):
-    """Give a tracker the detections of scan k, in the base frame, and return its trees."""
-    t.process(k * 100_000_000, pose or Pose2(), pose_covariance, detections(centre, **rest), free, view_range)
+def show(t, k, centre, *, pose=None, pose_covariance=SURE, births=None, gone=(), **rest: Any):
+    """Give a tracker the detections of scan k, in the base frame, and return its trees; see `track`."""
+    found = detections(centre, **rest)
+    track(t, k * 100_000_000, pose or Pose2(), pose_covariance, found, births=births, gone=gone)
     return t.trees()
 
 
@@ -86,7 +87,7 @@ def test_a_whole_run_is_the_same_with_both_engines(seed):
         noise = np.random.default_rng(seed)
         trees = t.trees()
         for k in range(15):
-            trees = show(t, k, world + noise.normal(0, 0.05, world.shape), free=ALL_FREE)
+            trees = show(t, k, world + noise.normal(0, 0.05, world.shape))
         told.append(trees)
     np.testing.assert_array_equal(told[0].number, told[1].number)
     for column in ("position", "covariance", "velocity", "eccentricity", "dbh", "coverage"):
@@ -105,7 +106,8 @@ def test_numbers_never_change_and_are_never_used_twice(seed):
     last = 0
     for k in range(25):
         seen = rng.uniform(-6, 6, (rng.integers(0, 7), 2))
-        trees = show(t, k, seen, free=ALL_FREE if k % 3 else NOTHING_SEEN)
+        births = rng.permutation(12)[: len(seen)] + 2 * (k // 5)
+        trees = show(t, k, seen, births=births, gone=np.arange(rng.integers(0, 20)))
         numbers = trees.number.tolist()
         assert numbers == sorted(set(numbers))
         now = set(numbers)
@@ -118,30 +120,85 @@ def test_numbers_never_change_and_are_never_used_twice(seed):
 
 
 def test_a_tree_keeps_its_number_while_others_come_and_go():
-    t = tracker(misses_per_hit=1)
-    show(t, 0, [[3.0, 0.0]], free=NOTHING_SEEN)
-    trees = t.trees()
+    t = tracker()
+    trees = show(t, 0, [[3.0, 0.0]])
     for k in range(1, 10):
-        trees = show(t, k, [[3.0, 0.0], [k, 6.0]], free=ALL_FREE)
-    assert trees.number[0] == 1
+        trees = show(t, k, [[3.0, 0.0], [k, 6.0]], births=[0, k], gone=[k - 1])
+    assert trees.number.tolist() == [1, 10]
     np.testing.assert_allclose(trees.position[0], [3.0, 0.0])
 
 
-# --- merging --------------------------------------------------------------------------------------
+# --- identity -------------------------------------------------------------------------------------
 
 
-def test_merging_keeps_the_older_number_and_adds_up():
-    t = tracker(proximity_radius=0.4)
+def test_a_detection_belongs_to_the_tree_of_its_landmark_however_near_another_one_is():
+    t = tracker()
+    show(t, 0, [[5.0, 0.0], [5.0, 1.0]], births=[3, 8])
+    trees = show(t, 1, [[5.0, 0.05], [5.0, 0.95]], births=[3, 8])
+    assert trees.number.tolist() == [1, 2]
+    assert trees.observations.tolist() == [2, 2]
+    np.testing.assert_allclose(trees.position[:, 1], [0.025, 0.975], atol=1e-9)
+
+
+def test_a_detection_without_landmark_belongs_to_no_tree():
+    t = tracker()
+    assert len(show(t, 0, [[5.0, 0.0]], births=[-1]).number) == 0
+    show(t, 1, [[5.0, 0.0]], births=[4])
+    assert show(t, 2, [[5.0, 0.0]], births=[-1]).observations.tolist() == [1]
+
+
+def test_a_tree_goes_with_its_landmark():
+    t = tracker()
+    show(t, 0, [[5.0, 0.0], [8.0, 0.0]], births=[0, 1])
+    assert show(t, 1, [], gone=[0]).number.tolist() == [2]
+
+
+def test_a_tree_continues_with_another_landmark_at_its_position():
+    """Another particle is the best one, and began the landmark of the same trunk at another scan."""
+    t = tracker()
+    show(t, 0, [[5.0, 0.0], [8.0, 0.0]], births=[0, 1])
+    trees = show(t, 1, [[5.05, 0.0], [8.0, 0.0]], births=[7, 1], gone=[0])
+    assert trees.number.tolist() == [1, 2]
+    assert trees.observations.tolist() == [2, 2]
+    assert t.tracks.landmark.tolist() == [7, 1]
+
+
+def test_a_landmark_far_from_a_tree_does_not_continue_it():
+    t = tracker()
+    show(t, 0, [[5.0, 0.0]], births=[0])
+    trees = show(t, 1, [[5.0, 0.9]], births=[7], gone=[0])
+    assert trees.number.tolist() == [2]
+    assert trees.observations.tolist() == [1]
+
+
+def test_trees_whose_landmarks_were_merged_are_one_with_the_older_number():
+    t = tracker(proximity_radius=0.0)
     for k in range(3):
-        show(t, k, [[5.0, 1.0], [5.0, 0.0]])
-    show(t, 3, [[5.0, 0.0]])
-    t.parameters = FOREST.model_copy(update={"proximity_radius": 1.1})
-    trees = show(t, 4, [[5.0, 0.0]])
+        show(t, k, [[5.0, 0.1], [5.0, 0.0]], births=[4, 9])
+    trees = show(t, 3, [[5.0, 0.05]], births=[4], gone=[9])
     assert trees.number.tolist() == [1]
     assert trees.first_seen_ns.tolist() == [0]
-    assert trees.last_seen_ns.tolist() == [400_000_000]
-    assert 0.2 < trees.position[0, 1] < 0.6
-    assert show(t, 99, [[20.0, 0.0]]).number.tolist() == [1, 3], "2 is not given again"
+    assert trees.last_seen_ns.tolist() == [300_000_000]
+    assert trees.observations.tolist() == [6], "a scan that shows both halves counts once"
+    assert show(t, 99, [[20.0, 0.0]], births=[30]).number.tolist() == [1, 3], "2 is not given again"
+
+
+@pytest.mark.parametrize(("radius", "numbers"), [(0.4, [1]), (0.0, [1, 2])])
+def test_a_landmark_next_to_a_tree_is_a_part_of_its_trunk(radius, numbers):
+    t = tracker(proximity_radius=radius)
+    trees = t.trees()
+    for k in range(4):
+        trees = show(t, k, [[5.0, 0.0], [5.0, 0.3]])
+    assert trees.number.tolist() == numbers
+    assert set(trees.observations.tolist()) == {4}
+
+
+def test_trees_that_come_nearer_than_the_radius_are_merged():
+    t = tracker(proximity_radius=0.4)
+    show(t, 0, [[5.0, 0.0], [5.0, 0.45]])
+    trees = show(t, 1, [[5.0, 0.0], [5.0, 0.3]])
+    assert trees.number.tolist() == [1]
+    assert trees.observations.tolist() == [3]
 
 
 def test_two_trees_farther_apart_than_the_radius_stay_two():
@@ -158,18 +215,14 @@ def test_of_three_in_a_heap_one_is_left():
     assert trees.number.tolist() == [1]
 
 
-def test_a_trunk_in_two_pieces_is_seen_once_a_scan():
-    t = tracker(proximity_radius=0.4)
-    trees = t.trees()
-    for k in range(4):
-        trees = show(t, k, [[5.0, 0.0], [5.0, 0.3]])
-    assert trees.number.tolist() == [1]
-    assert trees.observations.tolist() == [4], "number of scans it was seen in"
-
-
-def test_no_radius_no_merging():
-    t = tracker(proximity_radius=0.0)
-    assert show(t, 0, [[5.0, 0.0], [5.0, 0.0]]).number.tolist() == [1, 2]
+def test_a_tree_whose_detection_is_beyond_the_gate_restarts_at_its_landmark():
+    t = tracker(velocity_sigma=0.1)
+    for k in range(20):
+        show(t, k, [[5.0, 0.0]])
+    trees = show(t, 20, [[5.8, 0.0]])
+    np.testing.assert_allclose(trees.position, [[5.8, 0.0]], atol=1e-6)
+    assert trees.observations.tolist() == [21]
+    assert np.linalg.eigvalsh(t.tracks.P[0]).min() > -1e-12
 
 
 @given(seeds)
@@ -184,37 +237,6 @@ def test_fusing_is_the_best_of_two_independent_positions(seed):
     A, B = np.linalg.inv(P[:2, :2]), np.linalg.inv(Q[:2, :2])
     np.testing.assert_allclose(told_P[:2, :2], np.linalg.inv(A + B), atol=1e-9)
     np.testing.assert_allclose(told_x[:2], np.linalg.solve(A + B, A @ x[:2] + B @ y[:2]), atol=1e-9)
-
-
-# --- vanishing ------------------------------------------------------------------------------------
-
-
-def test_a_tree_that_is_missed_vanishes_and_a_hidden_one_stays():
-    t = tracker(misses_per_hit=2)
-    for k in range(3):
-        show(t, k, [[5.0, 0.0]])
-    for k in range(3, 50):
-        assert show(t, k, []).number.tolist() == [1], "nothing was seen there"
-    for k in range(50, 55):
-        assert show(t, k, [], free=ALL_FREE).number.tolist() == [1]
-    assert show(t, 55, [], free=ALL_FREE).number.tolist() == [], "3 hits, 6 misses at 2 a hit"
-
-
-def test_a_tree_out_of_view_range_is_not_missed():
-    t = tracker(misses_per_hit=1)
-    show(t, 0, [[5.0, 0.0]])
-    for k in range(1, 20):
-        assert len(show(t, k, [], free=ALL_FREE, view_range=4.9).number) == 1
-
-
-def test_a_felled_tree_vanishes_in_finite_time():
-    t = tracker(misses_per_hit=1)
-    for k in range(500):
-        show(t, k, [[5.0, 0.0]])
-    trees = t.trees()
-    for k in range(500, 530):
-        trees = show(t, k, [], free=ALL_FREE)
-    assert len(trees.number) == 0
 
 
 # --- what is known of a tree ----------------------------------------------------------------------
@@ -239,7 +261,7 @@ def test_a_diameter_is_told_for_breast_height(breast_height):
     t = tracker(dbh_arc_min=0.0, breast_height=breast_height)
     seen = detections([[5.0, 0.0]], radius=0.2)
     for k, height in enumerate((0.7, 1.0, 1.6, np.nan)):
-        t.process(k * 100_000_000, Pose2(), SURE, seen, NOTHING_SEEN, 15.0, np.array([height]))
+        track(t, k * 100_000_000, Pose2(), SURE, seen, heights=np.array([height]))
     above = np.array([0.7, 1.0, 1.6, breast_height]) - breast_height
     lost = np.average(np.where(above < 0.0, 0.01, 0.005) * above, weights=1.0 / (1.0 + (above / 0.5) ** 2))
     assert t.trees().dbh[0] == pytest.approx(2.0 * (0.2 + lost))
@@ -280,7 +302,7 @@ def test_an_infinite_eccentricity_does_not_spoil_the_mean():
     views = detections([[5.0, 0.0]])
     for k, e in enumerate((4.0, np.inf, 6.0)):
         views.eccentricity[0] = e
-        t.process(k, Pose2(), SURE, views, NOTHING_SEEN, 0.0)
+        track(t, k, Pose2(), SURE, views)
     assert t.trees().eccentricity.tolist() == [5.0]
 
 

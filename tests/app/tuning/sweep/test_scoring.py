@@ -21,7 +21,7 @@ SETS: tuple[tuple[dict[str, float], bool], ...] = (
     ({"tracking.hits_to_confirm": 9}, False),
     ({"evaluation.match_distance": 0.05}, False),
     ({"detection.radius_max": 0.1}, False),
-    ({"detection.radius_max": 0.1, "tracking.gate": 2.0}, False),
+    ({"detection.radius_max": 0.1, "tracking.proximity_radius": 0.3}, False),
     ({"slam.particles": 7}, False),
     ({"clustering.eps": 0.3}, True),
     ({"clustering.eps": 0.3, "classification.tree_share": 0.9}, False),

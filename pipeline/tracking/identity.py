@@ -1,0 +1,161 @@
+"""Identity of the trees: each tree belongs to one landmark of SLAM's map.
+
+SLAM associates detections, counts misses and merges landmarks; the tracks follow it. A track whose landmark
+is gone, because SLAM merged or removed it or because another particle is the best one now, continues with the
+landmark at its position, joins the track of that landmark, or ends.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.geometry.gaussian import by_pose
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_borrowing
+from pipeline.slam.association import associate
+from pipeline.tracking.track_table import NO_LANDMARK, Rows, ScanPose, join
+from pipeline.types.records import Bool, Int, Verdict
+
+AGREE = 3.0  # sigma; a track farther from its landmark is moved there
+TREE = int(Verdict.TREE)
+
+
+@compiled
+def follow(
+    rows: Rows,
+    scan: ScanPose,
+    birth: Int,
+    position: Float,
+    covariance: Float,
+    score: Float,
+    gate: float,
+    distance_max: float,
+) -> Bool:
+    """Let the tracks follow the landmarks of SLAM's map.
+
+    Args:
+        rows: Tracks, changed in place.
+        scan: Pose of the robot.
+        birth, position, covariance, score, gate, distance_max: See `Landmarks`.
+
+    Returns:
+        Which tracks remain, shape (T,): those with a landmark, and those of a tree column.
+    """
+    T, L = rows.number.shape[0], birth.shape[0]
+    order = np.argsort(birth)
+    ordered = birth[order]
+    owner, landmark_of, before = np.full(L, -1), np.full(T, -1), rows.landmark.copy()
+    for t in range(T):
+        k = np.searchsorted(ordered, rows.landmark[t])
+        if k < L and ordered[k] == rows.landmark[t] and owner[order[k]] < 0:
+            owner[order[k]] = t
+            landmark_of[t] = order[k]
+    kept = np.ones(T, np.bool_)
+    lost = np.flatnonzero(landmark_of < 0)
+    spread = np.empty((T, 3))
+    _fill_spread(rows, scan, spread)
+    if lost.shape[0] > 0 and L > 0:
+        free = np.flatnonzero(owner < 0)
+        at, _ = associate(
+            rows.x[lost][:, :2].copy(), spread[lost], position[free], covariance[free], gate, distance_max
+        )
+        for k in range(lost.shape[0]):
+            if at[k] >= 0:
+                owner[free[at[k]]] = lost[k]
+                landmark_of[lost[k]] = free[at[k]]
+        # A landmark that is gone while another track has the one at its position was merged with it.
+        merged = lost[(landmark_of[lost] < 0) & (before[lost] != NO_LANDMARK)]
+        if merged.shape[0] > 0:
+            taken = np.flatnonzero(owner >= 0)
+            at, _ = associate(
+                rows.x[merged][:, :2].copy(), spread[merged], position[taken], covariance[taken], gate,
+                distance_max,
+            )  # fmt: skip
+            for k in range(merged.shape[0]):
+                if at[k] >= 0:
+                    j = taken[at[k]]
+                    old, young = min(owner[j], merged[k]), max(owner[j], merged[k])
+                    join(rows, old, young)
+                    landmark_of[old], landmark_of[young] = j, -1
+                    owner[j] = old
+                    kept[young] = False
+    for t in range(T):
+        j = landmark_of[t]
+        rows.landmark[t] = birth[j] if j >= 0 else NO_LANDMARK
+        if j >= 0:
+            rows.score[t] = score[j]
+        kept[t] = kept[t] and (j >= 0 or rows.verdict[t] == TREE)
+    return kept
+
+
+@compiled
+def tracks_of(landmark: Int, births: Int) -> Int:
+    """Return the row of the track of each birth, int64, shape (D,); -1 for none.
+
+    Args:
+        landmark: Landmark of each track, shape (T,).
+        births: Landmark of each detection, shape (D,); -1 for none.
+    """
+    rows = np.full(births.shape[0], -1)
+    order = np.argsort(landmark)
+    ordered = landmark[order]
+    for d in range(births.shape[0]):
+        k = np.searchsorted(ordered, births[d])
+        if births[d] != NO_LANDMARK and k < landmark.shape[0] and ordered[k] == births[d]:
+            rows[d] = order[k]
+    return rows
+
+
+@compiled
+def merge_near(rows: Rows, seen: Int, radius: float) -> Bool:
+    """Join tracks nearer to each other than a radius; the older number and its landmark stay.
+
+    Args:
+        rows: Tracks, changed in place.
+        seen: Rows of the tracks that moved in this scan, shape (K,).
+        radius: [m].
+
+    Returns:
+        Which tracks remain, shape (T,).
+    """
+    kept = np.ones(rows.number.shape[0], np.bool_)
+    for k in range(seen.shape[0]):
+        for t in range(kept.shape[0]):
+            s = seen[k]
+            dx, dy = rows.x[t, 0] - rows.x[s, 0], rows.x[t, 1] - rows.x[s, 1]
+            if t != s and kept[s] and kept[t] and dx * dx + dy * dy < radius * radius:
+                join(rows, min(s, t), max(s, t))
+                kept[max(s, t)] = False
+    return kept
+
+
+@compiled
+def stand_apart(position: Float, x: Float, radius: float) -> Bool:
+    """Return which positions are at least a radius from all tracks and from those before them, shape (K,).
+
+    Args:
+        position: Positions, shape (K, 2) [m].
+        x: States of the tracks, shape (T, 4).
+        radius: Minimum distance [m].
+    """
+    apart = np.ones(position.shape[0], np.bool_)
+    for k in range(position.shape[0]):
+        for t in range(x.shape[0]):
+            dx, dy = x[t, 0] - position[k, 0], x[t, 1] - position[k, 1]
+            apart[k] = apart[k] and dx * dx + dy * dy >= radius * radius
+        for j in range(k):
+            dx, dy = position[j, 0] - position[k, 0], position[j, 1] - position[k, 1]
+            apart[k] = apart[k] and not (apart[j] and dx * dx + dy * dy < radius * radius)
+    return apart
+
+
+@compiled_borrowing
+def _fill_spread(rows: Rows, scan: ScanPose, spread: Float) -> None:
+    """Fill in the covariance xx, xy, yy of each track relative to the landmarks, shape (T, 3) [m^2]: without
+    the part that both share with the frame of the map."""
+    x, P, shared = rows.x, rows.P, rows.shared
+    for t in range(spread.shape[0]):
+        xx, xy, yy = by_pose(x[t, 0] - scan.pose[0], x[t, 1] - scan.pose[1], scan.relative)
+        spread[t, 0] = P[t, 0, 0] - shared[t, 0, 0] + xx
+        spread[t, 1] = P[t, 0, 1] - shared[t, 0, 1] + xy
+        spread[t, 2] = P[t, 1, 1] - shared[t, 1, 1] + yy
