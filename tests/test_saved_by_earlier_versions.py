@@ -30,7 +30,7 @@ import pytest
 from app.cli import main
 
 # The saved files use names that the parameters had then.
-pytestmark = pytest.mark.filterwarnings("ignore:the parameter .* is now called")
+pytestmark = pytest.mark.filterwarnings("ignore:the parameter .* (is now called|no longer exists)")
 
 SAVED = Path(__file__).parent / "data" / "saved_by_0_1_0"
 RUN, MERGED, DATA_FOLDER = SAVED / "run", SAVED / "merged", SAVED / "data_folder"
