@@ -19,10 +19,17 @@ from pipeline.front_end import DetectionResult, SegmentedScan, detect, segment
 from pipeline.geometry.poses import Float, Pose2, Pose3
 from pipeline.ground.terrain_map import HeightMapper, HeightMapState
 from pipeline.loop_closure import detection
-from pipeline.loop_closure.correction import LoopClosure, Relocalisation, Restart, SearchFailure
+from pipeline.loop_closure.correction import (
+    LoopClosure,
+    Relocalisation,
+    Restart,
+    SearchFailure,
+    Smoothing,
+)
 from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
+from pipeline.loop_closure.map_correction import Bend
 from pipeline.odometry.gyro import fused
-from pipeline.slam import BackEnd, BackEndState, Loop, Motion
+from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.slam.motion import noise_of, step_variances
 from pipeline.slam.pose_gate import REFUSED, within_gate
 from pipeline.slam.trajectory_buffer import GrowingPath
@@ -41,6 +48,8 @@ from pipeline.types.records import (
 )
 
 NOTHING_FREE: Float = np.zeros(BINS)
+# m; columns and terrain are grids with cells of 0.1 m and more, which a smaller correction does not change.
+CORRECTION_MIN = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +57,7 @@ class MapperState:
     """An independent copy of all that the mapper knows between two scans, without its parameters.
 
     Attributes:
-        slam: Particles or pose graph, with their path.
+        slam: Particles, their path, and the graph of keyframes.
         gathering: Voxel columns.
         ground: Terrain map.
         tracks: Kalman filter of each tree.
@@ -59,9 +68,10 @@ class MapperState:
         closed: Scan at which the last loop was closed.
         recovery: Search for a lost robot.
         last: Pose after the last scan, with its covariance.
+        delayed: Correction of the path that columns and terrain do not have yet.
     """
 
-    slam: BackEndState
+    slam: SlamState
     gathering: ColumnClassifierState
     ground: HeightMapState
     tracks: TrackTable
@@ -72,9 +82,10 @@ class MapperState:
     closed: int = 0
     recovery: RelocaliserState[MapperState] = field(default_factory=RelocaliserState)
     last: tuple[Pose2, Float] | None = None
+    delayed: Bend | None = None
 
 
-Correction = Restart[MapperState] | Relocalisation | LoopClosure | SearchFailure
+Correction = Restart[MapperState] | Relocalisation | LoopClosure | Smoothing | SearchFailure
 
 
 class Mapper:
@@ -106,7 +117,7 @@ class Mapper:
         self._sensor = sensor
         self._T_base_lidar = T_base_lidar
         self._timer = timer
-        self._slam = BackEnd(parameters.slam, seed)
+        self._slam = FastSlam(parameters.slam, seed)
         self._columns = ColumnClassifier(
             parameters.classification, all_around=sensor.rings > 0, forests=forests
         )
@@ -117,6 +128,7 @@ class Mapper:
         self._odometry: Pose2 | None = None
         self._placed = self._closed = 0
         self._last: tuple[Pose2, Float] | None = None
+        self._delayed: Bend | None = None
 
     def process(self, step: Step, scan: SegmentedScan | None = None) -> Frame:
         """Map one scan.
@@ -211,6 +223,7 @@ class Mapper:
             self._closed,
             self._relocaliser.state.copy(),
             self._last,
+            self._delayed,
         )
 
     def restore(self, state: MapperState) -> None:
@@ -348,16 +361,17 @@ class Mapper:
             return relocaliser.search(index, motion, found.detections, scan.free, p, run)
         return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_astray else None
 
-    def _check_loop(self, index: int, estimate: PoseEstimate) -> LoopClosure | None:
-        """The loop that the robot has just closed, if any."""
+    def _check_loop(self, index: int, estimate: PoseEstimate) -> LoopClosure | Smoothing | None:
+        """The loop that the robot has just closed, if any, or that the graph should be solved."""
         p = self._parameters.relocalisation
-        if p.method == "none" or self._relocaliser.is_searching:
+        if self._relocaliser.is_searching:
             return None
-        if not detection.is_due(index, self._path.sigma_xy):
-            return None
-        with self._timer("slam"):
-            loop = detection.find_loop(self._history(estimate), p)
-        return None if loop is None else LoopClosure(loop)
+        if p.method != "none" and detection.is_due(index, self._path.sigma_xy):
+            with self._timer("slam"):
+                loop = detection.find_loop(self._history(estimate), p)
+            if loop is not None:
+                return LoopClosure(loop)
+        return Smoothing() if self._slam.is_smoothing_due else None
 
     def _history(self, estimate: PoseEstimate) -> detection.RunHistory:
         return detection.RunHistory(
@@ -384,26 +398,38 @@ class Mapper:
                 slam.place(index, pose, covariance)
                 self._placed = index + 1
                 estimate = slam.estimate(estimate)
+            case Smoothing():
+                self._correct_map(slam.smooth(index), estimate)
+                return slam.estimate(estimate)
             case LoopClosure(loop=loop):
-                estimate = self._close_loop(index, loop, estimate)
+                if self._correct_map(slam.close(index, loop), estimate):
+                    self._closed = index
+                elif self._relocaliser.is_searching:  # the path to the place is unknown, the place is not
+                    slam.place(index, loop.T_map_base, loop.covariance)
+                    self._placed = index + 1
+                estimate = slam.estimate(estimate)
         self._relocaliser.reset()
         return estimate
 
-    def _close_loop(self, index: int, loop: Loop, estimate: PoseEstimate) -> PoseEstimate:
-        """Bend the path, and move the map with it; returns the corrected pose."""
-        bend = self._slam.close(index, loop)
-        estimate = self._slam.estimate(estimate)
+    def _correct_map(self, bend: Bend | None, before: PoseEstimate) -> bool:
+        """Move trees, columns and terrain with the path; returns whether there is a correction."""
+        if bend is None:
+            return False
+        estimate = self._slam.estimate(before)
         self._tracker.bend(bend, self._path.stamp_ns, estimate, self._slam.landmarks())
-        self._columns.bend(bend)
-        self._terrain.bend(bend)
-        self._closed = index
-        return estimate
+        self._delayed = bend if self._delayed is None else self._delayed.followed_by(bend)
+        if self._delayed.largest >= CORRECTION_MIN:
+            self._columns.bend(self._delayed)
+            self._terrain.bend(self._delayed)
+            self._delayed = None
+        return True
 
     def _restore_map(self, before: MapperState) -> None:
         """Return to the map of an earlier state; path, odometry and the numbers of trees go on."""
         self._slam.state = before.slam.copy()
         self._columns.restore(before.gathering)
         self._terrain.state = before.ground
+        self._delayed = before.delayed
         self._tracker.tracks = before.tracks.copy()
 
     # --- result ---------------------------------------------------------------------------------------

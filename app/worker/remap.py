@@ -18,7 +18,7 @@ from pipeline.config import Parameters
 from pipeline.front_end import SegmentedScan
 from pipeline.remapping import ClusterTable, Rerun
 from pipeline.remapping.rerun import Segment
-from pipeline.slam import Genealogy, Smoother
+from pipeline.slam import Genealogy, KeyframeGraph
 from pipeline.types.records import Frame, Path, Step
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
@@ -171,7 +171,7 @@ _MOST_BYTES = 256 << 20
 
 def nbytes(state: object) -> int:
     """Return the number of bytes of all arrays in nested dataclasses, lists and tuples."""
-    if isinstance(state, np.ndarray | Genealogy | Smoother):
+    if isinstance(state, np.ndarray | Genealogy | KeyframeGraph):
         return state.nbytes
     if isinstance(state, list | tuple):
         return sum(map(nbytes, state))

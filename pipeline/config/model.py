@@ -22,6 +22,8 @@ RENAMED = {
     "slam.looks": "slam.independent_views_max",
     "shape.slices": "shape.split_slices",
 }
+# Choices of earlier versions and their replacement: a graph of keyframes now always corrects FastSLAM.
+RENAMED_CHOICES = {("slam.method", "graph"): "fastslam2"}
 # Parameters of earlier versions that no longer exist; their values are ignored.
 REMOVED = frozenset({"tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"})
 
@@ -88,8 +90,11 @@ def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
     precedence over one under an earlier name.
     """
     result: dict[str, Any] = {}
-    for name, value in values.items():
-        current = _current_name(name)
+    for name, given in values.items():
+        current, value = _current_name(name), given
+        if isinstance(given, str) and (name, given) in RENAMED_CHOICES:
+            value = RENAMED_CHOICES[name, given]
+            _warn(f"{name} = {given} no longer exists; {value} is used")
         if current is None:
             _warn(f"the parameter {name} no longer exists and is ignored")
         elif current == name:
@@ -132,9 +137,11 @@ def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
     nested = {stage: values for stage, values in tree.items() if isinstance(values, Mapping)}
     result = {stage: values for stage, values in tree.items() if stage not in nested}
     old = any(
-        stage not in known or _current_name(f"{stage}.{name}") != f"{stage}.{name}"
+        stage not in known
+        or _current_name(f"{stage}.{name}") != f"{stage}.{name}"
+        or (isinstance(value, str) and (f"{stage}.{name}", value) in RENAMED_CHOICES)
         for stage, values in nested.items()
-        for name in values
+        for name, value in values.items()
     )
     if not old:
         return result | {stage: dict(values) for stage, values in nested.items()}

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
-from pydantic import AfterValidator, model_validator
+from pydantic import model_validator
 
 from pipeline.config.declaration import Stage, choice, count, name, number
 
@@ -244,22 +243,13 @@ class Detection(Stage):
 # --- the pose -------------------------------------------------------------------------------------
 
 
-def _installed(method: str) -> str:
-    if method == "graph" and find_spec("gtsam") is None:
-        raise ValueError(
-            "slam.method = graph needs GTSAM, which is not installed. Install the extra: "
-            "pip install 'stemmap[graph]', or in a clone `uv sync --extra graph`"
-        )
-    return method
-
-
 class Slam(Stage):
-    """SLAM: FastSLAM with a map per particle (Eq. 5-7), or a pose graph."""
+    """SLAM: FastSLAM with a map per particle (Eq. 5-7), and a graph of keyframes that corrects it."""
 
-    method: Annotated[Literal["fastslam1", "fastslam2", "graph"], AfterValidator(_installed)] = choice(
+    method: Literal["fastslam1", "fastslam2"] = choice(
         "fastslam2",
         "Method",
-        "FastSLAM 1.0 (odometry proposal), 2.0 (odometry and scan proposal), or a pose graph (extra).",
+        "FastSLAM 1.0 (odometry proposal) or 2.0 (odometry and scan proposal).",
     )
     particles: int = count(100, "Particles", "", 1, 5000, "Number of particles (hypotheses of the path).")
     noise_distance: float = number(
@@ -375,6 +365,15 @@ class Slam(Stage):
         10.0,
         0.05,
         "Motion between two scans that update the filter; 0 uses every scan.",
+    )
+    keyframe_distance: float = number(
+        1.0,
+        "Keyframe distance",
+        "m",
+        0.1,
+        100.0,
+        0.1,
+        "Motion between two keyframes of the graph that corrects path and map; a turn of 1 rad counts 1 m.",
     )
 
 

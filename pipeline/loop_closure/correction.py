@@ -76,6 +76,16 @@ class LoopClosure:
 
 
 @dataclass(frozen=True, slots=True)
+class Smoothing:
+    """Known trees were seen again: path and map are corrected by the graph of keyframes."""
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """No text: the correction is small."""
+        return ()
+
+
+@dataclass(frozen=True, slots=True)
 class SearchFailure:
     """A lost robot was not found in the map. Mapping goes on where the odometry leads."""
 

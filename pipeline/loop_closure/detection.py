@@ -36,8 +36,7 @@ OWN = np.diag(np.square([0.05, 0.05, 0.01]))  # m, rad; of a particle's pose amo
 LEAST_LEFT = 2  # trees that agree, at least, that the robot left at the same time
 FARTHEST = 90.0  # m, maximum radius of the search around the robot
 SIGMA = 0.1  # m, maximum sigma of a position relative to its neighbours
-# Ties: pairs of scans at one place, with trees that were seen at both times.
-TIE_NEAR, TIE_APART, TIE_VIEW, TIE_TREES, TIE_SPACING = 6.0, 30.0, 12.0, 3, 2.0  # m, m, m, -, m
+GROUP_APART = 30.0  # m of the path between groups of trees that the robot left
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,8 +151,7 @@ def loop_to(
     if jumps and _is_beyond(_gap(T_map_base, driven[-1]), since + R):
         return None
     anchor = int(np.argmin(np.hypot(*(path[: first + 1, :2] - [T_map_base.x, T_map_base.y]).T)))
-    ties = _ties(run, first, last_mapped)
-    return Loop(first, last_mapped, anchor, T_map_base, R, ties, run.motion)
+    return Loop(first, last_mapped, anchor, T_map_base, R)
 
 
 def _gap(T_map_base: Pose2, pose: Float) -> Float:
@@ -196,7 +194,7 @@ def _left(seen: Int, way: Float) -> int:
         way: Distance driven at each scan, shape (N,) [m].
     """
     seen = np.sort(seen)
-    group = np.cumsum(np.diff(way[seen], prepend=way[seen[0]]) > TIE_APART)
+    group = np.cumsum(np.diff(way[seen], prepend=way[seen[0]]) > GROUP_APART)
     counts = np.bincount(group)
     return int(np.median(seen[group == np.argmax(counts >= max(LEAST_LEFT, len(seen) / 4))]))
 
@@ -217,27 +215,3 @@ def _stems(place: Float, covariance: Float) -> Stems:
     since the error that all positions share is what the match finds."""
     unknown = np.full(len(place), np.nan)
     return Stems(place, np.minimum(worst_sigma(covariance), SIGMA), unknown, unknown)
-
-
-def _ties(run: RunHistory, first: int, last: int) -> Int:
-    """Return pairs of scans at one place whose relative pose is known (see Loop), int64, shape (K, 2): at
-    least TIE_TREES nearby trees were known at the earlier scan and seen at the later one."""
-    from scipy.spatial import cKDTree
-
-    path, trees = run.path, run.trees
-    way = _way(path[: last + 1])
-    nodes = np.flatnonzero(np.diff(np.floor(way / TIE_SPACING), prepend=-1.0) > 0)
-    pairs = cKDTree(path[nodes, :2]).query_pairs(TIE_NEAR, output_type="ndarray")
-    early, late = nodes[pairs.min(axis=1)], nodes[pairs.max(axis=1)]
-    apart = (late > first) & (way[late] - way[early] > TIE_APART)
-    early, late = early[apart], late[apart]
-    begun, seen = run.scan_of(trees.first_seen_ns), run.scan_of(trees.last_seen_ns)
-    kept: list[int] = []
-    for k in np.lexsort((early, late)).tolist():
-        if kept and late[k] == late[kept[-1]]:
-            continue  # one tie per later scan, with the earliest partner
-        near = np.hypot(*(trees.position - path[late[k], :2]).T) < TIE_VIEW
-        both = near & (begun <= early[k]) & (seen >= late[k])
-        if np.count_nonzero(both) >= TIE_TREES:
-            kept.append(k)
-    return np.column_stack([early[kept], late[kept]]).astype(np.int64)

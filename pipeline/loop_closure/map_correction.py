@@ -28,6 +28,17 @@ class Bend:
     first: int
     last: int
 
+    @property
+    def largest(self) -> float:
+        """Largest displacement of a scan that moves [m]."""
+        moved = self.after[self.first + 1 :, :2] - self.before[self.first + 1 :, :2]
+        return float(np.hypot(*moved.T).max(initial=0.0))
+
+    def followed_by(self, later: Bend) -> Bend:
+        """Return this correction and a later one as one."""
+        before = np.concatenate([self.before, later.before[len(self.before) :]])
+        return Bend(before, later.after, min(self.first, later.first), later.last)
+
     def moved(self, place: Float, scan: Int) -> Float:
         """Return the corrected positions, shape (N, 2) [m].
 

@@ -21,13 +21,21 @@ from pipeline.slam import slip_detection
 from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.best_particle import are_apart, heir, leader
 from pipeline.slam.frame_uncertainty import NOISE, FrameMemory, at_least
-from pipeline.slam.loop_correction import Loop, bent_landmarks, bent_path
+from pipeline.slam.keyframe_graph import REVISIT_DISTANCE, Keyframe, KeyframeGraph, Solution, View, combined
+from pipeline.slam.loop_correction import (
+    Loop,
+    corrected_landmarks,
+    corrected_path,
+    joined,
+    same_trees,
+)
 from pipeline.slam.measurement_update import against_slip, estimated, use_scan
-from pipeline.slam.motion import Motion, accumulated, noise_of, wrapped
+from pipeline.slam.motion import Motion, accumulated, compounded, noise_of, wrapped
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import shared_map, take_ancestors
 from pipeline.slam.particle_update import Rules
 from pipeline.slam.pose_quality import is_astray, judged
+from pipeline.slam.poses import composed, inverse
 from pipeline.slam.random_draws import draws
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.running_statistics import Doubted, Recent, remembered
@@ -38,6 +46,8 @@ from pipeline.slam.state import SlamState
 from pipeline.types.pose_health import Health
 from pipeline.types.records import Detections, Int, Landmarks, PoseEstimate, PoseMeasurement
 
+VIEWS = 20  # scans between two keyframes that count
+LOOP_WEIGHT_MIN = 0.5  # weight of a loop by its kernel; one that the graph contradicts has less
 PLACED = 1  # tells the draws of a placing from those of a scan
 
 
@@ -94,14 +104,16 @@ class FastSlam:
             state = replace(state, best=heir(state.best, ancestors, weights), shared=shared)
             state.log_weight[:] = 0.0
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
-        self.state = replace(state, genealogy=genealogy, frame=frame)
+        self.state = state = replace(state, genealogy=genealogy, frame=frame)
         health = judged(
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
         )
         # A survivor of the resampling keeps its row, so that row `best` is still that of the best particle.
-        landmark_of = (
-            births_of(detections, estimate, self.landmarks()) if births is None else births[state.best]
-        )
+        if births is None:
+            landmark_of = births_of(detections, estimate, self.landmarks())
+        else:
+            landmark_of = births[state.best]
+            self.state = self._with_keyframe(state, detections, landmark_of)
         return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
 
     def as_seen(self, pose: PoseMeasurement) -> PoseMeasurement:
@@ -113,8 +125,24 @@ class FastSlam:
 
         Args:
             index: Number of the scan, for the draws.
-            T_map_base: The pose; covariance: of x, y [m], yaw [rad], shape (3, 3).
+            T_map_base: The pose.
+            covariance: Covariance of x, y [m], yaw [rad], shape (3, 3).
         """
+        self._put(index, T_map_base, covariance)
+        graph = self.state.graph
+        if graph.keyframes:
+            keyframe = self._keyframe(self.state, (), self.state.detections)
+            keyframe = replace(keyframe, covariance=np.full((3, 3), np.inf))
+            graph = graph.with_keyframe(keyframe, T_map_base.as_array()).with_loop(0, T_map_base, covariance)
+        self.state = replace(
+            self.state,
+            graph=graph,
+            keyframe_motion=np.zeros(3),
+            keyframe_covariance=np.zeros((3, 3)),
+            views=(),
+        )
+
+    def _put(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         rng = np.random.default_rng([self.seed, index, PLACED])
         noise = rng.standard_normal((self.parameters.particles, 3))
         values, axes = np.linalg.eigh(covariance)
@@ -122,25 +150,77 @@ class FastSlam:
         pose[:, 2] = wrap_angle(pose[:, 2])
         self.state = self.state.placed(pose)
 
-    def close(self, index: int, loop: Loop) -> Bend:
-        """Close a loop that ends at the newest scan: the path since it began is bent, the landmarks with it,
-        and all particles go on from where the loop ends, with the map and the past of the best one.
+    @property
+    def is_smoothing_due(self) -> bool:
+        """Whether trees were seen again and no other source measures the pose."""
+        return self.state.graph.is_due and not self.state.shared.begun
+
+    def smooth(self, index: int) -> Bend | None:
+        """Solve the graph. All particles go on from its newest pose, with its path and landmarks.
 
         Args:
-            index: Number of the scan, for the draws; loop: what was found.
+            index: Number of the newest scan, for the draws.
+
+        Returns:
+            The correction; None where the graph has no solution.
         """
-        path = self.path()
-        bend = Bend(path, bent_path(path, loop, noise_of(self.parameters)), loop.first, loop.last)
-        before = self.state
-        known = before.map_of(before.best)
-        landmarks = bent_landmarks(known, before.frame.scan_of(known.birth), bend)
-        self.place(index, loop.T_map_base, loop.covariance)
+        graph, solution = self.state.graph, self.state.graph.solve()
+        if solution is None:
+            self.state = replace(self.state, graph=replace(graph, revisits=0))
+            return None
+        return self._corrected(index, graph, solution, solution.newest)
+
+    def close(self, index: int, loop: Loop) -> Bend | None:
+        """Close a loop that ends at the newest scan: solve the graph with it, and correct path and landmarks.
+        All particles go on from the corrected pose with the map of the best one.
+
+        Args:
+            index: Number of the scan, for the draws.
+            loop: The loop.
+
+        Returns:
+            The correction; None where the graph contradicts the loop, and nothing changes then.
+        """
+        state, path = self.state, self.path()
+        keyframe = self._keyframe(state, state.views, state.detections)
+        graph = state.graph.with_keyframe(keyframe, path[-1]).without_revisits(state.way - REVISIT_DISTANCE)
+        graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance)
+        solution = graph.solve()
+        if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:
+            return None
+        moved = corrected_landmarks(state.map_of(state.best), graph, solution, path)
+        names = same_trees(moved, graph.first_birth_after(loop.first))
+        graph = replace(graph.renamed(*names), pose=solution.pose)
+        again = graph.solve()
+        return self._corrected(index, graph, again or solution, loop.covariance, names)
+
+    def _corrected(
+        self,
+        index: int,
+        graph: KeyframeGraph,
+        solution: Solution,
+        covariance: Float,
+        names: tuple[Int, Int] | None = None,
+    ) -> Bend:
+        """Put all particles at the end of a solution, with its path and landmarks; `names`: see `joined`."""
+        before, path = self.state, self.path()
+        best = before.map_of(before.best)
+        moved = corrected_landmarks(best, graph, solution, path)
+        after = corrected_path(path, graph, solution)
+        bend = Bend(path, after, 0, len(path) - 1)
+        self._put(index, Pose2(*after[-1].tolist()), covariance)
         particles = len(self.state.pose)
+        frame = before.frame.corrected(bend, _at_scans(solution.covariance, graph, len(path)))
         self.state = replace(
             self.state,
-            maps=shared_map(particles, landmarks),
-            genealogy=Genealogy.of_path(bend.after, particles),
-            frame=self.state.frame.bent(bend, loop.covariance),
+            maps=shared_map(particles, moved if names is None else joined(moved, *names)),
+            genealogy=Genealogy.of_path(after, particles),
+            recent=before.recent,
+            frame=frame.forgotten(),
+            graph=graph.solved_by(solution),
+            keyframe_motion=np.zeros(3),
+            keyframe_covariance=np.zeros((3, 3)),
+            views=(),
         )
         return bend
 
@@ -214,6 +294,9 @@ class FastSlam:
         if trees.slipped:
             recent = replace(recent, distrust=1.0)
         shared = self._shared(state, motion, covariance, measured)
+        keyframe_motion, keyframe_covariance = compounded(
+            state.keyframe_motion, state.keyframe_covariance, motion[0], motion[1], motion[2], covariance
+        )
         maps, weights, mean, odometry, births = use_scan(
             state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
             state.detections, rules, shared.for_particles(measured),
@@ -226,6 +309,9 @@ class FastSlam:
             maps=maps,
             motion=np.zeros(3),
             motion_covariance=np.zeros((3, 3)),
+            keyframe_motion=keyframe_motion,
+            keyframe_covariance=keyframe_covariance,
+            way=state.way + (state.since_update if math.isfinite(state.since_update) else 0.0),
             since_update=0.0,
             detections=state.detections + found,
             best=leader(weights, state.best, state.pose, rules.distance_max),
@@ -233,6 +319,37 @@ class FastSlam:
             shared=shared,
         )
         return state, scan, weights, births
+
+    def _with_keyframe(self, state: SlamState, detections: Detections, birth: Int) -> SlamState:
+        """The state with the detections of this scan, which are of landmarks with these birth numbers, and
+        with a keyframe if the last one is far."""
+        graph, views, spacing = state.graph, state.views, self.parameters.keyframe_distance
+        # Scans of a robot that stands still share their errors.
+        if len(detections.cluster) and (not views or state.way - views[-1].way >= spacing / VIEWS):
+            scan, R = len(state.genealogy) - 1, rows_of(detections.covariance)
+            views = (*views, View(scan, state.way, birth, detections.centre, R))
+        if graph.keyframes and state.way - graph.keyframes[-1].way < spacing:
+            return state if views is state.views else replace(state, views=views)
+        keyframe = self._keyframe(state, views, state.detections - len(detections.cluster))
+        return replace(
+            state,
+            graph=graph.with_keyframe(keyframe, state.pose[state.best]),
+            keyframe_motion=np.zeros(3),
+            keyframe_covariance=np.zeros((3, 3)),
+            views=(),
+        )
+
+    def _keyframe(self, state: SlamState, views: tuple[View, ...], first_birth: int) -> Keyframe:
+        """The keyframe at the newest scan, with what the scans since the last one show."""
+        birth, centre, R = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
+        if views:
+            path = state.genealogy.path_since(state.best, views[0].scan)
+            at = path[[v.scan - views[0].scan for v in views]]
+            birth, centre, R = combined(views, composed(inverse(path[-1:]).repeat(len(at), axis=0), at))
+        scan = max(len(state.genealogy) - 1, 0)
+        return Keyframe(
+            scan, first_birth, state.way, state.keyframe_motion, state.keyframe_covariance, birth, centre, R
+        )
 
     def _by_trees(self, state: SlamState, centre: Float, R: Float, rules: Rules) -> ByTrees:
         return against_slip(
@@ -253,6 +370,13 @@ class FastSlam:
             now, _, _ = _estimate(moved, normalised(state.log_weight), self.parameters, 0.0)
             shared = SharedErrors.begun_at(len(state.pose), now.T_map_base.as_array(), now.covariance)
         return shared.measured(measured)
+
+
+def _at_scans(covariance: Float, graph: KeyframeGraph, scans: int) -> Float:
+    """Covariance of each scan's pose, shape (N, 3, 3), by that of its keyframe."""
+    keyframe = np.searchsorted(graph.scans, np.arange(scans), side="right") - 1
+    rows: Float = covariance[np.maximum(keyframe, 0)]
+    return rows
 
 
 def _farthest(detections: Detections) -> float:

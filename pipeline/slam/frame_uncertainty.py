@@ -129,22 +129,16 @@ class FrameMemory:
             shared[j] = carried(self.covariance[k], float(dx), float(dy))[:2, :2]
         return shared
 
-    def bent(self, bend: Bend, covariance: Float) -> FrameMemory:
-        """After a loop was closed: marks move with their scans, and what is known at both ends of a walk is
-        known the better in between (a Brownian bridge, by the share of the marks).
+    def corrected(self, bend: Bend, covariance: Float) -> FrameMemory:
+        """Return the memory after a correction of the path.
 
         Args:
-            covariance: Of the pose where the loop was closed, with respect to where it began, (3, 3).
+            bend: The correction.
+            covariance: Covariance of the pose of each scan, shape (N, 3, 3).
         """
-        late = np.flatnonzero(self.scan > bend.first)
-        if not len(late):
+        if not len(self.scan):
             return self
-        pose, sharper = self.pose.copy(), self.covariance.copy()
-        pose[late] = bend.poses(self.pose[late], self.scan[late])
-        base = covariance if late[0] == 0 else covariance + self.covariance[late[0] - 1]
-        share = (np.arange(len(late)) + 1.0) / len(late)
-        sharper[late] += share[:, None, None] * (base - sharper[late])
-        return replace(self, pose=pose, covariance=sharper)
+        return replace(self, pose=bend.poses(self.pose, self.scan), covariance=covariance[self.scan])
 
     def forgotten(self) -> FrameMemory:
         """Nothing hidden: the particles were put somewhere with the spread that is known."""

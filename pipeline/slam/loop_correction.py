@@ -1,10 +1,4 @@
-"""Correction of the path by a loop closure: least squares over the poses since the robot left a known place.
-
-x* = argmin sum |x_k^-1 x_k+1 - u_k|^2_Q + sum |x_i^-1 x_j - z_ij|^2_T + |x_n - z|^2_R
-
-u_k are the motions of the path before the correction, z_ij are ties between scans that saw the same trees,
-and z is the pose at which the known place was found again.
-"""
+"""Correction of path and landmarks by a solution of the keyframe graph."""
 
 from __future__ import annotations
 
@@ -13,17 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
-from pipeline.loop_closure.map_correction import Bend
 from pipeline.slam.association import associate
+from pipeline.slam.keyframe_graph import KeyframeGraph, Solution, rotated_rows
 from pipeline.slam.motion import Noise
 from pipeline.slam.particle_maps import MapColumns
 from pipeline.slam.poses import composed, interpolated, inverse
 from pipeline.types.records import Int
 
-SPACING, MOST_NODES = 1.0, 2000  # m between two nodes; more if the path would have more nodes
-TIE_SIGMA = np.array([0.1, 0.1, 0.02])  # m, m, rad
-FLOOR = 1e-3  # m, rad; minimum sigma of a motion, also of a robot that stands still
-ROUNDS, SETTLED = 20, 1e-6  # m, rad
 JUMP, JUMP_TURN = 1.0, 1.0  # m, rad; a larger difference between path and odometry is no motion
 TWICE = 1.0  # m; closer landmarks of before and after the loop are the same tree
 
@@ -33,14 +23,11 @@ class Loop:
     """A loop: the robot is at a known place again.
 
     Attributes:
-        first: Scan up to which path and map stay unchanged.
+        first: Scan at which the robot left the place.
         last: Last scan that changed the map.
         anchor: Scan at or before `first` that was taken near the place.
         T_map_base: Pose of the base at the newest scan.
         covariance: Covariance of this pose relative to the trees there, x, y [m], yaw [rad], shape (3, 3).
-        ties: int64, shape (K, 2): pairs of an earlier and a later scan that saw the same trees, so that their
-            relative pose is known.
-        motion: x, y [m], yaw [rad] by odometry from each scan to the next, shape (N, 3).
     """
 
     first: int
@@ -48,33 +35,72 @@ class Loop:
     anchor: int
     T_map_base: Pose2
     covariance: Float
-    ties: Int
-    motion: Float
 
 
-def bent_path(path: Float, loop: Loop, noise: Noise) -> Float:
-    """Return the corrected path, x, y [m], yaw [rad], shape (N, 3).
+def corrected_path(path: Float, graph: KeyframeGraph, solution: Solution) -> Float:
+    """Return the path with the keyframes of a solution, x, y [m], yaw [rad], shape (N, 3).
 
-    Args:
-        path: The path before the correction, shape (N, 3).
-        loop: The loop that ends at the newest scan.
-        noise: Noise of the odometry. The ratio of its parts decides how the correction is distributed; its
-            scale matters little.
+    Between two keyframes the path keeps its shape, and the difference at the second one is spread evenly.
     """
-    if loop.first >= len(path) - 1:
-        return path.copy()
-    driven = path.copy()
-    driven[loop.first :], _ = without_jumps(path[loop.first :], loop.motion[loop.first :])
-    nodes = _nodes(driven, loop.first)
-    between = composed(inverse(driven[nodes[:-1]]), driven[nodes[1:]])
-    edges = _edges(driven, nodes, between, loop, noise, _tied(path, driven, nodes, loop))
-    solved = _solved(driven[nodes], *edges)
-    scans = np.arange(loop.first, len(path))
-    node = np.searchsorted(nodes, scans, side="right") - 1
-    since = composed(inverse(driven[nodes[node]]), driven[scans])
-    motions = np.concatenate([np.full((1, 3), np.nan), between])
-    rows = interpolated(solved, motions, node, since)
-    return np.concatenate([path[: loop.first + 1], rows[1:]])
+    scans = graph.scans
+    keyframe = np.maximum(np.searchsorted(scans, np.arange(len(path)), side="right") - 1, 0)
+    before = path[scans]
+    since = composed(inverse(before[keyframe]), path)
+    motions = np.concatenate([np.full((1, 3), np.nan), composed(inverse(before[:-1]), before[1:])])
+    motions[[not np.isfinite(k.covariance).all() for k in graph.keyframes]] = np.nan
+    return interpolated(solution.pose, motions, keyframe, since)
+
+
+def corrected_landmarks(
+    known: MapColumns, graph: KeyframeGraph, solution: Solution, path: Float
+) -> MapColumns:
+    """Return the landmarks of one particle after a correction of the path.
+
+    A landmark of the graph is at its solution; another one moves with the keyframe that began it.
+    """
+    mean, turn = _moved_rigidly(known.mean, known.birth, graph, solution, path)
+    _, ours, theirs = np.intersect1d(known.birth, solution.birth, return_indices=True)
+    mean[ours] = solution.position[theirs]
+    return known._replace(mean=mean, covariance=rotated_rows(known.covariance, turn))
+
+
+def _moved_rigidly(
+    place: Float, birth: Int, graph: KeyframeGraph, solution: Solution, path: Float
+) -> tuple[Float, Float]:
+    """The positions, each moved with the keyframe that began it, and their rotations."""
+    first = np.array([k.first_birth for k in graph.keyframes], np.int64)
+    row = np.maximum(np.searchsorted(first, birth, side="right") - 1, 0)
+    was, now = path[graph.scans][row], solution.pose[row]
+    turn = wrap_angle(now[:, 2] - was[:, 2])
+    c, s = np.cos(turn), np.sin(turn)
+    dx, dy = (place - was[:, :2]).T
+    return now[:, :2] + np.column_stack([c * dx - s * dy, s * dx + c * dy]), turn
+
+
+def same_trees(known: MapColumns, first_birth: int) -> tuple[Int, Int]:
+    """Return the landmarks begun after a loop that stand where one from before it does, one to one: their
+    birth numbers, ascending, and the older birth numbers, shape (N,)."""
+    old, young = np.flatnonzero(known.birth < first_birth), np.flatnonzero(known.birth >= first_birth)
+    of, _ = associate(
+        known.mean[young], known.covariance[young], known.mean[old], known.covariance[old], np.inf, TWICE
+    )
+    again = np.flatnonzero(of >= 0)
+    birth, name = known.birth[young[again]], known.birth[old[of[again]]]
+    order = np.argsort(birth)
+    return birth[order], name[order]
+
+
+def joined(known: MapColumns, birth: Int, name: Int) -> MapColumns:
+    """Return the landmarks with those of some birth numbers joined to those that they are named after."""
+    hits, score = known.hits.copy(), known.score.copy()
+    keep = np.ones(len(known.birth), np.bool_)
+    row = {int(b): k for k, b in enumerate(known.birth)}
+    for young, old in zip(birth.tolist(), name.tolist(), strict=True):
+        k, o = row[young], row[old]
+        hits[o] += hits[k]
+        score[o] = max(score[o], score[k])
+        keep[k] = False
+    return MapColumns(known.mean[keep], known.covariance[keep], hits[keep], score[keep], known.birth[keep])
 
 
 def without_jumps(path: Float, motion: Float) -> tuple[Float, int]:
@@ -110,123 +136,3 @@ def drift_of(path: Float, first: int, noise: Noise) -> Float:
     total: Float = (lever * heading[:, None]).T @ lever
     total += noise.distance**2 * float(distance.sum()) * np.diag([1.0, 1.0, 0.0])
     return total
-
-
-def bent_landmarks(known: MapColumns, scan: Int, bend: Bend) -> MapColumns:
-    """Return the landmarks after a correction of the path.
-
-    A landmark moves with the scan that began it. Duplicates of before and after the loop are joined one to
-    one and keep the older birth.
-
-    Args:
-        known: The landmarks before the correction.
-        scan: int64, shape (L,): the scan that began each landmark.
-        bend: The correction.
-    """
-    mean, turn = bend.of_trees(known.mean, scan)
-    c, s = np.cos(turn), np.sin(turn)
-    C = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
-    flat = (C @ known.covariance[:, [[0, 1], [1, 2]]] @ C.transpose(0, 2, 1))[:, [0, 0, 1], [0, 1, 1]]
-    covariance = np.where((scan > bend.first)[:, None], flat, known.covariance)
-    old, young = np.flatnonzero(scan <= bend.first), np.flatnonzero(scan > bend.first)
-    of, _ = associate(mean[young], covariance[young], mean[old], covariance[old], np.inf, TWICE)
-    hits, score = known.hits.copy(), known.score.copy()
-    again = of >= 0
-    hits[old[of[again]]] += known.hits[young[again]]
-    score[old[of[again]]] = np.maximum(score[old[of[again]]], known.score[young[again]])
-    keep = np.ones(len(mean), np.bool_)
-    keep[young[again]] = False
-    moved = known._replace(mean=mean, covariance=covariance, hits=hits, score=score)
-    return MapColumns(
-        moved.mean[keep], moved.covariance[keep], moved.hits[keep], moved.score[keep], moved.birth[keep]
-    )
-
-
-def _nodes(path: Float, first: int) -> Int:
-    """Return the scans from `first` to the last one that are nodes of the graph, about SPACING apart."""
-    way = _way(path)[first:]
-    spacing = max(SPACING, float(way[-1] - way[0]) / MOST_NODES)
-    cell = np.floor((way - way[0]) / spacing)
-    nodes = first + np.flatnonzero(np.diff(cell, prepend=-1.0) > 0)
-    return np.append(nodes, len(path) - 1) if nodes[-1] < len(path) - 1 else nodes
-
-
-def _way(path: Float) -> Float:
-    """Return the distance driven until each scan, shape (N,) [m]; a turn counts one metre per radian."""
-    step = np.diff(path, axis=0, prepend=path[:1])
-    way: Float = np.cumsum(np.hypot(step[:, 0], step[:, 1]) + np.abs(wrap_angle(step[:, 2])))
-    return way
-
-
-_Edges = tuple[Int, Int, Float, Float]
-
-
-def _edges(
-    path: Float, nodes: Int, between: Float, loop: Loop, noise: Noise, tied: tuple[Int, Int, Float]
-) -> _Edges:
-    """Return the edges of the graph: first node, second node, measured motion, shape (E, 3), and the square
-    root of its information matrix, shape (E, 3, 3)."""
-    step = np.diff(path, axis=0, prepend=path[:1])
-    distance = np.cumsum(np.hypot(step[:, 0], step[:, 1]))[nodes]
-    turn = np.cumsum(np.abs(wrap_angle(step[:, 2])))[nodes]
-    along = noise.distance**2 * np.diff(distance) + FLOOR**2
-    heading = noise.turn_distance**2 * np.diff(distance) + noise.turn**2 * np.diff(turn) + FLOOR**2
-    chain = np.zeros((len(between), 3, 3))
-    chain[:, 0, 0] = chain[:, 1, 1] = 1.0 / np.sqrt(along)
-    chain[:, 2, 2] = 1.0 / np.sqrt(heading)
-    start = path[loop.first]
-    c, s = np.cos(start[2]), np.sin(start[2])
-    C = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    found = composed(inverse(start[None]), loop.T_map_base.as_array()[None])
-    R = C.T @ loop.covariance @ C + FLOOR**2 * np.eye(3)
-    root = np.linalg.cholesky(np.linalg.inv(R)).T
-    k = np.arange(len(between))
-    return (
-        np.concatenate([k, tied[0], [0]]),
-        np.concatenate([k + 1, tied[1], [len(nodes) - 1]]),
-        np.concatenate([between, tied[2], found]),
-        np.concatenate([chain, np.tile(np.diag(1.0 / TIE_SIGMA), (len(tied[0]), 1, 1)), root[None]]),
-    )
-
-
-def _tied(path: Float, driven: Float, nodes: Int, loop: Loop) -> tuple[Int, Int, Float]:
-    """Return the ties as edges between nodes: first node, second node, motion. A tie with a scan that stays
-    fixes the other scan. Both scans saw the same trees, so the motion is that of the path with its jumps."""
-    scans = np.maximum(loop.ties, loop.first)
-    ends = np.searchsorted(nodes, scans)
-    apart = ends[:, 1] > ends[:, 0] + 1
-    (early, late), (i, j) = scans[apart].T, ends[apart].T
-    motion = composed(inverse(path[early]), path[late])
-    before, after = (composed(inverse(driven[s]), driven[nodes[k]]) for s, k in ((early, i), (late, j)))
-    return i, j, composed(composed(inverse(before), motion), after)
-
-
-def _solved(x: Float, i: Int, j: Int, z: Float, root: Float) -> Float:
-    """Return the poses that minimise the squared errors of the edges, by Gauss-Newton from the poses x, shape
-    (K, 3); the first pose is fixed."""
-    from scipy import sparse
-    from scipy.sparse.linalg import spsolve
-
-    x = x.copy()
-    n, E = 3 * len(x), len(i)
-    rows = np.broadcast_to(3 * np.arange(E)[:, None, None] + np.arange(3)[:, None], (E, 3, 3))
-    columns = [np.broadcast_to(3 * k[:, None, None] + np.arange(3), (E, 3, 3)) for k in (i, j)]
-    at = np.concatenate([rows.ravel()] * 2), np.concatenate([c.ravel() for c in columns])
-    for _ in range(ROUNDS):
-        c, s = np.cos(x[i, 2]), np.sin(x[i, 2])
-        dx, dy = (x[j, :2] - x[i, :2]).T
-        error = np.column_stack([c * dx + s * dy, c * dy - s * dx, x[j, 2] - x[i, 2]]) - z
-        error[:, 2] = wrap_angle(error[:, 2])
-        J = np.zeros((2, E, 3, 3))  # by the pose where an edge begins, and where it ends
-        J[1, :, 0, 0], J[1, :, 0, 1], J[1, :, 1, 0], J[1, :, 1, 1] = c, s, -s, c
-        J[1, :, 2, 2] = 1.0
-        J[0] = -J[1]
-        J[0, :, 0, 2], J[0, :, 1, 2] = c * dy - s * dx, -c * dx - s * dy
-        A = sparse.csc_matrix(((root @ J).ravel(), at), shape=(3 * E, n))[:, 3:]
-        b = (root @ error[:, :, None]).ravel()
-        step = spsolve((A.T @ A).tocsc(), -(A.T @ b)).reshape(-1, 3)
-        x[1:] += step
-        if np.abs(step).max() < SETTLED:
-            break
-    x[:, 2] = wrap_angle(x[:, 2])
-    return x

@@ -109,6 +109,13 @@ class Genealogy:
         """Return the path of particle `leaf` of the newest scan, x, y [m], yaw [rad], shape (N, 3)."""
         return np.concatenate([*self.settled, _walk(self.recent, leaf)])
 
+    def path_since(self, leaf: int, scan: int) -> Float:
+        """Return the path of particle `leaf` from a scan on; only the scans whose ancestors are kept."""
+        first = scan - BLOCK * len(self.settled)
+        if first < 0:
+            return self.path(leaf)[scan:]
+        return _walk(self.recent[first:], leaf)
+
 
 def _founders_after(
     scans: int, founders: tuple[Int, Int] | None, particles: int, ancestors: Int | None

@@ -109,6 +109,12 @@ class Tracker:
             for b in (slice(0, 2), slice(2, 4)):
                 t.P[:, a, b] = C @ t.P[:, a, b] @ C.transpose(0, 2, 1)
         t.shared[:] = C @ t.shared @ C.transpose(0, 2, 1)
+        # The graph estimates the landmarks from all detections, so the trees stand where they do.
+        order = np.argsort(landmarks.birth)
+        at = np.minimum(np.searchsorted(landmarks.birth[order], t.landmark), max(len(order) - 1, 0))
+        if len(order):
+            known = landmarks.birth[order][at] == t.landmark
+            t.x[known, :2] = landmarks.position[order[at[known]]]
         self._follow(self._scan.stamp_ns, estimate, landmarks, np.inf, LOOP_DISTANCE)
 
     def classify(self, stamp_ns: int, columns: Columns, parameters: Classification) -> Columns:

@@ -22,7 +22,7 @@ from pipeline.io.readers import open_source
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing import filters
 from pipeline.preprocessing.acquisition import acquire
-from pipeline.slam import BackEnd
+from pipeline.slam import FastSlam
 from pipeline.tracking import Tracker
 from pipeline.types.records import Detections, Float, Path, Trees, Truth
 from tests.benchmarks.table import Cell, Table
@@ -85,17 +85,20 @@ def seen_in(uri: str, parameters: Parameters | None = None) -> tuple[list[Seen],
 
 def mapped(rows: Sequence[Seen], truth: Truth, parameters: Parameters, seed: int) -> Mapped:
     """SLAM and tracking over a run."""
-    slam, tracker = BackEnd(parameters.slam, seed), Tracker(parameters.tracking)
+    slam, tracker = FastSlam(parameters.slam, seed), Tracker(parameters.tracking)
     before: Pose2 | None = None
     sigma = np.zeros(len(rows))
+    stamps = np.array([s.stamp_ns for s in rows])
     for k, seen in enumerate(rows):
         motion = Pose2() if before is None else before.inverse() @ seen.odometry
         before = seen.odometry
         at = slam.process(k, motion, seen.detections, seen.clear)
         tracker.process(seen.stamp_ns, at, seen.detections, slam.landmarks())
+        if slam.is_smoothing_due and (bend := slam.smooth(k)):
+            tracker.bend(bend, stamps[: k + 1], slam.estimate(at), slam.landmarks())
         sigma[k] = np.sqrt(0.5 * (at.covariance[0, 0] + at.covariance[1, 1]))
     poses = slam.path()
-    path = Path(np.array([s.stamp_ns for s in rows]), poses[:, 0], poses[:, 1], poses[:, 2], sigma)
+    path = Path(stamps, poses[:, 0], poses[:, 1], poses[:, 2], sigma)
     error = path_error(path, truth.path, align=True) if truth.path else None
     trees = tracker.trees()
     return Mapped(
@@ -110,7 +113,6 @@ def mapped(rows: Sequence[Seen], truth: Truth, parameters: Parameters, seed: int
     )
 
 
-#: The pose graph, which takes a hundred times as long, has a benchmark of its own.
 METHODS = ("fastslam1", "fastslam2")
 METHOD_SEEDS = (1, 2, 3)
 METHOD_COLUMNS = ("method", *COLUMNS, "s")

@@ -16,7 +16,7 @@ from pipeline.geometry.poses import Float, Pose2
 from pipeline.ground.terrain_map import PackedHeightMap
 from pipeline.loop_closure.kidnapped_robot import RelocaliserState
 from pipeline.mapper import Mapper, MapperState
-from pipeline.slam import GraphState, SlamState
+from pipeline.slam import SlamState
 from pipeline.slam.frame_uncertainty import FrameMemory
 from pipeline.slam.particle_ancestry import BLOCK
 from pipeline.slam.particle_maps import is_sound
@@ -55,11 +55,9 @@ class SavedMap:
 
     @classmethod
     def of(cls, mapper: Mapper) -> SavedMap:
-        """Return the state of a mapper; a pose graph is saved as particles."""
+        """Return the state of a mapper."""
         state, path = mapper.snapshot(), mapper.path
         slam, lost = state.slam, state.recovery
-        if isinstance(slam, GraphState):
-            slam = slam.as_particles(mapper.parameters.slam.particles, seed=0)
         return cls(
             slam,
             PackedVoxelMap.of(state.gathering.folded()),

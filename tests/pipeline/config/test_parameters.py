@@ -305,6 +305,15 @@ def test_a_removed_parameter_is_ignored_with_one_warning():
     assert len(warned) == 1
 
 
+def test_a_removed_choice_is_replaced_with_one_warning():
+    with pytest.warns(RenamedParameterWarning, match="fastslam2 is used") as warned:
+        changed = preset("paper").replace({"slam.method": "graph"})
+    assert len(warned) == 1
+    with pytest.warns(RenamedParameterWarning, match="fastslam2 is used"):
+        from_file = from_toml('[slam]\nmethod = "graph"\n', Parameters(), "old.toml")
+    assert changed.slam.method == from_file.slam.method == "fastslam2"
+
+
 def test_names_of_earlier_versions_are_accepted_with_one_warning_each():
     with pytest.warns(RenamedParameterWarning, match=r"slam.looks is now called slam.independent_views_max"):
         by_name = Parameters().replace({"slam.looks": 50.0})

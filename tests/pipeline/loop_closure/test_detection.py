@@ -20,19 +20,17 @@ from pipeline.ground.terrain_map import SIDE as CELLS
 from pipeline.ground.terrain_map import bent as bent_tiles
 from pipeline.loop_closure.map_correction import TILE, Bend
 from pipeline.mapper import Mapper
-from pipeline.slam import BackEnd, Loop
-from pipeline.slam.loop_correction import bent_path, drift_of
+from pipeline.slam.loop_correction import drift_of
 from pipeline.slam.motion import Noise, compounded
 from pipeline.slam.poses import composed, inverse
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import Landmarks, PoseEstimate
 from tests.benchmarks.wide_ring import REACH, SENSOR, WideRing, mapped
-from tests.pipeline.strategies import NOTHING_SEEN, detections, first_of, seeds
+from tests.pipeline.strategies import first_of, seeds
 from tests.pipeline.test_mapper import as_bytes
 
 NOISE = Noise(0.05, 0.01, 0.03)
-NO_TIES = np.zeros((0, 2), np.int64)
 SURE = np.diag(np.square([0.02, 0.02, 0.004]))
 STEMS = preset("stems")
 
@@ -50,50 +48,6 @@ def circle(n=300, radius=30.0, laps=1.0, turn=0.0, longer=1.0):
 def driven(path):
     """The odometry of a path without jumps."""
     return np.concatenate([np.zeros((1, 3)), composed(inverse(path[:-1]), path[1:])])
-
-
-def loop(path, at, first=0, ties=NO_TIES, sigma=SURE, motion=None):
-    """A loop that ends at a pose."""
-    motion = driven(path) if motion is None else motion
-    return Loop(first, len(path) - 1, first, Pose2(*at), sigma, ties, motion)
-
-
-# --- the path -------------------------------------------------------------------------------------
-
-
-@given(st.floats(-1e-3, 1e-3), st.floats(0.97, 1.03), st.integers(0, 100))
-def test_a_path_with_a_steady_error_is_bent_back_onto_the_truth(turn, longer, first):
-    truth, told = circle(), circle(turn=turn, longer=longer)
-    at = composed(told[first][None], composed(inverse(truth[first][None]), truth[-1][None]))[0]
-    bent = bent_path(told, loop(told, at, first), NOISE)
-    assert bent[: first + 1].tobytes() == told[: first + 1].tobytes(), "what was known stays"
-    np.testing.assert_allclose(bent[-1, :2], at[:2], atol=0.05)
-    wanted = composed(told[first][None], composed(inverse(truth[first][None]).repeat(300, 0), truth))
-    before = np.hypot(*(told - wanted)[first:, :2].T).max()
-    # A circle that is too large comes back by itself: nothing tells how large it was.
-    assert (
-        np.hypot(*(bent - wanted)[first:, :2].T).max() <= max(0.5 * before, abs(longer - 1.0) * 62.0) + 0.05
-    )
-
-
-def test_the_bend_is_spread_evenly_over_a_straight_way_that_is_too_long():
-    told = np.column_stack([np.arange(101.0), np.zeros(101), np.zeros(101)])
-    bent = bent_path(told, loop(told, [90.0, 0.0, 0.0]), NOISE)
-    np.testing.assert_allclose(bent[:, 0], 0.9 * told[:, 0], atol=0.05)
-    np.testing.assert_allclose(bent[:, 1:], 0.0, atol=1e-6)
-
-
-def test_a_loop_that_fits_bends_nothing():
-    path = circle(laps=0.9)
-    np.testing.assert_allclose(bent_path(path, loop(path, path[-1]), NOISE), path, atol=1e-6)
-
-
-def test_a_scan_that_known_trees_held_stays_where_it_is():
-    told = np.column_stack([np.arange(101.0), np.zeros(101), np.zeros(101)])
-    held = np.array([[10, 50]])
-    bent = bent_path(told, loop(told, [100.0, 5.0, 0.1], 20, ties=held), NOISE)
-    free = bent_path(told, loop(told, [100.0, 5.0, 0.1], 20), NOISE)
-    assert abs(bent[50, 1]) < 0.15 < abs(free[50, 1])
 
 
 @given(seeds, st.integers(0, 20))
@@ -283,25 +237,3 @@ def test_who_has_not_come_back_closes_no_loop(seed):
     run = mapped(WideRing(laps=0.9), seed, STEMS)
     assert not run.closed()
     assert run.told()[-1] > 5.0, "however far the wheels drift"
-
-
-def test_the_pose_graph_closes_it_too():
-    pytest.importorskip("gtsam", reason="the pose graph needs the extra `graph`")
-    slam = BackEnd(STEMS.slam.model_copy(update={"method": "graph"}), 0)
-    trees = np.array([[2.0, 3.0], [4.0, -3.0], [-1.0, 4.0], [6.0, 2.5], [0.5, -4.0]])
-    true, told, n = circle(60, radius=8.0), circle(60, radius=8.0, turn=0.01), 60
-    for k in range(n):
-        step = Pose2(*(composed(inverse(told[k - 1][None]), told[k][None])[0] if k else np.zeros(3)))
-        near = Pose2(*true[k]).inverse().apply(trees)
-        slam.process(k, step, detections(near if k < 8 else near[:0]), NOTHING_SEEN)
-    before = slam.path()
-    assert np.hypot(*(before - true)[-1, :2]) > 1.0
-    bend = slam.close(n - 1, Loop(8, n - 1, 4, Pose2(*true[-1]), SURE, NO_TIES, driven(told)))
-    assert bend.before.tobytes() == before.tobytes()
-    assert bend.after.tobytes() == slam.path().tobytes()
-    assert np.hypot(*(bend.after - true)[-1, :2]) < 0.15
-    assert np.hypot(*(bend.after - true)[:, :2].T).max() < 0.5 * np.hypot(*(before - true)[:, :2].T).max()
-    np.testing.assert_allclose(bend.after[:8], before[:8], atol=0.05)
-    place = slam.landmarks().position
-    assert np.hypot(*(place[:, None] - trees).transpose(2, 0, 1)).min(axis=1).max() < 0.2
-    assert len(slam.begun_since(30)[0]) == 0 < len(slam.begun_since(0)[0])

@@ -11,26 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.poses import Pose2
-from pipeline.loop_closure.detection import TIE_APART, TIE_NEAR, RunHistory, loop_to
+from pipeline.loop_closure.detection import RunHistory, loop_to
 from pipeline.loop_closure.map_correction import Bend
 from pipeline.slam.frame_uncertainty import FrameMemory
-from pipeline.slam.loop_correction import bent_landmarks, bent_path, without_jumps
+from pipeline.slam.keyframe_graph import Keyframe, KeyframeGraph, Solution
+from pipeline.slam.loop_correction import corrected_landmarks, without_jumps
 from pipeline.slam.particle_maps import MapColumns
 from pipeline.slam.poses import composed
 from pipeline.types.records import PoseEstimate, Trees
-from tests.pipeline.loop_closure.test_detection import NOISE, SURE, circle, driven, loop
+from tests.pipeline.loop_closure.test_detection import NOISE, SURE, circle, driven
 from tests.pipeline.strategies import seeds
-
-STRIDE = 0.15  # m
-
-
-def square(side=60.0):
-    """Around a square, back to the start; x, y [m], yaw [rad]."""
-    way = np.arange(0.0, 4.0 * side, STRIDE)
-    k, rest = (way // side).astype(int), way % side
-    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * side
-    along = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    return np.column_stack([corner[k] + along[k] * rest[:, None], k * np.pi / 2.0])
 
 
 def line(metres=24.0, step=0.4):
@@ -91,42 +81,6 @@ def test_a_step_that_the_odometry_tells_of_is_driven_however_far_it_leads(seed, 
     assert (same.tobytes(), jumps) == (path.tobytes(), 0)
 
 
-@pytest.mark.parametrize("lost", [0, 20])
-def test_over_lost_scans_the_path_leads_on_as_far_as_it_was_driven(lost):
-    path = np.delete(square(), np.arange(600, 600 + lost), axis=0)
-    bent = bent_path(path, loop(path, path[-1] + [0.6, 0.5, 0.0], 10), NOISE)
-    moved = np.hypot(*(bent - path)[:, :2].T)
-    assert moved.max() < 1.0, "no scan moves by much more than what the loop lacks"
-    step = np.hypot(*np.diff(bent[:, :2], axis=0).T)
-    assert step[599] == pytest.approx((1 + lost) * STRIDE, rel=0.05)
-
-
-def test_a_jump_before_the_loop_begins_leaves_what_was_known_alone():
-    path, motion = square(), driven(square())
-    path[100:, :2] += [3.0, -4.0]
-    bent = bent_path(path, loop(path, path[-1] + [0.6, 0.5, 0.0], 200, motion=motion), NOISE)
-    assert bent[:201].tobytes() == path[:201].tobytes()
-    assert np.hypot(*(bent - path)[:, :2].T).max() < 1.0
-
-
-def test_scans_that_saw_the_same_trees_stay_together_over_a_jump():
-    """Out and back: before the jump the path has drifted aside, behind it the known trees are met again."""
-    n = 150
-    x = np.concatenate([np.arange(n) * 0.4, np.arange(n)[::-1] * 0.4])
-    yaw = np.repeat([0.0, np.pi], n)
-    true = np.column_stack([x, np.zeros(2 * n), yaw])
-    path = true.copy()
-    path[30:220, 1] = 0.02 * np.arange(190)
-    motion = driven(path)
-    motion[220] = driven(true)[220]
-    ties = np.array([[2 * n - 1 - k, k] for k in range(225, 290, 10)])
-    bent = bent_path(path, loop(path, true[-1] + [0.0, 0.6, 0.0], 20, ties, motion=motion), NOISE)
-    held = ties[ties[:, 0] <= 20]
-    assert len(held) > 0
-    assert np.abs((bent - path)[held[:, 1], 1]).max() < 0.7
-    assert np.abs(np.diff(bent[:, :2], axis=0)).max() < 0.7, "the jump is spread over the way"
-
-
 # --- which loop is one ----------------------------------------------------------------------------
 
 
@@ -145,15 +99,12 @@ def two_runs():
 
 
 @pytest.mark.parametrize("gap", [[0.3, 0.8, 0.0], [-0.6, 0.3, 0.02]])
-def test_no_loop_bends_what_was_driven_before_the_robot_was_put_elsewhere(gap):
+def test_a_loop_begins_where_the_robot_was_put_last(gap):
     path, motion, known, placed = two_runs()
     at = Pose2(*(path[-1] + gap))
     found = loop_to(mapped(path, motion, known, placed), known.number, at, SURE, len(path) - 1)
     assert found is not None
     assert found.first == placed
-    bent = bent_path(path, found, NOISE)
-    assert bent[: placed + 1].tobytes() == path[: placed + 1].tobytes(), "the finished run stays"
-    assert np.hypot(*(bent - path)[:, :2].T).max() < 3.0 * np.hypot(*gap[:2])
 
 
 def test_who_was_just_put_in_place_closes_no_loop():
@@ -178,25 +129,6 @@ def test_what_a_loop_has_bent_has_drifted_no_more(closed, is_loop):
     run = replace(mapped(path, driven(path), known), closed=closed)
     at = Pose2(*(path[-1] + [3.0, -2.0, 0.05]))
     assert (loop_to(run, known.number, at, SURE, 299) is not None) == is_loop
-
-
-@given(seeds)
-def test_a_scan_is_tied_to_the_earliest_one_of_its_place(seed):
-    random = np.random.default_rng(seed)
-    path = circle(n=360, radius=9.0, laps=3.6)
-    # Some were left early, and by them the loop is found; the others were seen all the time.
-    place = random.uniform([-1.0, 8.0], [1.0, 10.0], (7, 2))
-    known = trees(place, [0] * 7, [20] * 4 + [359] * 3)
-    run = mapped(path, driven(path), known)
-    at = Pose2(*(path[-1] + [0.6, 0.3, 0.0]))
-    found = loop_to(run, known.number[:4], at, SURE, 359)
-    assert found is not None
-    assert len(found.ties) > 5
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
-    nodes = np.flatnonzero(np.diff(np.floor(way / 2.0), prepend=-1.0) > 0)
-    for early, late in found.ties.tolist():
-        near = np.hypot(*(path[nodes, :2] - path[late, :2]).T) <= TIE_NEAR
-        assert early == nodes[near & (way[late] - way[nodes] > TIE_APART)].min()
 
 
 @given(seeds)
@@ -231,15 +163,17 @@ def test_landmarks_that_are_older_than_all_marks_are_of_the_first_scan():
     "angle", [0.5, np.pi / 2.0]
 )  # a turn by -90 degrees gives the same covariance as by 90
 def test_mean_and_covariance_of_a_landmark_turn_with_the_correction(angle):
-    before = line()
     c, s = np.cos(angle), np.sin(angle)
     C = np.array([[c, -s], [s, c]])
-    after = np.column_stack([before[:, :2] @ C.T, np.full(len(before), angle)])
-    mean = np.array([[1.0, 1.0], [20.0, 1.0]])
-    flat = np.array([[0.04, 0.01, 0.01]] * 2)
-    known = MapColumns(mean, flat, np.full(2, 5, np.int32), np.full(2, 5.0, np.float32), np.arange(2))
-    bent = bent_landmarks(known, np.array([0, 50]), Bend(before, after, 5, len(before) - 1))
-    np.testing.assert_allclose(bent.mean, [mean[0], C @ mean[1]], atol=1e-9)
-    turned = C @ np.array([[0.04, 0.01], [0.01, 0.01]]) @ C.T
-    np.testing.assert_allclose(bent.covariance[1], turned[[0, 0, 1], [0, 1, 1]], atol=1e-12)
-    assert bent.covariance[0].tobytes() == flat[0].tobytes()
+    path = line()[[0, 10]]
+    none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
+    frames = [Keyframe(k, 10 * k, 4.0 * k, path[k], np.eye(3), *none) for k in range(2)]
+    graph = KeyframeGraph(tuple(frames), path)
+    turned = np.column_stack([path[:, :2] @ C.T, np.full(2, angle)])
+    solution = Solution(turned, *none[:2], np.zeros((2, 3, 3)), np.zeros((3, 3)), np.zeros(0))
+    mean, flat = np.array([[1.0, 1.0], [20.0, 1.0]]), np.array([[0.04, 0.01, 0.01]] * 2)
+    known = MapColumns(mean, flat, np.full(2, 5, np.int32), np.full(2, 5.0, np.float32), np.array([0, 15]))
+    moved = corrected_landmarks(known, graph, solution, path)
+    np.testing.assert_allclose(moved.mean, mean @ C.T, atol=1e-9)
+    expected = C @ np.array([[0.04, 0.01], [0.01, 0.01]]) @ C.T
+    np.testing.assert_allclose(moved.covariance, np.tile(expected[[0, 0, 1], [0, 1, 1]], (2, 1)), atol=1e-12)

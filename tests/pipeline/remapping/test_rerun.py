@@ -44,7 +44,7 @@ def is_later(name: str) -> bool:
 def another(spec: FieldSpec, share: float) -> Value:
     """A value that is not the default: the other choice, or away from it by a share of the way to a bound."""
     if spec.kind == "choice":
-        return next(c for c in spec.choices if c not in ("graph", spec.default))
+        return next(c for c in spec.choices if c != spec.default)
     if spec.kind == "bool":
         return not spec.default
     if spec.kind == "name":

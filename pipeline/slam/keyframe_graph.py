@@ -1,0 +1,509 @@
+"""Pose graph of keyframes and stems: the smoother behind FastSLAM.
+
+x*, l* = argmin   sum_k  |x_k-1^-1 x_k - u_k|^2_Q
+                + sum_kj rho(|C_k^T (l_j - p_k) - z_kj|_R)
+                + sum_ij rho(|x_i^-1 x_j - t_ij|_T)
+
+x_k are the poses of keyframes, p_k and C_k their position and rotation, l_j the positions of stems, u_k the
+motions by odometry between keyframes, z_kj the detections of stems, for which FastSLAM decides the data
+association, and t_ij the loops that stem matching finds. rho is the kernel of Cauchy, which switches off a
+wrong association or a wrong loop. Levenberg-Marquardt on sparse normal equations solves the problem, from the
+present estimate on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pipeline.geometry.poses import Float, Pose2, wrap_angle
+from pipeline.slam.poses import composed, inverse
+from pipeline.types.records import Int
+
+Sparse = Any  # scipy.sparse.csc_matrix, or its factors; scipy has no types
+#: Scale of the Cauchy kernel [sigma], which has 95 % of the efficiency of least squares for Gaussian errors
+#: (Holland, Welsch 1977).
+CAUCHY = 2.385
+#: Stems of one keyframe that enter the graph, the nearest first, so that a keyframe has a bounded cost.
+STEMS_MAX = 24
+#: Keyframes of the graph; beyond it every second one is dropped, so that a solution has a bounded cost.
+KEYFRAMES_MAX = 2000
+#: m of the path; a stem that was not seen for so long and is seen again closes a loop.
+REVISIT_DISTANCE = 30.0
+#: Growth of the graph between two solutions, so that all solutions cost a bounded multiple of the last one.
+GROWTH, GROWTH_MIN = 0.1, 5
+#: m, m, rad; smallest sigma of a motion, also of a robot that stands still.
+MOTION_SIGMA_MIN = np.array([1e-3, 1e-3, 1e-4])
+SETTLED = 1e-3  # a smaller part of the cost that a step takes off ends the iteration
+ROUNDS_MAX = 20
+DAMPING = (1e-6, 10.0, 1e6)  # first value, factor, and the value at which the iteration gives up
+MARGINALS = 16  # keyframes of which the covariance is computed; it is interpolated in between
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keyframe:
+    """One keyframe.
+
+    Attributes:
+        scan: Number of the scan.
+        first_birth: Landmarks with this birth number or a later one were begun at this keyframe or after it.
+        way: Distance driven until here [m].
+        motion: x, y [m], yaw [rad] since the keyframe before, shape (3,).
+        covariance: Covariance of `motion`, shape (3, 3); infinite where no odometry connects the two.
+        birth: int64, shape (D,), ascending by distance: landmarks that were detected.
+        centre: Their positions in the frame of the base, shape (D, 2) [m].
+        R: Covariances of the positions xx, xy, yy, shape (D, 3) [m^2].
+    """
+
+    scan: int
+    first_birth: int
+    way: float
+    motion: Float
+    covariance: Float
+    birth: Int
+    centre: Float
+    R: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """The detections of one scan between two keyframes; the attributes are those of Keyframe."""
+
+    scan: int
+    way: float
+    birth: Int
+    centre: Float
+    R: Float
+
+
+def combined(views: tuple[View, ...], T_keyframe_base: Float) -> tuple[Int, Float, Float]:
+    """Return the weighted means of detections of the same landmark over several scans.
+
+    Args:
+        views: The scans.
+        T_keyframe_base: Pose of each scan with respect to the keyframe, shape (V, 3).
+
+    Returns:
+        Birth numbers, positions and covariances of the landmarks, the nearest first; see Keyframe.
+    """
+    count = [len(v.birth) for v in views]
+    pose = np.repeat(T_keyframe_base, count, axis=0)
+    birth, z = np.concatenate([v.birth for v in views]), np.concatenate([v.centre for v in views])
+    R = rotated_rows(np.concatenate([v.R for v in views]), pose[:, 2])
+    z = composed(pose, np.column_stack([z, np.zeros(len(z))]))[:, :2]
+    names, of = np.unique(birth, return_inverse=True)
+    weight = 1.0 / (R[:, 0] + R[:, 2])
+    total = np.bincount(of, weight, len(names))
+    mean = np.column_stack([np.bincount(of, weight * z[:, a], len(names)) for a in range(2)]) / total[:, None]
+    # The covariance of a weighted mean of independent errors.
+    square = np.column_stack([np.bincount(of, weight**2 * R[:, a], len(names)) for a in range(3)])
+    spread = square / (total**2)[:, None]
+    near = np.argsort(np.hypot(mean[:, 0], mean[:, 1]), kind="stable")[:STEMS_MAX]
+    return names[near], mean[near], spread[near]
+
+
+def rotated_rows(covariance: Float, turn: Float) -> Float:
+    """Return covariances xx, xy, yy, shape (N, 3), rotated by angles, shape (N,)."""
+    c, s = np.cos(turn), np.sin(turn)
+    xx, xy, yy = covariance.T
+    return np.column_stack(
+        [
+            c * c * xx - 2.0 * c * s * xy + s * s * yy,
+            c * s * (xx - yy) + (c * c - s * s) * xy,
+            s * s * xx + 2.0 * c * s * xy + c * c * yy,
+        ]
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopEdge:
+    """A relative pose that stem matching measured.
+
+    Attributes:
+        scans: Scan numbers of both keyframes.
+        motion: x, y [m], yaw [rad] from the first to the second, shape (3,).
+        covariance: Covariance of it, shape (3, 3).
+    """
+
+    scans: tuple[int, int]
+    motion: Float
+    covariance: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The minimum of a graph.
+
+    Attributes:
+        pose: x, y [m], yaw [rad] of each keyframe, shape (K, 3).
+        birth: int64, shape (L,), ascending: landmarks of the graph.
+        position: Their positions, shape (L, 2) [m].
+        covariance: Covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3).
+        newest: Covariance of the newest keyframe's pose given the rest of the graph, shape (3, 3).
+        loop_weight: Weight of each loop by its kernel, shape (E,): 1 where it fits, near 0 where it does not.
+    """
+
+    pose: Float
+    birth: Int
+    position: Float
+    covariance: Float
+    newest: Float
+    loop_weight: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeyframeGraph:
+    """The graph so far. It is immutable, so that states may share it.
+
+    Attributes:
+        keyframes: In the order of the path.
+        pose: Pose of each keyframe by the filter or by the last solution, shape (K, 3).
+        loops: Loops that stem matching found.
+        revisits: Keyframes since the last solution that show stems which were not seen for long.
+        solved: Number of keyframes at the last solution.
+    """
+
+    keyframes: tuple[Keyframe, ...] = ()
+    pose: Float = field(default_factory=lambda: np.zeros((0, 3)))
+    loops: tuple[LoopEdge, ...] = ()
+    revisits: int = 0
+    solved: int = 0
+
+    @property
+    def scans(self) -> Int:
+        """Scan numbers of the keyframes, shape (K,)."""
+        return np.array([k.scan for k in self.keyframes], np.int64)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of all arrays."""
+        size = sum(
+            k.birth.nbytes + k.centre.nbytes + k.R.nbytes + k.covariance.nbytes for k in self.keyframes
+        )
+        return size + self.pose.nbytes
+
+    def with_keyframe(self, keyframe: Keyframe, pose: Float) -> KeyframeGraph:
+        """Return the graph with one more keyframe, at a pose by the filter, shape (3,)."""
+        graph = replace(
+            self,
+            keyframes=(*self.keyframes, keyframe),
+            pose=np.concatenate([self.pose, pose[None]]),
+            revisits=self.revisits + self._is_revisit(keyframe),
+        )
+        return graph.thinned() if len(graph.keyframes) > KEYFRAMES_MAX else graph
+
+    def with_loop(self, anchor: int, T_map_base: Pose2, covariance: Float) -> KeyframeGraph:
+        """Return the graph with a loop from an earlier keyframe to the newest one.
+
+        Args:
+            anchor: Number of a scan near the place, at or after the earlier keyframe.
+            T_map_base: Pose of the newest keyframe, found by the trees around the anchor.
+            covariance: Covariance of x, y [m], yaw [rad] of this pose, axes of the map, shape (3, 3).
+        """
+        row = max(int(np.searchsorted(self.scans[:-1], anchor, side="right")) - 1, 0)
+        pose = self.pose[row]
+        motion = composed(inverse(pose[None]), T_map_base.as_array()[None])[0]
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        C = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        scans = (self.keyframes[row].scan, self.keyframes[-1].scan)
+        return replace(self, loops=(*self.loops, LoopEdge(scans, motion, C @ covariance @ C.T)))
+
+    def first_birth_after(self, scan: int) -> int:
+        """Return the birth number from which on landmarks were begun after a scan."""
+        row = int(np.searchsorted(self.scans, scan, side="right"))
+        return self.keyframes[min(row, len(self.keyframes) - 1)].first_birth
+
+    def solved_by(self, solution: Solution) -> KeyframeGraph:
+        """Return the graph at its solution."""
+        return replace(self, pose=solution.pose, revisits=0, solved=len(self.keyframes))
+
+    @property
+    def is_due(self) -> bool:
+        """Whether stems were seen again since the last solution, and the graph has grown enough."""
+        grown = len(self.keyframes) - self.solved
+        return self.revisits > 0 and grown >= max(GROWTH_MIN, GROWTH * len(self.keyframes))
+
+    def renamed(self, birth: Int, name: Int) -> KeyframeGraph:
+        """Return the graph with landmarks under other birth numbers, because two of them are one tree.
+
+        Args:
+            birth: int64, shape (N,), ascending; name: int64, shape (N,), what they are called from now on.
+        """
+        if not len(birth):
+            return self
+
+        def rename(keyframe: Keyframe) -> Keyframe:
+            row = np.minimum(np.searchsorted(birth, keyframe.birth), len(birth) - 1)
+            return replace(keyframe, birth=np.where(birth[row] == keyframe.birth, name[row], keyframe.birth))
+
+        return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
+
+    def without_revisits(self, way: float) -> KeyframeGraph:
+        """Return the graph without associations by a pose that turned out to be wrong: in the keyframes
+        after a distance driven, the detections of landmarks begun more than REVISIT_DISTANCE before it."""
+        start = [k.first_birth for k in self.keyframes if k.way >= way - REVISIT_DISTANCE]
+
+        def cleaned(keyframe: Keyframe) -> Keyframe:
+            if keyframe.way < way:
+                return keyframe
+            keep = keyframe.birth >= start[0]
+            return replace(
+                keyframe, birth=keyframe.birth[keep], centre=keyframe.centre[keep], R=keyframe.R[keep]
+            )
+
+        return replace(self, keyframes=tuple(cleaned(k) for k in self.keyframes))
+
+    def thinned(self) -> KeyframeGraph:
+        """Return the graph without every second keyframe, whose detections are dropped."""
+        kept: list[Keyframe] = [self.keyframes[0]]
+        for i in range(2, len(self.keyframes), 2):
+            between, after = self.keyframes[i - 1], self.keyframes[i]
+            motion, covariance = _compounded(between, after)
+            kept.append(replace(after, motion=motion, covariance=covariance))
+        rows = np.arange(0, len(self.keyframes), 2)
+        if len(self.keyframes) % 2 == 0:  # the newest keyframe stays
+            kept.append(self.keyframes[-1])
+            rows = np.append(rows, len(self.keyframes) - 1)
+        scans = np.array([k.scan for k in kept], np.int64)
+        loops = tuple(
+            replace(e, scans=(_nearest(scans, e.scans[0]), _nearest(scans, e.scans[1]))) for e in self.loops
+        )
+        return replace(
+            self, keyframes=tuple(kept), pose=self.pose[rows], loops=loops, solved=self.solved // 2
+        )
+
+    def solve(self) -> Solution | None:
+        """Return the minimum; None without convergence or where keyframes are not connected."""
+        if len(self.keyframes) < 2:
+            return None
+        problem = _Problem(self)
+        if self.loops:
+            # Far from its minimum the kernel has no slope, so the newest loop counts fully at first.
+            problem.trusted = 1
+            begun = problem.solve()
+            if begun is None:
+                return None
+            problem.pose, problem.trusted = begun.pose, 0
+        return problem.solve()
+
+    def _is_revisit(self, keyframe: Keyframe) -> bool:
+        """Whether a keyframe shows at least two stems that were not seen in the last REVISIT_DISTANCE."""
+        recent: list[Int] = []
+        first_birth = -1
+        for before in reversed(self.keyframes):
+            if keyframe.way - before.way > REVISIT_DISTANCE:
+                first_birth = before.first_birth
+                break
+            recent.append(before.birth)
+        if first_birth < 0:
+            return False
+        old = keyframe.birth[keyframe.birth < first_birth]
+        seen = np.concatenate(recent) if recent else old[:0]
+        return int(np.count_nonzero(~np.isin(old, seen))) >= 2
+
+
+def _compounded(first: Keyframe, second: Keyframe) -> tuple[Float, Float]:
+    """The motion over two keyframes, and its covariance."""
+    c, s = np.cos(first.motion[2]), np.sin(first.motion[2])
+    F, G = np.eye(3), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    ahead = G @ second.motion
+    F[0, 2], F[1, 2] = -ahead[1], ahead[0]
+    motion = composed(first.motion[None], second.motion[None])[0]
+    if not (np.isfinite(first.covariance).all() and np.isfinite(second.covariance).all()):
+        return motion, np.full((3, 3), np.inf)
+    return motion, F @ first.covariance @ F.T + G @ second.covariance @ G.T
+
+
+def _nearest(scans: Int, scan: int) -> int:
+    row = int(np.searchsorted(scans, scan))
+    rows = [r for r in (row - 1, row) if 0 <= r < len(scans)]
+    return int(scans[min(rows, key=lambda r: abs(int(scans[r]) - scan))])
+
+
+class _Problem:
+    """The columns of a graph: poses K, landmarks L, motions E, detections M."""
+
+    def __init__(self, graph: KeyframeGraph) -> None:
+        keyframes = graph.keyframes
+        birth = np.concatenate([k.birth for k in keyframes])
+        row = np.repeat(np.arange(len(keyframes)), [len(k.birth) for k in keyframes])
+        names, of, count = np.unique(birth, return_inverse=True, return_counts=True)
+        used = count[of] > 1  # a stem that was seen once tells nothing of a pose
+        self.birth = names[count > 1]
+        self.row = row[used]
+        self.of = np.searchsorted(self.birth, birth[used])
+        self.z = np.concatenate([k.centre for k in keyframes])[used]
+        R = np.concatenate([k.R for k in keyframes])[used]
+        self.root_R = _root_information(R[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+        self.pose = graph.pose
+        self.trusted = 0  # newest loops without a kernel
+        # Motions by odometry, then loops.
+        connected = [k for k in range(1, len(keyframes)) if np.isfinite(keyframes[k].covariance).all()]
+        scans = graph.scans
+        ends = [np.searchsorted(scans, e.scans) for e in graph.loops]
+        self.motions = len(connected)
+        self.first = np.array([k - 1 for k in connected] + [i for i, _ in ends], np.int64)
+        self.second = np.array(connected + [j for _, j in ends], np.int64)
+        motion = [keyframes[k].motion for k in connected] + [e.motion for e in graph.loops]
+        covariance = [keyframes[k].covariance for k in connected] + [e.covariance for e in graph.loops]
+        self.u = np.array(motion).reshape(-1, 3)
+        floor = np.diag(np.square(MOTION_SIGMA_MIN))
+        self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
+
+    def solve(self) -> Solution | None:
+        """Levenberg-Marquardt; see KeyframeGraph.solve."""
+        x, l = self.pose.copy(), self._triangulated()  # noqa: E741
+        cost, H, g, weight = self._linearised(x, l)
+        damping, factor, most = DAMPING
+        for _ in range(ROUNDS_MAX):
+            step = self._step(H, g, damping)
+            if step is None:
+                return None
+            dx, dl = step[: 3 * len(x)].reshape(-1, 3), step[3 * len(x) :].reshape(-1, 2)
+            moved, placed = x + dx, l + dl
+            new_cost, new_H, new_g, new_weight = self._linearised(moved, placed)
+            if new_cost > cost * (1.0 + 1e-9):
+                damping *= factor
+                if damping > most:
+                    return None
+                continue
+            settled = cost - new_cost < SETTLED * cost
+            x, l, cost, H, g, weight = moved, placed, new_cost, new_H, new_g, new_weight  # noqa: E741
+            damping = max(damping / factor, DAMPING[0])
+            if settled:
+                break
+        x[:, 2] = wrap_angle(x[:, 2])
+        return self._solution(x, l, H, weight)
+
+    def _solution(self, x: Float, l: Float, H: Sparse, weight: Float) -> Solution:  # noqa: E741
+        """The result; H is the normal matrix at the minimum. Its block of the newest pose is the information
+        of this pose given all else."""
+        end = 3 * len(x)
+        newest = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
+        return Solution(x, self.birth, l, self._marginals(H), newest, weight[self.motions :])
+
+    def _triangulated(self) -> Float:
+        """Mean position of each landmark by the poses, shape (L, 2)."""
+        c, s = np.cos(self.pose[self.row, 2]), np.sin(self.pose[self.row, 2])
+        x = self.pose[self.row, 0] + c * self.z[:, 0] - s * self.z[:, 1]
+        y = self.pose[self.row, 1] + s * self.z[:, 0] + c * self.z[:, 1]
+        n = np.bincount(self.of, minlength=len(self.birth))
+        return np.column_stack([np.bincount(self.of, v, len(self.birth)) for v in (x, y)]) / n[:, None]
+
+    def _linearised(self, x: Float, l: Float) -> tuple[float, Sparse, Float, Float]:  # noqa: E741
+        """Robust cost, normal matrix, gradient, and weights of the motions and loops at an estimate."""
+        from scipy import sparse
+
+        K, L, M, E = len(x), len(l), len(self.row), len(self.first)
+        i, j = self.first, self.second
+        c, s = np.cos(x[i, 2]), np.sin(x[i, 2])
+        dx, dy = (x[j, :2] - x[i, :2]).T
+        e = np.column_stack([c * dx + s * dy, c * dy - s * dx, x[j, 2] - x[i, 2]]) - self.u
+        e[:, 2] = wrap_angle(e[:, 2])
+        J = np.zeros((2, E, 3, 3))
+        J[1, :, 0, 0], J[1, :, 0, 1], J[1, :, 1, 0], J[1, :, 1, 1], J[1, :, 2, 2] = c, s, -s, c, 1.0
+        J[0] = -J[1]
+        J[0, :, 0, 2], J[0, :, 1, 2] = c * dy - s * dx, -c * dx - s * dy
+        e, J = (self.root_Q @ e[:, :, None])[:, :, 0], self.root_Q @ J
+        d2 = np.einsum("ea,ea->e", e, e)
+        weight = np.ones(E)
+        robust = slice(self.motions, E - self.trusted)
+        weight[robust] = _weight(d2[robust])
+        cost = float(d2[: self.motions].sum() + _cost(d2[robust]).sum() + d2[E - self.trusted :].sum())
+        J, e = np.sqrt(weight)[:, None, None] * J, np.sqrt(weight)[:, None] * e
+
+        c, s = np.cos(x[self.row, 2]), np.sin(x[self.row, 2])
+        dx, dy = (l[self.of] - x[self.row, :2]).T
+        h = np.column_stack([c * dx + s * dy, c * dy - s * dx])
+        Jl = np.empty((M, 2, 2))
+        Jl[:, 0, 0], Jl[:, 0, 1], Jl[:, 1, 0], Jl[:, 1, 1] = c, s, -s, c
+        Jx = np.empty((M, 2, 3))
+        Jx[:, :, :2], Jx[:, 0, 2], Jx[:, 1, 2] = -Jl, h[:, 1], -h[:, 0]
+        r = (self.root_R @ (h - self.z)[:, :, None])[:, :, 0]
+        d2 = np.einsum("ma,ma->m", r, r)
+        cost += float(_cost(d2).sum())
+        q = np.sqrt(_weight(d2))
+        r, Jx, Jl = (
+            q[:, None] * r,
+            q[:, None, None] * (self.root_R @ Jx),
+            q[:, None, None] * (self.root_R @ Jl),
+        )
+
+        size = 3 * K + 2 * L
+        rows = [np.broadcast_to(3 * np.arange(E)[:, None, None] + np.arange(3)[:, None], (E, 3, 3))] * 2
+        columns = [np.broadcast_to(3 * k[:, None, None] + np.arange(3), (E, 3, 3)) for k in (i, j)]
+        at = 3 * E + 2 * np.arange(M)[:, None, None] + np.arange(2)[:, None]
+        rows += [np.broadcast_to(at, (M, 2, 3)), np.broadcast_to(at, (M, 2, 2))]
+        columns += [
+            np.broadcast_to(3 * self.row[:, None, None] + np.arange(3), (M, 2, 3)),
+            np.broadcast_to(3 * K + 2 * self.of[:, None, None] + np.arange(2), (M, 2, 2)),
+        ]
+        values = np.concatenate([J[0].ravel(), J[1].ravel(), Jx.ravel(), Jl.ravel()])
+        A = sparse.csc_matrix(
+            (
+                values,
+                (np.concatenate([v.ravel() for v in rows]), np.concatenate([v.ravel() for v in columns])),
+            ),
+            shape=(3 * E + 2 * M, size),
+        )
+        b = np.concatenate([e.ravel(), r.ravel()])
+        return cost, (A.T @ A).tocsc(), A.T @ b, weight
+
+    def _step(self, H: Sparse, g: Float, damping: float) -> Float | None:
+        step = self._factorised(H, damping)
+        if step is None:
+            return None
+        out: Float = -step.solve(g)
+        return out if np.isfinite(out).all() else None
+
+    def _factorised(self, H: Sparse, damping: float) -> Sparse | None:
+        """LU factors of the damped normal matrix; the first pose is held by a strong prior."""
+        from scipy import sparse
+        from scipy.sparse.linalg import splu
+
+        diagonal = damping * H.diagonal() + 1e-9
+        diagonal[:3] += 1e8
+        options = {"SymmetricMode": True}
+        try:
+            return splu(
+                (H + sparse.diags(diagonal)).tocsc(),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options=options,
+            )
+        except RuntimeError:  # singular: a part of the path that nothing connects
+            return None
+
+    def _marginals(self, H: Sparse) -> Float:
+        """Covariance of each keyframe's pose, shape (K, 3, 3)."""
+        K = len(self.pose)
+        factors: Sparse = self._factorised(H, 0.0)
+        chosen = np.unique(np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64))
+        unit = np.zeros((H.shape[0], 3 * len(chosen)))
+        columns = (3 * chosen[:, None] + np.arange(3)).ravel()
+        unit[columns, np.arange(len(columns))] = 1.0
+        inverse_H = factors.solve(unit)
+        blocks = np.array([inverse_H[3 * k : 3 * k + 3, 3 * n : 3 * n + 3] for n, k in enumerate(chosen)])
+        blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        at = np.arange(K)
+        return np.stack(
+            [np.interp(at, chosen, blocks[:, a, b]) for a in range(3) for b in range(3)], axis=1
+        ).reshape(-1, 3, 3)
+
+
+def _root_information(covariance: Float) -> Float:
+    """W with W^T W = covariance^-1, shape (N, n, n)."""
+    if not len(covariance):
+        return covariance
+    return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
+
+
+def _weight(d2: Float) -> Float:
+    """Weight of squared errors in the kernel of Cauchy."""
+    return 1.0 / (1.0 + d2 / CAUCHY**2)
+
+
+def _cost(d2: Float) -> Float:
+    return CAUCHY**2 * np.log1p(d2 / CAUCHY**2)

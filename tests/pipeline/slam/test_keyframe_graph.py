@@ -1,0 +1,227 @@
+"""The graph of keyframes: exact without errors, a minimum by two other solvers, robust, and bounded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.optimize import least_squares
+
+from pipeline.geometry.poses import Pose2, wrap_angle
+from pipeline.slam.keyframe_graph import (
+    CAUCHY,
+    KEYFRAMES_MAX,
+    REVISIT_DISTANCE,
+    Keyframe,
+    KeyframeGraph,
+    View,
+    combined,
+)
+from pipeline.slam.poses import composed, inverse
+from tests.pipeline.strategies import seeds
+
+STEMS = np.array([[2.0, 3.0], [4.0, -3.0], [-1.0, 4.0], [6.0, 2.5], [0.5, -4.0], [9.0, 4.0]])
+SIGMA, Q = 0.05, np.diag(np.square([0.05, 0.05, 0.01]))
+
+
+def arc(n, radius=8.0, turn=0.15):
+    """True poses along an arc, x, y [m], yaw [rad]."""
+    a = turn * np.arange(n)
+    return np.column_stack([radius * np.sin(a), radius * (1.0 - np.cos(a)), wrap_angle(a)])
+
+
+def graph_of(true, rng=None, stems=STEMS, birth=None):
+    """A graph of noisy motions and detections whose first guess is the path by odometry."""
+    noise = (lambda *size: rng.normal(size=size)) if rng else (lambda *size: np.zeros(size))
+    birth = np.arange(len(stems)) if birth is None else birth
+    graph, pose = KeyframeGraph(), true[0]
+    for k, T in enumerate(true):
+        motion = np.zeros(3)
+        if k:
+            motion = composed(inverse(true[k - 1 : k]), true[k : k + 1])[0] + noise(3) * np.sqrt(np.diag(Q))
+            pose = composed(pose[None], motion[None])[0]
+        centre = Pose2(*T).inverse().apply(stems) + SIGMA * noise(len(stems), 2)
+        R = np.tile([SIGMA**2, 0.0, SIGMA**2], (len(stems), 1))
+        graph = graph.with_keyframe(Keyframe(k, 0, float(k), motion, Q, birth, centre, R), pose)
+    return graph
+
+
+def off(pose, true):
+    """Distances from the truth [m]."""
+    return np.hypot(*(pose - true)[:, :2].T)
+
+
+def residuals(graph, x, birth, place):
+    """Whitened errors, scaled such that the sum of their squares is the robust cost."""
+    rows = []
+    for k, keyframe in enumerate(graph.keyframes):
+        if k:
+            e = composed(inverse(x[k - 1 : k]), x[k : k + 1])[0] - keyframe.motion
+            e[2] = wrap_angle(e[2])
+            rows.append(np.linalg.solve(np.linalg.cholesky(Q), e))
+        e = (
+            Pose2(*x[k]).inverse().apply(place[np.searchsorted(birth, keyframe.birth)]) - keyframe.centre
+        ) / SIGMA
+        d2 = np.maximum((e * e).sum(axis=1), 1e-12)
+        rows.append((e * np.sqrt(CAUCHY**2 * np.log1p(d2 / CAUCHY**2) / d2)[:, None]).ravel())
+    return np.concatenate(rows)
+
+
+def test_without_errors_the_truth_is_found():
+    true = arc(12)
+    solution = graph_of(true).solve()
+    np.testing.assert_allclose(solution.pose, true, atol=1e-6)
+    np.testing.assert_allclose(solution.position, STEMS, atol=1e-6)
+
+
+@given(seeds)
+@settings(max_examples=5)
+def test_the_minimum_is_that_of_a_dense_solver(seed):
+    true = arc(8)
+    graph = graph_of(true, np.random.default_rng(seed))
+    solution = graph.solve()
+    n = 3 * (len(true) - 1)
+
+    def errors(v):
+        return residuals(
+            graph, np.vstack([graph.pose[:1], v[:n].reshape(-1, 3)]), solution.birth, v[n:].reshape(-1, 2)
+        )
+
+    start = np.concatenate([solution.pose[1:].ravel(), solution.position.ravel()])
+    best = least_squares(errors, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    assert 0.5 * (errors(start) ** 2).sum() <= best.cost * 1.002 + 1e-9
+    np.testing.assert_allclose(solution.pose[1:].ravel(), best.x[:n], atol=0.01)
+
+
+def test_the_minimum_and_its_covariance_are_those_of_gtsam():
+    gtsam = pytest.importorskip("gtsam")
+    true = arc(10)
+    graph = graph_of(true, np.random.default_rng(4))
+    solution = graph.solve()
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    X, L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
+    held = gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)
+    factors.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(*graph.pose[0]), held))
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY)
+    # Far from the robot a circular error of the position is one of bearing and range.
+    for k, keyframe in enumerate(graph.keyframes):
+        values.insert(X(k), gtsam.Pose2(*graph.pose[k]))
+        if k:
+            noise = gtsam.noiseModel.Gaussian.Covariance(Q)
+            factors.add(gtsam.BetweenFactorPose2(X(k - 1), X(k), gtsam.Pose2(*keyframe.motion), noise))
+        for j, z in zip(keyframe.birth, keyframe.centre, strict=True):
+            r = np.hypot(*z)
+            sigmas = gtsam.noiseModel.Diagonal.Sigmas(np.array([SIGMA / r, SIGMA]))
+            robust = gtsam.noiseModel.Robust.Create(cauchy, sigmas)
+            factors.add(
+                gtsam.BearingRangeFactor2D(X(k), L(int(j)), gtsam.Rot2(np.arctan2(z[1], z[0])), r, robust)
+            )
+    for j, place in zip(solution.birth, solution.position, strict=True):
+        values.insert(L(int(j)), place)
+    best = gtsam.LevenbergMarquardtOptimizer(factors, values).optimize()
+    theirs = np.array([[(p := best.atPose2(X(k))).x(), p.y(), p.theta()] for k in range(len(true))])
+    # Both are estimates of the same poses, whose errors of linearisation are far below their sigma.
+    sigma = np.sqrt(solution.covariance[:, 0, 0] + solution.covariance[:, 1, 1])
+    assert np.all(off(solution.pose, theirs) < 0.2 * sigma + 2e-3)
+    last = len(true) - 1
+    Sigma = gtsam.Marginals(factors, best).marginalCovariance(X(last))
+    C = np.eye(3)
+    C[:2, :2] = Pose2(*theirs[last]).rotation()
+    np.testing.assert_allclose(solution.covariance[last], C @ Sigma @ C.T, rtol=0.25, atol=1e-5)
+
+
+def test_a_wrong_association_is_switched_off():
+    true = arc(12)
+    graph = graph_of(true, np.random.default_rng(1))
+    wrong = graph.keyframes[6]
+    birth = wrong.birth.copy()
+    birth[[0, 1]] = birth[[1, 0]]  # two trees 6 m apart
+    keyframes = (*graph.keyframes[:6], replace(wrong, birth=birth), *graph.keyframes[7:])
+    assert off(replace(graph, keyframes=keyframes).solve().pose, true).max() < 0.1
+
+
+@pytest.mark.parametrize(("shift", "weight"), [(0.0, 0.8), (3.0, 0.1)])
+def test_a_loop_counts_where_the_graph_does_not_contradict_it(shift, weight):
+    true = arc(40)
+    graph = graph_of(true, np.random.default_rng(2))
+    place = Pose2(true[-1, 0] + shift, true[-1, 1], true[-1, 2])
+    solution = graph.with_loop(0, place, np.diag(np.square([0.05, 0.05, 0.01]))).solve()
+    assert (solution.loop_weight[-1] > weight) == (shift == 0.0)
+    assert off(solution.pose, true).max() < 0.3
+
+
+def test_a_loop_corrects_the_drift_of_the_way_between():
+    true = arc(42)
+    bare = graph_of(true, np.random.default_rng(3), STEMS[:0])
+    loop = bare.with_loop(0, Pose2(*true[-1]), 1e-6 * np.eye(3)).solve()
+    assert off(loop.pose, true)[-1] < 0.01
+    assert off(loop.pose, true).mean() < 0.7 * off(bare.pose, true).mean()
+
+
+def test_two_names_of_one_tree_become_one():
+    true = arc(6)
+    graph = graph_of(true, birth=np.array([0, 1, 2, 3, 4, 9]))
+    renamed = graph.renamed(np.array([9]), np.array([5]))
+    assert renamed.keyframes[0].birth.tolist() == [0, 1, 2, 3, 4, 5]
+    assert graph.renamed(np.zeros(0, np.int64), np.zeros(0, np.int64)) is graph
+
+
+def test_a_part_that_nothing_connects_has_no_solution_or_stays():
+    true = arc(6)
+    graph = graph_of(true, stems=STEMS[:0])
+    cut = replace(graph.keyframes[3], covariance=np.full((3, 3), np.inf))
+    graph = replace(graph, keyframes=(*graph.keyframes[:3], cut, *graph.keyframes[4:]))
+    solution = graph.solve()
+    assert solution is None or np.allclose(solution.pose, graph.pose)
+    assert KeyframeGraph().solve() is None
+
+
+def test_the_graph_stays_bounded_and_keeps_its_motion():
+    graph = KeyframeGraph()
+    none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
+    rng = np.random.default_rng(0)
+    total = np.zeros(3)
+    for k in range(KEYFRAMES_MAX + 1):
+        motion = rng.normal(0.0, 0.1, 3) if k else np.zeros(3)
+        total = composed(total[None], motion[None])[0]
+        graph = graph.with_keyframe(Keyframe(k, k, float(k), motion, Q, *none), total)
+    assert len(graph.keyframes) < KEYFRAMES_MAX
+    assert graph.scans[-1] == KEYFRAMES_MAX
+    chain = np.zeros(3)
+    for keyframe in graph.keyframes:
+        chain = composed(chain[None], keyframe.motion[None])[0]
+    np.testing.assert_allclose(chain[:2], total[:2], atol=1e-9)
+    assert abs(wrap_angle(chain[2] - total[2])) < 1e-9
+
+
+def test_a_solution_is_due_when_trees_are_seen_again_after_long():
+    def keyframe(k, birth, way):
+        n = len(birth)
+        R = np.tile([SIGMA**2, 0.0, SIGMA**2], (n, 1))
+        return Keyframe(k, 10 * k, way, np.zeros(3), Q, np.array(birth, np.int64), np.zeros((n, 2)), R)
+
+    graph = KeyframeGraph()
+    for k in range(20):
+        graph = graph.with_keyframe(keyframe(k, [10 * k, 10 * k + 1], 4.0 * k), np.zeros(3))
+    assert not graph.is_due, "every tree is new"
+    again = graph.with_keyframe(keyframe(20, [190, 191], 80.0), np.zeros(3))
+    assert not again.is_due, f"these were seen within {REVISIT_DISTANCE} m"
+    assert graph.with_keyframe(keyframe(20, [0, 1], 80.0), np.zeros(3)).is_due
+
+
+def test_detections_between_two_keyframes_are_combined_by_their_weight():
+    true = arc(5, turn=0.02)
+    T = composed(inverse(true[-1:]).repeat(5, axis=0), true)
+    views = []
+    for k, pose in enumerate(true):
+        centre = Pose2(*pose).inverse().apply(STEMS)
+        R = np.tile([0.01 * (k + 1), 0.0, 0.01 * (k + 1)], (len(STEMS), 1))
+        views.append(View(k, float(k), np.arange(len(STEMS)), centre, R))
+    birth, centre, R = combined(tuple(views), T)
+    expected = Pose2(*true[-1]).inverse().apply(STEMS)[birth]
+    np.testing.assert_allclose(centre, expected, atol=1e-9)
+    assert np.all(np.diff(np.hypot(*centre.T)) >= 0.0), "the nearest first"
+    weight = 1.0 / (0.02 * np.arange(1, 6))
+    np.testing.assert_allclose(R[:, 0], (weight**2 * 0.01 * np.arange(1, 6)).sum() / weight.sum() ** 2)
