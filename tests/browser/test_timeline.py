@@ -22,7 +22,7 @@ def test_a_mark_seeks_to_its_event_and_a_loop_is_repeated(dashboard: Dashboard):
     expect(change).to_be_visible()
     page.get_by_role("button", name="Ten scans forward").click()
     dashboard.until_server("/api/status", "it.time_s > 12.9")
-    change.click()
+    change.press("Enter")  # a mark of another change may cover it for the mouse
     dashboard.until_server("/api/status", "it.state === 'paused' && it.time_s > 11.9 && it.time_s < 12.1")
 
     loop = page.locator("#loop")

@@ -1,4 +1,4 @@
-"""Victoria Park from its raw laser: the error of the path against GPS, over ten seeds."""
+"""Victoria Park from its raw laser: the error of the path against GPS, over twenty seeds."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 from tests.benchmarks.table import Table
 
 NAME = "victoria"
-LINE = "Victoria Park, 100 particles, ten seeds: path against GPS, trees, duplicates"
-SEEDS = range(1, 11)
+LINE = "Victoria Park, 100 particles, twenty seeds: path against GPS, trees, duplicates"
+SEEDS = range(1, 21)
 
 
 def run() -> list[Table]:
-    """Ten seeds after one pass through the stages before SLAM, and the methods beside one another."""
+    """Twenty seeds after one pass through the stages before SLAM, and the methods beside one another."""
     from tests.benchmarks.slam_runs import COLUMNS, by_method, mapped, seen_in, summary
 
     data = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
