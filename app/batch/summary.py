@@ -126,6 +126,25 @@ class RunHealth:
         return [f"health: {count(weak, 'scan')} weak, {lost} lost; most often: {why.most_common(1)[0][0]}"]
 
 
+JUST_BEGUN = 20  # scans
+
+
+def health_word(frame: Frame | None) -> str:
+    """Return the pose quality of a scan in one or two words: that of `Health.state`, or why it is too early.
+
+    "good" means that nothing contradicts the pose. Without trees, and in the first `JUST_BEGUN` scans,
+    nothing could contradict it; the result is then "no trees yet" or "just begun", and "no scan yet" for
+    None.
+    """
+    if frame is None:
+        return "no scan yet"
+    if frame.health.state != "good":
+        return frame.health.state
+    if not frame.trees.confirmed.any():
+        return "no trees yet"
+    return "just begun" if frame.index < JUST_BEGUN else "good"
+
+
 _SAME_DRIVE = ("origin", "resume")
 _NS = 1e-9
 

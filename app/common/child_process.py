@@ -39,14 +39,27 @@ class ProtocolError(StemmapError):
 
 
 def python_module(name: str, *arguments: str) -> tuple[str, ...]:
-    """The command that runs a module of this program in another Python process."""
+    """Return the command that runs a module of this program in another Python process.
+
+    Args:
+        name: Dotted name of the module.
+        arguments: Arguments of the command line.
+    """
     # -P: a file `app.py` in the working directory must not replace this package.
     return (sys.executable, "-P", "-m", name, *arguments)
 
 
 def exit_reason(returncode: int) -> str:
-    """How a process ended: "ended by signal 9" or "exit code 1"."""
-    return f"ended by signal {-returncode}" if returncode < 0 else f"exit code {returncode}"
+    """Return how a process ended: "signal 9, SIGKILL" or "exit code 1".
+
+    Args:
+        returncode: Return code; that of a process that a signal ended is the negative number of the signal.
+    """
+    if returncode >= 0:
+        return f"exit code {returncode}"
+    with contextlib.suppress(ValueError):
+        return f"signal {-returncode}, {signal.Signals(-returncode).name}"
+    return f"signal {-returncode}"
 
 
 class ChildProcess:

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from app.dashboard.payload import first_difference, path_points
+from app.common.arrays import first_difference
+from app.dashboard.payload import path_points
 
 _encode = msgspec.json.encode
 

@@ -21,7 +21,6 @@ from app.dashboard.annotations import AnnotationEditor
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.camera_view import CameraView
 from app.dashboard.events import Events
-from app.dashboard.map_changes import MapChanges
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, Counts, counts_of, map_payload, truth_payload
 from app.dashboard.run_recorder import RunRecorder, RunState
@@ -32,6 +31,7 @@ from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
 from app.tuning.sweep.sensitivity import Sensitivity, question_of
+from app.worker.map_changes import MapChanges
 from app.worker.outbox import joined
 from app.worker.protocol import (
     Answer,

@@ -24,7 +24,6 @@ Float = NDArray[np.float64]
 _NS = 1_000_000_000
 # 0.1 mm: finer than any sensor, and short in JSON.
 _DIGITS = 4
-JUST_BEGUN = 20  # scans
 
 
 def map_payload(shown: Shown) -> dict[str, Any]:
@@ -67,20 +66,6 @@ def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
         return None
     ahead, beside = _known(clearance.ahead), _known(clearance.beside)
     return {"zone": clearance.zone.label, "ahead_m": ahead, "beside_m": beside, "within_m": clearance.within}
-
-
-def health_word(frame: Frame | None) -> str:
-    """Return the pose quality in one or two words.
-
-    "good" means that nothing contradicts the pose; it is not used before there is a map that could.
-    """
-    if frame is None:
-        return "no scan yet"
-    if frame.health.state != "good":
-        return frame.health.state
-    if not frame.trees.confirmed.any():
-        return "no trees yet"
-    return "just begun" if frame.index < JUST_BEGUN else "good"
 
 
 def health_payload(health: Health) -> dict[str, Any]:
@@ -159,15 +144,6 @@ def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
 def path_points(path_xy: Float, start: int) -> dict[str, Any]:
     """Return the rows of a path (N, 2) from a row on, for a page that has the rows before."""
     return {"start": start, "points": np.round(path_xy[start:], 3).tolist()}
-
-
-def first_difference(old: Float | None, new: Float) -> int:
-    """Return the number of leading rows that two paths (N, 2) have in common."""
-    if old is None:
-        return 0
-    n = min(len(old), len(new))
-    differs = (old[:n] != new[:n]).any(axis=1)
-    return int(np.argmax(differs)) if differs.any() else n
 
 
 def _rounded(values: Float) -> list[float]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from app.common.arrays import evenly_spaced
 from app.explain.history import TreeHistory, half_axes
 from app.explain.records import CheckResult, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
 from app.training.learned_forests import kept_forests
@@ -90,7 +91,7 @@ def cluster_of_frame(
     fit = fit_one(points, sensor) if np.isfinite(clusters.radius_sigma[row]) else None
     to_picture = _to_picture(clusters.centre[row])
     offset = points[:, :2] - clusters.centre[row] if fit is None else fit.offset
-    some = _evenly(len(points), _MOST_POINTS)
+    some = evenly_spaced(len(points), _MOST_POINTS)
     place = pose.apply(clusters.centre[row] + frame.sensor_offset[:2])
     tree, tree_distance = _nearest_tree(frame, place, parameters.slam.distance_max)
     return ClusterStory(
@@ -269,8 +270,3 @@ def _axes(points: Float, to_picture: Float) -> list[tuple[float, float]]:
     values, vectors = np.linalg.eigh(spread.T @ spread / max(len(points), 1))
     arms = to_picture @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     return [(float(arms[0, k]), float(arms[1, k])) for k in (1, 0)]
-
-
-def _evenly(n: int, most: int) -> NDArray[np.int64]:
-    """Return at most `most` rows of a table of n rows, evenly spaced and without repetition."""
-    return np.arange(n) if n <= most else np.arange(most) * n // most

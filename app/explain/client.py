@@ -7,8 +7,16 @@ import itertools
 from collections.abc import Awaitable, Callable
 
 from app.explain.records import ClusterStory, TreeStory
-from app.worker.camera import CameraPicture
-from app.worker.protocol import Answer, AskCamera, AskCluster, AskCompare, AskTree, Question, WorkerBusyError
+from app.worker.protocol import (
+    Answer,
+    AskCamera,
+    AskCluster,
+    AskCompare,
+    AskTree,
+    CameraPicture,
+    Question,
+    WorkerBusyError,
+)
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame

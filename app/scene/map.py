@@ -9,10 +9,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from app.common.arrays import first_difference
 from app.scene import colours, nodes
 from app.scene.labels import NUMBER_WIDTH, Label, LabelNodes, apart
 from app.scene.layers import ViewSettings
-from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments, first_change
+from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
 from pipeline.config.stages import Evaluation
 from pipeline.types.records import Frame, Trees, TruthTrees
 
@@ -322,7 +323,7 @@ class MapCloud:
             block.visible = visible and number * BLOCK < len(self._sent)
 
     def _send(self, points: NDArray[np.float32]) -> None:
-        first = first_change(points, self._sent)
+        first = first_difference(self._sent, points)
         if first == len(points) == len(self._sent):
             return
         self._sent = points

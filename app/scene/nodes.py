@@ -11,6 +11,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from app.common.arrays import first_difference
 from app.scene import colours
 from app.scene.colours import Colours, Rgb
 from pipeline.types.records import HeightMap
@@ -234,7 +235,7 @@ class LineNode:
         """Show the line through places (N, 2) [m], above the heights of the ground there, shape (N,) [m]."""
         places = np.array(places, dtype=np.float64).reshape(-1, 2)
         points = np.column_stack([places, np.broadcast_to(self._height + ground, len(places))])
-        first = first_change(points, self._sent)
+        first = first_difference(self._sent, points)
         if first == len(points) == len(self._sent):
             return
         self._sent = points
@@ -275,13 +276,6 @@ class LineNode:
                 visible=self._visible,
             )
         )
-
-
-def first_change(new: Points, old: Points) -> int:
-    """Return the first row that differs, or the number of rows that both have."""
-    shared = min(len(new), len(old))
-    changed = np.flatnonzero(np.any(new[:shared] != old[:shared], axis=1))
-    return int(changed[0]) if len(changed) else shared
 
 
 MOST_CELLS = 40_000  # of the mesh; in a larger map two by two cells are averaged

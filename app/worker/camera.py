@@ -2,42 +2,29 @@
 
 from __future__ import annotations
 
-import msgspec
-
 from app.robot.source import LiveSource
+from app.worker.protocol import CameraPicture
 from pipeline.errors import StemmapError
 from pipeline.io.readers.base import Source, SourceDescription
-from pipeline.io.readers.camera import SHOWN_NS, Camera, Picture, PictureSource
+from pipeline.io.readers.camera import SHOWN_NS, PictureSource
 from pipeline.io.readers.ros_messages import COMPRESSED_IMAGE, IMAGE
 from pipeline.odometry.odometry_override import OdometryOverride
 
 
-class CameraPicture(msgspec.Struct, frozen=True):
-    """An encoded picture with the pose of its camera.
-
-    Attributes:
-        picture: Encoded picture.
-        camera: Camera model and pose, None if unknown.
-        why: Reason why the camera model is unknown.
-        told: Number of received pictures of a live run as text; "" for a recording.
-    """
-
-    picture: Picture
-    camera: Camera | None
-    why: str
-    told: str = ""
-
-
 def has_camera(description: SourceDescription) -> bool:
-    """Return whether a source has pictures."""
+    """Return whether a source has camera pictures."""
     return any(t.read_as == "camera" and t.type in (IMAGE, COMPRESSED_IMAGE) for t in description.topics)
 
 
 def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
-    """Return the picture closest to a time.
+    """Return the camera picture of a source that is closest to a time.
+
+    Args:
+        source: The open source; None where no run is open.
+        stamp_ns: The time [ns].
 
     Raises:
-        StemmapError: There is none, and why.
+        StemmapError: The source has no camera, or no picture within `SHOWN_NS` of the time.
     """
     origin: object = source.source if isinstance(source, OdometryOverride) else source
     if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
@@ -48,5 +35,5 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
             f"no picture was taken within {SHOWN_NS / 1e9:g} s of this scan",
             remedy="Play on, or go to another scan",
         )
-    told = origin.pictures_told if isinstance(origin, LiveSource) else ""
-    return CameraPicture(picture, *origin.camera(), told)
+    received = origin.pictures_told if isinstance(origin, LiveSource) else ""
+    return CameraPicture(picture, *origin.camera(), received)

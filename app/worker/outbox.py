@@ -10,8 +10,8 @@ from typing import BinaryIO
 
 import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
+from app.common.arrays import evenly_spaced, first_difference
 from app.explain.history import RecentScans
 from app.worker.codec import WireError, from_worker
 from app.worker.protocol import FromWorker, Opened, Report, Shown
@@ -154,32 +154,25 @@ def _replaces(newer: FromWorker, older: FromWorker) -> bool:
     return (newer.status.source, newer.status.state) == (older.status.source, older.status.state)
 
 
+_PATH_COLUMNS = ("stamp_ns", "x", "y", "yaw", "sigma_xy")
+
+
 def rows_in_common(old: Path, new: Path) -> int:
     """Return the number of equal leading rows of two paths."""
-    n = min(old.x.size, new.x.size)
-    differs = np.zeros(n, dtype=np.bool_)
-    for name in ("stamp_ns", "x", "y", "yaw", "sigma_xy"):
-        differs |= getattr(old, name)[:n] != getattr(new, name)[:n]
-    return int(np.argmax(differs)) if differs.any() else n
+    return min(first_difference(getattr(old, name), getattr(new, name)) for name in _PATH_COLUMNS)
 
 
 def rows_from(path: Path, start: int) -> Path:
-    """Return the rows of a path from a row onwards."""
-    return Path(
-        path.stamp_ns[start:], path.x[start:], path.y[start:], path.yaw[start:], path.sigma_xy[start:]
-    )
+    """Return the rows of a path from row `start` onwards."""
+    return Path(*(getattr(path, name)[start:] for name in _PATH_COLUMNS))
 
 
 def joined(old: Path | None, start: int, tail: Path) -> Path:
-    """Return the path with the rows from `start` onwards replaced by `tail`."""
+    """Return the path `old` with its rows from `start` onwards replaced by `tail`."""
     if old is None or start == 0:
         return tail
-    return Path(
-        *(
-            np.concatenate([getattr(old, name)[:start], getattr(tail, name)])
-            for name in ("stamp_ns", "x", "y", "yaw", "sigma_xy")
-        )
-    )
+    columns = ((getattr(old, name)[:start], getattr(tail, name)) for name in _PATH_COLUMNS)
+    return Path(*(np.concatenate(parts) for parts in columns))
 
 
 MOST_POINTS = 200_000
@@ -187,9 +180,12 @@ NOT_DRAWN = "not drawn"
 
 
 def picture_of(frame: Frame) -> Frame:
-    """The frame with at most MOST_POINTS raw and MOST_POINTS filtered points, taken evenly; the count
-    "not drawn" says how many were left out."""
-    raw, filtered = _evenly(len(frame.raw)), _evenly(len(frame.filtered))
+    """Return the frame with at most MOST_POINTS raw and MOST_POINTS filtered points, selected evenly.
+
+    `counts["not drawn"]` is the number of points that were left out.
+    """
+    raw = evenly_spaced(len(frame.raw), MOST_POINTS)
+    filtered = evenly_spaced(len(frame.filtered), MOST_POINTS)
     left_out = len(frame.raw) - len(raw) + len(frame.filtered) - len(filtered)
     if left_out == 0:
         return frame
@@ -203,11 +199,6 @@ def picture_of(frame: Frame) -> Frame:
 
 
 def for_comparison(frame: Frame) -> Frame:
-    """The picture without what is the same under all parameters or is not drawn: the raw points, the
-    gathered columns and the ground."""
+    """Return the frame for the comparison of parameter sets: as `picture_of`, without raw points, voxel
+    columns and ground, which do not depend on the parameters or are not drawn."""
     return picture_of(replace(frame, raw=np.zeros((0, 3), np.float32), columns=None, ground=None))
-
-
-def _evenly(n: int) -> NDArray[np.int64]:
-    """Rows of a table of n rows, at most MOST_POINTS of them and none twice."""
-    return np.arange(n) if n <= MOST_POINTS else np.arange(MOST_POINTS) * n // MOST_POINTS

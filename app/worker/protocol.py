@@ -8,11 +8,11 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from app.dashboard.map_changes import MapChanges
 from app.explain.records import ClusterStory, TreeStory
 from app.sources.request import SourceRequest
-from app.worker.camera import CameraPicture
+from app.worker.map_changes import MapChanges
 from pipeline.errors import StemmapError
+from pipeline.io.readers.camera import Camera, Picture
 from pipeline.types.records import Float, Frame, Path, Trees, TruthTrees
 
 # Beyond any run, and well inside of an int64 of nanoseconds.
@@ -271,6 +271,22 @@ class AskCamera(_Question, frozen=True, tag="ask_camera"):
     """
 
     stamp_ns: int
+
+
+class CameraPicture(msgspec.Struct, frozen=True):
+    """An encoded picture with the pose of its camera.
+
+    Attributes:
+        picture: Encoded picture.
+        camera: Camera model and pose, None if unknown.
+        why: Reason why the camera model is unknown; empty otherwise.
+        told: Number of received pictures of a live run as text; empty for a recording.
+    """
+
+    picture: Picture
+    camera: Camera | None
+    why: str
+    told: str = ""
 
 
 class Answer(msgspec.Struct, frozen=True, tag="answer"):

@@ -12,8 +12,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from app.dashboard.map_changes import MapChanges, changes_between
 from app.explain.history import TreeHistory
+from app.worker.map_changes import MapChanges, changes_between
 from pipeline.config import Parameters
 from pipeline.front_end import SegmentedScan
 from pipeline.remapping import ClusterTable, Rerun

@@ -13,13 +13,12 @@ from typing import Literal
 
 import numpy as np
 
-from app.batch.summary import driven
-from app.dashboard.map_changes import MapChanges
-from app.dashboard.payload import health_word
+from app.batch.summary import driven, health_word
 from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
 from app.worker.camera import has_camera
+from app.worker.map_changes import MapChanges
 from app.worker.protocol import LONGEST_S, Opened, State, Status
 from app.worker.remap import MapComparison
 from app.worker.run import MakeMapper, MakeSynchroniser, OpenCaches, Run, RunFactory, unnamed_caches

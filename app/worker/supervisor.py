@@ -5,13 +5,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Literal
 
+from app.common.child_process import exit_reason, python_module
 from app.common.timers import cancel
 from app.robot.address import is_live
 from app.worker.codec import LENGTH_BYTES, WireError, check_size, from_worker, to_worker
@@ -31,8 +30,7 @@ from app.worker.protocol import (
     WorkerBusyError,
 )
 
-# -P: a folder that holds a file `app.py` must not decide what runs.
-WORKER = (sys.executable, "-P", "-m", "app.worker.process")
+WORKER = python_module("app.worker.process")
 
 _log = logging.getLogger(__name__)
 
@@ -247,7 +245,7 @@ class WorkerProcess:
                 check_size(size)
                 await self._hand_on(self._channel_in.decode(await process.stdout.readexactly(size)))
         except asyncio.IncompleteReadError:
-            return _ending(await process.wait())
+            return exit_reason(await process.wait())
         except WireError as error:
             return f"protocol error: {error}"
 
@@ -304,11 +302,3 @@ class WorkerProcess:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
             await process.wait()
-
-
-def _ending(code: int) -> str:
-    if code >= 0:
-        return f"exit code {code}"
-    with contextlib.suppress(ValueError):
-        return f"signal {-code}, {signal.Signals(-code).name}"
-    return f"signal {-code}"

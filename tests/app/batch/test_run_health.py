@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.batch.summary import MOST_SPANS, RunHealth
-from app.dashboard.payload import JUST_BEGUN, health_payload, health_word
+from app.batch.summary import JUST_BEGUN, MOST_SPANS, RunHealth, health_word
+from app.dashboard.payload import health_payload
 from pipeline.types.pose_health import Health, HealthState
 from pipeline.types.records import Frame
 from tests.app import fakes

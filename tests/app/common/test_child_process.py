@@ -56,7 +56,7 @@ async def test_a_child_that_dies_gives_no_message():
     await child.send("die")
     assert await child.receive(int) is None
     await child.send("1")
-    assert exit_reason(await child.end()) == "ended by signal 9"
+    assert exit_reason(await child.end()) == "signal 9, SIGKILL"
     blocking = BlockingChildProcess(PROGRAM)
     blocking.send("unknown")
     assert blocking.receive(int) is None

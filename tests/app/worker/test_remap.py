@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from app.dashboard.map_changes import MapChanges
+from app.worker.map_changes import MapChanges
 from app.worker.process import new_session
 from app.worker.session import Session
 from pipeline.config import Parameters

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from app.dashboard.payload import health_word
+from app.batch.summary import health_word
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Pose3

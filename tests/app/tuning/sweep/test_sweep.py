@@ -88,7 +88,7 @@ def test_processes_that_are_killed_in_the_middle_are_replaced_and_counted(tmp_pa
     with processes(2, tmp_path) as workers:
         outcome = sweep(jobs, workers, NOTHING)
     assert f1_of(outcome.answers) == [0.1, 0.2, 0.3, None]
-    assert outcome.lost == {"ended by signal 9": 1 + MOST_LOSSES}
+    assert outcome.lost == {"signal 9, SIGKILL": 1 + MOST_LOSSES}
     assert f"{MOST_LOSSES} workers were lost" in outcome.answers[3].error
 
 
