@@ -27,7 +27,7 @@ from pipeline.loop_closure.correction import (
     Smoothing,
 )
 from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
-from pipeline.loop_closure.map_correction import Bend
+from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.odometry.gyro import fused
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.slam.motion import noise_of, step_variances
@@ -82,7 +82,7 @@ class MapperState:
     closed: int = 0
     recovery: RelocaliserState[MapperState] = field(default_factory=RelocaliserState)
     last: tuple[Pose2, Float] | None = None
-    delayed: Bend | None = None
+    delayed: PathCorrection | None = None
 
 
 Correction = Restart[MapperState] | Relocalisation | LoopClosure | Smoothing | SearchFailure
@@ -128,7 +128,7 @@ class Mapper:
         self._odometry: Pose2 | None = None
         self._placed = self._closed = 0
         self._last: tuple[Pose2, Float] | None = None
-        self._delayed: Bend | None = None
+        self._delayed: PathCorrection | None = None
 
     def process(self, step: Step, scan: SegmentedScan | None = None) -> Frame:
         """Map one scan.
@@ -151,7 +151,7 @@ class Mapper:
             self._path.append(stamp_ns, motion.step)
             estimate = self._update_slam(step.index, motion, found, scan)
             correction = self._check_lost(step.index, motion, found, scan, estimate)
-            estimate = self._apply(step.index, correction, estimate)
+            estimate, correction = self._apply(step.index, correction, estimate)
             self._path.set_sigma(estimate.covariance)
 
         # Section 3.5: one Kalman filter per tree; the columns classify the trees. A lost robot maps nothing.
@@ -163,8 +163,8 @@ class Mapper:
             self._update_terrain(scan, estimate)
 
         # Back at a known place: close the loop.
-        closure = self._check_loop(step.index, estimate)
-        estimate = self._apply(step.index, closure, estimate)
+        closure: Correction | None = self._check_loop(step.index, estimate)
+        estimate, closure = self._apply(step.index, closure, estimate)
 
         self._last = (estimate.T_map_base, estimate.covariance)
         return self._frame(step, scan, found, estimate, notices, correction, closure)
@@ -379,48 +379,57 @@ class Mapper:
             noise_of(self._parameters.slam), self._path.motion, self._placed, self._closed,
         )  # fmt: skip
 
-    def _apply(self, index: int, correction: Correction | None, estimate: PoseEstimate) -> PoseEstimate:
-        """Correct SLAM, trees, columns and terrain; returns the corrected pose."""
+    def _apply(
+        self, index: int, correction: Correction | None, estimate: PoseEstimate
+    ) -> tuple[PoseEstimate, Correction | None]:
+        """Correct SLAM, trees, columns and terrain.
+
+        Returns:
+            The corrected pose, and the correction that was applied: a loop that the graph contradicts changes
+            nothing, but a lost robot is located by it.
+        """
         slam = self._slam
         match correction:
             case None:
-                return estimate
+                return estimate, None
             case Restart(state=state, motions=motions):
                 recent = slam.state.recent
                 self._restore_map(state)
                 for scan, motion in motions:
                     estimate = slam.process(scan, motion, no_detections(), NOTHING_FREE)
                 slam.state = replace(slam.state, recent=recent)
-                return replace(estimate, health=slam.lost(estimate))
-            case SearchFailure():
-                slam.give_up()
+                return replace(estimate, health=slam.lost(estimate)), correction
+            case Smoothing():
+                self._correct_map(slam.smooth(index), estimate)
+                return slam.estimate(estimate), correction
+            case LoopClosure(loop=loop, stems=stems):
+                if self._correct_map(slam.close(index, loop), estimate):
+                    self._closed = index
+                    estimate = slam.estimate(estimate)
+                elif stems is None:
+                    return estimate, None
+                else:  # the graph contradicts the path to the place, not the place itself
+                    located = Relocalisation(loop.T_map_base, loop.covariance, stems)
+                    return self._apply(index, located, estimate)
             case Relocalisation(T_map_base=pose, covariance=covariance):
                 slam.place(index, pose, covariance)
                 self._placed = index + 1
                 estimate = slam.estimate(estimate)
-            case Smoothing():
-                self._correct_map(slam.smooth(index), estimate)
-                return slam.estimate(estimate)
-            case LoopClosure(loop=loop):
-                if self._correct_map(slam.close(index, loop), estimate):
-                    self._closed = index
-                elif self._relocaliser.is_searching:  # the path to the place is unknown, the place is not
-                    slam.place(index, loop.T_map_base, loop.covariance)
-                    self._placed = index + 1
-                estimate = slam.estimate(estimate)
+            case SearchFailure():
+                slam.reset_health()
         self._relocaliser.reset()
-        return estimate
+        return estimate, correction
 
-    def _correct_map(self, bend: Bend | None, before: PoseEstimate) -> bool:
+    def _correct_map(self, correction: PathCorrection | None, before: PoseEstimate) -> bool:
         """Move trees, columns and terrain with the path; returns whether there is a correction."""
-        if bend is None:
+        if correction is None:
             return False
         estimate = self._slam.estimate(before)
-        self._tracker.bend(bend, self._path.stamp_ns, estimate, self._slam.landmarks())
-        self._delayed = bend if self._delayed is None else self._delayed.followed_by(bend)
+        self._tracker.correct(correction, self._path.stamp_ns, estimate, self._slam.landmarks())
+        self._delayed = correction if self._delayed is None else self._delayed.followed_by(correction)
         if self._delayed.largest >= CORRECTION_MIN:
-            self._columns.bend(self._delayed)
-            self._terrain.bend(self._delayed)
+            self._columns.correct(self._delayed)
+            self._terrain.correct(self._delayed)
             self._delayed = None
         return True
 

@@ -25,20 +25,20 @@ from pipeline.classification.voxel_map import (
 from pipeline.config.stages import Classification as Classification
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.loop_closure.map_correction import Bend
+from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.types.records import Bool, Columns, Float32, Int, Int32, Verdict
 
 LOW, HIGH = 0.6, 1.6  # m above the ground; voxels in this band decide when a column was last seen
 
 
-def bent(memory: VoxelMap, bend: Bend) -> VoxelMap:
+def corrected_voxels(memory: VoxelMap, correction: PathCorrection) -> VoxelMap:
     """Return the voxels after a correction of the path: each moves with the last scan that saw it, and voxels
     in the same cell are joined. Tiles that changed become due for classification."""
     n = memory.used
     mean = memory.mean[:n].copy()
     latest = memory.latest[:n].astype(np.int64)
-    mean[:, :2] = bend.moved(memory.mean[:n, :2].astype(np.float64), latest)
-    key = np.where(latest > bend.first, keys_of(mean), memory.key[:n])
+    mean[:, :2], _ = correction.moved(memory.mean[:n, :2].astype(np.float64), latest)
+    key = keys_of(mean)
     kept = np.flatnonzero(key >= 0)  # coordinates within 1,000 km have a key
     names, first, of = np.unique(key[kept], return_index=True, return_inverse=True)
     order = np.argsort(first)  # in the previous order
@@ -68,13 +68,13 @@ def _room(room: int, keys: Int) -> int:
     return room
 
 
-def bent_columns(columns: Columns, memory: VoxelMap, bend: Bend) -> Columns:
+def corrected_columns(columns: Columns, memory: VoxelMap, correction: PathCorrection) -> Columns:
     """Return the columns after a correction of the path: each moves with the voxels around it.
 
     Args:
         columns: The columns.
         memory: The voxels before the correction.
-        bend: The correction.
+        correction: The correction.
     """
     from scipy.spatial import cKDTree
 
@@ -85,8 +85,7 @@ def bent_columns(columns: Columns, memory: VoxelMap, bend: Bend) -> Columns:
     _, nearest = cKDTree(memory.mean[rows, :2]).query(columns.axis[:, :2])
     scan = memory.latest[rows[nearest]].astype(np.int64)
     axis = columns.axis.copy()
-    axis[:, :2] = bend.moved(columns.axis[:, :2], scan)
-    turn = bend.turned(columns.axis[:, :2], scan)
+    axis[:, :2], turn = correction.moved(columns.axis[:, :2], scan)
     c, s = np.cos(turn), np.sin(turn)
     u, v = columns.axis[:, 2], columns.axis[:, 3]
     axis[:, 2], axis[:, 3] = c * u - s * v, s * u + c * v
@@ -230,10 +229,10 @@ class ColumnClassifier:
         self.columns = state.columns
         self._vote_again = True  # another forest may have voted at that time
 
-    def bend(self, bend: Bend) -> None:
+    def correct(self, correction: PathCorrection) -> None:
         """Move voxels and columns with a corrected path."""
-        self.columns = bent_columns(self.columns, self.memory, bend)
-        self._memory = bent(self.memory, bend)
+        self.columns = corrected_columns(self.columns, self.memory, correction)
+        self._memory = corrected_voxels(self.memory, correction)
         self.settle()
 
     @property

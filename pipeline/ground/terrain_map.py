@@ -11,7 +11,7 @@ from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.ground.terrain import Terrain, ground_at, ring_at
 from pipeline.jit import compiled
-from pipeline.loop_closure.map_correction import Bend
+from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.types.records import Bool, Float32, HeightMap, Int
 
 CELL = 0.5  # m
@@ -88,9 +88,9 @@ def fuse(block: Float32, below: Float, weight: Float, sensor_z: float) -> None:
 Tile = tuple[int, int]
 
 
-def bent(tiles: Mapping[Tile, Float32], bend: Bend) -> dict[Tile, Float32]:
-    """The tiles where they are now: each cell goes by whole cells with the scan that was taken nearest, so
-    that no gap comes about inside of a piece; cells that meet are averaged by their weights."""
+def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -> dict[Tile, Float32]:
+    """Return the tiles after a correction of the path: each cell moves by whole cells with the nearest scan,
+    and cells that meet are averaged by their weights."""
     from scipy.spatial import cKDTree
 
     keys = np.array(list(tiles), np.int64).reshape(-1, 2)
@@ -101,8 +101,9 @@ def bent(tiles: Mapping[Tile, Float32], bend: Bend) -> dict[Tile, Float32]:
     row: Float = cells[n, i, j].astype(np.float64)
     place = SIDE * keys[n] + np.column_stack([i, j])
     centre: Float = (place.astype(np.float64) + 0.5) * CELL
-    _, scan = cKDTree(bend.before[: bend.last + 1, :2]).query(centre)
-    shift = np.round((bend.moved(centre, np.asarray(scan)) - centre) / CELL).astype(np.int64)
+    _, scan = cKDTree(correction.before[:, :2]).query(centre)
+    corrected, _ = correction.moved(centre, np.asarray(scan))
+    shift = np.round((corrected - centre) / CELL).astype(np.int64)
     moved, of = np.unique(place + shift, axis=0, return_inverse=True)
     fresh = _averaged(row, of.ravel(), len(moved))
     home, rest = np.divmod(moved, SIDE)
@@ -201,9 +202,9 @@ class HeightMapper:
         due = scans <= 2 or scans % (RENEW + len(tiles) // TILES_A_SCAN) == 0
         self.state = HeightMapState(tiles, z, scans, _record(tiles) if due else old.record)
 
-    def bend(self, bend: Bend) -> None:
-        """Move what is known with a path that was bent."""
-        tiles = bent(self.state.tiles, bend)
+    def correct(self, correction: PathCorrection) -> None:
+        """Move the terrain with a corrected path."""
+        tiles = corrected_tiles(self.state.tiles, correction)
         self.state = replace(self.state, tiles=tiles, record=_record(tiles))
 
     def record(self) -> HeightMap:

@@ -10,13 +10,13 @@ from pipeline.slam import Loop, Motion
 
 S = TypeVar("S")
 
-LOOP = "a loop is closed: path and map since the place was left are bent, so that the trees there stand once"
-ASTRAY = (
-    "the robot is lost: what was mapped since the known trees were last seen is taken back, and the map is "
-    "searched for the stems around"
+LOOP = "loop closed: path and map are corrected since this place was left"
+LOST = (
+    "the robot is lost: the map returns to the scan before the known trees disappeared, and the stems around "
+    "the robot are searched for in it"
 )
-BENT = "the path drifted since then: it is bent, and what was mapped from it with it"
-NOT_FOUND = "the stems around were not found in the map; it goes on where the odometry leads"
+DRIFT = "the path had drifted: path and map are corrected"
+NOT_FOUND = "the stems around the robot were not found in the map; mapping continues from the odometry"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,12 +34,12 @@ class Restart(Generic[S]):
     @property
     def messages(self) -> tuple[str, ...]:
         """Text for the warnings of the scan."""
-        return (ASTRAY,)
+        return (LOST,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relocalisation:
-    """A lost robot is found in the map, at a place to which it was carried.
+    """A lost robot is located in the map, at a place to which it was carried.
 
     Attributes:
         T_map_base: Pose of the base.
@@ -54,16 +54,16 @@ class Relocalisation:
     @property
     def messages(self) -> tuple[str, ...]:
         """Text for the warnings of the scan."""
-        return (_found_again(self.stems),)
+        return (_located(self.stems),)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopClosure:
-    """The path returned to known trees: it is bent so that it ends there.
+    """The path returned to known trees: it is corrected to end there.
 
     Attributes:
         loop: The constraints of the path.
-        stems: Number of trees by which a lost robot was found; None where it was not lost.
+        stems: Number of trees by which a lost robot was located; None if it was not lost.
     """
 
     loop: Loop
@@ -72,7 +72,7 @@ class LoopClosure:
     @property
     def messages(self) -> tuple[str, ...]:
         """Text for the warnings of the scan."""
-        return (LOOP,) if self.stems is None else (_found_again(self.stems), BENT)
+        return (LOOP,) if self.stems is None else (_located(self.stems), DRIFT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,5 +95,5 @@ class SearchFailure:
         return (NOT_FOUND,)
 
 
-def _found_again(stems: int) -> str:
-    return f"found again in the map by {stems} stems that agree"
+def _located(stems: int) -> str:
+    return f"robot located in the map by {stems} stems"

@@ -151,7 +151,7 @@ def loop_to(
     if jumps and _is_beyond(_gap(T_map_base, driven[-1]), since + R):
         return None
     anchor = int(np.argmin(np.hypot(*(path[: first + 1, :2] - [T_map_base.x, T_map_base.y]).T)))
-    return Loop(first, last_mapped, anchor, T_map_base, R)
+    return Loop(first, anchor, T_map_base, R)
 
 
 def _gap(T_map_base: Pose2, pose: Float) -> Float:

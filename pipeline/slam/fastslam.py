@@ -16,12 +16,19 @@ import numpy as np
 from pipeline.config.stages import Slam
 from pipeline.geometry.gaussian import rows_of
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
-from pipeline.loop_closure.map_correction import Bend
+from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam import slip_detection
 from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.best_particle import are_apart, heir, leader
 from pipeline.slam.frame_uncertainty import NOISE, FrameMemory, at_least
-from pipeline.slam.keyframe_graph import REVISIT_DISTANCE, Keyframe, KeyframeGraph, Solution, View, combined
+from pipeline.slam.keyframe_graph import (
+    REVISIT_DISTANCE,
+    Keyframe,
+    KeyframeGraph,
+    ScanDetections,
+    Solution,
+    combined,
+)
 from pipeline.slam.loop_correction import (
     Loop,
     corrected_landmarks,
@@ -46,14 +53,14 @@ from pipeline.slam.state import SlamState
 from pipeline.types.pose_health import Health
 from pipeline.types.records import Detections, Int, Landmarks, PoseEstimate, PoseMeasurement
 
-VIEWS = 20  # scans between two keyframes that count
-LOOP_WEIGHT_MIN = 0.5  # weight of a loop by its kernel; one that the graph contradicts has less
-PLACED = 1  # tells the draws of a placing from those of a scan
+SCANS_MAX = 20  # scans between two keyframes whose detections the graph uses
+LOOP_WEIGHT_MIN = 0.5  # weight of a loop by its kernel; the graph contradicts a loop with less
+PLACED = 1  # distinguishes the random numbers of `place` from those of a scan
 
 
 class FastSlam:
-    """The filter. Its random numbers depend on the seed and the number of the scan alone, so that a
-    changed parameter shows its own effect and not that of other draws."""
+    """The filter. Its random numbers depend only on the seed and the number of the scan, so that a changed
+    parameter shows its own effect and not that of other random numbers."""
 
     def __init__(self, parameters: Slam, seed: int) -> None:
         self.parameters = parameters
@@ -63,13 +70,13 @@ class FastSlam:
     def process(
         self, index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
     ) -> PoseEstimate:
-        """Move with the odometry, weigh by the detections, and resample when it is due.
+        """Predict the particles by the odometry, weigh them by the detections, and resample when it is due.
 
         Args:
             index: Number of the scan.
-            motion: T_base(t-1)_base(t) by the odometry, alone or with what else is known of it.
+            motion: T_base(t-1)_base(t) by the odometry, or the same with its uncertainty.
             detections: Trees in the base frame.
-            clear_range: shape (bins,) [m]: how far the view is free by direction (see visibility).
+            clear_range: Free distance by azimuth, shape (bins,) [m]; see `detection.free_space`.
         """
         p = self.parameters
         noise, offset = draws(self.seed, index, p.particles)
@@ -117,14 +124,14 @@ class FastSlam:
         return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
 
     def as_seen(self, pose: PoseMeasurement) -> PoseMeasurement:
-        """A measured pose without what all poses of its source are known by now to err by."""
+        """Return a measured pose corrected by the estimated error that all poses of its source share."""
         return self.state.shared.as_seen(pose, normalised(self.state.log_weight))
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
-        """Put all particles where another source says the base is now, with the map of the best one.
+        """Set the pose of all particles by another source; they keep the map of the best particle.
 
         Args:
-            index: Number of the scan, for the draws.
+            index: Number of the scan, which seeds the random numbers.
             T_map_base: The pose.
             covariance: Covariance of x, y [m], yaw [rad], shape (3, 3).
         """
@@ -139,10 +146,11 @@ class FastSlam:
             graph=graph,
             keyframe_motion=np.zeros(3),
             keyframe_covariance=np.zeros((3, 3)),
-            views=(),
+            since_keyframe=(),
         )
 
     def _put(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
+        """Draw all particles from a Gaussian; they keep the map and the path of the best particle."""
         rng = np.random.default_rng([self.seed, index, PLACED])
         noise = rng.standard_normal((self.parameters.particles, 3))
         values, axes = np.linalg.eigh(covariance)
@@ -152,14 +160,15 @@ class FastSlam:
 
     @property
     def is_smoothing_due(self) -> bool:
-        """Whether trees were seen again and no other source measures the pose."""
-        return self.state.graph.is_due and not self.state.shared.begun
+        """Whether the newest scan is a keyframe, the graph is due, and no other source measures the pose."""
+        graph, scan = self.state.graph, len(self.state.genealogy) - 1
+        return graph.is_due and graph.newest_scan == scan and not self.state.shared.begun
 
-    def smooth(self, index: int) -> Bend | None:
-        """Solve the graph. All particles go on from its newest pose, with its path and landmarks.
+    def smooth(self, index: int) -> PathCorrection | None:
+        """Solve the graph. All particles continue from its newest pose with its path and landmarks.
 
         Args:
-            index: Number of the newest scan, for the draws.
+            index: Number of the newest scan, which seeds the random numbers.
 
         Returns:
             The correction; None where the graph has no solution.
@@ -168,30 +177,33 @@ class FastSlam:
         if solution is None:
             self.state = replace(self.state, graph=replace(graph, revisits=0))
             return None
-        return self._corrected(index, graph, solution, solution.newest)
+        return self._corrected(index, graph, solution, solution.conditional)
 
-    def close(self, index: int, loop: Loop) -> Bend | None:
+    def close(self, index: int, loop: Loop) -> PathCorrection | None:
         """Close a loop that ends at the newest scan: solve the graph with it, and correct path and landmarks.
-        All particles go on from the corrected pose with the map of the best one.
+        All particles continue from the corrected pose with the map of the best one.
 
         Args:
-            index: Number of the scan, for the draws.
+            index: Number of the scan, which seeds the random numbers.
             loop: The loop.
 
         Returns:
-            The correction; None where the graph contradicts the loop, and nothing changes then.
+            The correction; None if the graph contradicts the loop. The state is unchanged then.
         """
         state, path = self.state, self.path()
-        keyframe = self._keyframe(state, state.views, state.detections)
-        graph = state.graph.with_keyframe(keyframe, path[-1]).without_revisits(state.way - REVISIT_DISTANCE)
+        graph = state.graph
+        if graph.newest_scan != len(path) - 1:
+            keyframe = self._keyframe(state, state.since_keyframe, state.detections)
+            graph = graph.with_keyframe(keyframe, path[-1])
+        graph = graph.without_revisits(state.distance - REVISIT_DISTANCE)
         graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance)
-        solution = graph.solve()
+        solution = graph.solve(new_loop=True)
         if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:
             return None
         moved = corrected_landmarks(state.map_of(state.best), graph, solution, path)
         names = same_trees(moved, graph.first_birth_after(loop.first))
         graph = replace(graph.renamed(*names), pose=solution.pose)
-        again = graph.solve()
+        again = graph.solve(new_loop=True)
         return self._corrected(index, graph, again or solution, loop.covariance, names)
 
     def _corrected(
@@ -201,16 +213,25 @@ class FastSlam:
         solution: Solution,
         covariance: Float,
         names: tuple[Int, Int] | None = None,
-    ) -> Bend:
-        """Put all particles at the end of a solution, with its path and landmarks; `names`: see `joined`."""
+    ) -> PathCorrection:
+        """Put all particles at the newest keyframe of a solution, which is the newest scan, with its path and
+        landmarks.
+
+        Args:
+            index: Number of the newest scan.
+            graph: The graph.
+            solution: Its solution.
+            covariance: Covariance of the pose of the particles, shape (3, 3).
+            names: Landmarks that are joined; see `joined`.
+        """
         before, path = self.state, self.path()
         best = before.map_of(before.best)
         moved = corrected_landmarks(best, graph, solution, path)
         after = corrected_path(path, graph, solution)
-        bend = Bend(path, after, 0, len(path) - 1)
+        correction = PathCorrection(path, after)
         self._put(index, Pose2(*after[-1].tolist()), covariance)
         particles = len(self.state.pose)
-        frame = before.frame.corrected(bend, _at_scans(solution.covariance, graph, len(path)))
+        frame = before.frame.corrected(correction, _at_scans(solution.covariance, graph, len(path)))
         self.state = replace(
             self.state,
             maps=shared_map(particles, moved if names is None else joined(moved, *names)),
@@ -220,13 +241,13 @@ class FastSlam:
             graph=graph.solved_by(solution),
             keyframe_motion=np.zeros(3),
             keyframe_covariance=np.zeros((3, 3)),
-            views=(),
+            since_keyframe=(),
         )
-        return bend
+        return correction
 
     @property
     def is_astray(self) -> bool:
-        """Whether the known trees are not where they should be seen."""
+        """Whether most known trees are missing where they should be visible."""
         return is_astray(self.state.recent)
 
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
@@ -236,16 +257,16 @@ class FastSlam:
         return replace(estimate, health=before.health, landmark_of=before.landmark_of)
 
     def lost(self, estimate: PoseEstimate) -> Health:
-        """The health of an estimate that no tree has told anything of."""
+        """Return the health of an estimate without any tree."""
         ancestors = self.state.genealogy.distinct_ancestors
         return judged(self.state.recent, ScanTold(), estimate.n_eff, ancestors, _relative(estimate))
 
-    def give_up(self) -> None:
-        """Judge the health anew: what the known trees said no longer counts."""
+    def reset_health(self) -> None:
+        """Discard the statistics of recent scans, by which the health is judged."""
         self.state = replace(self.state, recent=Recent(mapped=self.state.recent.mapped))
 
     def path(self) -> Float:
-        """x, y [m], yaw [rad] at every scan as the best particle has it behind it, shape (N, 3)."""
+        """Return the path of the best particle: x, y [m], yaw [rad] at every scan, shape (N, 3)."""
         return self.state.genealogy.path(self.state.best)
 
     def landmarks(self) -> Landmarks:
@@ -255,8 +276,8 @@ class FastSlam:
         return Landmarks(known.birth, known.mean, known.covariance, score, p.gate, p.distance_max)
 
     def begun_since(self, scan: int) -> tuple[Float, Float]:
-        """The well known landmarks of the best particle that were begun at a scan or later: positions, shape
-        (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]; they fit the end of its path."""
+        """Return the landmarks of the best particle that were begun at a scan or later and have at least
+        `hits_to_weigh` hits: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""
         known = self.state.map_of(self.state.best)
         young = self.state.frame.scan_of(known.birth) >= scan
         rows = young & (known.hits >= self.parameters.hits_to_weigh)
@@ -311,7 +332,7 @@ class FastSlam:
             motion_covariance=np.zeros((3, 3)),
             keyframe_motion=keyframe_motion,
             keyframe_covariance=keyframe_covariance,
-            way=state.way + (state.since_update if math.isfinite(state.since_update) else 0.0),
+            distance=state.distance + (state.since_update if math.isfinite(state.since_update) else 0.0),
             since_update=0.0,
             detections=state.detections + found,
             best=leader(weights, state.best, state.pose, rules.distance_max),
@@ -321,35 +342,44 @@ class FastSlam:
         return state, scan, weights, births
 
     def _with_keyframe(self, state: SlamState, detections: Detections, birth: Int) -> SlamState:
-        """The state with the detections of this scan, which are of landmarks with these birth numbers, and
-        with a keyframe if the last one is far."""
-        graph, views, spacing = state.graph, state.views, self.parameters.keyframe_distance
-        # Scans of a robot that stands still share their errors.
-        if len(detections.cluster) and (not views or state.way - views[-1].way >= spacing / VIEWS):
+        """Return the state with the detections of this scan, and with a keyframe if the last one is far.
+
+        Args:
+            state: State after the scan.
+            detections: Detections of the scan.
+            birth: Birth number of the landmark of each detection, shape (D,).
+        """
+        graph, scans, spacing = state.graph, state.since_keyframe, self.parameters.keyframe_distance
+        # Scans from the same place share their errors.
+        if len(detections.cluster) and (
+            not scans or state.distance - scans[-1].distance >= spacing / SCANS_MAX
+        ):
             scan, R = len(state.genealogy) - 1, rows_of(detections.covariance)
-            views = (*views, View(scan, state.way, birth, detections.centre, R))
-        if graph.keyframes and state.way - graph.keyframes[-1].way < spacing:
-            return state if views is state.views else replace(state, views=views)
-        keyframe = self._keyframe(state, views, state.detections - len(detections.cluster))
+            scans = (*scans, ScanDetections(scan, state.distance, birth, detections.centre, R))
+        if graph.keyframes and state.distance - graph.keyframes[-1].distance < spacing:
+            return state if scans is state.since_keyframe else replace(state, since_keyframe=scans)
+        keyframe = self._keyframe(state, scans, state.detections - len(detections.cluster))
         return replace(
             state,
             graph=graph.with_keyframe(keyframe, state.pose[state.best]),
             keyframe_motion=np.zeros(3),
             keyframe_covariance=np.zeros((3, 3)),
-            views=(),
+            since_keyframe=(),
         )
 
-    def _keyframe(self, state: SlamState, views: tuple[View, ...], first_birth: int) -> Keyframe:
-        """The keyframe at the newest scan, with what the scans since the last one show."""
+    def _keyframe(self, state: SlamState, scans: tuple[ScanDetections, ...], first_birth: int) -> Keyframe:
+        """Return the keyframe at the newest scan with the detections of scans since the last keyframe; see
+        Keyframe for `first_birth`."""
         birth, centre, R = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
-        if views:
-            path = state.genealogy.path_since(state.best, views[0].scan)
-            at = path[[v.scan - views[0].scan for v in views]]
-            birth, centre, R = combined(views, composed(inverse(path[-1:]).repeat(len(at), axis=0), at))
-        scan = max(len(state.genealogy) - 1, 0)
+        if scans:
+            path = state.genealogy.path_since(state.best, scans[0].scan)
+            T_map_base = path[[s.scan - scans[0].scan for s in scans]]
+            T_keyframe_map = inverse(path[-1:]).repeat(len(scans), axis=0)
+            birth, centre, R = combined(scans, composed(T_keyframe_map, T_map_base))
         return Keyframe(
-            scan, first_birth, state.way, state.keyframe_motion, state.keyframe_covariance, birth, centre, R
-        )
+            max(len(state.genealogy) - 1, 0), first_birth, state.distance, state.keyframe_motion,
+            state.keyframe_covariance, birth, centre, R,
+        )  # fmt: skip
 
     def _by_trees(self, state: SlamState, centre: Float, R: Float, rules: Rules) -> ByTrees:
         return against_slip(
@@ -373,14 +403,14 @@ class FastSlam:
 
 
 def _at_scans(covariance: Float, graph: KeyframeGraph, scans: int) -> Float:
-    """Covariance of each scan's pose, shape (N, 3, 3), by that of its keyframe."""
+    """Return the covariance of each scan's pose, shape (N, 3, 3): that of the keyframe before it."""
     keyframe = np.searchsorted(graph.scans, np.arange(scans), side="right") - 1
     rows: Float = covariance[np.maximum(keyframe, 0)]
     return rows
 
 
 def _farthest(detections: Detections) -> float:
-    """Distance of the farthest one [m], 0 where there is none."""
+    """Return the distance of the farthest detection [m], 0 without one."""
     centre = detections.centre
     return math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
 
@@ -390,7 +420,7 @@ def _relative(estimate: PoseEstimate) -> Float:
 
 
 def rules_of(p: Slam) -> Rules:
-    """What the kernels ask of the parameters."""
+    """Return the parameters as the kernels take them."""
     return Rules(
         use_proposal=p.method != "fastslam1",
         gate=p.gate,

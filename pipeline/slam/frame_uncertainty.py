@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.loop_closure.map_correction import Bend
+from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam.motion import wrapped
 from pipeline.types.records import Int, Int32
 
@@ -114,31 +114,16 @@ class FrameMemory:
         k = np.searchsorted(self.serial, birth, side="right") - 1
         return np.where(k >= 0, self.scan[np.maximum(k, 0)], 0)
 
-    def at_places(self, birth: Int, place: Float) -> Float:
-        """What landmarks share with the pose that they were begun from: covariance of the frame where they
-        stand, shape (L, 2, 2) [m^2].
-
-        Args:
-            birth: shape (L,); place: shape (L, 2) [m].
-        """
-        shared = np.zeros((len(birth), 2, 2))
-        mark = np.searchsorted(self.serial, birth, side="right") - 1
-        for j in np.flatnonzero(mark >= 0):
-            k = mark[j]
-            dx, dy = place[j] - self.pose[k, :2]
-            shared[j] = carried(self.covariance[k], float(dx), float(dy))[:2, :2]
-        return shared
-
-    def corrected(self, bend: Bend, covariance: Float) -> FrameMemory:
+    def corrected(self, correction: PathCorrection, covariance: Float) -> FrameMemory:
         """Return the memory after a correction of the path.
 
         Args:
-            bend: The correction.
+            correction: The correction.
             covariance: Covariance of the pose of each scan, shape (N, 3, 3).
         """
         if not len(self.scan):
             return self
-        return replace(self, pose=bend.poses(self.pose, self.scan), covariance=covariance[self.scan])
+        return replace(self, pose=correction.poses(self.pose, self.scan), covariance=covariance[self.scan])
 
     def forgotten(self) -> FrameMemory:
         """Nothing hidden: the particles were put somewhere with the spread that is known."""

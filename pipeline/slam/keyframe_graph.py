@@ -4,11 +4,10 @@ x*, l* = argmin   sum_k  |x_k-1^-1 x_k - u_k|^2_Q
                 + sum_kj rho(|C_k^T (l_j - p_k) - z_kj|_R)
                 + sum_ij rho(|x_i^-1 x_j - t_ij|_T)
 
-x_k are the poses of keyframes, p_k and C_k their position and rotation, l_j the positions of stems, u_k the
-motions by odometry between keyframes, z_kj the detections of stems, for which FastSLAM decides the data
-association, and t_ij the loops that stem matching finds. rho is the kernel of Cauchy, which switches off a
-wrong association or a wrong loop. Levenberg-Marquardt on sparse normal equations solves the problem, from the
-present estimate on.
+x_k are the poses of keyframes, p_k and C_k their positions and rotations, l_j the positions of stems, u_k the
+motions by odometry between keyframes, z_kj the detections of stems with the data association of FastSLAM, and
+t_ij the loops that stem matching finds. rho is the Cauchy kernel, which switches off a wrong association or a
+wrong loop. Levenberg-Marquardt solves the sparse normal equations, starting at the present estimate.
 """
 
 from __future__ import annotations
@@ -19,27 +18,30 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
-from pipeline.slam.poses import composed, inverse
+from pipeline.slam.motion import compounded
+from pipeline.slam.poses import composed, inverse, rotated_rows
 from pipeline.types.records import Int
 
 Sparse = Any  # scipy.sparse.csc_matrix, or its factors; scipy has no types
-#: Scale of the Cauchy kernel [sigma], which has 95 % of the efficiency of least squares for Gaussian errors
-#: (Holland, Welsch 1977).
+#: Scale of the Cauchy kernel [sigma]: 95 % of the efficiency of least squares for Gaussian errors (Holland,
+#: Welsch 1977).
 CAUCHY = 2.385
-#: Stems of one keyframe that enter the graph, the nearest first, so that a keyframe has a bounded cost.
+#: Stems of one keyframe in the graph, the nearest first; bounds the cost of a keyframe.
 STEMS_MAX = 24
-#: Keyframes of the graph; beyond it every second one is dropped, so that a solution has a bounded cost.
+#: Keyframes of the graph; beyond it every second one is dropped, which bounds the cost of a solution.
 KEYFRAMES_MAX = 2000
-#: m of the path; a stem that was not seen for so long and is seen again closes a loop.
+#: m of path without a view of a stem; a view after it is a revisit.
 REVISIT_DISTANCE = 30.0
-#: Growth of the graph between two solutions, so that all solutions cost a bounded multiple of the last one.
+#: Growth of the graph between two solutions: a share of it, and at least so many keyframes. All solutions
+#: of a run together cost a bounded multiple of the last one.
 GROWTH, GROWTH_MIN = 0.1, 5
-#: m, m, rad; smallest sigma of a motion, also of a robot that stands still.
-MOTION_SIGMA_MIN = np.array([1e-3, 1e-3, 1e-4])
-SETTLED = 1e-3  # a smaller part of the cost that a step takes off ends the iteration
-ROUNDS_MAX = 20
-DAMPING = (1e-6, 10.0, 1e6)  # first value, factor, and the value at which the iteration gives up
-MARGINALS = 16  # keyframes of which the covariance is computed; it is interpolated in between
+MOTION_SIGMA_MIN = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad; lower bound, for a robot that does not move
+CONVERGED = 1e-3  # relative decrease of the cost; a smaller one ends the iteration
+ITERATIONS_MAX = 20
+DAMPING = (1e-6, 10.0, 1e6)  # first value, factor, and the value at which the solver fails
+FIXED = 1e8  # 1/m^2, 1/rad^2; information that holds the first pose, which is the frame of the map
+REGULAR = 1e-9  # 1/m^2, 1/rad^2; information of a pose or stem that nothing observes
+MARGINALS = 16  # keyframes whose covariance is computed; it is interpolated in between
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +51,7 @@ class Keyframe:
     Attributes:
         scan: Number of the scan.
         first_birth: Landmarks with this birth number or a later one were begun at this keyframe or after it.
-        way: Distance driven until here [m].
+        distance: Distance driven until here [m].
         motion: x, y [m], yaw [rad] since the keyframe before, shape (3,).
         covariance: Covariance of `motion`, shape (3, 3); infinite where no odometry connects the two.
         birth: int64, shape (D,), ascending by distance: landmarks that were detected.
@@ -59,7 +61,7 @@ class Keyframe:
 
     scan: int
     first_birth: int
-    way: float
+    distance: float
     motion: Float
     covariance: Float
     birth: Int
@@ -68,30 +70,30 @@ class Keyframe:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class ScanDetections:
     """The detections of one scan between two keyframes; the attributes are those of Keyframe."""
 
     scan: int
-    way: float
+    distance: float
     birth: Int
     centre: Float
     R: Float
 
 
-def combined(views: tuple[View, ...], T_keyframe_base: Float) -> tuple[Int, Float, Float]:
+def combined(scans: tuple[ScanDetections, ...], T_keyframe_base: Float) -> tuple[Int, Float, Float]:
     """Return the weighted means of detections of the same landmark over several scans.
 
     Args:
-        views: The scans.
-        T_keyframe_base: Pose of each scan with respect to the keyframe, shape (V, 3).
+        scans: The scans.
+        T_keyframe_base: Pose of each scan with respect to the keyframe, shape (S, 3).
 
     Returns:
         Birth numbers, positions and covariances of the landmarks, the nearest first; see Keyframe.
     """
-    count = [len(v.birth) for v in views]
+    count = [len(s.birth) for s in scans]
     pose = np.repeat(T_keyframe_base, count, axis=0)
-    birth, z = np.concatenate([v.birth for v in views]), np.concatenate([v.centre for v in views])
-    R = rotated_rows(np.concatenate([v.R for v in views]), pose[:, 2])
+    birth, z = np.concatenate([s.birth for s in scans]), np.concatenate([s.centre for s in scans])
+    R = rotated_rows(np.concatenate([s.R for s in scans]), pose[:, 2])
     z = composed(pose, np.column_stack([z, np.zeros(len(z))]))[:, :2]
     names, of = np.unique(birth, return_inverse=True)
     weight = 1.0 / (R[:, 0] + R[:, 2])
@@ -104,19 +106,6 @@ def combined(views: tuple[View, ...], T_keyframe_base: Float) -> tuple[Int, Floa
     return names[near], mean[near], spread[near]
 
 
-def rotated_rows(covariance: Float, turn: Float) -> Float:
-    """Return covariances xx, xy, yy, shape (N, 3), rotated by angles, shape (N,)."""
-    c, s = np.cos(turn), np.sin(turn)
-    xx, xy, yy = covariance.T
-    return np.column_stack(
-        [
-            c * c * xx - 2.0 * c * s * xy + s * s * yy,
-            c * s * (xx - yy) + (c * c - s * s) * xy,
-            s * s * xx + 2.0 * c * s * xy + c * c * yy,
-        ]
-    )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopEdge:
     """A relative pose that stem matching measured.
@@ -124,7 +113,7 @@ class LoopEdge:
     Attributes:
         scans: Scan numbers of both keyframes.
         motion: x, y [m], yaw [rad] from the first to the second, shape (3,).
-        covariance: Covariance of it, shape (3, 3).
+        covariance: Its covariance, shape (3, 3).
     """
 
     scans: tuple[int, int]
@@ -141,7 +130,7 @@ class Solution:
         birth: int64, shape (L,), ascending: landmarks of the graph.
         position: Their positions, shape (L, 2) [m].
         covariance: Covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3).
-        newest: Covariance of the newest keyframe's pose given the rest of the graph, shape (3, 3).
+        conditional: Covariance of the newest keyframe's pose given all other poses and stems, shape (3, 3).
         loop_weight: Weight of each loop by its kernel, shape (E,): 1 where it fits, near 0 where it does not.
     """
 
@@ -149,19 +138,19 @@ class Solution:
     birth: Int
     position: Float
     covariance: Float
-    newest: Float
+    conditional: Float
     loop_weight: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KeyframeGraph:
-    """The graph so far. It is immutable, so that states may share it.
+    """The graph. It is immutable, so that states may share it.
 
     Attributes:
         keyframes: In the order of the path.
         pose: Pose of each keyframe by the filter or by the last solution, shape (K, 3).
         loops: Loops that stem matching found.
-        revisits: Keyframes since the last solution that show stems which were not seen for long.
+        revisits: Keyframes since the last solution that show stems for the first time in REVISIT_DISTANCE.
         solved: Number of keyframes at the last solution.
     """
 
@@ -177,6 +166,11 @@ class KeyframeGraph:
         return np.array([k.scan for k in self.keyframes], np.int64)
 
     @property
+    def newest_scan(self) -> int:
+        """Scan number of the newest keyframe, -1 without one."""
+        return self.keyframes[-1].scan if self.keyframes else -1
+
+    @property
     def nbytes(self) -> int:
         """Size of all arrays."""
         size = sum(
@@ -185,11 +179,13 @@ class KeyframeGraph:
         return size + self.pose.nbytes
 
     def with_keyframe(self, keyframe: Keyframe, pose: Float) -> KeyframeGraph:
-        """Return the graph with one more keyframe, at a pose by the filter, shape (3,)."""
+        """Return the graph with one more keyframe, at a pose by the filter, shape (3,). It replaces a
+        keyframe at the same scan."""
+        kept = len(self.keyframes) - (self.newest_scan == keyframe.scan)
         graph = replace(
             self,
-            keyframes=(*self.keyframes, keyframe),
-            pose=np.concatenate([self.pose, pose[None]]),
+            keyframes=(*self.keyframes[:kept], keyframe),
+            pose=np.concatenate([self.pose[:kept], pose[None]]),
             revisits=self.revisits + self._is_revisit(keyframe),
         )
         return graph.thinned() if len(graph.keyframes) > KEYFRAMES_MAX else graph
@@ -211,7 +207,7 @@ class KeyframeGraph:
         return replace(self, loops=(*self.loops, LoopEdge(scans, motion, C @ covariance @ C.T)))
 
     def first_birth_after(self, scan: int) -> int:
-        """Return the birth number from which on landmarks were begun after a scan."""
+        """Return the birth number of the first landmark that was begun at the next keyframe after a scan."""
         row = int(np.searchsorted(self.scans, scan, side="right"))
         return self.keyframes[min(row, len(self.keyframes) - 1)].first_birth
 
@@ -221,15 +217,16 @@ class KeyframeGraph:
 
     @property
     def is_due(self) -> bool:
-        """Whether stems were seen again since the last solution, and the graph has grown enough."""
+        """Whether revisits were added since the last solution, and the graph has grown by GROWTH."""
         grown = len(self.keyframes) - self.solved
         return self.revisits > 0 and grown >= max(GROWTH_MIN, GROWTH * len(self.keyframes))
 
     def renamed(self, birth: Int, name: Int) -> KeyframeGraph:
-        """Return the graph with landmarks under other birth numbers, because two of them are one tree.
+        """Return the graph with other birth numbers for some landmarks, which are the same trees.
 
         Args:
-            birth: int64, shape (N,), ascending; name: int64, shape (N,), what they are called from now on.
+            birth: Their birth numbers, int64, shape (N,), ascending.
+            name: Their new birth numbers, int64, shape (N,).
         """
         if not len(birth):
             return self
@@ -240,15 +237,15 @@ class KeyframeGraph:
 
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
-    def without_revisits(self, way: float) -> KeyframeGraph:
-        """Return the graph without associations by a pose that turned out to be wrong: in the keyframes
-        after a distance driven, the detections of landmarks begun more than REVISIT_DISTANCE before it."""
-        start = [k.first_birth for k in self.keyframes if k.way >= way - REVISIT_DISTANCE]
+    def without_revisits(self, distance: float) -> KeyframeGraph:
+        """Return the graph without the associations of a wrong pose: keyframes from a distance driven [m] on
+        lose the detections of landmarks that were begun more than REVISIT_DISTANCE before it."""
+        recent = [k.first_birth for k in self.keyframes if k.distance >= distance - REVISIT_DISTANCE]
 
         def cleaned(keyframe: Keyframe) -> Keyframe:
-            if keyframe.way < way:
+            if keyframe.distance < distance:
                 return keyframe
-            keep = keyframe.birth >= start[0]
+            keep = keyframe.birth >= recent[0]
             return replace(
                 keyframe, birth=keyframe.birth[keep], centre=keyframe.centre[keep], R=keyframe.R[keep]
             )
@@ -256,11 +253,14 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(cleaned(k) for k in self.keyframes))
 
     def thinned(self) -> KeyframeGraph:
-        """Return the graph without every second keyframe, whose detections are dropped."""
+        """Return the graph without every second keyframe and its detections; motions are compounded."""
         kept: list[Keyframe] = [self.keyframes[0]]
         for i in range(2, len(self.keyframes), 2):
             between, after = self.keyframes[i - 1], self.keyframes[i]
-            motion, covariance = _compounded(between, after)
+            x, y, yaw = after.motion
+            motion, covariance = compounded(between.motion, between.covariance, x, y, yaw, after.covariance)
+            if not (np.isfinite(between.covariance).all() and np.isfinite(after.covariance).all()):
+                covariance = np.full((3, 3), np.inf)
             kept.append(replace(after, motion=motion, covariance=covariance))
         rows = np.arange(0, len(self.keyframes), 2)
         if len(self.keyframes) % 2 == 0:  # the newest keyframe stays
@@ -274,26 +274,30 @@ class KeyframeGraph:
             self, keyframes=tuple(kept), pose=self.pose[rows], loops=loops, solved=self.solved // 2
         )
 
-    def solve(self) -> Solution | None:
-        """Return the minimum; None without convergence or where keyframes are not connected."""
+    def solve(self, *, new_loop: bool = False) -> Solution | None:
+        """Return the minimum; None without convergence.
+
+        Args:
+            new_loop: Whether the last loop was just added. The Cauchy kernel has no slope far from the
+                minimum, so the problem is first solved with the full weight of this loop.
+        """
         if len(self.keyframes) < 2:
             return None
         problem = _Problem(self)
-        if self.loops:
-            # Far from its minimum the kernel has no slope, so the newest loop counts fully at first.
-            problem.trusted = 1
-            begun = problem.solve()
-            if begun is None:
+        if new_loop:
+            first = problem.minimum(quadratic_loops=1)
+            if first is None:
                 return None
-            problem.pose, problem.trusted = begun.pose, 0
-        return problem.solve()
+            problem.pose = first[0]
+        minimum = problem.minimum()
+        return None if minimum is None else problem.solution(*minimum)
 
     def _is_revisit(self, keyframe: Keyframe) -> bool:
-        """Whether a keyframe shows at least two stems that were not seen in the last REVISIT_DISTANCE."""
+        """Whether a keyframe shows at least two known stems for the first time in REVISIT_DISTANCE."""
         recent: list[Int] = []
         first_birth = -1
         for before in reversed(self.keyframes):
-            if keyframe.way - before.way > REVISIT_DISTANCE:
+            if keyframe.distance - before.distance > REVISIT_DISTANCE:
                 first_birth = before.first_birth
                 break
             recent.append(before.birth)
@@ -304,33 +308,22 @@ class KeyframeGraph:
         return int(np.count_nonzero(~np.isin(old, seen))) >= 2
 
 
-def _compounded(first: Keyframe, second: Keyframe) -> tuple[Float, Float]:
-    """The motion over two keyframes, and its covariance."""
-    c, s = np.cos(first.motion[2]), np.sin(first.motion[2])
-    F, G = np.eye(3), np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    ahead = G @ second.motion
-    F[0, 2], F[1, 2] = -ahead[1], ahead[0]
-    motion = composed(first.motion[None], second.motion[None])[0]
-    if not (np.isfinite(first.covariance).all() and np.isfinite(second.covariance).all()):
-        return motion, np.full((3, 3), np.inf)
-    return motion, F @ first.covariance @ F.T + G @ second.covariance @ G.T
-
-
 def _nearest(scans: Int, scan: int) -> int:
+    """Return the element of ascending scan numbers that is nearest to a scan."""
     row = int(np.searchsorted(scans, scan))
     rows = [r for r in (row - 1, row) if 0 <= r < len(scans)]
     return int(scans[min(rows, key=lambda r: abs(int(scans[r]) - scan))])
 
 
 class _Problem:
-    """The columns of a graph: poses K, landmarks L, motions E, detections M."""
+    """A graph as arrays of K poses, L landmarks, E motions and loops, and M detections."""
 
     def __init__(self, graph: KeyframeGraph) -> None:
         keyframes = graph.keyframes
         birth = np.concatenate([k.birth for k in keyframes])
         row = np.repeat(np.arange(len(keyframes)), [len(k.birth) for k in keyframes])
         names, of, count = np.unique(birth, return_inverse=True, return_counts=True)
-        used = count[of] > 1  # a stem that was seen once tells nothing of a pose
+        used = count[of] > 1  # a single view of a stem does not constrain a pose
         self.birth = names[count > 1]
         self.row = row[used]
         self.of = np.searchsorted(self.birth, birth[used])
@@ -338,7 +331,6 @@ class _Problem:
         R = np.concatenate([k.R for k in keyframes])[used]
         self.root_R = _root_information(R[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
         self.pose = graph.pose
-        self.trusted = 0  # newest loops without a kernel
         # Motions by odometry, then loops.
         connected = [k for k in range(1, len(keyframes)) if np.isfinite(keyframes[k].covariance).all()]
         scans = graph.scans
@@ -352,48 +344,58 @@ class _Problem:
         floor = np.diag(np.square(MOTION_SIGMA_MIN))
         self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
 
-    def solve(self) -> Solution | None:
-        """Levenberg-Marquardt; see KeyframeGraph.solve."""
+    def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Sparse, Float] | None:
+        """Return poses, stems, normal matrix and weights of motions and loops at the minimum by
+        Levenberg-Marquardt; None without convergence.
+
+        Args:
+            quadratic_loops: Number of loops at the end that have no Cauchy kernel.
+        """
         x, l = self.pose.copy(), self._triangulated()  # noqa: E741
-        cost, H, g, weight = self._linearised(x, l)
+        cost, H, g, weight = self._linearised(x, l, quadratic_loops)
         damping, factor, most = DAMPING
-        for _ in range(ROUNDS_MAX):
+        for _ in range(ITERATIONS_MAX):
             step = self._step(H, g, damping)
             if step is None:
                 return None
             dx, dl = step[: 3 * len(x)].reshape(-1, 3), step[3 * len(x) :].reshape(-1, 2)
             moved, placed = x + dx, l + dl
-            new_cost, new_H, new_g, new_weight = self._linearised(moved, placed)
+            new_cost, new_H, new_g, new_weight = self._linearised(moved, placed, quadratic_loops)
             if new_cost > cost * (1.0 + 1e-9):
                 damping *= factor
                 if damping > most:
                     return None
                 continue
-            settled = cost - new_cost < SETTLED * cost
+            converged = cost - new_cost < CONVERGED * cost
             x, l, cost, H, g, weight = moved, placed, new_cost, new_H, new_g, new_weight  # noqa: E741
             damping = max(damping / factor, DAMPING[0])
-            if settled:
+            if converged:
                 break
         x[:, 2] = wrap_angle(x[:, 2])
-        return self._solution(x, l, H, weight)
+        return x, l, H, weight
 
-    def _solution(self, x: Float, l: Float, H: Sparse, weight: Float) -> Solution:  # noqa: E741
-        """The result; H is the normal matrix at the minimum. Its block of the newest pose is the information
-        of this pose given all else."""
+    def solution(self, x: Float, l: Float, H: Sparse, weight: Float) -> Solution:  # noqa: E741
+        """Return the record of a minimum. A diagonal block of the normal matrix H is the information of a
+        pose given all other unknowns."""
         end = 3 * len(x)
-        newest = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
-        return Solution(x, self.birth, l, self._marginals(H), newest, weight[self.motions :])
+        conditional = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
+        return Solution(x, self.birth, l, self._marginals(H), conditional, weight[self.motions :])
 
     def _triangulated(self) -> Float:
-        """Mean position of each landmark by the poses, shape (L, 2)."""
+        """Return the mean position of each landmark by its detections, shape (L, 2) [m]."""
         c, s = np.cos(self.pose[self.row, 2]), np.sin(self.pose[self.row, 2])
         x = self.pose[self.row, 0] + c * self.z[:, 0] - s * self.z[:, 1]
         y = self.pose[self.row, 1] + s * self.z[:, 0] + c * self.z[:, 1]
         n = np.bincount(self.of, minlength=len(self.birth))
         return np.column_stack([np.bincount(self.of, v, len(self.birth)) for v in (x, y)]) / n[:, None]
 
-    def _linearised(self, x: Float, l: Float) -> tuple[float, Sparse, Float, Float]:  # noqa: E741
-        """Robust cost, normal matrix, gradient, and weights of the motions and loops at an estimate."""
+    def _linearised(
+        self,
+        x: Float,
+        l: Float,  # noqa: E741
+        quadratic_loops: int,
+    ) -> tuple[float, Sparse, Float, Float]:
+        """Return robust cost, normal matrix, gradient, and weights of motions and loops at an estimate."""
         from scipy import sparse
 
         K, L, M, E = len(x), len(l), len(self.row), len(self.first)
@@ -409,9 +411,9 @@ class _Problem:
         e, J = (self.root_Q @ e[:, :, None])[:, :, 0], self.root_Q @ J
         d2 = np.einsum("ea,ea->e", e, e)
         weight = np.ones(E)
-        robust = slice(self.motions, E - self.trusted)
+        robust = slice(self.motions, E - quadratic_loops)
         weight[robust] = _weight(d2[robust])
-        cost = float(d2[: self.motions].sum() + _cost(d2[robust]).sum() + d2[E - self.trusted :].sum())
+        cost = float(d2[: self.motions].sum() + _cost(d2[robust]).sum() + d2[E - quadratic_loops :].sum())
         J, e = np.sqrt(weight)[:, None, None] * J, np.sqrt(weight)[:, None] * e
 
         c, s = np.cos(x[self.row, 2]), np.sin(x[self.row, 2])
@@ -459,12 +461,12 @@ class _Problem:
         return out if np.isfinite(out).all() else None
 
     def _factorised(self, H: Sparse, damping: float) -> Sparse | None:
-        """LU factors of the damped normal matrix; the first pose is held by a strong prior."""
+        """Return LU factors of the damped normal matrix with the first pose fixed; None if it is singular."""
         from scipy import sparse
         from scipy.sparse.linalg import splu
 
-        diagonal = damping * H.diagonal() + 1e-9
-        diagonal[:3] += 1e8
+        diagonal = damping * H.diagonal() + REGULAR
+        diagonal[:3] += FIXED
         options = {"SymmetricMode": True}
         try:
             return splu(
@@ -473,11 +475,11 @@ class _Problem:
                 diag_pivot_thresh=0.0,
                 options=options,
             )
-        except RuntimeError:  # singular: a part of the path that nothing connects
+        except RuntimeError:
             return None
 
     def _marginals(self, H: Sparse) -> Float:
-        """Covariance of each keyframe's pose, shape (K, 3, 3)."""
+        """Return the covariance of each keyframe's pose, shape (K, 3, 3)."""
         K = len(self.pose)
         factors: Sparse = self._factorised(H, 0.0)
         chosen = np.unique(np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64))
@@ -494,16 +496,17 @@ class _Problem:
 
 
 def _root_information(covariance: Float) -> Float:
-    """W with W^T W = covariance^-1, shape (N, n, n)."""
+    """Return W with W^T W = covariance^-1, shape (N, n, n)."""
     if not len(covariance):
         return covariance
     return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
 
 
 def _weight(d2: Float) -> Float:
-    """Weight of squared errors in the kernel of Cauchy."""
+    """Return the weights of squared errors by the Cauchy kernel."""
     return 1.0 / (1.0 + d2 / CAUCHY**2)
 
 
 def _cost(d2: Float) -> Float:
+    """Return the Cauchy kernel of squared errors."""
     return CAUCHY**2 * np.log1p(d2 / CAUCHY**2)

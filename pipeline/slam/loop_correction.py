@@ -8,10 +8,10 @@ import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.association import associate
-from pipeline.slam.keyframe_graph import KeyframeGraph, Solution, rotated_rows
+from pipeline.slam.keyframe_graph import KeyframeGraph, Solution
 from pipeline.slam.motion import Noise
 from pipeline.slam.particle_maps import MapColumns
-from pipeline.slam.poses import composed, interpolated, inverse
+from pipeline.slam.poses import composed, interpolated, inverse, rotated_rows
 from pipeline.types.records import Int
 
 JUMP, JUMP_TURN = 1.0, 1.0  # m, rad; a larger difference between path and odometry is no motion
@@ -24,14 +24,12 @@ class Loop:
 
     Attributes:
         first: Scan at which the robot left the place.
-        last: Last scan that changed the map.
         anchor: Scan at or before `first` that was taken near the place.
         T_map_base: Pose of the base at the newest scan.
         covariance: Covariance of this pose relative to the trees there, x, y [m], yaw [rad], shape (3, 3).
     """
 
     first: int
-    last: int
     anchor: int
     T_map_base: Pose2
     covariance: Float
@@ -67,7 +65,8 @@ def corrected_landmarks(
 def _moved_rigidly(
     place: Float, birth: Int, graph: KeyframeGraph, solution: Solution, path: Float
 ) -> tuple[Float, Float]:
-    """The positions, each moved with the keyframe that began it, and their rotations."""
+    """Return positions, shape (L, 2) [m], each moved with the keyframe that began it, and their rotations,
+    shape (L,) [rad]."""
     first = np.array([k.first_birth for k in graph.keyframes], np.int64)
     row = np.maximum(np.searchsorted(first, birth, side="right") - 1, 0)
     was, now = path[graph.scans][row], solution.pose[row]
@@ -78,8 +77,13 @@ def _moved_rigidly(
 
 
 def same_trees(known: MapColumns, first_birth: int) -> tuple[Int, Int]:
-    """Return the landmarks begun after a loop that stand where one from before it does, one to one: their
-    birth numbers, ascending, and the older birth numbers, shape (N,)."""
+    """Return pairs of landmarks at the same place, one begun before a loop and one after it: the birth
+    numbers of the later ones, ascending, and of the earlier ones, int64, shape (N,) each.
+
+    Args:
+        known: Landmarks of one particle after the correction.
+        first_birth: Birth number of the first landmark after the loop.
+    """
     old, young = np.flatnonzero(known.birth < first_birth), np.flatnonzero(known.birth >= first_birth)
     of, _ = associate(
         known.mean[young], known.covariance[young], known.mean[old], known.covariance[old], np.inf, TWICE
@@ -91,7 +95,8 @@ def same_trees(known: MapColumns, first_birth: int) -> tuple[Int, Int]:
 
 
 def joined(known: MapColumns, birth: Int, name: Int) -> MapColumns:
-    """Return the landmarks with those of some birth numbers joined to those that they are named after."""
+    """Return the landmarks without those of the birth numbers `birth`, whose hits go to those of the birth
+    numbers `name`; see `same_trees`."""
     hits, score = known.hits.copy(), known.score.copy()
     keep = np.ones(len(known.birth), np.bool_)
     row = {int(b): k for k, b in enumerate(known.birth)}

@@ -1,4 +1,4 @@
-"""Rows of poses, and the path at every scan from keyframes that a loop may have moved since."""
+"""Arrays of poses and covariances, one per row, and the path between corrected keyframes."""
 
 from __future__ import annotations
 
@@ -46,3 +46,16 @@ def interpolated(keyframes: Float, motions: Float, keyframe: Int, since: Float) 
     first = np.searchsorted(keyframe, np.arange(len(keyframes) + 1))
     part = (np.arange(len(keyframe)) - first[keyframe]) / (first[keyframe + 1] - first[keyframe])
     return composed(composed(keyframes[keyframe], since), part[:, None] * lacking[keyframe])
+
+
+def rotated_rows(covariance: Float, turn: Float) -> Float:
+    """Return covariances xx, xy, yy, shape (N, 3), rotated by angles, shape (N,)."""
+    c, s = np.cos(turn), np.sin(turn)
+    xx, xy, yy = covariance.T
+    return np.column_stack(
+        [
+            c * c * xx - 2.0 * c * s * xy + s * s * yy,
+            c * s * (xx - yy) + (c * c - s * s) * xy,
+            s * s * xx + 2.0 * c * s * xy + c * c * yy,
+        ]
+    )

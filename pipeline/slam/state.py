@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.io.checkpoints.codec import NOT_SAVED
+from pipeline.io.checkpoints.codec import ADDED, NOT_SAVED
 from pipeline.slam.frame_uncertainty import FrameMemory
-from pipeline.slam.keyframe_graph import KeyframeGraph, View
+from pipeline.slam.keyframe_graph import KeyframeGraph, ScanDetections
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
 from pipeline.slam.resampling import normalised
@@ -35,10 +35,10 @@ class SlamState:
         frame: How well the frame was known where landmarks were begun.
         graph: Keyframes and the landmarks that they show.
         keyframe_motion: Motion since the last keyframe, shape (3,); keyframe_covariance: of it, shape (3, 3).
-        way: Distance driven, and a metre per radian turned [m].
-        views: Detections since the last keyframe.
-        shared: What measured poses err by alike; a map that is saved does not have it, for another source
-            lies in it otherwise.
+        distance: Distance driven, and a metre per radian turned [m].
+        since_keyframe: Detections of the scans since the last keyframe.
+        shared: Error that the measured poses of one source share; it is not saved, because another source has
+            another error.
     """
 
     pose: Float
@@ -52,11 +52,11 @@ class SlamState:
     genealogy: Genealogy = field(default_factory=Genealogy)
     recent: Recent = field(default_factory=Recent)
     frame: FrameMemory = field(default_factory=FrameMemory)
-    graph: KeyframeGraph = field(default_factory=KeyframeGraph, metadata={NOT_SAVED: True})
-    keyframe_motion: Float = field(default_factory=lambda: np.zeros(3), metadata={NOT_SAVED: True})
-    keyframe_covariance: Float = field(default_factory=lambda: np.zeros((3, 3)), metadata={NOT_SAVED: True})
-    way: float = field(default=0.0, metadata={NOT_SAVED: True})
-    views: tuple[View, ...] = field(default=(), metadata={NOT_SAVED: True})
+    graph: KeyframeGraph = field(default_factory=KeyframeGraph, metadata={ADDED: None})
+    keyframe_motion: Float = field(default_factory=lambda: np.zeros(3), metadata={ADDED: None})
+    keyframe_covariance: Float = field(default_factory=lambda: np.zeros((3, 3)), metadata={ADDED: None})
+    distance: float = field(default=0.0, metadata={ADDED: None})
+    since_keyframe: tuple[ScanDetections, ...] = field(default=(), metadata={ADDED: None})
     shared: SharedErrors = field(default_factory=SharedErrors, metadata={NOT_SAVED: True})
 
     @classmethod

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.config.stages import Classification, Tracking
 from pipeline.geometry.gaussian import in_map, spread_by_pose
 from pipeline.geometry.poses import Float
-from pipeline.loop_closure.map_correction import Bend
+from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.tracking.identity import follow, merge_near, stand_apart, tracks_of
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.observation import FigureLimits, add_observations, table_figures
@@ -91,17 +91,19 @@ class Tracker:
         if not kept.all():
             self.tracks = self.tracks.take(kept)
 
-    def bend(self, bend: Bend, stamps_ns: Int, estimate: PoseEstimate, landmarks: Landmarks) -> None:
-        """Move the trees after a loop closure.
+    def correct(
+        self, correction: PathCorrection, stamps_ns: Int, estimate: PoseEstimate, landmarks: Landmarks
+    ) -> None:
+        """Move the trees with a corrected path.
 
         Args:
-            bend: The correction of the path.
+            correction: The correction of the path.
             stamps_ns: Time of each scan of the path.
             estimate: Pose after the correction.
             landmarks: Landmarks after the correction.
         """
         t = self.tracks
-        t.x[:, :2], turn = bend.of_trees(t.x[:, :2], np.searchsorted(stamps_ns, t.first_ns))
+        t.x[:, :2], turn = correction.moved(t.x[:, :2], np.searchsorted(stamps_ns, t.first_ns))
         c, s = np.cos(turn), np.sin(turn)
         C = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
         t.x[:, 2:] = np.einsum("nij,nj->ni", C, t.x[:, 2:])

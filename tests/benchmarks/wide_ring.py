@@ -96,7 +96,7 @@ class Mapped:
 
     def closed(self) -> list[int]:
         """The scans at which a loop was closed."""
-        return [f.index for f in self.frames if any("loop is closed" in word for word in f.warnings)]
+        return [f.index for f in self.frames if any("loop closed" in word for word in f.warnings)]
 
 
 def mapped(ring: WideRing, seed: int, parameters: Parameters | None = None) -> Mapped:

@@ -23,7 +23,8 @@ from pipeline.errors import StemmapError
 
 R = TypeVar("R")
 NOT_SAVED = "not saved"  # in the metadata of a field that is not saved and gets its default
-# In the metadata of a field that files of an earlier version lack: a function that makes it from the others.
+# In the metadata of a field that files of an earlier version lack: a function of the other fields that
+# returns its value, or None for its default.
 ADDED = "added"
 _ALIGN = 8
 _hints = cache(typing.get_type_hints)
@@ -156,7 +157,7 @@ def _record(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN4
         for part in wanted
         if part not in added
     }
-    return kind(**parts, **{part: make(parts) for part, make in added.items()})
+    return kind(**parts, **{part: make(parts) for part, make in added.items() if make})
 
 
 def _tuple(of: tuple[Any, ...], tree: Any, blob: _Block, name: str) -> tuple[Any, ...]:  # noqa: ANN401

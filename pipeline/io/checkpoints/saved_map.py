@@ -18,6 +18,7 @@ from pipeline.loop_closure.kidnapped_robot import RelocaliserState
 from pipeline.mapper import Mapper, MapperState
 from pipeline.slam import SlamState
 from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.keyframe_graph import KEYFRAMES_MAX, Keyframe, LoopEdge, ScanDetections
 from pipeline.slam.particle_ancestry import BLOCK
 from pipeline.slam.particle_maps import is_sound
 from pipeline.tracking import Tracker
@@ -142,6 +143,7 @@ def _check_slam(slam: SlamState) -> None:
     if past.founders is not None and any(len(f) != P or not _within(f, 1 << 20) for f in past.founders):
         raise ValueError("the particles have other founders")
     _check_frame(slam.frame, len(past))
+    _check_graph(slam, len(past))
 
 
 def _check_frame(frame: FrameMemory, scans: int) -> None:
@@ -155,6 +157,34 @@ def _check_frame(frame: FrameMemory, scans: int) -> None:
     if marks and not 0 <= frame.scan[0] <= frame.scan[-1] < scans:
         raise ValueError("the marks of the frame are of no scan")
     _check_finite(frame.pose, frame.covariance, frame.hidden, frame.at)
+
+
+def _check_graph(slam: SlamState, scans: int) -> None:
+    graph, K = slam.graph, len(slam.graph.keyframes)
+    if graph.pose.shape != (K, 3) or K > KEYFRAMES_MAX or not 0 <= graph.solved <= K:
+        raise ValueError("the keyframes have no poses")
+    for numbers in (graph.scans, np.array([s.scan for s in slam.since_keyframe], np.int64)):
+        if len(numbers) and not (0 <= numbers[0] <= numbers[-1] < scans and np.all(np.diff(numbers) > 0)):
+            raise ValueError("the keyframes are out of order")
+    _check_finite(graph.pose, slam.keyframe_motion)
+    parts: list[Keyframe | ScanDetections] = [*graph.keyframes, *slam.since_keyframe]
+    for part in parts:
+        D = len(part.birth)
+        if not (part.birth.shape == (D,) and part.centre.shape == (D, 2) and part.R.shape == (D, 3)):
+            raise ValueError("the detections of a keyframe do not fit")
+        xx, xy, yy = part.R.T
+        if not np.isfinite(part.distance) or not np.all((xx > 0.0) & (xx * yy > xy * xy)):
+            raise ValueError("a covariance of a keyframe is not positive definite")
+        _check_finite(part.centre, part.R)
+    edges: list[Keyframe | LoopEdge] = [*graph.keyframes, *graph.loops]
+    for edge in edges:
+        if edge.motion.shape != (3,) or edge.covariance.shape != (3, 3):
+            raise ValueError("a motion between keyframes has another shape")
+        known = np.isfinite(edge.covariance).all()
+        if not np.isfinite(edge.motion).all() or (known and np.linalg.eigvalsh(edge.covariance)[0] < -1e-9):
+            raise ValueError("a motion between keyframes is not finite")
+    if any(not np.isin(e.scans, graph.scans).all() or np.isinf(e.covariance).any() for e in graph.loops):
+        raise ValueError("a loop has no keyframe")
 
 
 def _check_finite(*columns: Float) -> None:

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from pipeline.classification import ColumnClassifier, Forest, ScanView, depth_image, no_columns
-from pipeline.classification.column_classifier import FOLD, HIGHER, MOST_STALE, bent, seen_higher
+from pipeline.classification.column_classifier import (
+    FOLD,
+    HIGHER,
+    MOST_STALE,
+    corrected_voxels,
+    seen_higher,
+)
 from pipeline.classification.decision_rule import GONE_SCANS
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES, DecisionTrees
@@ -17,7 +23,7 @@ from pipeline.config import preset
 from pipeline.detection.free_space import BINS
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground.terrain import SECTORS
-from pipeline.loop_closure.map_correction import Bend
+from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.mapper import Mapper
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_classification import DUE_NS
@@ -273,8 +279,8 @@ def test_a_map_that_is_turned_over_more_tiles_stays_whole(side, turn):
     memory = filled(side, 256)
     assert memory.tiles == side**2
     before = np.array([[0.0, 0.0, 0.0], [30.0, 30.0, 0.0]])
-    bend = Bend(before, before + np.array([0.9, 0.7, turn]), 0, 1)
-    fresh = bent(memory, bend)
+    correction = PathCorrection(before, before + np.array([0.9, 0.7, turn]))
+    fresh = corrected_voxels(memory, correction)
     assert len(fresh.tile_key) > fresh.tiles >= memory.tiles
     assert int(fresh.returns[: fresh.used].sum()) == int(memory.returns[: memory.used].sum())
     keys = fresh.key[: fresh.used]

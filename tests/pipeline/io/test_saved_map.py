@@ -22,6 +22,7 @@ from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import decode, encode, read_archive, write_archive
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.keyframe_graph import LoopEdge
 from pipeline.types.records import Float, Float32, Int
 from tests.pipeline.test_mapper import as_bytes, fed, mapper, run
 
@@ -45,6 +46,7 @@ def test_from_a_saved_map_another_mapper_goes_on_to_the_same_bytes():
     read = through_a_file(state)
     m = mapper()
     m.load(read.state(), read.stamp_ns, read.sigma_xy, read.motion)
+    assert len(m.snapshot().slam.graph.keyframes) == len(state.slam.graph.keyframes) > 0
     assert fed(m, run()[0][12:]) == wanted
     assert as_bytes(m.path) == path
 
@@ -166,6 +168,15 @@ def _with(state, **changes: Any):
     return replace(state, slam=replace(state.slam, **changes))
 
 
+def _with_graph(state, **changes: Any):
+    return _with(state, graph=replace(state.slam.graph, **changes))
+
+
+def _with_keyframe(state, **changes: Any):
+    first, *rest = state.slam.graph.keyframes
+    return _with_graph(state, keyframes=(replace(first, **changes), *rest))
+
+
 def _with_maps(state, **changes: Any):
     return _with(state, maps=state.slam.maps._replace(**changes))
 
@@ -186,6 +197,14 @@ def _with_maps(state, **changes: Any):
         lambda s: _with_maps(s, mean=s.slam.maps.mean[:, :, :1]),
         lambda s: _with(s, pose=s.slam.pose * np.nan),
         lambda s: _with_maps(s, mean=s.slam.maps.mean + np.nan),
+        lambda s: _with_graph(s, pose=s.slam.graph.pose[:-1]),
+        lambda s: _with_graph(s, solved=-1),
+        lambda s: _with_keyframe(s, scan=-1),
+        lambda s: _with_keyframe(s, birth=s.slam.graph.keyframes[0].birth[:-1]),
+        lambda s: _with_keyframe(s, R=-s.slam.graph.keyframes[0].R),
+        lambda s: _with_keyframe(s, motion=np.full(3, np.nan)),
+        lambda s: _with_keyframe(s, covariance=-np.eye(3)),
+        lambda s: _with_graph(s, loops=(LoopEdge((0, 1 << 40), np.zeros(3), np.eye(3)),)),
         lambda s: replace(s, tracks=replace(s.tracks, x=s.tracks.x + np.nan)),
         lambda s: replace(s, stamp_ns=s.stamp_ns[:, None]),
         lambda s: replace(s, columns=replace(s.columns, axis=s.columns.axis[:, :3])),

@@ -1,4 +1,4 @@
-"""Loops: the path and all that was mapped from it are bent, and nothing is bent where no loop is."""
+"""Loop closure: path and map are corrected after a loop, and nowhere else."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.classification.column_classifier import bent as bent_memory
-from pipeline.classification.column_classifier import bent_columns, no_columns
+from pipeline.classification.column_classifier import corrected_columns, corrected_voxels, no_columns
 from pipeline.classification.voxel_map import SIDE, VoxelMap
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.ground.terrain_map import CELL, COLUMNS, VIEWS, WEIGHT
+from pipeline.ground.terrain_map import CELL, COLUMNS, VIEWS, WEIGHT, corrected_tiles
 from pipeline.ground.terrain_map import SIDE as CELLS
-from pipeline.ground.terrain_map import bent as bent_tiles
-from pipeline.loop_closure.map_correction import TILE, Bend
+from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.mapper import Mapper
 from pipeline.slam.loop_correction import drift_of
 from pipeline.slam.motion import Noise, compounded
@@ -72,26 +70,40 @@ def test_the_drift_is_that_of_the_steps_one_after_another(seed, first):
 
 
 def shifted(dx=0.0, dy=0.0, first=-1, scans=60):
-    """A way along x that is moved as a whole after a scan."""
+    """A path along x whose part after a scan is moved."""
     before = np.column_stack([0.5 * np.arange(scans), np.zeros(scans), np.zeros(scans)])
     after = before.copy()
     after[first + 1 :, :2] += [dx, dy]
-    return Bend(before, after, first, scans - 1)
+    return PathCorrection(before, after)
 
 
 @given(seeds)
-def test_what_stands_in_one_tile_moves_as_one_piece_and_what_was_known_stays(seed):
+def test_the_voxels_of_one_trunk_stay_together(seed):
+    """Also where the path passed the trunk before with another error."""
     random = np.random.default_rng(seed)
-    path = circle(turn=1e-3)
-    bend = Bend(path, circle(), 40, len(path) - 1)
-    tile = TILE * np.floor(random.uniform(-8, 8, 2))
-    place = tile + random.uniform(0.0, TILE, (12, 2))
-    scan = np.full(12, 200)
-    moved = bend.moved(place, scan)
-    apart = lambda p: np.hypot(*(p[:, None] - p[None]).transpose(2, 0, 1))  # noqa: E731
-    np.testing.assert_allclose(apart(moved), apart(place), atol=1e-9)
-    assert bend.moved(place, np.full(12, 40)).tobytes() == place.tobytes()
-    assert np.all(bend.turned(place, np.full(12, 40)) == 0.0)
+    x = np.concatenate([np.arange(0.0, 60.0, 0.5), np.arange(60.0, 0.0, -0.5)])
+    before = np.column_stack([x, 0.5 * (np.arange(240) >= 120), np.zeros(240)])
+    after = before + np.linspace(0.0, 1.0, 240)[:, None] * [3.0, -2.0, 0.1]
+    trunk = random.uniform([4.0, -4.0], [26.0, 4.0], (1, 2))
+    place = trunk + random.uniform(-0.2, 0.2, (40, 2))
+    passes = int(2.0 * trunk[0, 0]), 239 - int(2.0 * trunk[0, 0])
+    scan = random.choice(passes) + random.integers(-3, 4, 40)
+    moved, turn = PathCorrection(before, after).moved(place, scan)
+    np.testing.assert_allclose(moved - moved.mean(axis=0), place - place.mean(axis=0), atol=0.1)
+    assert np.ptp(turn) < 0.01
+
+
+@given(seeds)
+def test_what_moves_rigidly_keeps_all_distances(seed):
+    random = np.random.default_rng(seed)
+    path = np.column_stack([0.5 * np.arange(60), np.zeros(60), np.zeros(60)])
+    shift, angle = random.uniform(-5.0, 5.0, 2), random.uniform(-3.0, 3.0)
+    whole = Pose2(shift[0], shift[1], angle)
+    after = composed(whole.as_array()[None].repeat(60, axis=0), path)
+    place, scan = random.uniform(-10.0, 40.0, (20, 2)), random.integers(0, 60, 20)
+    moved, turn = PathCorrection(path, after).moved(place, scan)
+    np.testing.assert_allclose(moved, whole.apply(place), atol=1e-9)
+    np.testing.assert_allclose(turn, angle)
 
 
 def test_of_two_trees_that_were_one_the_older_number_stays_and_two_beside_it_stay_two():
@@ -110,11 +122,11 @@ def test_of_two_trees_that_were_one_the_older_number_stays_and_two_beside_it_sta
     )
     pose = Pose2(11.0, 0.0, 0.0)
     estimate = PoseEstimate(pose, SURE, pose.as_array()[None], np.ones(1), 1.0, place, False)
-    tracker.bend(shifted(dx=-3.0, first=10), np.arange(60), estimate, landmarks)
-    bent = tracker.tracks
-    assert bent.number.tolist() == bent.landmark.tolist() == [3, 4, 12]
-    assert bent.hits.tolist() == [10, 10, 5]
-    np.testing.assert_allclose(bent.x[:, :2], [[5.0, 1.0], [5.0, 1.5], [11.0, 2.0]], atol=0.05)
+    tracker.correct(shifted(dx=-3.0, first=10), np.arange(60), estimate, landmarks)
+    corrected = tracker.tracks
+    assert corrected.number.tolist() == corrected.landmark.tolist() == [3, 4, 12]
+    assert corrected.hits.tolist() == [10, 10, 5]
+    np.testing.assert_allclose(corrected.x[:, :2], [[5.0, 1.0], [5.0, 1.5], [11.0, 2.0]], atol=0.05)
 
 
 @given(seeds)
@@ -125,13 +137,14 @@ def test_voxels_move_and_no_return_is_lost(seed):
         near = 0.5 * scan + random.uniform(-4, 4, (40, 1))
         points = np.column_stack([near, random.uniform(-4, 4, 40), random.uniform(0.0, 5.9, 40)])
         memory.add(points.astype(np.float32), scan, 1 << 12)
-    same = bent_memory(memory, shifted())
+    same = corrected_voxels(memory, shifted())
     assert set(same.key[: same.used].tolist()) == set(memory.key[: memory.used].tolist())
-    moved = bent_memory(memory, shifted(dx=2.0, dy=-3 * SIDE, first=20))
+    correction = shifted(dx=2.0, dy=-3 * SIDE, first=20)
+    moved = corrected_voxels(memory, correction)
     n, m = memory.used, moved.used
     assert moved.returns[:m].sum() == memory.returns[:n].sum() == moved.tile_returns[: moved.tiles].sum()
-    late = memory.latest[:n] > 20
-    wanted = memory.mean[:n] + np.where(late, 1.0, 0.0)[:, None] * [2.0, -3 * SIDE, 0.0]
+    wanted = memory.mean[:n].astype(np.float64)
+    wanted[:, :2], _ = correction.moved(wanted[:, :2], memory.latest[:n].astype(np.int64))
     centre = np.average(wanted, axis=0, weights=memory.returns[:n])
     np.testing.assert_allclose(
         np.average(moved.mean[:m], axis=0, weights=moved.returns[:m]), centre, atol=1e-3
@@ -148,10 +161,10 @@ def test_columns_go_with_their_voxels():
     two = {name: np.zeros((2, *getattr(empty, name).shape[1:]), getattr(empty, name).dtype) for name in names}
     axis = np.array([[1.0, 1.0, 0.01, 0.0, 9.0], [25.0, 1.0, 0.01, 0.0, 9.0]])
     columns = replace(empty, tile=np.floor(axis[:, :2] / 4.0).astype(np.int64), axis=axis, **two)
-    bent = bent_columns(columns, memory, shifted(dx=-6.0, first=20))
-    np.testing.assert_allclose(bent.axis[:, 0], [1.0, 19.0])
-    assert bent.tile.tolist() == [[0, 0], [4, 0]]
-    assert bent_columns(empty, memory, shifted(dx=-6.0)) is empty
+    corrected = corrected_columns(columns, memory, shifted(dx=-6.0, first=20))
+    np.testing.assert_allclose(corrected.axis[:, 0], [1.0, 19.0])
+    assert corrected.tile.tolist() == [[0, 0], [4, 0]]
+    assert corrected_columns(empty, memory, shifted(dx=-6.0)) is empty
 
 
 def test_the_ground_moves_by_whole_cells_and_keeps_its_views():
@@ -159,17 +172,17 @@ def test_the_ground_moves_by_whole_cells_and_keeps_its_views():
     tile = random.uniform(0.5, 1.0, (CELLS, CELLS, COLUMNS)).astype(np.float32)
     tile[..., VIEWS] = 3.0
     tiles = {(0, 0): tile, (1, 0): 2.0 * tile}
-    same = bent_tiles(tiles, shifted())
+    same = corrected_tiles(tiles, shifted())
     assert list(same) == list(tiles)
     np.testing.assert_allclose(same[0, 0], tile, rtol=1e-6)
-    moved = bent_tiles(tiles, shifted(dx=CELLS * CELL, dy=CELL))
+    moved = corrected_tiles(tiles, shifted(dx=CELLS * CELL, dy=CELL))
     np.testing.assert_allclose(moved[1, 0][:, 1:], tile[:, :-1], rtol=1e-6)
     views = sum(float(one[..., VIEWS].sum()) for one in moved.values())
     assert views == sum(float(one[..., VIEWS].sum()) for one in tiles.values())
-    onto = bent_tiles(tiles, shifted(dx=-CELLS * CELL, first=20))
+    onto = corrected_tiles(tiles, shifted(dx=-CELLS * CELL, first=20))
     weight = sum(float(one[..., WEIGHT].sum()) for one in onto.values())
     assert weight == pytest.approx(sum(float(one[..., WEIGHT].sum()) for one in tiles.values()), rel=1e-5)
-    assert bent_tiles({}, shifted()) == {}
+    assert corrected_tiles({}, shifted()) == {}
 
 
 # --- the outcome ----------------------------------------------------------------------------------
@@ -182,13 +195,13 @@ def ring(seed, method="constellation"):
 
 
 @pytest.mark.parametrize("seed", first_of([0, 5]))
-def test_back_after_a_long_way_path_and_map_are_bent(seed):
-    bent, left = ring(seed), ring(seed, "none")
-    assert bent.closed()
+def test_a_loop_after_a_long_path_corrects_path_and_map(seed):
+    closed, left = ring(seed), ring(seed, "none")
+    assert closed.closed()
     assert not left.closed()
-    assert bent.told().max() > 10.0, "the wheels drift by more than trees stand apart"
-    assert np.sqrt(np.mean(bent.errors() ** 2)) < min(2.5, 0.4 * np.sqrt(np.mean(left.errors() ** 2)))
-    assert bent.told()[bent.closed()[0]] < 0.5
+    assert closed.told().max() > 10.0, "the wheels drift by more than trees stand apart"
+    assert np.sqrt(np.mean(closed.errors() ** 2)) < min(2.5, 0.4 * np.sqrt(np.mean(left.errors() ** 2)))
+    assert closed.told()[closed.closed()[0]] < 0.5
 
 
 @pytest.mark.parametrize("seed", first_of([0, 5]))
