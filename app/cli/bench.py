@@ -4,6 +4,8 @@ tree."""
 from __future__ import annotations
 
 import argparse
+import os
+import re
 import sys
 from datetime import date
 from pathlib import Path
@@ -19,6 +21,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("names", metavar="NAME", nargs="*", help="benchmarks to run (default: all)")
     parser.add_argument("--list", action="store_true", help="only list the benchmarks")
+    parser.add_argument(
+        "--seeds",
+        metavar="A-B",
+        type=_seeds,
+        help="seeds of benchmarks that map a recording several times, such as 1-20 (default: their own)",
+    )
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures as JSON")
     parser.add_argument(
         "--out", metavar="FILE", type=Path, help="Markdown file (default: docs/benchmarks.md of the tree)"
@@ -47,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     _find_benchmarks(_ROOT)
     from tests.benchmarks.runner import descriptions
     from tests.benchmarks.runner import run as run_benchmarks
+    from tests.benchmarks.seeds import VARIABLE
 
     if arguments.list:
         known = descriptions()
@@ -61,6 +70,8 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     out = arguments.out or _ROOT / "docs" / "benchmarks.md"
     day = arguments.date or date.today()
+    if arguments.seeds is not None:
+        os.environ[VARIABLE] = arguments.seeds
     failed = run_benchmarks(arguments.names, out=out, json_file=arguments.json, day=day)
     return 1 if failed else 0
 
@@ -73,6 +84,12 @@ def _find_benchmarks(root: Path) -> None:
         )
     if str(root) not in sys.path:
         sys.path.insert(0, str(root))
+
+
+def _seeds(text: str) -> str:
+    if not re.fullmatch(r"\d{1,9}(-\d{1,9})?", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a range of seeds like 1-20")
+    return text
 
 
 def _date(text: str) -> date:
