@@ -21,7 +21,7 @@ from app.batch.summary import evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
 from app.training.learned_forests import kept_forests
 from pipeline.config import Parameters
-from pipeline.evaluation import Evaluation, evaluate
+from pipeline.evaluation import MapScores, evaluate
 from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap, map_plot
 from pipeline.inventory.cloud import WholeCloud
@@ -171,7 +171,7 @@ def _run_record(
     plot: PlotMap,
     preset: str,
     parameters: Parameters,
-    evaluation: Evaluation | None,
+    evaluation: MapScores | None,
     warnings: list[str],
     losses: dict[str, int],
 ) -> dict[str, Any]:
@@ -206,7 +206,7 @@ def _range(values: Float) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: Evaluation | None) -> list[str]:
+def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: MapScores | None) -> list[str]:
     dbh = 100.0 * trees.dbh[np.isfinite(trees.dbh)]
     wide = f", DBH {dbh.min():.1f} to {dbh.max():.1f} cm ({len(dbh)} measured)" if len(dbh) else ", no DBH"
     verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict if v != Verdict.TREE)

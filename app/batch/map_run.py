@@ -29,7 +29,7 @@ from app.sources.opening import ChosenOdometry, with_odometry
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
-from pipeline.evaluation import Evaluation, PathError, evaluate, path_error
+from pipeline.evaluation import MapScores, PathError, evaluate, path_error
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers.base import Source
 from pipeline.io.result_files import RunFiles, terrain_text
@@ -152,7 +152,7 @@ def _map(
     losses = {reason: n for reason, n in counted.items() if n}
     state = _saved(plan, begun, mapper, start_ns, losses).as_bytes()
     tally.warn_of_far_truth(evaluation)
-    if plan.parameters.classification.method == "none":  # else a track is judged by more than its hits
+    if plan.parameters.classification.method == "none":  # else a track is classified by more than its hits
         tally.warn_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
@@ -206,15 +206,15 @@ def _map_scans(
 def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: MappingResult) -> None:
     """The map is complete already; errors here become warnings."""
     try:
-        kept, told = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
+        kept, warning = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
     except (StemmapError, OSError) as error:
-        kept, told = 0, f"some pictures of trees are missing: {error}"
+        kept, warning = 0, f"some pictures of trees are missing: {error}"
     except KeyboardInterrupt:
-        kept, told = 0, "some pictures of trees are missing because of Ctrl-C; the map is complete"
+        kept, warning = 0, "some pictures of trees are missing because of Ctrl-C; the map is complete"
     if kept:
         outcome.summary.append(f"{count(kept, 'picture')} of trees in {folder / PICTURES}")
-    if told:
-        outcome.warnings.append(told)
+    if warning:
+        outcome.warnings.append(warning)
 
 
 def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
@@ -237,8 +237,8 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
 
 
 def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunStart:
-    told = (chosen.warning,) if chosen.warning else ()
-    warnings = [*told, *plan.source.description.warnings]
+    warned = (chosen.warning,) if chosen.warning else ()
+    warnings = [*warned, *plan.source.description.warnings]
     if plan.continued is None:
         return at_origin(plan.source, warnings)
     return continue_map(plan.continued, plan.source, mapper, chosen.steps, plan.seed, warnings)
@@ -265,7 +265,7 @@ def _truth(plan: OfflineRun, begun: RunStart) -> Truth:
     return Truth(plan.truth_trees or known.trees, known.path)
 
 
-def _evaluate(trees: Trees, path: Path, truth: Truth, parameters: Parameters) -> Evaluation | None:
+def _evaluate(trees: Trees, path: Path, truth: Truth, parameters: Parameters) -> MapScores | None:
     if truth.trees is None:
         return None
     return evaluate(trees, truth.trees, parameters.evaluation, np.stack([path.x, path.y], axis=1))
@@ -277,7 +277,7 @@ def _run_record(
     frame: Frame,
     driven_s_m: tuple[float, float],
     start_ns: int,
-    evaluation: Evaluation | None,
+    evaluation: MapScores | None,
     error: PathError | None,
     losses: dict[str, int],
 ) -> dict[str, Any]:

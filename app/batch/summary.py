@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.common.text import count
-from pipeline.evaluation import Evaluation, PathError, Rate
+from pipeline.evaluation import MapScores, PathError, Rate
 from pipeline.types.pose_health import Health, HealthState
 from pipeline.types.records import Frame, Path, Verdict
 
@@ -23,7 +23,7 @@ MOST_SPANS = 200  # written; the rest is counted
 
 
 @dataclass(slots=True)
-class _Span:
+class _HealthSpan:
     """Scans after one another in one state; the reason is that of the first."""
 
     state: HealthState
@@ -39,7 +39,7 @@ class RunHealth:
     """Takes the health of each scan and sums it up."""
 
     _scans: Counter[str] = field(default_factory=Counter)
-    _spans: list[_Span] = field(default_factory=list)
+    _spans: list[_HealthSpan] = field(default_factory=list)
     _spans_left_out: int = 0
     _was: HealthState = "good"
     _worst: dict[str, float] = field(default_factory=dict)
@@ -82,7 +82,7 @@ class RunHealth:
                 self._spans[-1].last, self._spans[-1].end_ns = frame.index, frame.stamp_ns
         elif len(self._spans) < MOST_SPANS:
             at, stamp = frame.index, frame.stamp_ns
-            self._spans.append(_Span(health.state, health.reason, at, at, stamp, stamp))
+            self._spans.append(_HealthSpan(health.state, health.reason, at, at, stamp, stamp))
         else:
             self._spans_left_out += 1
 
@@ -172,7 +172,7 @@ class RunTotals:
         self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
         self.warned.update(frame.warnings)
 
-    def warn_of_far_truth(self, evaluation: Evaluation | None) -> None:
+    def warn_of_far_truth(self, evaluation: MapScores | None) -> None:
         """Warn where no true tree is near the path."""
         if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
             self.warned[far_truth(evaluation.reach)] += 1
@@ -223,7 +223,7 @@ def summary_lines(
     uri: str,
     frame: Frame,
     driven_s_m: tuple[float, float],
-    evaluation: Evaluation | None,
+    evaluation: MapScores | None,
     error: PathError | None,
 ) -> list[str]:
     """Return the summary of a run, with scores where ground truth is known.
@@ -251,7 +251,7 @@ def summary_lines(
     return lines
 
 
-def evaluation_lines(e: Evaluation, *, whole: bool = False) -> list[str]:
+def evaluation_lines(e: MapScores, *, whole: bool = False) -> list[str]:
     """Return the scores as text, with counts and rates.
 
     Args:
@@ -270,7 +270,7 @@ def evaluation_lines(e: Evaluation, *, whole: bool = False) -> list[str]:
     ]
 
 
-def truth_in_doubt(e: Evaluation) -> str:
+def truth_in_doubt(e: MapScores) -> str:
     """Return a warning where the ground truth may belong to another forest; empty otherwise."""
     if not e.is_doubtful:
         return ""

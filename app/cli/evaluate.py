@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from app.tuning.sweep.sweep import SweepResult, Workers
     from pipeline.config import Parameters
     from pipeline.config.model import Value
-    from pipeline.evaluation import Evaluation
+    from pipeline.evaluation import MapScores
     from pipeline.types.records import TruthTrees
 
 HELP = "score mapped runs against ground truth trees, or compare parameter sets on runs"
@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if not failed else 1 if failed == len(arguments.runs) else 3
 
 
-def _print(arguments: argparse.Namespace, evaluation: Evaluation, whole: bool) -> int:
+def _print(arguments: argparse.Namespace, evaluation: MapScores, whole: bool) -> int:
     from app.batch.summary import evaluation_lines
 
     if arguments.json:
@@ -112,7 +112,7 @@ def _print(arguments: argparse.Namespace, evaluation: Evaluation, whole: bool) -
     return 0
 
 
-def _score(arguments: argparse.Namespace, number: int) -> tuple[Evaluation, bool]:
+def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]:
     """The scores of a run, and whether it is a whole cloud."""
     import numpy as np
 
@@ -260,12 +260,12 @@ def run_grid(arguments: argparse.Namespace) -> int:
         return 1
 
     from app.tuning.sweep.jobs import plan_jobs
-    from app.tuning.sweep.report import compare_answers
+    from app.tuning.sweep.report import compare_results
 
     plan = plan_jobs(runs, sets, lambda run, changes: _base(arguments, run, changes))
     numbers = list(plan.jobs)
     outcome = _swept(arguments, plan)
-    comparison = compare_answers(plan, dict(zip(numbers, outcome.answers, strict=True)))
+    comparison = compare_results(plan, dict(zip(numbers, outcome.answers, strict=True)))
     return _print_comparison(arguments, comparison, outcome, refused=refused)
 
 
@@ -306,10 +306,10 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> SweepResult:
     from tqdm import tqdm
 
     from app.common.environment import from_environment
-    from app.tuning.sweep.sweep import AnswerStore, sweep
+    from app.tuning.sweep.sweep import ResultStore, sweep
 
     folder = from_environment().folder
-    kept = AnswerStore(arguments.keep or (folder and folder / "results"))
+    kept = ResultStore(arguments.keep or (folder and folder / "results"))
     with (
         _workers(arguments, len(plan.jobs)) as workers,
         tqdm(

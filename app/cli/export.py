@@ -49,6 +49,6 @@ def run(arguments: argparse.Namespace) -> int:
     frames, trees = count(len(finished.path.x), "frame"), count(len(finished.trees.number), "tree")
     print(f"{frames} with {trees} in {arguments.out}")
     if left_out:
-        told = f"trees farther than {arguments.reach:g} m from the path ({left_out:,})"
-        print(f"left out: {told}", file=sys.stderr)
+        left = f"trees farther than {arguments.reach:g} m from the path ({left_out:,})"
+        print(f"left out: {left}", file=sys.stderr)
     return 3 if left_out else 0

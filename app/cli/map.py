@@ -179,7 +179,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)
         try:
-            bar = _Bar(opened.description.scans)
+            bar = _MapProgress(opened.description.scans)
             outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
         except OSError as error:
             raise cannot_write(error, arguments.out) from None
@@ -232,7 +232,7 @@ def _start(text: str) -> str | tuple[float, float, float]:
     raise argparse.ArgumentTypeError(f"{text!r} is not auto, last, resume or three numbers x,y,yaw")
 
 
-class _Bar:
+class _MapProgress:
     """A progress bar on a terminal; silent elsewhere."""
 
     def __init__(self, scans: int | None) -> None:

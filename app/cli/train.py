@@ -216,10 +216,10 @@ def _chosen(store: Store, names: list[str]) -> list[AnnotatedRun]:
     known = {word: source for source in sources for word in (source.source, source.request.uri, source.name)}
     unknown = [name for name in names if name not in known and str(Path(name).absolute()) not in known]
     if unknown:
-        told = ", ".join(source.name for source in sources[:10]) or "none"
+        names_known = ", ".join(source.name for source in sources[:10]) or "none"
         raise UsageError(
             f"there is no annotated run {unknown[0]!r}",
-            remedy=f"{count(len(sources), 'annotated run')}: {told}",
+            remedy=f"{count(len(sources), 'annotated run')}: {names_known}",
         )
     if not sources:
         raise StemmapError(

@@ -236,7 +236,7 @@ def _search(search: Search, number: int) -> tuple[bool, int]:
 
     plan = search.plan
     workers: SearchWorkers | None = None
-    bar = _Bar(plan)
+    bar = _SearchProgress(plan)
     since, before = time.monotonic(), 0
     try:
         bar.begin(search.begin(), search)
@@ -292,7 +292,7 @@ def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool, los
     return 0
 
 
-class _Bar:
+class _SearchProgress:
     """A progress bar, and a line for each set that is better than all before."""
 
     def __init__(self, plan: Plan) -> None:
@@ -322,13 +322,13 @@ class _Bar:
         if best is None or best.loss is None or (self._best is not None and best.loss >= self._best):
             return
         self._best = best.loss
-        told = f"trial {best.number}: {self._goal.shown(best.loss)}"
+        line = f"trial {best.number}: {self._goal.shown(best.loss)}"
         if best.held_out:
             from app.tuning.plan import pool
 
-            told += f"   held out: F1 {pool(best.held_out).f1:.3f}"
+            line += f"   held out: F1 {pool(best.held_out).f1:.3f}"
         self._bar.set_postfix_str(self._goal.shown(best.loss), refresh=False)
-        self._line(told)
+        self._line(line)
 
     def close(self, made: int, seconds: float) -> None:
         """End the bar and print the speed of the search."""

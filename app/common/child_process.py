@@ -63,10 +63,11 @@ def exit_reason(returncode: int) -> str:
 
 
 class ChildProcess:
-    """A child process, used from an event loop. `start` makes one; as a context manager it is ended.
+    """A child process, used from an event loop. Create it with `start`; as a context manager it ends the
+    process.
 
     Attributes:
-        pid: Its process number.
+        pid: Process number.
     """
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
@@ -109,7 +110,7 @@ class ChildProcess:
         await self.end()
 
     async def send(self, message: object) -> None:
-        """Send a message. A child that has ended is not an error here; `receive` reports it."""
+        """Send a message. If the child has ended, nothing is raised; `receive` then returns None."""
         with contextlib.suppress(ConnectionError):
             self._stdin.write(_encoded(message))
             await self._stdin.drain()
@@ -152,7 +153,8 @@ class ChildProcess:
         return self._process.returncode or 0
 
     async def _wait(self) -> None:
-        """Wait for the end. Output that fills the buffer is read, because it would keep the pipe open."""
+        """Wait for the end of the process. Its remaining output is read, because a full pipe would block
+        it."""
         with contextlib.suppress(RuntimeError):  # another task waits in `receive`, which reads it
             while await self._stdout.read(1 << 16):
                 pass
@@ -196,7 +198,7 @@ class BlockingChildProcess:
         return self._process.poll()
 
     def send(self, message: object) -> None:
-        """Send a message. A child that has ended is not an error here; `receive` reports it."""
+        """Send a message. If the child has ended, nothing is raised; `receive` then returns None."""
         with contextlib.suppress(ConnectionError):
             self._stdin.write(_encoded(message))
             self._stdin.flush()
@@ -270,7 +272,7 @@ class ParentConnection:
         return message
 
     def send(self, message: object) -> None:
-        """Send a message."""
+        """Send a message, encoded as a line of JSON, to the parent."""
         self._outgoing.write(_encoded(message))
         self._outgoing.flush()
 
@@ -318,8 +320,11 @@ def run_child(
 
 
 def private_streams() -> tuple[BinaryIO, BinaryIO]:
-    """Return the pipes from and to the parent, moved away from where a library may read or print: standard
-    input is empty then, and standard output is standard error."""
+    """Return the pipes from and to the parent as streams of their own, so that no library can read or write
+    them.
+
+    Afterwards standard input is empty, and standard output is standard error.
+    """
     incoming, outgoing = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nowhere, 0)
@@ -337,7 +342,8 @@ def _limit_memory(limit: int) -> None:
 
 
 def _environment(one_thread: bool) -> dict[str, str]:
-    """The parent's environment; a thread number that is set there stays."""
+    """Return the environment of the child; with `one_thread`, numerical libraries get one thread unless a
+    number is set already."""
     return {**(dict.fromkeys(_THREAD_VARIABLES, "1") if one_thread else {}), **os.environ}
 
 
@@ -346,7 +352,7 @@ def _encoded(message: object) -> bytes:
 
 
 def _number(value: object) -> object:
-    """The number of a scalar of NumPy, for JSON."""
+    """Convert a NumPy scalar to a number for JSON."""
     if isinstance(value, SupportsFloat):
         return value.item() if hasattr(value, "item") else float(value)
     raise NotImplementedError(f"{type(value).__name__} cannot be sent")

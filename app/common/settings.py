@@ -38,17 +38,17 @@ class Settings:
     """How the server runs.
 
     Attributes:
-        host: Address to listen on.
-        port: To listen on, 0 for any free one, None for the default or one of the next.
-        token: Of the link; empty for a new one.
-        hosts: Further names by which browsers may call the server.
+        host: Address on which it listens.
+        port: Port on which it listens; 0 for any free port, None for the default port or one of the next.
+        token: Token of the owner's link; empty for a new one.
+        hosts: Further host names by which browsers may call the server.
         recordings: Folder whose recordings the page offers, or None.
-        body_limit: Largest body of a request [bytes].
-        folder: Where runs, annotations and uploads are kept; None keeps them in memory only.
+        body_limit: Maximum size of the body of a request [bytes].
+        folder: Folder of runs, annotations and uploads; None keeps them in memory.
         database: Address of a PostgreSQL database for runs and annotations; empty for a file in the folder.
-        upload_limit: Largest recording that a browser may upload [bytes].
-        message_limit: Largest message of a browser's websocket [bytes].
-        files: Which files an owner may open: "any", "folders" (recordings of the data folders), or "" for any
+        upload_limit: Maximum size of an uploaded recording [bytes].
+        message_limit: Maximum size of a websocket message of a browser [bytes].
+        files: Files that an owner may open: "any", "folders" (recordings in the data folders), or "" for any
             file in requests from this machine and only the data folders in others.
     """
 
@@ -92,7 +92,12 @@ def is_loopback(host: str) -> bool:
 
 
 def recordings_place(settings: Settings, now_s: float) -> Path:
-    """Return the path of a new recording in the data folder, named by the time [s since 1970].
+    """Return the path of a new recording in the data folder, for example
+    recordings/live-20260102-030405.mcap.
+
+    Args:
+        settings: Settings of the deployment.
+        now_s: Time in its name [s since 1970].
 
     Raises:
         StemmapError: There is no data folder.
@@ -103,7 +108,11 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
 
 
 def data_folder(given: Mapping[str, str]) -> Path | None:
-    """Return the data folder: the configured one, or the default of the system."""
+    """Return the data folder: STEMMAP_FOLDER, or the default of the system; None if neither is known.
+
+    Args:
+        given: The environment variables.
+    """
     if named := given.get("STEMMAP_FOLDER"):
         return Path(named).expanduser()
     home = given.get("HOME") or given.get("USERPROFILE")

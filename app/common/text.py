@@ -17,11 +17,11 @@ COMPILING = "compiling for this machine; it takes some minutes the first time, l
 
 
 def count(n: int, one: str, many: str = "") -> str:
-    """Return a number with its noun: "1 scan", "1,200 scans", "2 spans of scans".
+    """Return a number with its noun, for example "1 scan" or "1,200 scans".
 
     Args:
         n: Number.
-        one: Singular noun.
+        one: Singular of the noun.
         many: Plural, if it is not the singular with an s.
     """
     return f"{n:,} {one if n == 1 else many or f'{one}s'}"
@@ -31,21 +31,30 @@ MOST = 6  # maximum number of values in a line
 
 
 def changed_values(name: str, parameters: Parameters) -> dict[str, Value]:
-    """Return the values that differ from a preset, by dotted name; all values if the preset does not
-    exist."""
+    """Return the values that differ from a preset, by dotted name; all values if the preset does not exist.
+
+    Args:
+        name: Name of the preset.
+        parameters: The values.
+    """
     from pipeline.config import PRESETS, preset
 
     return parameters.changes_from(preset(name)) if name in PRESETS else dict(parameters.flat())
 
 
 def preset_words(name: str, parameters: Parameters) -> str:
-    """Return a description such as "preset forest" or "preset forest with clustering.eps = 0.2"."""
+    """Return a description such as "preset forest" or "preset forest with clustering.eps = 0.2".
+
+    Args:
+        name: Name of the preset.
+        parameters: Parameters; those that differ from the preset are named.
+    """
     changed = changed_values(name, parameters)
     if not changed:
         return f"preset {name}"
-    told = [f"{key} = {value}" for key, value in changed.items()]
-    rest = f" and {len(told) - MOST} more" if len(told) > MOST else ""
-    return f"preset {name} with {', '.join(told[:MOST])}{rest}"
+    values = [f"{key} = {value}" for key, value in changed.items()]
+    rest = f" and {len(values) - MOST} more" if len(values) > MOST else ""
+    return f"preset {name} with {', '.join(values[:MOST])}{rest}"
 
 
 def version() -> str:

@@ -1,4 +1,5 @@
-"""Limits of how often a function is called, the end of tasks, and times of the stages of the pipeline."""
+"""Limits on the rate of function calls, cancellation of tasks, and measurement of the stages of the
+pipeline."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ _log = logging.getLogger(__name__)
 
 
 class Throttle(Generic[P]):
-    """Limits the rate of calls of a function; the newest arguments are used.
+    """Limits the rate of calls of a function. A call that is too early is made later, with the newest
+    arguments.
 
     Args:
         function: Function that is called on the event loop.
@@ -76,13 +78,13 @@ async def cancel(task: asyncio.Task[Any] | None) -> None:
 
 
 class Stopwatch:
-    """The mapper's `Watch`: remembers how long each stage took over the last scans.
+    """Median times of the stages over the last scans; the `StageTimer` of a mapper.
 
-    What was disturbed (see `disturb`) is not remembered.
+    Measurements during which `disturb` is called are discarded.
 
     Args:
-        scans: Over how many scans medians are taken.
-        clock: Seconds from any start.
+        scans: Number of scans over which medians are taken.
+        clock: Returns the time [s] from any origin.
     """
 
     def __init__(self, scans: int = 50, clock: Callable[[], float] = time.perf_counter) -> None:

@@ -19,7 +19,11 @@ current_user: ContextVar[str] = ContextVar("current_user", default="")
 
 
 def user_of_cookies(cookies: list[str]) -> str:
-    """Return the valid name in the Cookie headers of a request, or SOMEBODY."""
+    """Return the name of the person in the Cookie headers of a request; SOMEBODY without a valid name.
+
+    Args:
+        cookies: Values of the headers.
+    """
     for line in cookies:
         for part in line.split(";"):
             name, _, value = part.strip().partition("=")
@@ -29,5 +33,6 @@ def user_of_cookies(cookies: list[str]) -> str:
 
 
 def is_user_name(name: str) -> bool:
-    """Whether a name has 1 to 40 letters, digits, spaces and . @ - _ and begins with a letter or digit."""
+    """Return whether a name has 1 to 40 letters, digits, spaces and . @ - _ and begins with a letter or
+    digit."""
     return re.match(USER_NAME, name) is not None

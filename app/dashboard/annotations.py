@@ -44,7 +44,10 @@ def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Agains
 
 
 def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> Counted:
-    """Return which ground truth is used, where one of the two may be missing."""
+    """Return which ground truth is used for the scores; arguments as in `truth_of`.
+
+    "none" is returned if the chosen ground truth does not exist; with "both", the one that exists is used.
+    """
     if own is None:
         return "annotations" if rows and against != "own" else "none"
     # A person who chose the annotations is not shown the ground truth of the source instead.
@@ -88,7 +91,7 @@ def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
 
 
 def contents_of(truth: TruthTrees) -> list[Content]:
-    """Return the rows of a table of trees."""
+    """Return the rows of a table of true trees as contents of annotations; a DBH of NaN becomes None."""
     columns = zip(truth.x.tolist(), truth.y.tolist(), truth.kind, truth.dbh.tolist(), strict=True)
     return [Content(x, y, kind, dbh if dbh == dbh else None) for x, y, kind, dbh in columns]
 
@@ -103,7 +106,13 @@ def _as_truth(contents: Sequence[Content]) -> TruthTrees:
 
 
 def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
-    """Return an annotation, at the position of the source (row k, -1: none) if both have the same class."""
+    """Return an annotation; if the object of the source has the same class, at the position of that object.
+
+    Args:
+        own: Ground truth of the source.
+        k: Row of the object in it; -1 for none.
+        content: The annotation.
+    """
     if k < 0 or own.kind[k] != content.kind:
         return content
     known = float(own.dbh[k])
@@ -143,20 +152,20 @@ class AnnotationEditor:
     """The annotations of the open run.
 
     Args:
-        keeper: The store.
+        store: Access to the store.
 
     Attributes:
         run: Number of the run in the store, None while none is open.
         rows: The annotations of the run.
         truth: Ground truth against which the map is scored.
         against: Choice of the ground truth, see `truth_of`.
-        problem: Why nothing can be annotated, empty when all is well.
+        problem: Reason why nothing can be annotated; empty otherwise.
         changed: Called when the ground truth may have changed.
-        edited: Called after an edit with the author and the number of annotations.
-        serial: Grows with each edit, so that a page knows when its edit is shown.
+        edited: Called after an edit with its author and the number of annotations that it changed.
+        serial: Number of edits so far, by which a page knows that its edit is shown.
     """
 
-    def __init__(self, keeper: AsyncStore) -> None:
+    def __init__(self, store: AsyncStore) -> None:
         self.run: int | None = None
         self.rows: list[Annotation] = []
         self.truth: TruthTrees | None = None
@@ -166,16 +175,16 @@ class AnnotationEditor:
         self.changed: Callable[[], None] = lambda: None
         self.edited: Callable[[str, int], None] = lambda _who, _number: None
         self._own: TruthTrees | None = None
-        self._keeper = keeper
+        self._store = store
         self._generation = 0  # grows whenever another run is opened or the run is left
 
     async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
-        """A run was opened.
+        """Read the annotations of a run that was opened. An error of the store is stored in `problem`.
 
         Args:
-            source: Digest of what was recorded, else the URI.
-            uri: As it was opened.
-            own: The truth that the source brings, if any.
+            source: Digest of the recording, or its URI if it has no digest.
+            uri: URI with which it was opened.
+            own: Ground truth of the source, if any.
         """
         self.leave()
 
@@ -187,7 +196,7 @@ class AnnotationEditor:
         self._own = self.truth = own
         generation = self._generation
         try:
-            run, rows, truth = await self._keeper.ask(work)
+            run, rows, truth = await self._store.ask(work)
             if generation != self._generation:  # another run was opened meanwhile
                 return
             self.run, self.rows = run, rows
@@ -202,22 +211,22 @@ class AnnotationEditor:
             self.problem = str(error)
 
     def leave(self) -> None:
-        """No run is open."""
+        """Forget the annotations, because the run was closed."""
         self._generation += 1
         self.run, self.rows, self.truth, self._own, self.against = None, [], None, None, "both"
 
     def score_against(self, against: Against) -> None:
-        """Choose the ground truth for the scores; nothing is edited."""
+        """Choose the ground truth for the scores, see `truth_of`; no annotation changes."""
         self.against = against
         self.truth = truth_of(self._own, self.rows, against)
         self.changed()
 
     async def edit(self, run: int, function: Callable[[Store], T]) -> T:
-        """Run an edit in the thread of the store, and update the annotations.
+        """Run an edit in the thread of the store, update the annotations, and return the result of the edit.
 
         Args:
             run: Number of the run that is edited.
-            function: The edit.
+            function: The edit; it is called with the store.
 
         Raises:
             StaleError: Another run was opened meanwhile, or another person has changed the annotation.
@@ -241,7 +250,7 @@ class AnnotationEditor:
             rows = store.annotations(run)
             return done, rows, truth_of(own, rows, against)
 
-        done, rows, truth = await self._keeper.ask(work)
+        done, rows, truth = await self._store.ask(work)
         if generation == self._generation:  # else another run was opened meanwhile
             who, number = _edits(self.rows, rows)
             self.rows = rows
@@ -255,14 +264,15 @@ class AnnotationEditor:
         return done
 
     async def read(self, function: Callable[[Store, int], T]) -> T | None:
-        """Ask the store about the run; None where there is none."""
+        """Return the result of a function of the store and the number of the run; None if no run is open."""
         run = self.run
         if run is None or self.problem:
             return None
-        return await self._keeper.ask(lambda store: function(store, run))
+        return await self._store.ask(lambda store: function(store, run))
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers."""
+        """Return the annotations, the choice of the ground truth and the state of the editor as JSON
+        values."""
         return {
             "run": self.run,
             "serial": self.serial,
@@ -277,7 +287,7 @@ class AnnotationEditor:
 
 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:
-    """Who made the last edit that is still to be seen, and how many annotations differ."""
+    """Return the author of the newest edit and the number of annotations that differ between two states."""
     old = {row.id: row.version for row in before}
     new = {row.id: row.version for row in after}
     edited = [row for row in after if old.get(row.id) != row.version]
@@ -286,7 +296,7 @@ def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[s
 
 
 def row_payload(row: Annotation) -> dict[str, Any]:
-    """One annotation, with the units in the names."""
+    """Return an annotation as JSON values for the page, with units in the names."""
     content = row.content
     return {
         "id": row.id,

@@ -1,6 +1,5 @@
-"""Broadcasts states to the browsers. Only the newest message of each kind counts: a slow browser skips the
-messages in between, and does not slow down the others.
-"""
+"""Broadcasts states to the browsers. Of each kind of message only the newest counts: a slow browser skips the
+messages in between and does not delay the others."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ _EMPTY_MAP: dict[str, Any] = {"type": "map", "index": -1, "trees": []}
 
 
 class Broadcast:
-    """The newest message of each kind, and the browsers that listen."""
+    """The newest message of each kind, and the connected browsers."""
 
     def __init__(self) -> None:
         self._messages: dict[str, tuple[int, bytes]] = {}
@@ -36,11 +35,17 @@ class Broadcast:
 
     @property
     def listeners(self) -> int:
-        """How many browsers listen."""
+        """Number of connected browsers."""
         return len(self._listeners)
 
     def tell(self, kind: str, content: object) -> None:
-        """Replace the message of a kind; the content is a dict, a record or None."""
+        """Replace the message of a kind.
+
+        Args:
+            kind: Kind of the message; it becomes its field `type`.
+            content: A dict or record, whose fields become those of the message; other values become the field
+                `value`.
+        """
         plain = msgspec.to_builtins(content) if content is not None else None
         # A message without content says so; the page shows the empty state.
         message = {"type": kind, **plain} if isinstance(plain, dict) else {"type": kind, "value": plain}
@@ -51,18 +56,23 @@ class Broadcast:
         self._wake()
 
     def show(self, payload: dict[str, Any], path_xy: NDArray[np.float64]) -> None:
-        """Replace the map. `path_xy`, shape (N, 2), must not be changed afterwards."""
+        """Replace the map.
+
+        Args:
+            payload: Message "map" without its path.
+            path_xy: Path, shape (N, 2) [m]; it must not be modified afterwards.
+        """
         self._map = (self._next(), _encode(payload), path_xy)  # once for all listeners
         self._wake()
 
     def forget_map(self) -> None:
-        """Replace the map by an empty one, because another run begins."""
+        """Replace the map with an empty one, because another run begins."""
         if self._map is not None:
             self.show(_EMPTY_MAP, np.zeros((0, 2)))
 
     @contextmanager
     def listener(self) -> Iterator[Listener]:
-        """Listen inside the context; the newest message of each kind comes first."""
+        """Register a listener inside the context; its first messages are the newest ones of each kind."""
         listener = Listener(self)
         self._listeners.add(listener)
         try:
@@ -71,15 +81,22 @@ class Broadcast:
             self._listeners.discard(listener)
 
     def messages_after(self, count: int) -> list[tuple[int, bytes]]:
-        """Return the messages after a count, in their order."""
+        """Return the messages, as JSON, that are newer than message number `count`, with their numbers,
+        ascending."""
         return sorted(m for m in self._messages.values() if m[0] > count)
 
     def map_after(self, count: int) -> tuple[int, bytes, NDArray[np.float64]] | None:
-        """Return count, JSON and path of the map if it was shown after a count."""
+        """Return number, JSON and path of the map if its number is larger than `count`, else None."""
         return self._map if self._map is not None and self._map[0] > count else None
 
     def path_json(self, count: int, path_xy: NDArray[np.float64], start: int) -> bytes:
-        """Return the path of the map shown at a count, from a row on, as JSON that listeners share."""
+        """Return the path of a map as JSON. Listeners that need the same rows share the result.
+
+        Args:
+            count: Number of the message with the map.
+            path_xy: Its path, shape (N, 2) [m].
+            start: First row.
+        """
         if self._path_json[:2] != (count, start):
             self._path_json = (count, start, _encode(path_points(path_xy, start)))
         return self._path_json[2]
@@ -94,7 +111,14 @@ class Broadcast:
 
 
 class Listener:
-    """The messages that one browser still has to receive."""
+    """The messages that one browser has not received yet.
+
+    Args:
+        live: The broadcast.
+
+    Attributes:
+        news: Set when there are new messages.
+    """
 
     def __init__(self, live: Broadcast) -> None:
         self.news = asyncio.Event()
@@ -106,7 +130,7 @@ class Listener:
         self._path: NDArray[np.float64] | None = None
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield JSON texts as they are broadcast, for ever; maps at most ten a second."""
+        """Yield messages as JSON without end; maps at intervals of at least `MAP_PAUSE_S`."""
         while True:
             await self._wait()
             self.news.clear()

@@ -1,5 +1,5 @@
-"""The picture of the standing scan for the page: asked of the mapping process, decoded and made smaller by a
-process of its own, and kept for who asks for the same one."""
+"""Camera picture of the current scan for the page. The worker finds the picture, a child process decodes and
+scales it, and recent pictures are kept for other browsers."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _MOST_KEPT = 8
 
 
 class CameraView:
-    """Pictures of the run that is shown.
+    """Camera pictures of the shown run.
 
     Args:
-        asking: Of the mapping process.
+        worker_client: Requests the pictures from the worker.
     """
 
-    def __init__(self, asking: WorkerClient) -> None:
-        self._asking = asking
+    def __init__(self, worker_client: WorkerClient) -> None:
+        self._client = worker_client
         self._kept: OrderedDict[int, bytes] = OrderedDict()
         self._turn = asyncio.Lock()
         self._next_at = 0.0
@@ -39,29 +39,30 @@ class CameraView:
         self._of = time.time_ns() // 1_000_000
 
     def forget(self) -> None:
-        """Another run begins."""
+        """Remove the pictures, because another run begins."""
         self._kept.clear()
         self._of += 1
 
     def jpeg(self, stamp_ns: int) -> bytes | None:
-        """Return a recently announced picture as JPEG."""
+        """Return the picture with a stamp that `look` returned as JPEG; None if it is not kept any more."""
         return self._kept.get(stamp_ns)
 
     async def look(self, frame: Frame, path: Path | None) -> dict[str, Any]:
-        """What is to be seen at the time of a scan: the picture's stamp, its marks, why there are none, and
-        `of`, another number for each run.
+        """Return the camera picture at the time of a scan as JSON values: its stamp, the boxes of trees and
+        clusters in it, the reason if there are no boxes, and `of`, a number of the run.
 
         Args:
-            frame: Of the scan.
-            path: Of the run; it tells where the robot was when the picture was taken.
+            frame: Results of the scan.
+            path: Path of the run, from which the pose of the robot at the time of the picture is
+                interpolated.
 
         Raises:
-            NoStoryError: There is no picture, and why.
+            NoStoryError: There is no picture; the message has the reason.
         """
         async with self._turn:
             of = self._of
             await asyncio.sleep(max(0.0, self._next_at - time.monotonic()))
-            found = await self._asking.camera(frame.stamp_ns)
+            found = await self._client.camera(frame.stamp_ns)
             self._check(of)
             picture = found.picture
             if picture.stamp_ns not in self._kept:
@@ -83,11 +84,15 @@ class CameraView:
             "later_ms": round((picture.stamp_ns - frame.stamp_ns) / 1e6),
             "marks": [] if camera is None else await asyncio.to_thread(marks_of, frame, camera, moved),
             "why": found.why,
-            "told": found.told,
+            "received": found.received,
         }
 
     def _check(self, of: int) -> None:
-        """Raises: NoStoryError: Another run was opened since."""
+        """Check that run number `of` is still shown.
+
+        Raises:
+            NoStoryError: Another run was opened.
+        """
         if of != self._of:
             raise NoStoryError("another run was opened", remedy="Its picture comes with its first scan")
 
@@ -97,18 +102,21 @@ MOST = 150
 
 
 def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Boxes of clusters and of trees that are in view, the farthest of each first; the MOST nearest at most.
+    """Return boxes around the clusters and trees in a picture as JSON values. Only the MOST nearest objects
+    have a box; clusters come before trees, and distant objects before near ones, so that near trees are drawn
+    last.
 
-    The robot's tilt is not known here, so on a slope the boxes of trees are a little too high or low.
+    The tilt of the robot is not known here, so the boxes of trees are slightly too high or too low on a
+    slope.
 
     Args:
-        frame: Of the scan.
-        camera: Of the picture.
-        moved: T_scan_picture of the base, where the picture was taken at another time.
+        frame: Results of the scan.
+        camera: Camera of the picture.
+        moved: T_scan_picture of the base, because the picture was taken at another time.
     """
     found = [*_trees(frame, camera, moved), *_clusters(frame, camera, moved)]
     nearest = sorted(found, key=lambda mark: float(mark["distance_m"]))[:MOST]
-    # What comes later lies on top and takes the click.
+    # Later boxes are drawn over earlier ones and receive the click.
     return sorted(nearest, key=lambda mark: (mark["kind"] == "tree", -float(mark["distance_m"])))
 
 
@@ -148,7 +156,8 @@ def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]
 
 
 def _box(camera: Camera, points: Float) -> dict[str, float] | None:
-    """The box around points of the base frame, None where it is not in view."""
+    """Return the box around points of the base frame, shape (N, 3) [m], as shares of the size of the picture;
+    None if it is not in view."""
     pixels, depth = camera.project(points)
     if not (depth > NEAREST).all():
         return None
@@ -167,9 +176,10 @@ _STEADY_NS = 500_000_000
 
 
 def motion(path: Path | None, from_ns: int, to_ns: int) -> Pose2:
-    """`T_from_to` of the base between two times, none where the path has fewer than two poses.
+    """Return `T_from_to` of the base between two times [ns]; the identity if the path has fewer than two
+    poses.
 
-    Within the path it is interpolated; before and after it the robot's velocities are held.
+    Within the path, poses are interpolated; outside, the velocities at its end are extrapolated.
     """
     if path is None or len(path.stamp_ns) < 2:
         return Pose2()
@@ -177,7 +187,7 @@ def motion(path: Path | None, from_ns: int, to_ns: int) -> Pose2:
 
 
 def _pose_at(path: Path, stamp_ns: int) -> Pose2:
-    """`T_map_base` at a time."""
+    """Return `T_map_base` at a time [ns], see `motion`."""
     stamps = path.stamp_ns
     first, last = 0, len(stamps) - 1
     if stamp_ns <= stamps[first]:
@@ -195,7 +205,12 @@ def _pose_at(path: Path, stamp_ns: int) -> Pose2:
 
 
 def _held(begin: Pose2, end: Pose2, part: float) -> Pose2:
-    """Before `begin` (part < 0) or beyond `end` (part > 1) with the motion between them held."""
+    """Extrapolate the motion between two poses: before `begin` (part < 0) or beyond `end` (part > 1).
+
+    Args:
+        begin, end: The poses.
+        part: Time as a fraction of the time between the poses.
+    """
     moved = begin.inverse() @ end
     rest = part if part < 0.0 else part - 1.0
     turn = rest * moved.yaw

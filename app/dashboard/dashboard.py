@@ -1,6 +1,6 @@
-"""The dashboard's state: the last results of the worker and the choices of the users.
+"""State of the dashboard: the newest results of the worker and the choices of the users.
 
-Joins the worker, the parameters, the 3D scene and the browsers. Everything runs on the event loop.
+It connects the worker, the parameters, the 3D scene and the browsers. All of it runs on the event loop.
 """
 
 from __future__ import annotations
@@ -94,37 +94,37 @@ _SCENE_PAUSE_S = 0.09
 
 
 class Dashboard:
-    """What is shown, and what can be done to it. `worker` and `scene` are set before `start`.
+    """What is shown, and the actions of users. `worker` and `scene` are set before `start`.
 
     Args:
-        parameters: In force at the beginning.
-        live: Where the browsers listen.
-        keeper: Of the store; None keeps all in memory.
+        parameters: Parameters at the beginning.
+        live: Broadcast to the browsers.
+        store: Access to the store; None keeps everything in memory.
     """
 
     worker: WorkerLike
     scene: SceneLike
 
-    def __init__(self, parameters: ParameterState, live: Broadcast, keeper: AsyncStore | None = None) -> None:
+    def __init__(self, parameters: ParameterState, live: Broadcast, store: AsyncStore | None = None) -> None:
         self.parameters = parameters
-        self.keeper = keeper or AsyncStore(None)
-        self.logbook = RunRecorder(self.keeper)
-        self.annotating = AnnotationEditor(self.keeper)
-        self.annotating.changed, self.annotating.edited = self._use_truth, self._mark_edits
+        self.store = store or AsyncStore(None)
+        self.run_recorder = RunRecorder(self.store)
+        self.annotation_editor = AnnotationEditor(self.store)
+        self.annotation_editor.changed, self.annotation_editor.edited = self._use_truth, self._mark_edits
         self.live = live
         self.scores = Scores(self._tell_score)
-        self.sensitivity = Sensitivity(lambda told: live.tell("sensitivity", told))
+        self.sensitivity = Sensitivity(lambda state: live.tell("sensitivity", state))
         self.status = Status(state="starting", detail="Starting")
         self.shown: Shown | None = None
         self.path: Path | None = None
         self.path_xy = np.zeros((0, 2))
         self.truth: TruthTrees | None = None
-        self.sets = ParameterSets(self.keeper, self._show_parameters)
+        self.sets = ParameterSets(self.store, self._show_parameters)
         self._before_after = BeforeAfter()
-        self.asking = WorkerClient(lambda question: self.worker.send(question), lambda: self._run)
-        self.camera = CameraView(self.asking)
-        self.selecting = Selector(
-            self.asking,
+        self.worker_client = WorkerClient(lambda question: self.worker.send(question), lambda: self._run)
+        self.camera = CameraView(self.worker_client)
+        self.selector = Selector(
+            self.worker_client,
             live,
             lambda tree, ring: self.scene.select(tree, ring),
             run=lambda: self._run,
@@ -133,7 +133,7 @@ class Dashboard:
         self.source = SourceRequest("")
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
-        self.search = TuneSearch(lambda told: live.tell("search", told))
+        self.search = TuneSearch(lambda state: live.tell("search", state))
         self.loop = LoopPlayback(live, self._send_if_ready)
         self._run: int | None = None
         self._notice = ""
@@ -145,11 +145,11 @@ class Dashboard:
 
     @property
     def start_ns(self) -> int:
-        """Time of the run's first scan, 0 before one is shown."""
+        """Time of the first scan of the run [ns]; 0 before a scan is shown."""
         return 0 if self.shown is None else self.shown.frame.stamp_ns - round(self.shown.time_s * 1e9)
 
     async def start(self, source: SourceRequest) -> None:
-        """Start the worker with a source; it plays as soon as it is open."""
+        """Start the worker and open a source, which plays as soon as it is open."""
         await self.sets.load()
         self.live.tell("view", self.scene.view)
         await self.worker.start()
@@ -157,33 +157,37 @@ class Dashboard:
         await self.open(source)
 
     async def close(self) -> None:
-        """End the worker and the scene."""
+        """End the worker, the scene and the store."""
         self.scores.close()
         await self.sensitivity.leave()
-        self.selecting.leave()
+        self.selector.leave()
         self._show_scene.cancel()
         await self.search.leave()
-        await self.logbook.close()
+        await self.run_recorder.close()
         await self.worker.close()
-        await self.keeper.close()
+        await self.store.close()
         await asyncio.to_thread(self.scene.close)
 
-    # --- what people do --------------------------------------------------------------------------
+    # --- actions of users ------------------------------------------------------------------------
 
     async def command(self, command: ToWorker) -> None:
-        """Hand a command to the worker."""
+        """Send a command to the worker."""
         self._notice = ""
         # A worker that is down comes back with the source closed; then this is still to be done.
         self._go = isinstance(command, Play | Open) and self.worker.pid is None
         await self.worker.send(command)
 
     async def _send_if_ready(self, command: ToWorker) -> None:
-        """Send a command that has no meaning while the worker restarts."""
+        """Send a command unless the worker is being restarted."""
         with contextlib.suppress(WorkerBusyError):
             await self.worker.send(command)
 
     async def choose_view(self, name: str, value: str | bool) -> None:
-        """Show or hide a layer of the scene, or colour, label or follow otherwise.
+        """Set a choice of the 3D scene for all browsers.
+
+        Args:
+            name: Name of a layer, of "follow", or of the choice of colours or labels.
+            value: Visibility, or the name of the choice.
 
         Raises:
             ParameterError: There is no such choice.
@@ -193,16 +197,16 @@ class Dashboard:
 
     @property
     def request(self) -> SourceRequest:
-        """How the open run is mapped now: its source and the parameters in force."""
+        """Request that maps the open run in the same way: its source and the parameters in force."""
         state = self.parameters
         changed = state.parameters.changes_from(preset(state.preset))
         return msgspec.structs.replace(self.source, preset=state.preset, parameters=changed)
 
     async def open(self, request: SourceRequest) -> None:
-        """Leave the run and open another source, with the parameters of the request if it has any.
+        """Close the run and open another source, with the parameters of the request if it has any.
 
         Raises:
-            ParameterError: The parameters are not those of this version; nothing is changed.
+            ParameterError: The parameters are not valid in this version; nothing changes.
         """
         if request.preset or request.parameters:
             self.parameters.take(request.preset, request.parameters)
@@ -217,35 +221,35 @@ class Dashboard:
                 await self.command(command)
 
     async def _leave_for(self, source: SourceRequest) -> None:
-        """Leave the run; from now on this source is the one that is expected to open."""
+        """Close the run; from now on, `source` is the source that is expected to open."""
         self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self._run, self.source, self.digest = None, source, ""
         self.live.tell("source", source.for_page())
         self.camera.forget()
-        self.logbook.leave()
-        self.annotating.leave()
+        self.run_recorder.leave()
+        self.annotation_editor.leave()
         await self.sensitivity.leave()
         await self.search.leave()
         await self._forget()
 
     async def change_parameters(self, changes: dict[str, Value], gesture: str = "") -> None:
-        """Change values by their dotted names, as part of a gesture (see `ParameterState.change`).
+        """Change values by dotted name, as part of a gesture (see `ParameterState.change`).
 
         Raises:
-            ParameterError: A value does not fit; nothing is changed.
+            ParameterError: A value is not valid; nothing changes.
         """
         await self.tune(lambda state: state.change(changes, gesture))
 
     async def use_preset(self, name: str) -> None:
-        """Take all values of a preset.
+        """Use all values of a preset.
 
         Raises:
-            ParameterError: There is none of this name.
+            ParameterError: There is no preset of this name.
         """
         await self.tune(lambda state: state.use_preset(name))
 
     async def reset_parameters(self, names: list[str]) -> None:
-        """Give parameters (none named: all) the preset's values again.
+        """Reset the named parameters, or all if the list is empty, to the values of the preset.
 
         Raises:
             ParameterError: A name is unknown.
@@ -253,10 +257,13 @@ class Dashboard:
         await self.tune(lambda state: state.reset(names))
 
     async def tune(self, change: Callable[[ParameterState], None]) -> None:
-        """Let parameters be changed, and tell everybody.
+        """Change parameters, and send them to the worker, the scene, the browsers and the store.
+
+        Args:
+            change: Called with the parameter state, which it changes.
 
         Raises:
-            StemmapError: The change is refused; nothing is changed.
+            StemmapError: The change is refused; nothing changes.
         """
         before, step = self.parameters.parameters, self.parameters.step
         change(self.parameters)
@@ -269,21 +276,25 @@ class Dashboard:
             self._tell_events()
         state = self.parameters
         who = current_user.get() or SOMEBODY
-        self.logbook.changed(before.flat(), state.parameters.flat(), state.preset, state.revision, who)
+        self.run_recorder.changed(before.flat(), state.parameters.flat(), state.preset, state.revision, who)
         self._score()
 
     async def reach(self, *, whole: bool) -> None:
-        """Let changes of parameters act on the whole run, which is mapped again at once, or from the standing
-        scan on."""
+        """Choose whether changes of parameters apply to the whole run, which is then mapped again at once, or
+        from the current scan onwards."""
         self.parameters.whole = whole
         self._show_parameters()
         await self._send_parameters()
 
     def how_much_matters(self, name: str, values: list[Value]) -> None:
-        """Have the whole run scored over values of a parameter.
+        """Start the sensitivity analysis of a parameter: the whole run is scored with each value.
+
+        Args:
+            name: Dotted name of the parameter.
+            values: Its values, in the order in which they are computed.
 
         Raises:
-            StemmapError: It cannot be, and why.
+            StemmapError: The run cannot be scored; the message has the reason.
         """
         state = self.parameters.parameters
         self.sensitivity.ask(
@@ -291,16 +302,20 @@ class Dashboard:
         )
 
     async def select_tree(self, number: int | None) -> None:
-        """Select a tree everywhere; None selects nothing."""
-        self.selecting.tree(number)
+        """Select a tree in all views by its number; None clears the selection."""
+        self.selector.tree(number)
 
     async def select_cluster(self, scan: int, cluster: int) -> None:
-        """Select a cluster of a recently shown scan everywhere, with its tree.
+        """Select a cluster of a recently shown scan, with its tree, in all views.
+
+        Args:
+            scan: Index of the scan.
+            cluster: Row of the cluster in it.
 
         Raises:
-            NoStoryError: It is not known any more.
+            NoStoryError: The scan is not stored any more.
         """
-        await self.selecting.cluster(scan, cluster)
+        await self.selector.cluster(scan, cluster)
 
     def _show_parameters(self) -> None:
         state = self.parameters
@@ -317,10 +332,10 @@ class Dashboard:
         values = state.parameters.model_dump()
         await self.worker.send(SetParameters(values, state.revision, state.whole, state.step))
 
-    # --- what the worker says --------------------------------------------------------------------
+    # --- messages of the worker ------------------------------------------------------------------
 
     async def receive(self, message: FromWorker) -> None:
-        """Take a message of the worker."""
+        """Process a message of the worker."""
         match message:
             case Report(status=status):
                 self._set_status(status)
@@ -329,14 +344,14 @@ class Dashboard:
             case Shown():
                 await self._show(message)
             case Answer():
-                self.asking.take(message)
+                self.worker_client.take(message)
             case Remapped(run=run, changes=changes) if run == self._run:
                 self._remapped(changes)
             case Rough(run=run, revision=revision, trees=trees) if run == self._run:
                 await self._tell_rough(run, revision, trees)
 
     async def _tell_rough(self, run: int, revision: int, trees: Trees) -> None:
-        """The run is being mapped again: what will come of it, roughly, with its score."""
+        """Broadcast the preview of a map that is being computed, with its score."""
         score = None
         if self.truth is not None:
             evaluation = self.parameters.parameters.evaluation
@@ -347,24 +362,24 @@ class Dashboard:
         self.live.tell("rough", {"revision": revision, "places": places, "score": score})
 
     def _remapped(self, changes: MapChanges) -> None:
-        """The run was mapped again: the map has other trees, and other numbers."""
+        """Broadcast the differences after the run was mapped again, and renumber the selection."""
         self.live.tell("remapped", msgspec.to_builtins(changes))
         self.events.remapped(changes.confirmed, changes.time_s)
         self._tell_events()
-        self.selecting.renamed(dict(changes.followed))
+        self.selector.renamed(dict(changes.followed))
 
     async def _begin(self, opened: Opened) -> None:
-        """A source is open and waits: parameters that suit it first, then it plays."""
+        """Send the parameters for an opened source; then it plays."""
         self._run, self.digest = opened.run, opened.digest or opened.uri
         number = self._opens
-        await self.annotating.begin(opened.digest or opened.uri, opened.uri, opened.truth)
+        await self.annotation_editor.begin(opened.digest or opened.uri, opened.uri, opened.truth)
         if number != self._opens:  # another source was asked for meanwhile
             return
         await self._forget()
         if self.parameters.suit(opened.preset):
             self._show_parameters()
         restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
-        self.logbook.begin(self.annotating.run, self.source, opened, again=restarted)
+        self.run_recorder.begin(self.annotation_editor.run, self.source, opened, again=restarted)
         play = self._go or not restarted
         if not play:
             self._notice = "The mapping process ended and was started again. Press play to start again"
@@ -374,7 +389,7 @@ class Dashboard:
         await self.worker.send(Begin(opened.run, state.parameters.model_dump(), state.revision, play))
 
     async def _forget(self) -> None:
-        """Show an empty map, with the truth of the run that comes."""
+        """Show an empty map, and the ground truth of the run that begins."""
         self.shown = self.path = None
         self.path_xy = np.zeros((0, 2))
         self.live.forget_map()
@@ -388,14 +403,14 @@ class Dashboard:
         self._show_scene.cancel()
         self.scene.clear()
         self._use_truth()
-        self.selecting.tree(None)
+        self.selector.tree(None)
 
     def _use_truth(self) -> None:
-        """Show the truth, score against it, and tell what was annotated."""
-        self.truth = self.annotating.truth
+        """Show the ground truth and the annotations, and score the map against them."""
+        self.truth = self.annotation_editor.truth
         self.scene.show_truth(self.truth)
         self.live.tell("truth", truth_payload(self.truth))
-        self.live.tell("annotations", self.annotating.as_plain())
+        self.live.tell("annotations", self.annotation_editor.as_plain())
         if self.truth is None:
             self.scores.forget()
         self._score()
@@ -426,12 +441,12 @@ class Dashboard:
         self.live.show({**payload, **counts}, path_xy)
         if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
             self._tell_events()
-        self.logbook.shown(self._glance(shown))
+        self.run_recorder.shown(self._run_state(shown))
         self._score()
         self._show_scene(shown.frame, self.path_xy)
         await self.loop.shown(shown.time_s, self.status)
 
-    def _glance(self, shown: Shown) -> RunState:
+    def _run_state(self, shown: Shown) -> RunState:
         state = self.parameters
         return RunState(
             shown, self.path_xy, state.preset, state.parameters.flat(), self.truth, self.scores.latest
@@ -439,7 +454,7 @@ class Dashboard:
 
     def _tell_score(self, score: dict[str, Any] | None) -> None:
         self.live.tell("evaluation", score)
-        self.logbook.scored(score)
+        self.run_recorder.scored(score)
 
     def _score(self) -> None:
         if self.shown is not None and self.truth is not None:
@@ -458,12 +473,12 @@ class Dashboard:
 def _map_and_counts(
     shown: Shown, truth: TruthTrees | None, match_distance: float
 ) -> tuple[dict[str, Any], Counts]:
-    """The message "map" without its path, and the verdict counts of the scan."""
+    """Return the message "map" without its path, and the verdict counts of the scan."""
     return map_payload(shown), counts_of(shown.frame, truth, match_distance)
 
 
 def _open_command(request: SourceRequest) -> Open:
-    """The command that opens a source; only the command line can ask for a recording or publishing."""
+    """Return the command that opens a source. Only the command line can request a recording or publishing."""
     if isinstance(request, Open):
         return request
     return Open(**{name: getattr(request, name) for name in SourceRequest.__struct_fields__})
@@ -473,14 +488,14 @@ Span = tuple[float, float]
 
 
 class LoopPlayback:
-    """From where to where, and when to turn.
+    """Repeats a part of the run.
 
     Args:
-        live: Where the browsers are told.
+        live: Broadcast to the browsers.
         send: Sends a command to the worker.
 
     Attributes:
-        span: First and last time [s since the first scan], None for no loop.
+        span: First and last time of the part [s since the first scan]; None without repetition.
     """
 
     def __init__(self, live: Broadcast, send: Callable[[ToWorker], Awaitable[None]]) -> None:
@@ -489,12 +504,17 @@ class LoopPlayback:
         self._turning = False
 
     def choose(self, span: Span | None) -> None:
-        """Play this part; None plays on at its end."""
+        """Set the part that is repeated; None ends the repetition."""
         self.span, self._turning = span, False
         self._live.tell("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
 
     async def shown(self, time_s: float, status: Status) -> None:
-        """At the end of the part go to its beginning, while the run plays."""
+        """Seek to the beginning of the part if the shown scan is at its end and the run plays.
+
+        Args:
+            time_s: Time of the shown scan [s since the first scan].
+            status: Status of the run.
+        """
         if self.span is None:
             return
         if time_s < self.span[1]:

@@ -1,4 +1,4 @@
-"""Events of the run for the marks on the timeline."""
+"""Events of the run, which the page shows on the timeline."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LONGEST = 300
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One mark of the timeline.
+    """One event on the timeline.
 
     Attributes:
         time_s: Time since the first scan of the run [s].
@@ -36,8 +36,8 @@ class Event:
 class Events:
     """Events of a run, at most 400; the oldest are removed first.
 
-    After a change of parameters, events later than the current scan remain, marked as from before the change,
-    until the run reaches them again.
+    After a change of parameters, events later than the current scan remain, flagged as from before the
+    change, until the run reaches them again.
     """
 
     def __init__(self) -> None:
@@ -58,13 +58,13 @@ class Events:
         self._edits = ("", 0)
 
     def shown(self, frame: Frame, time_s: float, confirmed_s: Float | None = None) -> bool:
-        """Add the events of a displayed scan and return whether there are any.
+        """Add the events of a shown scan; return whether the list of events changed.
 
-        A tree that is confirmed again after stepping back keeps the mark of its first confirmation.
+        A tree that is confirmed again after stepping back keeps the event of its first confirmation.
 
         Args:
-            frame: Displayed frame; while seeking, not every frame is displayed.
-            time_s: Time of the frame [s].
+            frame: Shown frame; while seeking, not every frame is shown.
+            time_s: Time of the frame [s since the first scan].
             confirmed_s: Confirmation time of each tree [s], NaN if unknown; None if all are unknown.
         """
         known = set(self._events)
@@ -98,7 +98,12 @@ class Events:
             self._note(f"tree {number}", Event(at, "tree", f"Tree {number} confirmed"))
 
     def warned(self, warnings: list[str], time_s: float) -> bool:
-        """Set the active warnings and return whether there is a new one."""
+        """Add events for new warnings; return whether there are any.
+
+        Args:
+            warnings: All active warnings.
+            time_s: Time of the current scan [s since the first scan].
+        """
         new = [warning for warning in warnings if warning not in self._warnings]
         self._warnings = frozenset(warnings)
         for warning in new:
@@ -106,13 +111,13 @@ class Events:
         return bool(new)
 
     def changed(self, before: dict[str, Value], after: dict[str, Value], time_s: float) -> None:
-        """Add a change of parameters; successive changes at one time (a slider drag) are combined.
+        """Add a change of parameters. Successive changes at one time (a slider drag) become one event.
 
-        Later events of the run are marked as from before the change.
+        Later events of the run are flagged as from before the change.
 
         Args:
             before, after: All values by dotted name.
-            time_s: Time of the current scan [s].
+            time_s: Time of the current scan [s since the first scan].
         """
         undone = self._set_aside(lambda event: event.time_s > time_s)
         self._confirmed = {number for number in self._confirmed if f"tree {number}" not in undone}
@@ -127,12 +132,12 @@ class Events:
             self._note(key, Event(time_s, "change", f"{', '.join(texts[:3])}{more}"[:_LONGEST]))
 
     def annotated(self, who: str, number: int, time_s: float) -> None:
-        """Add edits of annotations; edits at one time share one mark with their number.
+        """Add edits of annotations; edits at one time share one event with their number.
 
         Args:
             who: Author of the last edit, empty if unknown.
             number: Number of added, changed or deleted annotations.
-            time_s: Time of the current scan [s].
+            time_s: Time of the current scan [s since the first scan].
         """
         key = f"annotation {time_s:.1f}"
         self._edits = (key, number + (self._edits[1] if self._edits[0] == key else 0))
@@ -141,7 +146,8 @@ class Events:
         self._note(key, Event(time_s, "annotation", f"{who or 'Somebody'} edited {edits}"[:_LONGEST]))
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the events for the page in order of time; `before` marks events from before a change."""
+        """Return the events for the page, ordered by time; `before` flags events from before a change of
+        parameters."""
         room = _MOST - len(self._events)
         marks = [(event, False) for event in self._events.values()]
         marks += [(event, True) for event in list(self._before.values())[:room]]
@@ -154,7 +160,7 @@ class Events:
         }
 
     def _set_aside(self, which: Callable[[Event], bool]) -> set[str]:
-        """Mark events of the map as from before a change and return their keys."""
+        """Flag the events of the map that `which` selects as from before a change; return their keys."""
         keys = {k for k, event in self._events.items() if event.kind in _OF_THE_MAP and which(event)}
         self._before |= {key: self._events.pop(key) for key in sorted(keys)}
         return keys

@@ -1,4 +1,5 @@
-"""The web process's side of learning from annotations: asks a process of its own, and tells the browsers."""
+"""Training of the classifier with annotations, as the web process sees it: a child process trains, and the
+progress is sent to the browsers."""
 
 from __future__ import annotations
 
@@ -26,23 +27,28 @@ _UNDER_WAY = "decision trees are being grown already"
 
 
 class Learning:
-    """Learns when somebody asks, one thing at a time.
+    """The newest training; one runs at a time.
 
     Args:
-        keeper: Of the store.
-        folder: The data folder, None where nothing is kept.
-        tell: Called with what the browsers are to know.
-        command: The process that learns.
+        store: Access to the store.
+        folder: Data folder; None if nothing is stored.
+        tell: Called with the state for the browsers whenever it changes.
+        command: Program and arguments of the child process.
+
+    Attributes:
+        state: "idle", "working", "done" or "failed".
+        words: Progress or reason of the failure, as text.
+        learned: Result of the training, see `app.training.learn_process.as_plain`; None before.
     """
 
     def __init__(
         self,
-        keeper: AsyncStore,
+        store: AsyncStore,
         folder: Path | None,
         tell: Callable[[dict[str, Any]], None],
         command: Sequence[str] = LEARN,
     ) -> None:
-        self._keeper, self._folder, self._tell, self._command = keeper, folder, tell, command
+        self._store, self._folder, self._tell, self._command = store, folder, tell, command
         self._forests = Forests(folder)
         self._task: asyncio.Task[None] | None = None
         self.state = "idle"
@@ -50,11 +56,15 @@ class Learning:
         self.learned: dict[str, Any] | None = None
 
     async def known(self, in_force: str = PACKAGE) -> dict[str, Any]:
-        """What there is to learn from: annotations by class, runs, and what is needed; and where the decision
-        trees in force come from, None for those of the package.
+        """Return what a training can use, as JSON values: numbers of runs and of annotations by class, the
+        numbers that are needed, the provenance of the forest in force (None for that of the package), and the
+        state.
+
+        Args:
+            in_force: Name of the forest in force.
         """
         in_use = await asyncio.to_thread(self._forests.provenance, in_force)
-        sources = await self._keeper.ask(lambda store: store.annotated_sources())
+        sources = await self._store.ask(lambda store: store.annotated_sources())
         by_class = Counter(each.kind for source in sources for each in source.annotations)
         needed = {"trees": LEAST_TREES, "others": LEAST_OTHERS}
         return {
@@ -66,33 +76,36 @@ class Learning:
         }
 
     async def begin(self, parameters: Parameters) -> None:
-        """Grow new decision trees in a process of its own.
+        """Start a training with all annotations.
+
+        Args:
+            parameters: Parameters in force, with the forest that is compared.
 
         Raises:
-            StemmapError: It is under way already, or there is nowhere to keep them.
+            StemmapError: A training runs already, or there is no data folder.
         """
         if self._task is not None:
             raise StemmapError(_UNDER_WAY)
         if self._folder is None:
             raise StemmapError("there is no data folder for the decision trees")
-        sources = await self._keeper.ask(lambda store: store.annotated_sources())
+        sources = await self._store.ask(lambda store: store.annotated_sources())
         if self._task is not None:  # somebody else asked meanwhile
             raise StemmapError(_UNDER_WAY)
         self._task = asyncio.create_task(self._learn(sources, parameters, self._folder), name="learning")
         self._become("working", "Beginning")
 
     async def forget(self) -> None:
-        """Stop what is under way, and forget what came of it; its file stays."""
+        """Stop the training and remove its result; the file of a trained forest stays."""
         await self.close()
         self._become("idle", "")
 
     async def close(self) -> None:
-        """End the process."""
+        """End the child process."""
         task, self._task = self._task, None
         await cancel(task)
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers."""
+        """Return the state for the browsers."""
         return {"state": self.state, "words": self.words, "learned": self.learned}
 
     def _become(self, state: str, words: str, learned: dict[str, Any] | None = None) -> None:
@@ -107,18 +120,18 @@ class Learning:
             "date": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
         }
         try:
-            told = await self._ask(question)
+            reply = await self._ask(question)
         except StemmapError:
-            told = {}
+            reply = {}
         self._task = None
-        if learned := told.get("learned"):
+        if learned := reply.get("learned"):
             self._become("done", "", learned)
         else:
             broke = "the process ended without an answer; nothing was changed"
-            self._become("failed", str(told.get("error") or broke))
+            self._become("failed", str(reply.get("error") or broke))
 
     async def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Return the last message of the process; those before are progress."""
+        """Return the last message of the child process; the messages before are progress."""
         last: dict[str, Any] = {}
         async with await ChildProcess.start(self._command, line_limit=LONGEST_LINE) as process:
             await process.send(question)

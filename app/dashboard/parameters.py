@@ -24,19 +24,19 @@ _MOST_STEPS = 200
 
 
 def preset_alone(name: str) -> tuple[str, Parameters]:
-    """A preset as it is."""
+    """Return the name and the parameters of a preset."""
     return name, preset(name)
 
 
 class _Standing(NamedTuple):
-    """What holds at one time: it is undone to, and done again."""
+    """Preset and parameters at one time, for undo and redo."""
 
     preset: str
     parameters: Parameters
 
 
 class _Gesture(NamedTuple):
-    """What was changed last: which values, by which movement of a hand, and when [s]."""
+    """The last change: names of the values, identifier of the slider drag, and time [s]."""
 
     names: frozenset[str]
     gesture: str
@@ -47,18 +47,21 @@ _NO_GESTURE = _Gesture(frozenset(), "", 0.0)
 
 
 class ParameterState:
-    """A set of parameters with the preset it came from, and a revision that counts the changes.
+    """The parameters in force with their preset, the undo history, and a revision that counts the changes.
 
     Args:
-        begin: Preset name and parameters to begin with, from the preset that suits a source. It is asked
-            again for each source until a person changes something.
-        clock: Seconds from any start; changes of the same values in quick succession are one step.
+        begin: Returns preset name and initial parameters for the preset that suits a source. It is called for
+            each source until a person changes a parameter.
+        clock: Returns the time [s] from any origin; changes of the same values in quick succession are one
+            step.
 
     Attributes:
-        step: Grows with each change that is a step of its own.
-        whole: Whether a change acts on the whole run, which is mapped again then, or from the standing scan
-            on.
-        check: Called with parameters before they hold; raises a StemmapError for those that cannot.
+        preset, parameters: Name of the preset and the values in force.
+        revision: Number of changes so far.
+        step: Number of steps of the undo history so far.
+        whole: Whether a change applies to the whole run, which is then mapped again, or from the current scan
+            onwards.
+        check: Called with parameters before they are used; raises a StemmapError if they cannot be used.
     """
 
     def __init__(self, begin: Begin = preset_alone, clock: Callable[[], float] = time.monotonic) -> None:
@@ -73,15 +76,16 @@ class ParameterState:
         self._gesture = _NO_GESTURE
 
     def change(self, changes: dict[str, Value], gesture: str = "") -> None:
-        """Change values by their dotted names.
+        """Change values by dotted name.
 
         Args:
-            gesture: Of a slider that is held: all values until it is let go are one step, however long that
-                takes. Empty where unknown; then changes in quick succession are one step.
+            changes: New values by dotted name.
+            gesture: Identifier of a slider drag, whose values are one undo step however long it takes. Empty
+                if unknown; then changes in quick succession are one step.
 
         Raises:
-            ParameterError: A name is unknown, a value is out of bounds, or two values contradict;
-                then nothing is changed.
+            ParameterError: A name is unknown, a value is out of bounds, or two values contradict each other;
+                nothing changes.
         """
         parameters = self.parameters.replace(changes)
         names, now = frozenset(changes), self._clock()
@@ -91,19 +95,19 @@ class ParameterState:
         self._gesture = _Gesture(names, gesture, now)
 
     def use_preset(self, name: str) -> None:
-        """Take all values of a preset.
+        """Use all values of a preset.
 
         Raises:
-            ParameterError: There is none of this name.
+            ParameterError: There is no preset of this name.
         """
         self._become(name, preset(name))
 
     def use(self, preset_name: str, parameters: Parameters) -> None:
-        """Take all values of a set.
+        """Use all values of a parameter set.
 
         Args:
-            preset_name: That the set differs from.
-            parameters: Its values.
+            preset_name: Preset with which the set is compared.
+            parameters: The values.
 
         Raises:
             ParameterError: There is no such preset.
@@ -112,23 +116,23 @@ class ParameterState:
         self._become(preset_name, parameters)
 
     def undo(self) -> None:
-        """Take back the last step, of whoever made it.
+        """Undo the last step, whoever made it.
 
         Raises:
-            StemmapError: There is none.
+            StemmapError: There is no step to undo.
         """
         self._go_back(self._undo, self._redo, "there is no change of a parameter to undo")
 
     def redo(self) -> None:
-        """Do again what was undone last.
+        """Repeat the step that was undone last.
 
         Raises:
-            StemmapError: Nothing was, or something else was changed since.
+            StemmapError: No step was undone, or a parameter was changed since.
         """
         self._go_back(self._redo, self._undo, "there is no change of a parameter to do again")
 
     def reset(self, names: list[str]) -> None:
-        """Give parameters (none named: all) the preset's values again.
+        """Reset the named parameters, or all if the list is empty, to the values of the preset.
 
         Raises:
             ParameterError: A name is unknown.
@@ -140,17 +144,21 @@ class ParameterState:
         self._become(self.preset, self.parameters.replace({name: wanted[name] for name in names or wanted}))
 
     def take(self, preset_name: str, values: dict[str, Value]) -> None:
-        """Take all values, as another run had them.
+        """Use the parameters of another run.
+
+        Args:
+            preset_name: Its preset; an unknown or empty name means the preset in force.
+            values: Values by dotted name that differ from the preset.
 
         Raises:
-            ParameterError: The preset or a name is unknown, or a value does not fit.
+            ParameterError: A name is unknown or a value is not valid.
         """
         name = preset_name if preset_name in PRESETS else self.preset
         self._become(name, preset(name).replace(values))
 
     def suit(self, name: str) -> bool:
-        """Take the preset that suits a source, unless a person has chosen. Returns whether anything
-        changed."""
+        """Use the preset that suits a source, unless a person has changed a parameter. Return whether
+        anything changed."""
         if self._chosen:
             return False
         try:
@@ -165,8 +173,8 @@ class ParameterState:
         return True
 
     def as_plain(self) -> dict[str, Any]:
-        """What changes: what a change acts on, preset, revision, values, the names that differ from the
-        preset, and how many steps can be undone and done again."""
+        """Return the state for the page: reach of a change, preset, revision, values, names that differ from
+        the preset, and numbers of steps that can be undone and redone."""
         return {
             "whole": self.whole,
             "preset": self.preset,
@@ -178,12 +186,18 @@ class ParameterState:
         }
 
     def as_plain_with_specs(self) -> dict[str, Any]:
-        """The same with what never changes: how each parameter is declared, and the presets."""
+        """Return `as_plain` with the declarations of the parameters and the presets, which do not change."""
         presets = [{"name": name, "doc": doc} for name, (doc, _) in PRESETS.items()]
         return {**self.as_plain(), "specs": _SPECS, "presets": presets}
 
     def _become(self, preset_name: str, parameters: Parameters, goes_on: bool = False) -> None:
-        """Let this hold from now on; `goes_on`: as part of the step before."""
+        """Put parameters in force.
+
+        Args:
+            preset_name: Name of their preset.
+            parameters: The values.
+            goes_on: Whether the change belongs to the step before.
+        """
         before = _Standing(self.preset, self.parameters)
         self.check(parameters)
         self._gesture = _NO_GESTURE
@@ -214,20 +228,21 @@ _PRESET = re.compile(r"# preset: ([a-z0-9-]{1,40})\s*\n")
 
 
 def file_of(preset_name: str, parameters: Parameters) -> str:
-    """All values as a file that `--config` takes, with the preset that they came from as a remark."""
+    """Return all values as the text of a file for `--config`; a comment names their preset."""
     return f"# preset: {preset_name}\n{to_toml(parameters)}"
 
 
 def read_file(text: str, where: str, otherwise: str = DEFAULT_PRESET) -> tuple[str, Parameters]:
-    """The preset and the values of a file; what it does not say is as in the preset.
+    """Return the preset and the values of a parameter file; values that it does not contain are those of the
+    preset.
 
     Args:
-        text: Of the file.
-        where: Its name, for the error.
-        otherwise: The preset where the file names none.
+        text: Contents of the file.
+        where: Name of the file in errors.
+        otherwise: Preset if the file names none.
 
     Raises:
-        ParameterError: It is no such file, or a value does not fit.
+        ParameterError: The file or a value is not valid.
     """
     if _NESTED.search(text):
         raise ParameterError("the names in the file are nested too deeply", where=where)
@@ -237,22 +252,22 @@ def read_file(text: str, where: str, otherwise: str = DEFAULT_PRESET) -> tuple[s
 
 
 class ParameterSets:
-    """The saved sets of the store.
+    """The parameter sets that people saved.
 
     Args:
-        keeper: Of the store.
+        store: Access to the store.
         changed: Called when the saved sets have changed.
     """
 
-    def __init__(self, keeper: AsyncStore, changed: Callable[[], None]) -> None:
-        self._keeper, self._changed = keeper, changed
+    def __init__(self, store: AsyncStore, changed: Callable[[], None]) -> None:
+        self._store, self._changed = store, changed
         self._sets: dict[str, SavedSet] = {}
         self._values: dict[str, tuple[str, Parameters]] = {}
 
     async def load(self) -> None:
-        """Read what was saved; a store that cannot be used has none, and says so when asked to save."""
+        """Read the saved sets. Without access to the store there are none; `save` then raises the error."""
         try:
-            rows = await self._keeper.ask(lambda store: store.sets.all())
+            rows = await self._store.ask(lambda store: store.sets.all())
         except StemmapError:
             rows = []
         self._sets = {row.name: row for row in rows}
@@ -267,58 +282,67 @@ class ParameterSets:
     async def save(
         self, name: str, preset_name: str, parameters: Parameters, who: str, text: str = ""
     ) -> None:
-        """Keep parameters under a name, in place of those that have it.
+        """Save parameters under a name; a set of that name is replaced.
 
         Args:
-            text: A file of them that says more, to be kept in place of the plain one.
+            name: Name of the set.
+            preset_name: Name of their preset.
+            parameters: The values.
+            who: Name of the person.
+            text: Text of the file with further comments; empty for `file_of`.
 
         Raises:
             ParameterError: A preset has this name.
-            StemmapError: They cannot be kept.
+            StemmapError: The set cannot be stored.
         """
         if name in PRESETS:
             raise ParameterError("a preset has this name", where=name, remedy="Choose another")
         text = text or file_of(preset_name, parameters)
-        await self._keeper.ask(lambda store: store.sets.save(name, text, who))
+        await self._store.ask(lambda store: store.sets.save(name, text, who))
         await self.load()
 
     async def delete(self, name: str) -> None:
-        """Forget a set.
+        """Delete the saved set of this name.
 
         Raises:
-            UnknownError: There is none of this name.
+            UnknownError: There is no set of this name.
         """
-        await self._keeper.ask(lambda store: store.sets.delete(name))
+        await self._store.ask(lambda store: store.sets.delete(name))
         await self.load()
 
     def text(self, name: str) -> str:
-        """The file of a set.
+        """Return the parameter file of a saved set.
 
         Raises:
-            UnknownError: There is none of this name.
+            UnknownError: There is no set of this name.
         """
         if name not in self._sets:
             raise UnknownError("there is no saved set of this name", where=name)
         return self._sets[name].toml
 
     def named(self, name: str) -> tuple[str, Parameters]:
-        """The preset and the values of a preset or a saved set.
+        """Return the preset name and the values of a preset or a saved set.
 
         Raises:
-            UnknownError: There is none of this name.
-            ParameterError: A saved value does not fit any more.
+            UnknownError: There is neither of this name.
+            ParameterError: A saved value is not valid in this version.
         """
         if name in PRESETS:
             return name, preset(name)
         return read_file(self.text(name), name)
 
     def name_of(self, preset_name: str, parameters: Parameters) -> str:
-        """The saved set that is these values; empty when none is."""
+        """Return the name of the saved set with these values; empty if there is none.
+
+        Args:
+            preset_name: Name of the preset.
+            parameters: The values.
+        """
         wanted = (preset_name, parameters)
         return next((name for name, values in self._values.items() if values == wanted), "")
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers."""
+        """Return name, author and time of the saved sets for the page."""
         rows = [
             {"name": row.name, "who": row.who, "at_s": row.at_ns // 1_000_000_000}
             for row in self._sets.values()

@@ -142,7 +142,8 @@ def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
 
 
 def path_points(path_xy: Float, start: int) -> dict[str, Any]:
-    """Return the rows of a path (N, 2) from a row on, for a page that has the rows before."""
+    """Return rows of a path, shape (N, 2) [m], from row `start` onwards, for a page that has the rows
+    before."""
     return {"start": start, "points": np.round(path_xy[start:], 3).tolist()}
 
 
@@ -176,13 +177,18 @@ class Counts:
     wrong: int | None
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers."""
+        """Return the counts for the page."""
         return {"verdicts": self.verdicts, "right": self.right, "wrong": self.wrong}
 
 
 def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> Counts:
-    """Return the counts of a scan; `match_distance` [m] is the maximum distance of a detection to its
-    tree."""
+    """Return the verdict counts of a scan.
+
+    Args:
+        frame: Results of the scan.
+        truth: Ground truth, or None.
+        match_distance: Maximum distance between a detection and its true tree [m].
+    """
     verdicts = verdict_counts(frame.clusters.verdict)
     if truth is None:
         return Counts(frame.index, verdicts, None, None)
@@ -195,18 +201,18 @@ def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> 
 
 
 class BeforeAfter:
-    """Keeps the verdict counts of the current scan before the last change."""
+    """Keeps the verdict counts of the current scan before the last change of parameters."""
 
     def __init__(self) -> None:
         self._now: Counts | None = None
         self._before: Counts | None = None
 
     def forget(self) -> None:
-        """Another run begins."""
+        """Remove the counts, because another run begins."""
         self._now = self._before = None
 
     def step(self) -> None:
-        """Begin a change that is a step of its own."""
+        """Keep the present counts as those before a change that is a step of its own."""
         self._before = self._now
 
     def shown(self, counts: Counts) -> dict[str, Any]:
@@ -222,13 +228,13 @@ REACH = 0.45  # m; maximum distance between a tree and its column
 
 
 def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
-    """Return the confirmed trees with their votes, the most uncertain first.
+    """Return number and votes of each confirmed tree, the most uncertain first.
 
     Trees without a voxel column have no votes and come last.
 
     Args:
-        frame: Frame with its columns.
-        tree_share: Minimum share of votes of a tree.
+        frame: Results of the newest scan, with its voxel columns.
+        tree_share: Share of the votes that a tree needs.
     """
     from scipy.spatial import cKDTree
 
@@ -240,13 +246,13 @@ def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
     if columns is None or not len(columns.share):
         return [{"tree": each, "votes": None, "next": "", "next_votes": 0.0} for each in number]
     distance, column = cKDTree(columns.axis[:, :2]).query(frame.trees.position[rows])
-    told = []
+    listed = []
     for tree, far, row in zip(number, distance.tolist(), column.tolist(), strict=True):
         share = columns.share[row]
         other = 1 + int(share[1:].argmax())
         votes, following = (None if far > REACH else round(float(share[k]), 3) for k in (0, other))
-        told.append({"tree": tree, "votes": votes, "next": CLASSES[other].label, "next_votes": following})
-    return sorted(told, key=lambda each: _margin(each["votes"], tree_share))
+        listed.append({"tree": tree, "votes": votes, "next": CLASSES[other].label, "next_votes": following})
+    return sorted(listed, key=lambda each: _margin(each["votes"], tree_share))
 
 
 def _margin(votes: float | None, tree_share: float) -> float:
@@ -258,7 +264,12 @@ _FARTHEST_CM = 32_767
 
 
 def packed(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
-    """Return the binary block; see above."""
+    """Return a binary block: length of the header (4 bytes, little-endian), header as JSON, arrays.
+
+    Args:
+        header: JSON values. A list `arrays` with name, type, shape and position of each array is added.
+        arrays: Arrays by name, appended at multiples of four bytes.
+    """
     table, parts, place = [], [], 0
     for name, array in arrays.items():
         content = np.ascontiguousarray(array).tobytes()
@@ -277,7 +288,8 @@ def in_centimetres(points: NDArray[np.float32]) -> NDArray[np.int16]:
 
 
 def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Return the description of the clusters of a frame for the header."""
+    """Return the description of the clusters of a frame for the header of a binary block; arguments as in
+    `counts_of`."""
     counts = counts_of(frame, truth, match_distance)
     return {
         "index": frame.index,
@@ -296,7 +308,14 @@ def stages_payload(frame: Frame) -> bytes:
 def comparison_payload(
     frames: list[Frame], header: dict[str, Any], truth: TruthTrees | None, match_distance: float
 ) -> bytes:
-    """Return one scan under several parameter sets; array names end with the number of the set."""
+    """Return one scan under several parameter sets as a binary block; array names end with the number of the
+    set.
+
+    Args:
+        frames: Results of the scan with each set.
+        header: Further values of the header.
+        truth, match_distance: As in `counts_of`.
+    """
     arrays = {
         f"{name}{k}": array for k, frame in enumerate(frames) for name, array in _clustered(frame).items()
     }

@@ -72,11 +72,11 @@ class RunRecorder:
     """Writes the results of runs to the store, with a delay of some seconds and at their end.
 
     Args:
-        keeper: Asynchronous access to the store.
+        store: Asynchronous access to the store.
     """
 
-    def __init__(self, keeper: AsyncStore) -> None:
-        self._keeper = keeper
+    def __init__(self, store: AsyncStore) -> None:
+        self._store = store
         self._page: _Page | None = None
         self._writer: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
@@ -105,7 +105,7 @@ class RunRecorder:
         self._page = _Page(beginning, opened.scans)
 
     def leave(self) -> None:
-        """Write what is pending, since the run is closed."""
+        """Write pending changes, because the run is closed."""
         page, self._page = self._page, None
         if self._writer is not None:
             self._writer.cancel()
@@ -115,14 +115,15 @@ class RunRecorder:
         if page is not None and page.dirty:
             self._start(self._write(page))
 
-    def shown(self, glance: RunState) -> None:
-        """Record a displayed scan; the farthest scan counts, so that stepping back keeps the map."""
+    def shown(self, state: RunState) -> None:
+        """Record a shown scan. The scan with the largest index counts, so that stepping back keeps the
+        map."""
         page = self._page
         if page is None:
             return
-        page.newest = glance
-        if page.best is None or glance.shown.frame.index >= page.best.shown.frame.index:
-            page.best, page.dirty = glance, True
+        page.newest = state
+        if page.best is None or state.shown.frame.index >= page.best.shown.frame.index:
+            page.best, page.dirty = state, True
             self._soon(page)
 
     def scored(self, scores: dict[str, Any] | None) -> None:
@@ -137,7 +138,14 @@ class RunRecorder:
     def changed(
         self, before: dict[str, Value], after: dict[str, Value], preset: str, revision: int, who: str
     ) -> None:
-        """Record a change of parameters; all values by dotted name, before and after."""
+        """Record a change of parameters.
+
+        Args:
+            before, after: All values by dotted name.
+            preset: Name of the preset.
+            revision: Revision after the change.
+            who: Name of the person.
+        """
         changes = {name: [before[name], value] for name, value in after.items() if before[name] != value}
         page = self._page
         if page is None or page.newest is None or not changes:
@@ -154,14 +162,14 @@ class RunRecorder:
             page.reviser = self._start(self._revise_soon(page))
 
     async def close(self) -> None:
-        """Write what is pending."""
+        """Write pending changes and wait until they are stored."""
         self.leave()
         while self._tasks:
             await asyncio.gather(*self._tasks)
 
     def _soon(self, page: _Page) -> None:
         if self._writer is None or self._writer.done():
-            self._writer = asyncio.create_task(self._write_on(page), name="logbook")
+            self._writer = asyncio.create_task(self._write_on(page), name="run_recorder")
 
     async def _write_on(self, page: _Page) -> None:
         while page.dirty:
@@ -181,12 +189,12 @@ class RunRecorder:
 
     async def _write(self, page: _Page) -> None:
         async with page.lock:
-            glance, page.dirty = page.best, False
-            if glance is None:
+            state, page.dirty = page.best, False
+            if state is None:
                 return
 
             def work(store: Store) -> int:
-                standing = _standing(glance, page.all_scans)
+                standing = _figures_of(state, page.all_scans)
                 if page.record is None:
                     return store.book.begin(page.beginning, standing)
                 store.book.update(page.record, standing)
@@ -197,9 +205,9 @@ class RunRecorder:
             except StemmapError:  # the error was logged; the rest remains pending
                 page.dirty = True
 
-    async def _ask(self, work: Any) -> Any:  # noqa: ANN401 - as the keeper's
+    async def _ask(self, work: Any) -> Any:  # noqa: ANN401 - as the store's
         try:
-            done = await self._keeper.ask(work)
+            done = await self._store.ask(work)
         except StemmapError as error:
             if str(error) != self._problem:  # log once, not every five seconds
                 _log.warning("the run is not recorded: %s", error)
@@ -209,7 +217,7 @@ class RunRecorder:
         return done
 
     def _start(self, work: Any) -> asyncio.Task[None]:  # noqa: ANN401 - any coroutine
-        task: asyncio.Task[None] = asyncio.create_task(_quietly(work), name="logbook entry")
+        task: asyncio.Task[None] = asyncio.create_task(_quietly(work), name="run_recorder entry")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
@@ -220,23 +228,23 @@ async def _quietly(work: Any) -> None:  # noqa: ANN401 - any coroutine
         await work
 
 
-def _standing(glance: RunState, all_scans: int | None) -> RunFigures:
-    shown = glance.shown
+def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
+    shown = state.shown
     frame = shown.frame
     trees = trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * 1e9))
-    truth = truth_payload(glance.truth)
+    truth = truth_payload(state.truth)
     return RunFigures(
         scans=frame.index + 1,
         all_scans=all_scans,
         time_s=round(shown.time_s, 3),
-        distance_m=round(float(np.hypot(*np.diff(glance.path_xy, axis=0).T).sum()), 3),
+        distance_m=round(float(np.hypot(*np.diff(state.path_xy, axis=0).T).sum()), 3),
         trees=len(trees),
-        preset=glance.preset,
-        parameters=glance.parameters,
-        scores=glance.scores,
+        preset=state.preset,
+        parameters=state.parameters,
+        scores=state.scores,
         map={
             "trees": trees,
-            "path": thinned(glance.path_xy),
+            "path": thinned(state.path_xy),
             "truth": None if truth is None else truth["trees"],
         },
     )

@@ -1,8 +1,7 @@
-"""The score against the ground truth, kept up with the map.
+"""Scores of the map against the ground truth, at most three times a second.
 
-It is computed in the web process, in a thread: it needs nothing but the tree table, which is here
-already, takes about a millisecond, and the worker's time belongs to the mapping. Three times a
-second at most.
+They are computed in a thread of the web process: they need only the tree table, which is available here, take
+about a millisecond, and leave the time of the worker to the mapping.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.batch.summary import truth_in_doubt
-from pipeline.config.stages import Evaluation as Parameters
-from pipeline.evaluation import Evaluation, evaluate, match, pair_distances, pair_errors
+from pipeline.config.stages import Evaluation
+from pipeline.evaluation import MapScores, evaluate, match, pair_distances, pair_errors
 from pipeline.types.records import Trees, TruthTrees
 
 Float = NDArray[np.float64]
@@ -29,27 +28,38 @@ MOST_PAIRED = 300
 
 
 class Scores:
-    """Computes the newest score that was asked for.
+    """Computes scores in the background; of several requests only the newest is computed.
 
     Args:
-        tell: Called on the event loop with a score, or None when there is none any more.
+        tell: Called on the event loop with each score for the page, and with None when there is no map any
+            more.
+
+    Attributes:
+        latest: The newest score, or None.
     """
 
     def __init__(self, tell: Callable[[dict[str, Any] | None], None]) -> None:
         self.latest: dict[str, Any] | None = None
         self._tell = tell
-        self._asked: tuple[Trees, TruthTrees, Parameters, Float] | None = None
+        self._asked: tuple[Trees, TruthTrees, Evaluation, Float] | None = None
         self._task: asyncio.Task[None] | None = None
         self._runs = 0
 
-    def ask(self, trees: Trees, truth: TruthTrees, parameters: Parameters, path_xy: Float) -> None:
-        """Have the map scored soon, against the truth near the path (N, 2)."""
+    def ask(self, trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> None:
+        """Request the score of a map.
+
+        Args:
+            trees: The map.
+            truth: Ground truth.
+            parameters: Distances of a match and of the ground truth from the path.
+            path_xy: Path, shape (N, 2) [m].
+        """
         self._asked = (trees, truth, parameters, path_xy)
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._work(), name="scores")
 
     def forget(self) -> None:
-        """There is no map any more."""
+        """Remove the score, because there is no map any more."""
         self._asked = self.latest = None
         self._runs += 1
         self._tell(None)
@@ -74,12 +84,12 @@ class Scores:
             await asyncio.sleep(_PAUSE_S)
 
 
-def score_map(trees: Trees, truth: TruthTrees, parameters: Parameters, path_xy: Float) -> dict[str, Any]:
+def score_map(trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> dict[str, Any]:
     """Return the scores of a map for the page, see `score_payload`."""
     return score_payload(evaluate(trees, truth, parameters, path_xy))
 
 
-def score_payload(score: Evaluation) -> dict[str, Any]:
+def score_payload(score: MapScores) -> dict[str, Any]:
     """Return scores for the page, with units in the names. An undefined score is None."""
     rates = {"TA": score.TA, "TR": score.TR, "FA": score.FA, "FR": score.FR}
     return {
@@ -101,9 +111,15 @@ def score_payload(score: Evaluation) -> dict[str, Any]:
 
 
 def pairs_payload(trees: Trees, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Distances between the confirmed trees [m], and their errors [%] where both trees were matched.
+    """Return the distances between the confirmed trees [m], and their errors [%] if both trees are matched,
+    as JSON values.
 
-    A matrix of more than MOST_PAIRED trees is no picture any more: the first of them are taken.
+    Only the first MOST_PAIRED trees are included, because a larger matrix cannot be drawn.
+
+    Args:
+        trees: The map.
+        truth: Ground truth, or None.
+        match_distance: Maximum distance of a match [m].
     """
     rows = np.flatnonzero(trees.confirmed)
     kept = rows[:MOST_PAIRED]

@@ -47,19 +47,19 @@ Ring = tuple[float, float, float] | None
 
 
 class Selector:
-    """The selection, and how it comes about.
+    """The selected tree or cluster, and its changes.
 
     Args:
-        asking: Where stories are told.
-        live: Where the browsers are told.
-        mark: Marks a tree and a ring in the scene.
-        run: The present run, None for none.
-        newest: The newest scan that is shown, None for none.
+        worker_client: Requests the explanations.
+        live: Broadcast to the browsers.
+        mark: Highlights a tree and a ring in the scene.
+        run: Returns the number of the present run, None without one.
+        newest: Returns the index of the newest shown scan, None without one.
     """
 
     def __init__(
         self,
-        asking: WorkerClient,
+        worker_client: WorkerClient,
         live: Broadcast,
         mark: Callable[[int | None, Ring], None],
         *,
@@ -67,7 +67,7 @@ class Selector:
         newest: Callable[[], int | None],
     ) -> None:
         self.selection = Selection()
-        self._asking, self._live, self._mark = asking, live, mark
+        self._client, self._live, self._mark = worker_client, live, mark
         self._run, self._newest = run, newest
         self._task: asyncio.Task[None] | None = None
 
@@ -93,9 +93,12 @@ class Selector:
         self._task = asyncio.create_task(self._if_known(scan, cluster), name="select")
 
     async def story(self, scan: int | None, cluster: int) -> ClusterStory:
-        """Return the explanation of a cluster of a recent scan; None is the newest scan.
+        """Return the explanation of a cluster of a recent scan. For the selected cluster it is the
+        explanation at the time of its selection.
 
-        The explanation of the selected cluster is that of the time of its selection.
+        Args:
+            scan: Index of the scan; None for the newest.
+            cluster: Row of the cluster.
 
         Raises:
             NoStoryError: The cluster is not available.
@@ -103,10 +106,14 @@ class Selector:
         kept = self.selection.cluster
         if kept is not None and (kept.scan, kept.cluster) == (scan, cluster):
             return kept
-        return await self._asking.cluster(self._newest() if scan is None else scan, cluster)
+        return await self._client.cluster(self._newest() if scan is None else scan, cluster)
 
     def renamed(self, numbers: Mapping[int, int]) -> None:
-        """Clear the selection of a tree that no longer exists after renumbering."""
+        """Select the tree under its new number, or clear the selection if the tree does not exist any more.
+
+        Args:
+            numbers: New number by old number.
+        """
         selected = self.selection
         if selected.tree is not None:
             self._select(Selection(numbers.get(selected.tree), selected.cluster))

@@ -38,7 +38,11 @@ _SIDES = 36
 
 
 def warm_up(sensor: Sensor) -> None:
-    """Compile the kernels of the stories, so that the first story does not delay the mapping."""
+    """Compile the kernels of the explanations, so that the first one does not delay the mapping.
+
+    Args:
+        sensor: The LiDAR of the run.
+    """
     angle = np.linspace(2.0, 4.0, 12)
     arc = np.column_stack([5.0 + 0.2 * np.cos(angle), 0.2 * np.sin(angle), np.linspace(0.0, 1.0, 12)])
     fit_one(arc, sensor)
@@ -111,7 +115,7 @@ def cluster_of_frame(
         axes=_axes(points[:, :2], to_picture),
         tree=tree,
         tree_distance=tree_distance,
-        gathered=column_story(frame, place, parameters, sensor),
+        column=column_story(frame, place, parameters, sensor),
     )
 
 
@@ -144,7 +148,7 @@ def tree_of_frame(
         first_seen_s=(int(trees.first_seen_ns[row]) - start_ns) / _NS,
         last_seen_s=(int(trees.last_seen_ns[row]) - start_ns) / _NS,
         cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
-        gathered=column_story(frame, trees.position[row], parameters, sensor),
+        column=column_story(frame, trees.position[row], parameters, sensor),
         history=history.of(int(trees.number[row])),
     )
 
@@ -201,7 +205,7 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sen
         present=int(columns.present[row]),
         absent=int(columns.absent[row]),
         viewed=float(columns.viewed[row]),
-        told=[
+        effects=[
             FeatureEffect(NAMES[k], float(figures[k]), float(effect[k]))
             for k in strongest.tolist()
             if effect[k] != 0.0
@@ -210,7 +214,12 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sen
 
 
 def _decided_by(share: Float, tree_share: float) -> tuple[Verdict, ...]:
-    """Return the verdicts that the votes give without any rule."""
+    """Return the verdicts that the votes alone give.
+
+    Args:
+        share: Share of votes by class, in the order of CLASSES.
+        tree_share: Share that a tree needs.
+    """
     if share[0] >= tree_share:
         return (Verdict.TREE,)
     most = CLASSES[int(share.argmax())]

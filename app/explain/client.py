@@ -49,13 +49,18 @@ class WorkerClient:
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
 
     def take(self, answer: Answer) -> None:
-        """Deliver an answer of the worker; without effect if nothing waits for it any more."""
+        """Deliver an answer of the worker to the method that waits for it; without effect if none does."""
         waiting = self._waiting.get(answer.ticket)
         if waiting is not None and not waiting.done():
             waiting.set_result(answer)
 
     async def cluster(self, scan: int | None, cluster: int) -> ClusterStory:
-        """Return the story of a cluster of a recently shown scan; None stands for no scan."""
+        """Return the explanation of a cluster of a recently shown scan.
+
+        Args:
+            scan: Index of the scan; None if no scan is shown.
+            cluster: Row of the cluster.
+        """
         run = self._shown_run()
         if scan is None:
             raise _nothing_mapped()
@@ -65,7 +70,7 @@ class WorkerClient:
         return answer.cluster
 
     async def tree(self, number: int) -> TreeStory:
-        """Return the story of a tree after the current scan."""
+        """Return the explanation of a tree, by its number, after the current scan."""
         answer = await self._ask(AskTree(next(self._tickets), self._shown_run(), number))
         if answer.tree is None:
             raise NoStoryError(answer.missing or "there is no such tree")
@@ -80,7 +85,7 @@ class WorkerClient:
         return answer.frames
 
     async def camera(self, stamp_ns: int) -> CameraPicture:
-        """Return the camera picture of the run nearest to a time."""
+        """Return the camera picture of the run nearest to a time [ns]."""
         answer = await self._ask(AskCamera(next(self._tickets), self._shown_run(), stamp_ns))
         if answer.camera is None:
             raise NoStoryError(answer.missing or "there is no picture")

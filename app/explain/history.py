@@ -50,7 +50,8 @@ class TreeHistory:
         self._append(rows)
 
     def of(self, number: int) -> History:
-        """Return the estimates of one tree: at most 200 rows, the first and the last among them."""
+        """Return the estimates of the tree with this number: at most 200 rows, the first and the last among
+        them."""
         known = self._rows[: self._count]
         mine = known[known[:, _NUMBER] == number]
         if len(mine) > _MOST_RETURNED:  # closer together where it is young
@@ -99,7 +100,7 @@ def _matrices(xx_xy_yy: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rows_of(frame: Frame, start_ns: int) -> NDArray[np.float64]:
-    """A row for each tree that the scan has detected, shape (R, _WIDTH)."""
+    """Return a row for each tree that the scan detected, shape (R, _WIDTH)."""
     trees = frame.trees
     # A tree that began as a voxel column has a place before any scan detects it.
     rows = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
@@ -125,7 +126,12 @@ class RecentScans:
         self._lock = threading.Lock()
 
     def keep(self, run: int, frame: Frame) -> None:
-        """Store a scan of a run that is being sent to the browsers."""
+        """Store a scan that is being sent to the browsers.
+
+        Args:
+            run: Number of the run.
+            frame: Results of the scan.
+        """
         small = replace(frame, raw=np.zeros((0, 3), np.float32))
         with self._lock:
             self._frames[run, frame.index] = small
@@ -139,6 +145,11 @@ class RecentScans:
             self._frames.clear()
 
     def find(self, run: int, scan: int) -> Frame | None:
-        """Return a scan as it was sent last; None if it is not stored any more."""
+        """Return a scan as it was sent last; None if it is not stored any more.
+
+        Args:
+            run: Number of the run.
+            scan: Index of the scan.
+        """
         with self._lock:
             return self._frames.get((run, scan))

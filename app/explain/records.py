@@ -69,13 +69,13 @@ class ColumnStory(msgspec.Struct, frozen=True):
         votes: Share of the votes by class.
         tree_share: Share of the votes that a tree needs.
         tree_in_free_air: For an object with a free upper end, the share of votes for a tree of the decision
-            trees that separate trees from poles; None otherwise. Where they vote for a pole, `told` explains
-            their votes.
+            trees that separate trees from poles; None otherwise. Where they vote for a pole, `effects`
+            explain their votes.
         by_votes: Whether the votes decided the verdict; otherwise a rule did.
         present, absent: Number of accumulated scans with a clear view of the place that show it occupied, and
             that show it empty.
         viewed: Greatest height above ground that any scan observed there [m].
-        told: The most influential features, the strongest first.
+        effects: The most influential features, the strongest first.
     """
 
     verdict: str
@@ -87,7 +87,7 @@ class ColumnStory(msgspec.Struct, frozen=True):
     present: int
     absent: int
     viewed: float
-    told: list[FeatureEffect]
+    effects: list[FeatureEffect]
 
 
 class ClusterStory(msgspec.Struct, frozen=True):
@@ -108,7 +108,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
         circle: None if the preset fits no circle or the points are too few.
         axes: One standard deviation along the principal axes in the picture: (right, up) of each [m].
         tree, tree_distance: The nearest confirmed tree and its distance [m]; None and NaN if none is near.
-        gathered: Classification of the accumulated scans at its place; None without them.
+        column: Classification of the accumulated scans at its place; None without them.
     """
 
     scan: int
@@ -127,7 +127,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
     axes: list[tuple[float, float]]
     tree: int | None
     tree_distance: float
-    gathered: ColumnStory | None
+    column: ColumnStory | None
 
 
 class History(msgspec.Struct, frozen=True):
@@ -161,7 +161,7 @@ class TreeStory(msgspec.Struct, frozen=True):
         observations: Number of scans that detected it.
         first_seen_s, last_seen_s: [s].
         cluster: Row of its cluster in the current scan; None without one.
-        gathered: Classification of the accumulated scans at its place; None without them.
+        column: Classification of the accumulated scans at its place; None without them.
         history: Estimates in order of time.
     """
 
@@ -181,5 +181,5 @@ class TreeStory(msgspec.Struct, frozen=True):
     first_seen_s: float
     last_seen_s: float
     cluster: int | None
-    gathered: ColumnStory | None
+    column: ColumnStory | None
     history: History

@@ -375,7 +375,7 @@ class Fleet:
         self.live.tell("fleet", {"members": cards, "notice": self.notice})
 
     def _open_records(self) -> set[int | None]:
-        return {member.dashboard.logbook.record for member in self.members.values()}
+        return {member.dashboard.run_recorder.record for member in self.members.values()}
 
     def send_maps(self) -> None:
         """Send the maps to the pages."""

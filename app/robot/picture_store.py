@@ -83,8 +83,8 @@ class PictureStore:
         if not is_whole:
             count_loss(self.losses, REFUSED)
             return
-        told = Picture(picture.stamp_ns, picture.encoding, picture.width, picture.height, picture.step, b"")
-        self._kept[picture.stamp_ns] = _Kept(told, self._length, size)
+        empty = Picture(picture.stamp_ns, picture.encoding, picture.width, picture.height, picture.step, b"")
+        self._kept[picture.stamp_ns] = _Kept(empty, self._length, size)
         self._length += size
 
     def stamps(self) -> list[int]:
@@ -94,10 +94,10 @@ class PictureStore:
     def at(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
         """Yield the pictures of some of `stamps`, each once."""
         for stamp_ns in sorted(set(wanted_ns) & self._kept.keys()):
-            told, begin, length = self._kept[stamp_ns]
+            empty, begin, length = self._kept[stamp_ns]
             self._file.seek(begin)
             data = self._file.read(length)
-            yield Picture(stamp_ns, told.encoding, told.width, told.height, told.step, data)
+            yield Picture(stamp_ns, empty.encoding, empty.width, empty.height, empty.step, data)
 
     def close(self) -> None:
         """Close and delete the file."""

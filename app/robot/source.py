@@ -186,7 +186,7 @@ class LiveSource:
         return iter(()) if self._kept is None else self._kept.at(wanted_ns)
 
     @property
-    def pictures_told(self) -> str:
+    def picture_counts(self) -> str:
         """Numbers of pictures that arrived and were accepted, as text; "" where there is no camera."""
         if self._camera is None:
             return ""
@@ -310,8 +310,8 @@ class LiveSource:
 
     def notices(self) -> list[str]:
         """Return notices since the last call, such as a lost robot."""
-        told, self._notices = self._notices, []
-        return told
+        notices, self._notices = self._notices, []
+        return notices
 
     def waiting_for(self) -> str:
         """Why no scans arrive, as text; "" while they arrive."""

@@ -109,8 +109,8 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
     channels = tuple(
         Channel(k, p.topic, p.msgtype, "cdr", "", "", 0) for k, p in enumerate([*chosen, *camera], 1)
     )
-    told = tuple(_warnings(scans, scan, robot, named))
-    return Choice(scan.robot, channels[: len(chosen)], told, channels[len(chosen) :])
+    warnings = tuple(_warnings(scans, scan, robot, named))
+    return Choice(scan.robot, channels[: len(chosen)], warnings, channels[len(chosen) :])
 
 
 def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publisher | None:

@@ -44,7 +44,7 @@ class TookTooLongError(StemmapError):
 
 
 class _Answer(msgspec.Struct, frozen=True):
-    """Answer of the child process, or what went wrong, where, and what to do."""
+    """Answer of the child process, or the error: what, where, remedy."""
 
     content: dict[str, Any] = {}
     error: tuple[str, str, str] | None = None
@@ -53,7 +53,12 @@ class _Answer(msgspec.Struct, frozen=True):
 async def ask(
     question: dict[str, Any], *, patience_s: float = PATIENCE_S, command: Sequence[str] = COMMAND
 ) -> dict[str, Any]:
-    """Return the answer to a question: `ask` is a key of `QUESTIONS`, `path` the source.
+    """Return the answer of a child process to a question.
+
+    Args:
+        question: `ask` is a key of `QUESTIONS`, `path` the source; further values depend on the question.
+        patience_s: Time limit [s].
+        command: Program and arguments of the child process.
 
     Raises:
         SourceError: The source cannot be read; the error gives the reason.
@@ -87,7 +92,7 @@ HYPOTHESES = 1_000_000
 
 
 def recording(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the format of a recording, which is recognised by its contents."""
+    """Return the format of a recording, detected from its contents."""
     with closing(open_source(question["path"])) as source:
         return {"kind": source.description.kind}
 
@@ -98,7 +103,7 @@ def inside(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def finished(question: dict[str, Any]) -> dict[str, Any]:
-    """Return map and figures of a folder that `stemmap map` wrote."""
+    """Return map and figures of a folder that `stemmap map` wrote, as the store keeps them for a run."""
     import numpy as np
 
     from app.batch.run_folder import read_run, read_run_record
@@ -128,7 +133,13 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def alignment(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the pose of one map in another, found by stem matching."""
+    """Return the pose of one map in another, found by stem matching, the reason if there is none, and the
+    number of matched stems.
+
+    Args:
+        question: `local` and `reference` are the maps, with a row per stem: x, y, sigma, DBH and its
+            sigma [m].
+    """
     import numpy as np
 
     from pipeline.config import preset
@@ -161,7 +172,7 @@ QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 
 def answer(parent: ParentConnection) -> None:
-    """Answer one question."""
+    """Answer one question of the parent process."""
     question = parent.receive(dict)
     try:
         reply = _Answer(QUESTIONS[question["ask"]](question))
@@ -173,12 +184,12 @@ def answer(parent: ParentConnection) -> None:
 
 
 def _scores(evaluation: object) -> dict[str, Any] | None:
-    """The scores of run.json as the page shows them; None where there are none or they are damaged."""
+    """Return the scores of run.json for the page; None if there are none or they are damaged."""
     from app.dashboard.scores import score_payload
-    from pipeline.evaluation import Evaluation
+    from pipeline.evaluation import MapScores
 
     try:
-        return score_payload(msgspec.convert(evaluation, Evaluation))
+        return score_payload(msgspec.convert(evaluation, MapScores))
     except msgspec.ValidationError:
         return None
 
@@ -237,8 +248,8 @@ def heard(uri: str) -> dict[str, Any]:
             time.sleep(COUNT_S)
         numbers = {channel.number for channel in listened}
         topics = [_counted(each, inbox.heard(k), k in numbers) for k, each in enumerate(known[:MOST_TOPICS])]
-        told = [] if topics else [f"no topic was announced within {LISTEN_S:.0f} s"]
-        return {"kind": "live", "topics": topics, "mount": None, "warnings": told}
+        warnings = [] if topics else [f"no topic was announced within {LISTEN_S:.0f} s"]
+        return {"kind": "live", "topics": topics, "mount": None, "warnings": warnings}
 
 
 def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, Any]:

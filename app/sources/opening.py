@@ -89,7 +89,12 @@ def _no_matching(known: SourceDescription) -> str:
 
 
 def motion_of(known: SourceDescription, choice: str, chosen: ChosenOdometry) -> OdometryEstimator | None:
-    """Return the reader of the motion; None if the source provides it or there is none.
+    """Return the estimator of the motion; None if the source provides the motion or there is none.
+
+    Args:
+        known: Description of the source.
+        choice: As in `choose_odometry`.
+        chosen: Result of `choose_odometry`.
 
     Raises:
         SourceError: A pose file cannot be read.
@@ -108,6 +113,10 @@ def motion_of(known: SourceDescription, choice: str, chosen: ChosenOdometry) -> 
 def with_odometry(source: Source, choice: str) -> tuple[Source, ChosenOdometry]:
     """Return the source with the selected motion, and the selection.
 
+    Args:
+        source: The source.
+        choice: As in `choose_odometry`.
+
     Raises:
         SourceError: The choice is not available for this source.
     """
@@ -123,7 +132,7 @@ def with_odometry(source: Source, choice: str) -> tuple[Source, ChosenOdometry]:
 
 
 def open_any(uri: str, options: SourceOptions) -> Source | LiveSource:
-    """Open a source named by the user.
+    """Open a source by its URI: recorded, simulated or live.
 
     Raises:
         SourceError: The source does not exist, has an unknown format, or is damaged.

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Far more than all pages of a dashboard ask for at once; a database that hangs must not collect requests.
+# More than all pages of a dashboard request at once; while the database does not answer, requests must not
+# accumulate.
 LARGEST_QUEUE = 200
 
 

@@ -214,7 +214,7 @@ annotated = Table(
     Column("at_ns", BigInteger, nullable=False),
     Column("version", Integer, nullable=False),
     Column("deleted", Boolean, nullable=False),
-    Column("made_by", Integer, nullable=False, comment="the change that led to what stands; 0 none"),
+    Column("made_by", Integer, nullable=False, comment="the change that led to the current content; 0 none"),
     sqlite_autoincrement=True,
 )
 

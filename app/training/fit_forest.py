@@ -276,7 +276,7 @@ def _leaf(
         random_state=draw,
     ).fit(known.astype(np.float32), label == TREE, weight)
     leaf = tree.apply(known.astype(np.float32))
-    said = np.zeros((tree.tree_.node_count, len(CLASSES)))
-    np.add.at(said, (leaf, label), weight)
-    mixed = (PRIOR * share + said) / (PRIOR * share.sum() + said.sum(axis=1, keepdims=True))
+    counts = np.zeros((tree.tree_.node_count, len(CLASSES)))
+    np.add.at(counts, (leaf, label), weight)
+    mixed = (PRIOR * share + counts) / (PRIOR * share.sum() + counts.sum(axis=1, keepdims=True))
     return node_of(tree.tree_, np.round(mixed, 2), 0)

@@ -91,10 +91,10 @@ class Forests:
             try:
                 learned = self.read(name)["learned"]
                 things = {str(kind): int(n) for kind, n in learned["things"].items()}
-                told = {"date": str(learned["date"]), "things": things, "runs": len(learned["runs"])}
+                provenance = {"date": str(learned["date"]), "things": things, "runs": len(learned["runs"])}
             except (StemmapError, AttributeError, KeyError, TypeError, ValueError):
                 return None
-            self._provenance[name] = {"name": name, **told}
+            self._provenance[name] = {"name": name, **provenance}
         return self._provenance[name]
 
     def _read(self, name: str) -> tuple[dict[str, Any], list[Forest]]:

@@ -106,8 +106,8 @@ def learn(runs: Sequence[AnnotatedRun], asked: LearningOptions) -> LearningResul
         things += things_by_class(examples)
         used += [run for run, _ in some]
     if not validated:
-        told = [what_lacks([e for _, e in of_run]) if not warnings else "", *warnings]
-        raise StemmapError("too few annotations: " + "; ".join(w for w in told if w))
+        reasons = [what_lacks([e for _, e in of_run]) if not warnings else "", *warnings]
+        raise StemmapError("too few annotations: " + "; ".join(w for w in reasons if w))
     about = {
         "date": asked.date,
         "version": version(),

@@ -78,10 +78,10 @@ def validate(
     accepted_new = np.zeros(len(label), np.bool_)
     folds = fold_of(group, label == TREE, thing, seed)
     for fold in np.unique(folds):
-        rest, judged = folds != fold, folds == fold
+        rest, left_out = folds != fold, folds == fold
         grown = all_expanded(base, kind, figures[rest], label[rest], thing[rest], seed)
         forest = forest_of({**base, **grown}, kind)
-        accepted_new[judged] = _accepted(figures[judged], forest, share)
+        accepted_new[left_out] = _accepted(figures[left_out], forest, share)
     tree = label[last] == TREE
     return Validation(
         by,
@@ -120,8 +120,8 @@ def fold_of(group: Int, tree: Bool, thing: Int, seed: int) -> Int:
     number = min(FOLDS, len(np.unique(group)))
     split = StratifiedGroupKFold(number, shuffle=True, random_state=seed)
     of_group: dict[int, int] = {}
-    for fold, (_, judged) in enumerate(split.split(np.zeros((len(first), 1)), tree[first], group[first])):
-        of_group.update(dict.fromkeys(group[first][judged].tolist(), fold))
+    for fold, (_, left_out) in enumerate(split.split(np.zeros((len(first), 1)), tree[first], group[first])):
+        of_group.update(dict.fromkeys(group[first][left_out].tolist(), fold))
     return np.array([of_group[g] for g in group.tolist()], np.int64)
 
 

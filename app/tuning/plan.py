@@ -17,7 +17,7 @@ from app.sources.request import SourceRequest
 from pipeline.config import FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value, validated
 from pipeline.errors import ParameterError
-from pipeline.evaluation import Evaluation
+from pipeline.evaluation import MapScores
 from pipeline.types.records import TruthTrees
 
 # --- goal -------------------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ class Goal:
         return GOALS[self.name] + bound
 
 
-def score_of(e: Evaluation) -> RunScore:
+def score_of(e: MapScores) -> RunScore:
     """Return the scores that a search stores of an evaluation."""
     return RunScore(
         e.TA.count,
@@ -205,7 +205,7 @@ _DIGITS = 4  # significant digits of a value, so that the file stays readable
 _CORNERS = 4096
 
 
-class Axis(msgspec.Struct, frozen=True):
+class SearchAxis(msgspec.Struct, frozen=True):
     """A parameter of a search.
 
     Attributes:
@@ -251,7 +251,7 @@ class Axis(msgspec.Struct, frozen=True):
         return f"{self.name}={self.low:g}..{self.high:g}"
 
 
-def axes_of(texts: Sequence[str]) -> tuple[Axis, ...]:
+def axes_of(texts: Sequence[str]) -> tuple[SearchAxis, ...]:
     """Return the axes of `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`.
 
     Raises:
@@ -265,7 +265,7 @@ def axes_of(texts: Sequence[str]) -> tuple[Axis, ...]:
     return axes
 
 
-def check(axes: Iterable[Axis], start: Parameters) -> None:
+def check(axes: Iterable[SearchAxis], start: Parameters) -> None:
     """Check that the bounds contain a set without contradictions.
 
     Raises:
@@ -289,12 +289,12 @@ def check(axes: Iterable[Axis], start: Parameters) -> None:
         )
 
 
-def values_of(axes: Iterable[Axis], suggested: Mapping[str, Any]) -> dict[str, Value]:
+def values_of(axes: Iterable[SearchAxis], suggested: Mapping[str, Any]) -> dict[str, Value]:
     """Return the values of the parameters by name."""
     return {axis.name: axis.value_of(suggested[axis.name]) for axis in axes}
 
 
-def _axis(text: str) -> Axis:
+def _axis(text: str) -> SearchAxis:
     name, given, bounds = (part.strip() for part in text.partition("="))
     spec = next((spec for spec in field_specs() if spec.name == name), None)
     if spec is None:
@@ -306,9 +306,9 @@ def _axis(text: str) -> Axis:
     if spec.kind == "name":
         return _names(spec, bounds)
     if spec.minimum is None or spec.maximum is None:
-        return _choice(spec, bounds) if given else Axis(name, "choice", choices=_all_choices(spec))
+        return _choice(spec, bounds) if given else SearchAxis(name, "choice", choices=_all_choices(spec))
     low, high = _range(spec, bounds) if given else (spec.minimum, spec.maximum)
-    return Axis(name, "int" if spec.kind == "int" else "float", low, high)
+    return SearchAxis(name, "int" if spec.kind == "int" else "float", low, high)
 
 
 def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
@@ -335,17 +335,17 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
     return low, high
 
 
-def _choice(spec: FieldSpec, words: str) -> Axis:
+def _choice(spec: FieldSpec, words: str) -> SearchAxis:
     known = {_word(choice): choice for choice in _all_choices(spec)}
     asked = [word.strip() for word in words.split(",")]
     unknown = [word for word in asked if word not in known]
     if unknown or len(set(asked)) < 2:
         what = f"{unknown[0]!r} is not one of its values" if unknown else "at least two values are needed"
         raise ParameterError(f"{spec.name}={words}: {what}", remedy=f"Choose from {', '.join(known)}")
-    return Axis(spec.name, "choice", choices=tuple(known[word] for word in dict.fromkeys(asked)))
+    return SearchAxis(spec.name, "choice", choices=tuple(known[word] for word in dict.fromkeys(asked)))
 
 
-def _names(spec: FieldSpec, words: str) -> Axis:
+def _names(spec: FieldSpec, words: str) -> SearchAxis:
     asked = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
     if len(asked) < 2:
         raise ParameterError(
@@ -353,14 +353,14 @@ def _names(spec: FieldSpec, words: str) -> Axis:
         )
     for word in asked:
         Parameters().replace({spec.name: word})  # raises an error that says how a name is written
-    return Axis(spec.name, "choice", choices=asked)
+    return SearchAxis(spec.name, "choice", choices=asked)
 
 
 def _all_choices(spec: FieldSpec) -> tuple[str | bool, ...]:
     return spec.choices or (False, True)
 
 
-def _ends(axis: Axis) -> tuple[Value, ...]:
+def _ends(axis: SearchAxis) -> tuple[Value, ...]:
     if axis.kind == "choice":
         return axis.choices
     return axis.value_of(axis.low), axis.value_of(axis.high)
@@ -439,7 +439,7 @@ class Plan(msgspec.Struct, frozen=True):
     """
 
     runs: tuple[PlannedRun, ...]
-    axes: tuple[Axis, ...]
+    axes: tuple[SearchAxis, ...]
     start: dict[str, dict[str, Any]]
     storage: str
     preset: str = "forest"

@@ -149,8 +149,8 @@ def lines_of(plan: Plan, result: Result) -> list[str]:
     flat = plan.parameters.flat()
     for name, value in result.best.values.items():
         share = result.importance.get(name)
-        told = "" if share is None else f"   importance {100.0 * share:.0f} %"
-        lines.append(f"  {name}: {_word(flat[name])} -> {_word(value)}{told}")
+        suffix = "" if share is None else f"   importance {100.0 * share:.0f} %"
+        lines.append(f"  {name}: {_word(flat[name])} -> {_word(value)}{suffix}")
     return lines
 
 

@@ -22,7 +22,7 @@ from app.training.learned_forests import kept_forests
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
-from pipeline.evaluation import Evaluation, evaluate
+from pipeline.evaluation import MapScores, evaluate
 from pipeline.io.readers import open_source
 from pipeline.io.readers.clouds import is_cloud, open_cloud
 from pipeline.mapper import Mapper
@@ -55,7 +55,7 @@ class MappedRun:
     scans: int
     front_end_ran: bool
 
-    def evaluate(self, truth: TruthTrees, parameters: Parameters) -> Evaluation:
+    def evaluate(self, truth: TruthTrees, parameters: Parameters) -> MapScores:
         """Score the map, as `stemmap map` and `stemmap evaluate` do."""
         path = np.stack([self.path.x, self.path.y], axis=1) if self.scans else None
         return evaluate(self.trees, truth, parameters.evaluation, path)

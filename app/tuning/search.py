@@ -44,7 +44,7 @@ from app.tuning.storage import OtherSearchError, close_storage, open_study
 from pipeline.config import Parameters
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, SourceError, StemmapError
-from pipeline.evaluation import Evaluation
+from pipeline.evaluation import MapScores
 from pipeline.types.records import TruthTrees
 
 _ABANDONED_S = 1800.0  # a silent trial of another machine is repeated after this time
@@ -75,7 +75,7 @@ class SearchRun:
     run: OpenRun
     truth: TruthTrees
 
-    def evaluate(self, parameters: Parameters, tick: Tick) -> Evaluation:
+    def evaluate(self, parameters: Parameters, tick: Tick) -> MapScores:
         """Map the run and score the map."""
         return self.run.map(parameters, tick).evaluate(self.truth, parameters)
 
@@ -102,7 +102,7 @@ def scores_of(runs: Sequence[SearchRun], parameters: Parameters, tick: Tick = la
     return [score_of(run.evaluate(parameters, tick)) for run in runs]
 
 
-def check_start(run: SearchRun, evaluation: Evaluation, parameters: Parameters) -> None:
+def check_start(run: SearchRun, evaluation: MapScores, parameters: Parameters) -> None:
     """Check that a run can be scored at all.
 
     Raises:

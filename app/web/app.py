@@ -98,9 +98,9 @@ def build(
     dashboard = Dashboard(parameter_state, Broadcast(), AsyncStore(settings.folder, settings.database))
 
     learning = Learning(
-        dashboard.keeper, settings.folder, lambda state: dashboard.live.tell("learning", state)
+        dashboard.store, settings.folder, lambda state: dashboard.live.tell("learning", state)
     )
-    uploads = Uploads(settings.uploads, settings.upload_limit, dashboard.keeper)
+    uploads = Uploads(settings.uploads, settings.upload_limit, dashboard.store)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -118,7 +118,7 @@ def build(
     app = guarded(settings, port=port, token=token, lifespan=lifespan)
     app.state.dashboard, app.state.settings = dashboard, settings
     app.state.fleet_port = None if fleet is None else fleet.port
-    app.state.open_records = fleet.open_records if fleet else lambda: {dashboard.logbook.record}
+    app.state.open_records = fleet.open_records if fleet else lambda: {dashboard.run_recorder.record}
     app.state.uploads, app.state.learning, app.state.limits = uploads, learning, Limits()
     for router in ROUTERS:
         app.include_router(router)

@@ -47,11 +47,11 @@ class Uploads:
     Args:
         folder: Created with the first upload; None refuses uploads.
         limit: Maximum size of a file [bytes].
-        keeper: Access to the store, which records the original names.
+        store: Access to the store, which records the original names.
     """
 
-    def __init__(self, folder: Path | None, limit: int, keeper: AsyncStore) -> None:
-        self._folder, self.limit, self._keeper = folder, limit, keeper
+    def __init__(self, folder: Path | None, limit: int, store: AsyncStore) -> None:
+        self._folder, self.limit, self._store = folder, limit, store
         self._under_way = 0
         self._awaited = 0  # bytes that active uploads have not written yet
 
@@ -104,7 +104,7 @@ class Uploads:
         finally:
             part.unlink(missing_ok=True)
         with contextlib.suppress(StemmapError):  # it is then listed under its generated name
-            await self._keeper.ask(lambda store: store.book.add_upload(made_up, _shown(name), kind, size))
+            await self._store.ask(lambda store: store.book.add_upload(made_up, _shown(name), kind, size))
         return {"uri": str(place), "name": _shown(name), "kind": kind, "bytes": size}
 
     def _free(self) -> int:
@@ -186,14 +186,14 @@ async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 async def _look_at(part: Path, name: str) -> str:
     """Return a description of the file, found by a child process."""
     try:
-        told = await inspection.ask({"ask": "recording", "path": str(part)})
+        found = await inspection.ask({"ask": "recording", "path": str(part)})
     except inspection.TookTooLongError:
         return "not looked through yet"  # a very large file; errors appear when it is opened
     except StemmapError as error:
         # The path is that of the incomplete file; the person knows the original name.
         what, remedy = (text.replace(str(part), name) for text in (error.what, error.remedy))
         raise UploadError(422, what, where=_shown(name), remedy=remedy) from None
-    return str(told["kind"])
+    return str(found["kind"])
 
 
 def _shown(name: str) -> str:

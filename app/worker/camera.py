@@ -1,4 +1,4 @@
-"""Camera picture at the time of a scan; the worker finds it, another process decodes it."""
+"""Camera picture at the time of a scan. The worker finds it; another process decodes it."""
 
 from __future__ import annotations
 
@@ -35,5 +35,5 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
             f"no picture was taken within {SHOWN_NS / 1e9:g} s of this scan",
             remedy="Play on, or go to another scan",
         )
-    received = origin.pictures_told if isinstance(origin, LiveSource) else ""
+    received = origin.picture_counts if isinstance(origin, LiveSource) else ""
     return CameraPicture(picture, *origin.camera(), received)

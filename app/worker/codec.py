@@ -1,8 +1,8 @@
-"""Messages between the two processes: four bytes of length, then msgpack.
+"""Binary messages between the web process and the worker: four bytes with the length, then msgpack.
 
-Arrays travel as their dtype, shape and bytes. Both sides know the types that they expect: a message
-of another type, an array of another dtype or of a size that contradicts its bytes is refused. Nothing
-is ever run or imported because of what a message says, as pickle would.
+An array is encoded as dtype, shape and bytes. Both sides declare the types that they expect: a message of
+another type, an array of another dtype, or an array whose size contradicts its bytes is refused. Unlike
+pickle, a message cannot execute or import code.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ _MOST_DIMENSIONS = 3
 
 
 class WireError(Exception):
-    """A message that is too large, incomplete, or of an unexpected type."""
+    """A message is too large, incomplete, or of an unexpected type."""
 
 
-class _Array(msgspec.Struct, frozen=True, array_like=True):
-    """Encoded array."""
+class _EncodedArray(msgspec.Struct, frozen=True, array_like=True):
+    """An array as it is sent: dtype as in `numpy.dtype.str`, shape, and bytes in C order."""
 
     dtype: str
     shape: tuple[int, ...]
     content: bytes
 
 
-class Channel(Generic[M]):
+class MessageCodec(Generic[M]):
     """Encodes and decodes the messages of one direction.
 
     Args:
@@ -66,7 +66,7 @@ class Channel(Generic[M]):
         """Return the message decoded from its bytes without the length prefix.
 
         Raises:
-            WireError: It is not one of the agreed types.
+            WireError: The bytes are not a message of the declared types.
         """
         try:
             return self._decoder.decode(body)
@@ -77,7 +77,7 @@ class Channel(Generic[M]):
         """Return the next message of a blocking stream; None at its end.
 
         Raises:
-            WireError: The stream ends within a message, or the message is not as agreed.
+            WireError: The stream ends within a message, or the message is not of the declared types.
         """
         head = _read_exactly(stream, LENGTH_BYTES)
         if not head:
@@ -91,7 +91,7 @@ class Channel(Generic[M]):
 
 
 def check_size(size: int) -> None:
-    """Refuse a length before memory is taken for it.
+    """Check the length of a message [bytes] before memory is allocated for it.
 
     Raises:
         WireError: It is larger than LARGEST_MESSAGE.
@@ -100,18 +100,18 @@ def check_size(size: int) -> None:
         raise WireError(f"a message of {size} bytes is larger than {LARGEST_MESSAGE}")
 
 
-def to_worker() -> Channel[ToWorker]:
-    """Return the channel from the web process to the worker."""
-    return Channel(ToWorker)
+def to_worker() -> MessageCodec[ToWorker]:
+    """Return the codec of the messages from the web process to the worker."""
+    return MessageCodec(ToWorker)
 
 
-def from_worker() -> Channel[FromWorker]:
-    """Return the channel from the worker to the web process."""
-    return Channel(FromWorker)
+def from_worker() -> MessageCodec[FromWorker]:
+    """Return the codec of the messages from the worker to the web process."""
+    return MessageCodec(FromWorker)
 
 
 def _read_exactly(stream: BinaryIO, size: int) -> bytes:
-    """Read `size` bytes, or fewer at the end of the stream."""
+    """Read `size` bytes; fewer where the stream ends before."""
     parts: list[bytes] = []
     while size > 0 and (part := stream.read(size)):
         parts.append(part)
@@ -133,7 +133,7 @@ def _to_plain(value: object) -> object:
 def _from_plain(expected: Any, plain: object) -> object:  # noqa: ANN401 - the hook's own signature
     if getattr(expected, "__origin__", None) is not np.ndarray:
         raise NotImplementedError(f"{expected} cannot be received")
-    array = msgspec.convert(plain, _Array)
+    array = msgspec.convert(plain, _EncodedArray)
     want = np.dtype(get_args(get_args(expected)[1])[0])
     if array.dtype not in _DTYPES or np.dtype(array.dtype) != want:
         raise ValueError(f"an array of {array.dtype} where {want.str} was agreed")

@@ -44,7 +44,7 @@ class Cursor:
         self._source = source
         self._synchronise = synchronise
         self._stamps = array("q")
-        self._marks = array("q")
+        self._fingerprints = array("q")
         self._learnt: list[Learnt] = []
         self._next = 0
         self._ahead: Step | None = None
@@ -61,10 +61,8 @@ class Cursor:
         return self._stamps[index]
 
     def index_at(self, stamp_ns: int) -> int | None:
-        """Return the last step not later than a time, or the first step if all are later.
-
-        None if the time may belong to steps that were not read yet.
-        """
+        """Return the index of the last step not later than a time [ns], or 0 if all steps are later; None if
+        the time may belong to a step that was not read yet."""
         if not self._stamps or stamp_ns > self._stamps[-1]:
             return None
         return max(0, bisect_right(self._stamps, stamp_ns) - 1)
@@ -99,15 +97,18 @@ class Cursor:
         self._next += 1
         if step.index == len(self._stamps):
             self._stamps.append(step.scan.stamp_ns)
-            self._marks.append(_mark(step))
+            self._fingerprints.append(_fingerprint(step))
             self._learnt.append(step.learnt)
         return step
 
     def go_to(self, index: int) -> None:
-        """Move to the position before a step, at most `known`.
+        """Move to the position before a step.
+
+        Args:
+            index: Index of the step, at most `known`.
 
         Raises:
-            SourceError: The source does not give the same steps again.
+            SourceError: The source does not return the same steps again.
         """
         if index == self._next and self._failure is None:
             return
@@ -125,30 +126,34 @@ class Cursor:
     def _read(self, start_ns: int | None, after: Learnt | None = None) -> Iterator[Step]:
         return self._synchronise(self._source.records(start_ns), after=after)
 
-    def _resumed(self, anchor: int) -> Iterator[Step] | None:
-        """Return an iterator of the steps after step `anchor`, read from shortly before it; None if that step
-        differs."""
-        stamp_ns = self._stamps[anchor]
+    def _resumed(self, index: int) -> Iterator[Step] | None:
+        """Return an iterator of the steps after step `index`, read from one second before it; None if the
+        step differs from the one that was read first."""
+        stamp_ns = self._stamps[index]
         # Scans of equal time are distinguished by counting.
-        wanted = anchor - bisect_left(self._stamps, stamp_ns)
-        steps = self._read(stamp_ns - _LEAD_IN_NS, self._learnt[anchor])
+        wanted = index - bisect_left(self._stamps, stamp_ns)
+        steps = self._read(stamp_ns - _LEAD_IN_NS, self._learnt[index])
         for step in steps:
             if step.scan.stamp_ns < stamp_ns:
                 continue
             if step.scan.stamp_ns > stamp_ns:
                 return None
             if wanted == 0:
-                return steps if _mark(step) == self._marks[anchor] else None
+                return steps if _fingerprint(step) == self._fingerprints[index] else None
             wanted -= 1
         return None
 
-    def _recounted(self, anchor: int) -> Iterator[Step]:
-        """Return an iterator of the steps after step `anchor`, read from the start."""
+    def _recounted(self, index: int) -> Iterator[Step]:
+        """Return an iterator of the steps after step `index`, read from the start.
+
+        Raises:
+            SourceError: That step differs from the one that was read first.
+        """
         steps = self._read(None)
         for index, step in enumerate(steps):
-            if index == anchor and _mark(step) == self._marks[anchor]:
+            if index == index and _fingerprint(step) == self._fingerprints[index]:
                 return steps
-            if index == anchor:
+            if index == index:
                 break
         raise SourceError(
             "the source does not give the same scans again",
@@ -157,8 +162,9 @@ class Cursor:
         )
 
 
-def _mark(step: Step) -> int:
-    """Return a checksum of the motion and the size of a scan."""
+def _fingerprint(step: Step) -> int:
+    """Return a hash of time, number of points and motion of a step, by which a step that is read again is
+    recognised."""
     return hash(
         (
             step.scan.stamp_ns,
@@ -178,8 +184,8 @@ class LiveCursor:
 
     Args:
         source: The robot; the cursor does not close it.
-        chosen: Source of the motion.
-        moving: The robot with that motion.
+        chosen: Selected source of the motion.
+        moving: The source with that motion, see `with_odometry`.
     """
 
     def __init__(self, source: LiveSource, chosen: ChosenOdometry, moving: Source) -> None:
@@ -200,22 +206,22 @@ class LiveCursor:
         return self._stamps[index]
 
     def index_at(self, stamp_ns: int) -> None:
-        """Return None, since a live run has no seeking."""
+        """Return None, because a live run cannot seek."""
         del stamp_ns
 
     def peek(self) -> Step | None:
         """Return the next step without advancing; None if it has not arrived.
 
         Raises:
-            SourceError: What comes cannot be read.
+            SourceError: A message cannot be read.
         """
         while not self._ready:
             records = self._source.take()
             if not records:
                 return None
             for record in records:
-                for told in (record,) if self._moving is None else self._moving.pass_on(record):
-                    self._synchroniser.add(told)
+                for joined in (record,) if self._moving is None else self._moving.pass_on(record):
+                    self._synchroniser.add(joined)
                 self._ready.extend(self._synchroniser.ready())
         return self._ready[0]
 
@@ -223,7 +229,7 @@ class LiveCursor:
         """Return the next step and advance; None if it has not arrived.
 
         Raises:
-            SourceError: What comes cannot be read.
+            SourceError: A message cannot be read.
         """
         step = self.peek()
         if step is None:
@@ -233,10 +239,10 @@ class LiveCursor:
         return step
 
     def go_to(self, index: int) -> None:
-        """Accept only the current position, since a live run cannot go back.
+        """Check that `index` is the current position, because a live run cannot go back.
 
         Raises:
-            SourceError: Another is asked for.
+            SourceError: It is another position.
         """
         if index != self.known:
             raise SourceError(

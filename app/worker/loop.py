@@ -1,6 +1,5 @@
-"""Main loop of the mapping process: it takes commands between two scans, keeps the time of the replay, and
-sends results to the web process.
-"""
+"""Main loop of the mapping process: executes commands between two scans, keeps the time of the replay, and
+sends results to the web process."""
 
 from __future__ import annotations
 
@@ -76,10 +75,10 @@ class WorkerLoop:
 
     Args:
         session: The session with the run.
-        commands: Commands; another thread fills the queue. None ends the loop.
-        put: Sends a message to the web process without waiting.
-        clock: Returns seconds from any start.
-        recent: The frames that were sent last, for questions about them.
+        commands: Queue that another thread fills; None ends the loop.
+        put: Queues a message to the web process; must not block.
+        clock: Returns the time [s] from any origin.
+        recent: Frames that were sent recently, to which questions refer.
     """
 
     def __init__(
@@ -109,7 +108,7 @@ class WorkerLoop:
         self._at_once = 1
 
     def run(self) -> None:
-        """Take commands and map scans until the command None comes."""
+        """Execute commands and map scans until the command None."""
         self._report()
         while True:
             try:
@@ -128,7 +127,12 @@ class WorkerLoop:
                 self._obey(command)
 
     def _next_command(self) -> ToWorker | None:
-        """The next command; the last one of successive parameter changes, as of a slider that moves."""
+        """Return the next command, and wait for it until the next scan is due. Of successive parameter
+        changes (a slider drag) the last one is returned.
+
+        Raises:
+            queue.Empty: A scan is due.
+        """
         if not self._taken:
             self._taken.append(self._commands.get(timeout=self._patience()))
         with contextlib.suppress(queue.Empty):
@@ -142,7 +146,7 @@ class WorkerLoop:
         return command
 
     def _patience(self) -> float | None:
-        """Seconds until the next scan is due; None when only a command can start work."""
+        """Return the time until the next scan is due [s]; None if only a command can start work."""
         pace = self._session.pace
         if self._session.is_remapping:
             return 0.0
@@ -156,7 +160,7 @@ class WorkerLoop:
         return 0.0 if stamp_ns is None else self._replay.delay(stamp_ns, self._clock())
 
     def _map(self) -> None:
-        """Do the next piece of work: rerun, live messages, preparation or a scan."""
+        """Do the next piece of work: part of a rerun, live messages, preparation, or a scan."""
         if self._session.is_remapping:
             if self._mapped >= _SCANS_A_REMAP or not self._is_due():
                 self._mapped = 0
@@ -180,14 +184,14 @@ class WorkerLoop:
             return
         self._glimpse_at = now + _GLIMPSE_S
         self._show(self._session.frame)
-        standing = self._session.pace == "idle"
-        if standing:
+        current = self._session.pace == "idle"
+        if current:
             self._report()
         else:
             self._report_when_due(now)
 
     def _is_due(self) -> bool:
-        """Whether a scan is due now."""
+        """Return whether a scan is due now."""
         pace = self._session.pace
         if pace == "idle":
             return False
@@ -197,7 +201,7 @@ class WorkerLoop:
         return not self._prepared or stamp_ns is None or self._replay.delay(stamp_ns, self._clock()) <= 0.0
 
     def _remap(self) -> None:
-        """Go on with a rerun in the time between two scans, or while the run is paused."""
+        """Continue a rerun for up to `_REMAP_S`, and send the new map when the rerun is complete."""
         begun = self._clock()
         while True:
             asked = self._clock()
@@ -223,7 +227,8 @@ class WorkerLoop:
             self._report()
 
     def _listen(self) -> None:
-        """No scan of a live source waits: open the run once its first messages are here."""
+        """Process the messages of a live source while no scan is queued. The run is opened with the first
+        ones."""
         opened = self._session.listen()
         if opened is not None:
             self._tell_opened(opened)
@@ -295,7 +300,7 @@ class WorkerLoop:
             self._session.advance(1)
 
     def _prepare(self) -> None:
-        """Compile kernels before the first scan; at opening the parameters are not known yet."""
+        """Compile kernels before the first scan. At opening, the parameters are not known yet."""
         self._tell(self._preparing(), self._clock())
         self._prepared = True
         self._session.prepare()
@@ -306,7 +311,7 @@ class WorkerLoop:
         return replace(self._session.status(), state="starting", detail="Preparing the mapper")
 
     def compiling(self) -> None:
-        """Report that work waits for a kernel that is compiled; called during the compilation."""
+        """Report that the mapping waits for the compilation of a kernel; called during the compilation."""
         self._session.disturb()
         now = self._clock()
         if now > self._compiled_at + _COMPILES_ON_S:
@@ -360,7 +365,8 @@ class WorkerLoop:
         return behind if status.scans is None else min(behind, status.scans - 1 - status.scan_index)
 
     def _guarded(self, work: Callable[[], T]) -> T | None:
-        """Do some work. An error becomes the state "failed"; the process goes on."""
+        """Return the result of `work`. After an error, return None and set the state "failed"; the process
+        continues."""
         try:
             return work()
         except StemmapError as error:
@@ -380,7 +386,8 @@ class WorkerLoop:
 
 
 def answer(session: Session, recent: RecentScans, question: Question, run: int) -> Answer:
-    """Return the answer to a question, or why there is none. A question never changes the run.
+    """Return the answer to a question, or an answer with the reason why there is none. The run does not
+    change.
 
     Args:
         session: Session of the run.
@@ -426,9 +433,10 @@ LONGEST_DELAY_S = 3600.0
 
 
 class ReplayClock:
-    """Replays at a factor of real time. No scan is skipped; `behind` counts the scans that are late.
+    """Replay times at a factor of real time. No scan is skipped; `behind` counts the scans that are late.
 
-    Times of the computer are seconds from any start; times of the data are nanoseconds.
+    The anchor is a scan with the time at which it was shown; the due times of later scans follow from it.
+    Parameters `now` are times of the computer [s] from any origin; times of the data are nanoseconds.
     """
 
     def __init__(self) -> None:
@@ -438,7 +446,7 @@ class ReplayClock:
 
     @property
     def speed(self) -> float:
-        """Factor of real time, at least `SLOWEST`; 0 is as fast as possible."""
+        """Factor of real time, at least `SLOWEST`; 0 is the maximum speed."""
         return self._speed
 
     @speed.setter
@@ -446,17 +454,18 @@ class ReplayClock:
         self._speed = 0.0 if factor == 0.0 else max(factor, SLOWEST)
 
     def anchor(self, stamp_ns: int, now: float) -> None:
-        """Count the scan of `stamp_ns` as shown at `now`; later scans follow from there."""
+        """Make the scan of `stamp_ns`, shown at `now`, the anchor."""
         self._anchor = (stamp_ns, now)
         self._mapped.clear()
 
     def release(self) -> None:
-        """Let the next scan be the anchor: after a pause, a jump or a change of speed."""
+        """Make the next scan the anchor: after a pause, a jump or a change of speed."""
         self._anchor = None
         self._mapped.clear()
 
     def delay(self, stamp_ns: int, now: float) -> float:
-        """Seconds until the scan of `stamp_ns` is due, at most `LONGEST_DELAY_S`; 0 when it is late."""
+        """Return the time until the scan of `stamp_ns` is due [s], at most `LONGEST_DELAY_S`; 0 if it is
+        late. Without an anchor, the scan becomes the anchor."""
         if self.speed == 0.0:
             return 0.0
         if self._anchor is None:
@@ -464,11 +473,11 @@ class ReplayClock:
         return min(max(0.0, self._due(stamp_ns) - now), LONGEST_DELAY_S)
 
     def mapped(self, stamp_ns: int, now: float) -> None:
-        """Note that a scan was mapped now."""
+        """Record that the scan of `stamp_ns` was mapped at `now`."""
         self._mapped.append((stamp_ns, now))
 
     def behind(self, now: float) -> int:
-        """Number of scans that are due and not mapped yet."""
+        """Return the number of scans that are due at `now` and not mapped yet."""
         if self.speed == 0.0 or self._anchor is None or len(self._mapped) < 2:
             return 0
         first, last = self._mapped[0][0], self._mapped[-1][0]
@@ -478,7 +487,8 @@ class ReplayClock:
 
     @property
     def rate_hz(self) -> float:
-        """Scans mapped per second of the computer's time, over the last scans; 0 when the run stands."""
+        """Scans mapped per second of computing time, over the last `RATE_SCANS` scans; 0 with fewer than
+        two."""
         if len(self._mapped) < 2:
             return 0.0
         spent = self._mapped[-1][1] - self._mapped[0][1]

@@ -68,14 +68,15 @@ def changes_between(
     time_s: float,
     confirmed_s: Mapping[int, float],
 ) -> MapChanges:
-    """Compare two maps of the same scans.
+    """Return the differences between two maps of the same scans.
 
     Args:
-        before, after: The last scan of each.
-        shown: The same of the map that was shown last.
-        revision: Of the parameters of `after`.
-        time_s: Of both frames, since the run's first scan.
-        confirmed_s: When each tree on the way to `after` was confirmed.
+        before: Last scan in the old map.
+        shown: The same scan in the map that was shown last.
+        after: The same scan in the new map.
+        revision: Revision of the parameters of the new map.
+        time_s: Time of the scan [s since the first scan].
+        confirmed_s: Time at which each tree of the new map was confirmed, by its number [s].
     """
     old, new = np.flatnonzero(before.trees.confirmed), np.flatnonzero(after.trees.confirmed)
     old_at, new_at = before.trees.position[old], after.trees.position[new]
@@ -111,7 +112,7 @@ def changes_between(
 
 
 def _renamed(before: Trees, after: Trees) -> list[tuple[int, int]]:
-    """Old and new number of each tree of a map that is in another one too."""
+    """Return old and new number of each tree that is in both maps."""
     old, new = np.flatnonzero(before.confirmed), np.flatnonzero(after.confirmed)
     old_of = match(after.position[new], before.position[old], SAME)
     return [
@@ -166,7 +167,8 @@ def _column(columns: Columns, row: int) -> str:
 
 
 def _nearest(places: Float, place: Float) -> int:
-    """The row of the nearest place within reach, -1 where there is none."""
+    """Return the row of the nearest of some positions, shape (K, 2), to a position, shape (2,); -1 if none is
+    within SAME."""
     if not len(places):
         return -1
     distance = np.hypot(*(places - place).T)

@@ -15,10 +15,10 @@ def mapper_of(
     """Return a mapper before the first scan of a source.
 
     Args:
-        source: Description with the sensor and its mounting.
+        source: Description with the sensor and its extrinsics.
         parameters: Parameters of the mapper.
         seed: Random seed.
-        timer: See `Mapper`.
+        timer: Measures the stages, see `Mapper`.
     """
     return Mapper(
         parameters,

@@ -31,7 +31,8 @@ _POLL_S = 0.2
 
 
 def compile_ahead() -> None:
-    """Compile the kernels of the mapper in two processes, unless they are cached already.
+    """Compile the kernels of the mapper in two processes, unless they are cached already. Without a second
+    core nothing is done.
 
     Kernels that remain uncompiled are compiled at their first call.
     """
@@ -75,9 +76,10 @@ def _compile() -> None:
 
 @contextlib.contextmanager
 def _one_at_a_time() -> Iterator[None]:
-    """Hold the lock that lets one process of a user compile at a time; the next one then finds the cache.
+    """Hold the lock with which only one process of a user compiles at a time; the next one then finds the
+    cache.
 
-    Without a folder for the lock or file locks on this system, no process waits.
+    Without a folder for the lock, or without file locks on this system, no process waits.
     """
     from pipeline.jit import others_compile
 
@@ -103,7 +105,8 @@ _SCENE = "sim:stand?duration=1"
 
 
 def warm_up() -> None:
-    """Map one second of a simulated stand; the first time on a machine this takes minutes."""
+    """Compile or load all kernels of the mapper by mapping one second of a simulated stand. The first time on
+    a machine this takes minutes."""
     from pipeline.io.readers import open_source
     from pipeline.odometry.synchroniser import steps
 
@@ -115,8 +118,11 @@ def warm_up() -> None:
 
 
 def warm_front_end() -> None:
-    """Segment the scans of that second, cache them, and integrate them into columns and terrain at the poses
-    of the odometry: all of the mapper but SLAM and the Kalman filters of the trees."""
+    """Compile the kernels of all stages except SLAM and the Kalman filters of the trees.
+
+    The scans of `_SCENE` are segmented, cached, and integrated into voxel columns and terrain at the poses of
+    the odometry.
+    """
     from contextlib import closing
 
     from pipeline.classification import ColumnClassifier, ScanView
@@ -158,7 +164,8 @@ def warm_front_end() -> None:
 
 
 def warm_tree_map() -> None:
-    """Map detected stems, and compute a preview: SLAM and the Kalman filters of the trees."""
+    """Compile the kernels of SLAM, of the Kalman filters of the trees and of the preview, by mapping
+    simulated stems."""
     from pipeline.classification import no_columns
     from pipeline.config import preset
     from pipeline.geometry.poses import Pose3

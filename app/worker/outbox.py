@@ -30,17 +30,17 @@ class Outbox:
     the same. Other messages are sent in order; beyond MOST_MESSAGES the oldest is dropped. After `Opened`, no
     frame of an older run is sent. The status of a paused or finished run is sent after its frame, so that the
     web process never knows the time of a scan that it cannot show. A message that cannot be sent is dropped,
-    and the status reports it.
+    and the status has a warning.
 
     Args:
-        stream: Output stream, which is not closed here.
+        stream: Output stream; it is not closed here.
         recent: Stores the frames that are sent.
     """
 
     def __init__(self, stream: BinaryIO, recent: RecentScans | None = None) -> None:
         self._stream = stream
         self._recent = recent or RecentScans()
-        self._channel = from_worker()
+        self._codec = from_worker()
         self._changed = threading.Condition()
         self._messages: deque[FromWorker] = deque()
         self._picture: Shown | None = None
@@ -55,7 +55,7 @@ class Outbox:
         self._thread.start()
 
     def put(self, message: FromWorker) -> None:
-        """Send a message; of several frames only the newest one."""
+        """Queue a message. Of several waiting frames only the newest one is sent."""
         with self._changed:
             if isinstance(message, Shown):
                 self._picture = message
@@ -71,7 +71,11 @@ class Outbox:
             self._changed.notify()
 
     def close(self, timeout_s: float = 0.3) -> None:
-        """Send the waiting messages and end the thread."""
+        """Send the waiting messages and end the thread.
+
+        Args:
+            timeout_s: Maximum time to wait for the thread [s].
+        """
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -87,14 +91,15 @@ class Outbox:
             return  # the web process is gone; the reader of commands ends the worker
 
     def _packed(self, message: FromWorker) -> list[bytes]:
-        """Return the encoded message, or an encoded status that reports that it cannot be sent."""
+        """Return the encoded message; if it cannot be encoded, the encoded status with a warning, or nothing
+        before the first status."""
         try:
-            return [self._channel.encode(self._made_ready(message))]
+            return [self._codec.encode(self._made_ready(message))]
         except WireError as error:
             if isinstance(message, Shown):
                 self._sent_path = self._sent_ground = None  # what was in it did not arrive
             self._refused = f"a picture could not be shown: {error}"
-            return [] if self._report is None else [self._channel.encode(self._with_refusal(self._report))]
+            return [] if self._report is None else [self._codec.encode(self._with_refusal(self._report))]
 
     def _made_ready(self, message: FromWorker) -> FromWorker:
         if isinstance(message, Shown):

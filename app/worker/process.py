@@ -1,9 +1,7 @@
 """The process that owns the source and the mapper: `python -m app.worker.process [FOLDER]`.
 
-The scan cache is kept in the folder.
-
-Commands come on stdin, messages go to stdout; both as app.worker.codec says. It ends when stdin ends, so it
-never outlives the web process.
+The scan caches are stored in the folder. Commands arrive on stdin and messages are written to stdout, both
+encoded by `app.worker.codec`. The process ends when stdin ends, so it never outlives the web process.
 """
 
 from __future__ import annotations
@@ -35,10 +33,11 @@ _GRACE_S, _LIVE_GRACE_S = 1.0, 9.0
 
 
 def new_session(folder: Path | None = None) -> Session:
-    """A session on the real pipeline, for the worker and for commands that map in process.
+    """Return a session that uses the real pipeline, for the worker and for commands that map in this process.
 
     Args:
-        folder: Where what scans show is kept for the next opening of a recording; None keeps nothing.
+        folder: Folder of the scan caches, which the next opening of a recording uses again; None for
+            temporary caches.
     """
     from app.sources.opening import open_any
     from app.worker.mapper_factory import mapper_of
@@ -59,7 +58,13 @@ def new_session(folder: Path | None = None) -> Session:
 
 
 def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
-    """Drive a session by the commands of a stream until it ends."""
+    """Execute the commands of a stream with a session until the stream ends.
+
+    Args:
+        session: The session.
+        incoming: Stream of encoded commands.
+        outgoing: Stream for encoded messages.
+    """
     commands: queue.Queue[ToWorker | None] = queue.Queue()
     finished = threading.Event()
     reader = threading.Thread(target=_read, args=(incoming, commands, finished, session), daemon=True)
@@ -95,7 +100,8 @@ def _read(
 
 
 def run_as_worker(session: Session) -> None:
-    """Be the worker of the web process that started this one, until it closes our input."""
+    """Run this process as the worker of the web process that started it, until stdin ends; does not
+    return."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
     incoming, outgoing = private_streams()
     work(session, incoming, outgoing)

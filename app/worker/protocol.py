@@ -28,33 +28,34 @@ class Status:
     """Status of the run. Times are seconds since the first scan of the run.
 
     Attributes:
-        state: "waiting" is a live source from which nothing comes; "failed" says why in `detail`.
-        detail: What happened, what it means, what to do; empty when all is well.
-        source: The URI.
-        kind: The source's format in words.
-        odometry: Where the motion comes from, in words.
-        time_s, end_s: Of the standing scan, and of the last scan where it is known.
-        scan_index: Of the standing scan, -1 before the first.
-        scans: Number of scans in the run, None where it is not known.
-        speed: Factor of real time.
-        scan_rate_hz, mapping_ms: Measured over the last scans.
+        state: "waiting" means that a live source sends nothing; the reason of "failed" is in `detail`.
+        detail: What happened, what it means, and what to do; empty without a problem.
+        source: URI of the source.
+        kind: Name of the format of the source.
+        odometry: Description of the source of motion.
+        time_s, end_s: Time of the current scan, and of the last scan if it is known.
+        scan_index: Index of the current scan, -1 before the first.
+        scans: Number of scans in the run, None if unknown.
+        speed: Playback speed as a factor of real time.
+        scan_rate_hz, mapping_ms: Rate and mapping time, measured over the last scans.
         stage_ms: Median time of each stage over the last scans.
-        scans_behind: Scans that wait to be mapped.
-        trees: Confirmed trees.
-        distance_m: Distance driven.
-        health: "good", "weak" or "lost", or why it is too soon to say (see `health_word`).
-        warnings: The newest last, each once.
-        revision: Of the parameters in force.
-        going_to: The sought time or scan in words while it is not reached yet, else empty.
-        going_to_s: The sought time where it is known, else None.
-        going_far: Whether the way there takes long enough to speak of it.
+        scans_behind: Number of scans that wait to be mapped.
+        trees: Number of confirmed trees.
+        distance_m: Driven distance.
+        health: Pose quality "good", "weak" or "lost", or why it is too early to know (see `health_word`).
+        warnings: Warnings, each once, the newest last.
+        revision: Revision of the parameters in force.
+        going_to: Description of the sought time or scan until it is reached; empty otherwise.
+        going_to_s: Sought time if it is known, else None.
+        going_far: Whether the seek takes so long that the page shows it.
         live: Whether the source is live.
-        robot: Its namespace, empty for none.
-        robots: The namespaces of all robots on its network that publish scans.
-        compiling_since_s: When this machine began to compile what it does now [Unix time], else None.
-        remapped: How much of the run is mapped again (see `SetParameters`), from 0 to 1; None when it is not.
-        camera: Whether there are pictures of a camera.
-        recording: Where a live run is recorded to, or why it is no more; empty where it is not.
+        robot: Namespace of the robot, empty for none.
+        robots: Namespaces of all robots on the network that publish scans.
+        compiling_since_s: Start of the present compilation of kernels [s since 1970], None without one.
+        remapped: Share of the run that is mapped again (see `SetParameters`), from 0 to 1; None without a
+            rerun.
+        camera: Whether the source has camera pictures.
+        recording: State of the recording of a live run; empty without one.
     """
 
     state: State
@@ -117,10 +118,13 @@ class SetSpeed(msgspec.Struct, frozen=True, tag="set_speed"):
 class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
     """Set parameters, given as validated nested values.
 
-    They apply from the next scan onwards or, if paused, to the current scan. With `whole`, the run is mapped
-    again from its first scan.
+    They apply from the next scan onwards or, if the run is paused, from the current scan onwards. With
+    `whole`, the run is mapped again from its first scan.
 
     Attributes:
+        values: All values by stage and name.
+        revision: Number of the revision, which results repeat.
+        whole: Whether to map the run again.
         step: Changes with the same step (a slider drag) are compared with the map before the first of them;
             None is a step of its own.
     """
@@ -221,7 +225,7 @@ class Begin(msgspec.Struct, frozen=True, tag="begin"):
 
 
 class _Question(msgspec.Struct, frozen=True):
-    """A question about the run.
+    """A question about the run, answered by an `Answer` with the same ticket.
 
     Attributes:
         ticket: Identifier that the answer repeats.
@@ -264,10 +268,10 @@ class AskCompare(_Question, frozen=True, tag="ask_compare"):
 
 
 class AskCamera(_Question, frozen=True, tag="ask_camera"):
-    """Request the camera picture.
+    """Request the camera picture of the run nearest to a time.
 
     Attributes:
-        stamp_ns: Approximate time of the picture [ns].
+        stamp_ns: The time [ns].
     """
 
     stamp_ns: int
@@ -280,13 +284,13 @@ class CameraPicture(msgspec.Struct, frozen=True):
         picture: Encoded picture.
         camera: Camera model and pose, None if unknown.
         why: Reason why the camera model is unknown; empty otherwise.
-        told: Number of received pictures of a live run as text; empty for a recording.
+        received: Number of received pictures of a live run as text; empty for a recording.
     """
 
     picture: Picture
     camera: Camera | None
     why: str
-    told: str = ""
+    received: str = ""
 
 
 class Answer(msgspec.Struct, frozen=True, tag="answer"):

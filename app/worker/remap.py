@@ -1,4 +1,5 @@
-"""The run mapped again with other parameters: a few scans at a time, while the run is paused or plays."""
+"""Remapping: the run is mapped again with other parameters, a few scans at a time, while it is paused or
+plays."""
 
 from __future__ import annotations
 
@@ -26,7 +27,7 @@ NS = 1_000_000_000
 
 
 class MapperLike(Protocol):
-    """The part of `pipeline.mapper.Mapper` that a run uses; its state is opaque here."""
+    """The part of `pipeline.mapper.Mapper` that a run uses. The type of its snapshots is opaque here."""
 
     parameters: Parameters
 
@@ -38,14 +39,14 @@ class MapperLike(Protocol):
 
 
 @dataclass(slots=True)
-class RunRecord:
-    """Record of the mapped scans: what the map itself does not hold.
+class RunHistory:
+    """What the map itself does not hold about the mapped scans.
 
     Attributes:
         history: Estimate of each tree over time.
         confirmed_s: Time at which each tree was first confirmed, by its number [s since the first scan].
         clusters: Clusters of all scans.
-        time_s: Time of the last scan in the record.
+        time_s: Time of the last added scan [s since the first scan].
     """
 
     history: TreeHistory = field(default_factory=TreeHistory)
@@ -54,8 +55,13 @@ class RunRecord:
     time_s: float = -math.inf
 
     def add(self, frame: Frame, start_ns: int) -> None:
-        """Add a scan of a run whose first scan has the time `start_ns`. The record of this scan and of later
-        ones is replaced, because the run went back."""
+        """Add the results of a scan. If the run went back, the entries of this scan and of later ones are
+        replaced.
+
+        Args:
+            frame: Results of the scan.
+            start_ns: Time of the first scan of the run [ns].
+        """
         self.history.record(frame, start_ns)
         self.clusters.record(frame)
         time_s = (frame.stamp_ns - start_ns) / NS
@@ -68,25 +74,30 @@ class RunRecord:
 
 @dataclass(slots=True, eq=False)
 class RunMap:
-    """A map of the scans of a run, with what is needed to go on from it and to go back in it.
+    """A map of the scans of a run, with the states from which it can continue and to which it can return.
 
     Attributes:
-        parameters: Parameters that each scan was mapped with.
+        parameters: Parameters with which each scan was mapped.
         mapper: The mapper.
         snapshots: Earlier states of the mapper.
-        record: Record of the mapped scans.
+        record: History of the mapped scans.
         before: State of the mapper before the current scan; None before the first.
     """
 
     parameters: ParameterHistory
     mapper: MapperLike
     snapshots: Snapshots[Any]
-    record: RunRecord = field(default_factory=RunRecord)
+    record: RunHistory = field(default_factory=RunHistory)
     before: Any = None
 
     @classmethod
     def fresh(cls, mapper: MapperLike, parameters: Parameters) -> RunMap:
-        """A map without scans."""
+        """Return a map without scans.
+
+        Args:
+            mapper: A mapper before its first scan.
+            parameters: Parameters from the first scan onwards.
+        """
         return cls(ParameterHistory(parameters), mapper, Snapshots(mapper.snapshot()))
 
 
@@ -107,8 +118,12 @@ class Remapping:
         self._start_ns = start_ns
 
     def work(self, scans: int, until: int) -> bool:
-        """Map up to `scans` scans, until `until` are mapped; returns whether they are. Where the run went
-        back meanwhile, the rerun goes back as well.
+        """Map more scans; return whether `until` scans are mapped. If the run went back meanwhile, the rerun
+        goes back as well.
+
+        Args:
+            scans: Maximum number of scans to map now.
+            until: Number of scans that the complete rerun has.
 
         Raises:
             StemmapError: A scan cannot be read again.
@@ -123,7 +138,7 @@ class Remapping:
         return rerun.done == until
 
     def finish(self) -> RunMap:
-        """The new map. No more scans are mapped."""
+        """End the rerun and return the new map."""
         self.rerun.close()
         self.map.before = self.rerun.mapper.snapshot()
         return self.map
@@ -131,16 +146,16 @@ class Remapping:
 
 @dataclass(slots=True)
 class MapComparison:
-    """The map before a change of parameters, with which the new map is compared.
+    """Keeps the map before a change of parameters, with which the new map is compared.
 
-    Changes of one step, as of a slider that is held, are compared with the map before the first of them.
+    Changes of one step (a slider drag) are compared with the map before the first of them.
     """
 
     _step: int | None = None
     _before: Frame | None = None
 
     def begin(self, step: int | None) -> None:
-        """A change of parameters belongs to this step; None is a step of its own."""
+        """Begin a change of parameters that belongs to a step; None is a step of its own."""
         if step is None or step != self._step:
             self._before = None
         self._step = step
@@ -148,14 +163,14 @@ class MapComparison:
     def changes(
         self, shown: Frame, new: Frame, revision: int, time_s: float, confirmed_s: dict[int, float]
     ) -> MapChanges:
-        """Differences between the map before the step and the new one.
+        """Return the differences between the map before the step and the new map.
 
         Args:
-            shown: The current scan with the map so far.
+            shown: The current scan with the present map.
             new: The same scan with the new map.
-            revision: Revision of the parameters.
+            revision: Revision of the parameters of the new map.
             time_s: Time of the scan [s since the first scan].
-            confirmed_s: When each tree of the new map was confirmed [s].
+            confirmed_s: Time at which each tree of the new map was confirmed, by its number [s].
         """
         if self._before is None or self._before.index != new.index:  # the run went on, or elsewhere
             self._before = shown
@@ -196,7 +211,12 @@ class Snapshots(Generic[S]):
         self._spacing = _SPACING
 
     def offer(self, scans: int, state: S) -> None:
-        """Store a state if it is due."""
+        """Store a state if `is_due`.
+
+        Args:
+            scans: Number of scans that the state contains.
+            state: The state.
+        """
         if not self.is_due(scans):
             return
         self._states[scans], self._sizes[scans] = state, nbytes(state)
@@ -231,18 +251,26 @@ class ParameterHistory:
         self._sets = [parameters]
 
     def at(self, index: int) -> Parameters:
-        """Return the parameters with which a scan was or will be mapped."""
+        """Return the parameters with which the scan with this index was or will be mapped."""
         return self._sets[bisect_right(self._starts, index) - 1]
 
-    def were_always(self, parameters: Parameters, aside: set[str]) -> bool:
-        """Return whether every scan was mapped with these values, except those of some stages."""
+    def apply_to_all(self, parameters: Parameters, aside: set[str]) -> bool:
+        """Return whether every scan was mapped with these values.
+
+        Args:
+            parameters: The values.
+            aside: Stages that are not compared.
+        """
         wanted = parameters.model_dump(exclude=aside)
         return all(known.model_dump(exclude=aside) == wanted for known in self._sets)
 
     def set_from(self, index: int, parameters: Parameters) -> bool:
-        """Set the parameters from a scan onwards and return whether any value changes.
+        """Set the parameters from a scan onwards. Return whether any value changes; if not, the results of
+        later scans remain valid.
 
-        Without a change, the results of later scans remain valid.
+        Args:
+            index: Index of the scan.
+            parameters: The parameters.
         """
         if self.at(index) == parameters and self._starts[-1] <= index:
             return False
@@ -260,10 +288,10 @@ AHEAD = 4  # scans that are segmented ahead of the mapping; more only take memor
 
 
 def segment_ahead(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Step, SegmentedScan]]:
-    """Each step with its segmented scan, in order. An error is raised in the turn of its scan.
+    """Yield each step with its segmented scan, in order.
 
-    The caller reads the steps, so that the source is read by one thread only. Another thread segments up to
-    `AHEAD` scans ahead.
+    The caller's thread reads the steps; another thread segments up to `AHEAD` scans ahead. An exception of
+    `segment` is raised when its scan is due.
     """
     waiting: deque[tuple[Step, Future[SegmentedScan]]] = deque()
     pool = ThreadPoolExecutor(1, thread_name_prefix="segment")
@@ -280,6 +308,6 @@ def segment_ahead(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Ste
 
 
 def segment_all(segment: Segment, steps: list[Step]) -> list[SegmentedScan]:
-    """Some segmented scans; two threads work at them."""
+    """Return the segmented scan of each step; two threads segment them."""
     with ThreadPoolExecutor(2, thread_name_prefix="segment") as pool:
         return list(pool.map(segment, steps))

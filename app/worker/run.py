@@ -1,7 +1,7 @@
-"""One opened source with its mapper: maps scan after scan, and goes back to any scan.
+"""One opened source with its mapper: maps scan after scan, and returns to any scan.
 
-The picture of a scan depends on the source, the seed and the parameters that each scan up to it was
-mapped with, and on nothing else: not on pauses, jumps, or which states happen to be kept.
+The result of a scan depends only on the source, the seed and the parameters with which each scan up to it was
+mapped. It does not depend on pauses, jumps, or which states of the mapper are kept.
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ Remake = Callable[[Parameters], MapperLike]
 
 
 class Run:
-    """A source, from its first scan to the current one.
+    """A source, mapped from its first scan to the current one.
 
     Args:
-        source: What is mapped; `close` closes it.
-        mapper: A fresh mapper for this source.
+        source: The source; `close` closes it.
+        mapper: A mapper of this source before its first scan.
         cursor: Reads the steps of the source.
-        parameters: Parameters in force from the first scan onwards.
-        stopwatch: Times of the stages; the mapper measures with it.
-        odometry: Source of the motion, in words.
-        remake: Returns a fresh mapper for this source, so that the run can be mapped again.
+        parameters: Parameters from the first scan onwards.
+        stopwatch: Measures the stages of the mapper.
+        odometry: Description of the source of motion.
+        remake: Returns a new mapper of this source for parameters; None if the run cannot be mapped again.
         reread: Returns the steps from the first scan; None for a live run.
         caches: Caches of the segmented scans of this source.
 
     Attributes:
         frame: Result of the current scan; None before the first.
-        standing: Number of the current scan; -1 before the first.
-        is_bare: Whether the frame lacks its points, see `map_next`.
+        current: Index of the current scan; -1 before the first.
+        is_bare: Whether the frame has no points, see `map_next`.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Run:
         self.odometry = odometry
         self.stopwatch = stopwatch
         self.frame: Frame | None = None
-        self.standing = -1
+        self.current = -1
         self.is_bare = False
         self._cursor = cursor
         self._map = RunMap.fresh(mapper, parameters)
@@ -92,13 +92,14 @@ class Run:
         return self._map.record.history
 
     def confirmed_s(self, trees: Trees) -> Float:
-        """When each tree was first confirmed [s since the first scan], shape (T,); NaN where it was not."""
+        """Return the time at which each tree was first confirmed [s since the first scan], shape (T,); NaN
+        for trees that never were."""
         known = self._map.record.confirmed_s
         return np.array([known.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
 
     @property
     def start_ns(self) -> int:
-        """Time of the run's first scan; 0 before anything is known of it."""
+        """Time of the first scan of the run [ns]; 0 before it is known."""
         known = self.source.description.start_ns
         if known is not None:
             return known
@@ -110,16 +111,17 @@ class Run:
         return self._map.mapper.path
 
     def peek_ns(self) -> int | None:
-        """Time of the next scan, None at the end."""
+        """Return the time of the next scan [ns]; None at the end of the run, or before a live scan
+        arrived."""
         step = self._cursor.peek()
         return None if step is None else step.scan.stamp_ns
 
     def map_next(self, *, hurried: bool = False) -> Frame | None:
-        """Map the next scan; returns None at the end of the run.
+        """Map the next scan and return its result; None at the end of the run.
 
         Args:
-            hurried: Whether to take the segmented scan from the cache where it is there. The frame then has
-                no points (`is_bare`).
+            hurried: Whether to use the cached segmented scan if there is one. The frame then has no points
+                (`is_bare`).
         """
         step = self._cursor.take()
         if step is None:
@@ -129,17 +131,18 @@ class Run:
         return self._map_step(step, hurried=hurried)
 
     def map_again(self) -> Frame | None:
-        """Map the current scan once more, from the state before it; returns None if there is none."""
+        """Map the current scan again, from the state before it, and return its result; None without a
+        scan."""
         if self._step is None or self._broken:
             return None
         self._map.mapper.restore(self._map.before)
         return self._map_step(self._step)
 
     def map_with(self, sets: Sequence[Parameters]) -> list[Frame]:
-        """The current scan as mapped with each set of parameters; the run stays as it is.
+        """Return the current scan mapped with each set of parameters. The run does not change.
 
         Raises:
-            StemmapError: There is no scan to map, or a set cannot be mapped with.
+            StemmapError: There is no scan, or a set cannot be used.
         """
         if self._step is None or self._broken:
             raise StemmapError("no scan is mapped yet", remedy="Play, pause and ask again")
@@ -168,7 +171,7 @@ class Run:
         with self.stopwatch.whole_scan():
             self.frame = self._process(mapper, step, hurried=hurried)
         self._broken = False
-        self._step, self.standing = step, step.index
+        self._step, self.current = step, step.index
         self._sample.offer(step)
         self._map.record.add(self.frame, self.start_ns)
         return self.frame
@@ -183,10 +186,10 @@ class Run:
         return mapper.process(step, scan)
 
     def remap(self, parameters: Parameters) -> None:
-        """Begin to map the run again from its first scan; an earlier beginning is given up. Nothing begins
-        where the map would be the same."""
-        self.stay()
-        if self._map.parameters.were_always(parameters, NOT_OF_THE_MAP):
+        """Begin to map the run again from its first scan, in place of a rerun that is not complete. Nothing
+        begins if the map would not change."""
+        self.cancel_remapping()
+        if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
             return
         mapper = self._remake(parameters) if self._remake else None
         if not isinstance(mapper, Mapper):
@@ -204,64 +207,66 @@ class Run:
         known = KnownMap(present.parameters.at(0), present.record.clusters, self.path, frame.columns)
         sample = None
         if known.needs_sample(parameters) and self._reread is not None:
-            sample = self._sample.segmented(mapper.segmenter(), self.standing + 1, segment_all)
+            sample = self._sample.segmented(mapper.segmenter(), self.current + 1, segment_all)
         return preview_trees(known, parameters, sample)
 
-    def stay(self) -> None:
-        """Give up what `remap` began; the map stays as it is."""
+    def cancel_remapping(self) -> None:
+        """Cancel the rerun that `remap` began; the map does not change."""
         if self._remapping is not None:
             self._remapping.rerun.close()
             self._remapping = None
 
     @property
     def remapped(self) -> float | None:
-        """How much of the run is mapped again, up to the current scan, from 0 to 1; None when nothing is."""
+        """Share of the scans up to the current one that are mapped again, from 0 to 1; None without a
+        rerun."""
         remapping = self._remapping
         if remapping is None or not self.is_whole:
             return None
-        return min(remapping.rerun.done / max(self.standing, 1), 1.0)
+        return min(remapping.rerun.done / max(self.current, 1), 1.0)
 
     @property
     def preview(self) -> Trees | None:
-        """Approximate trees of the map that is being computed; None where they are unknown."""
+        """Approximate trees of the map that is being computed; None if they are unknown."""
         return None if self._remapping is None else self._preview
 
     @property
     def cache_notice(self) -> str:
-        """Why scans are not cached, or cached scans are not used; empty where they are."""
+        """Reason why scans are not cached, or cached scans are not used; empty if they are."""
         return "; ".join(filter(None, (self._cache.refusal, self._cache.notice)))
 
     def remap_on(self, scans: int) -> tuple[Frame, dict[int, float]] | None:
-        """Map up to `scans` scans again. When all are, the run goes on with that map as if its parameters had
-        been in force from the start.
+        """Map up to `scans` scans of the rerun. After the last one the run continues with the new map, as if
+        its parameters had been in force from the start.
 
         Returns:
-            The current scan in the new map, and when each tree was confirmed [s]; None while scans are left.
+            The current scan in the new map, and the time at which each tree was confirmed, by its number [s];
+            None while scans are left.
 
         Raises:
-            StemmapError: A scan cannot be read again. The map stays as it is.
+            StemmapError: A scan cannot be read again. The map does not change.
         """
         remapping = self._remapping
         if remapping is None or self._step is None or self._broken:  # or on the way to another scan
             return None
         try:
             with self.stopwatch.aside():
-                finished = remapping.work(scans, self.standing)
+                finished = remapping.work(scans, self.current)
         except BaseException:  # also a fault of the mapper, which another try would repeat
-            self.stay()
+            self.cancel_remapping()
             raise
         if not finished:
             return None
         self._remapping, self._map = None, remapping.finish()
-        self._cache = self._caches.of(self._map.parameters.at(self.standing))
+        self._cache = self._caches.of(self._map.parameters.at(self.current))
         return self._map_step(self._step), self._map.record.confirmed_s
 
     def parameters_at(self, index: int) -> Parameters:
-        """Parameters that a scan was or will be mapped with."""
+        """Return the parameters with which the scan with this index was or will be mapped."""
         return self._map.parameters.at(index)
 
     def prepare(self) -> None:
-        """Map the first scan and forget it again: what is compiled at its first use is ready then.
+        """Map the first scan and discard the result, so that all kernels are compiled.
 
         Raises:
             SourceError: There is no scan, or it cannot be read.
@@ -278,36 +283,41 @@ class Run:
         self.stopwatch.clear()
 
     def index_at(self, stamp_ns: int) -> int | None:
-        """The scan shown at a time; None when it was not read yet."""
+        """Return the index of the scan at a time [ns], see `Cursor.index_at`; None if it was not read yet."""
         return self._cursor.index_at(stamp_ns)
 
     def stamp_ns(self, index: int) -> int:
-        """Time of a scan that was read before."""
+        """Return the time of a scan that was read before [ns]."""
         return self._cursor.stamp_ns(index)
 
     @property
     def known(self) -> int:
-        """How many scans were read so far."""
+        """Number of scans that were read so far."""
         return self._cursor.known
 
     @property
     def is_whole(self) -> bool:
-        """Whether the mapper is where `standing` says, and can map that scan again."""
+        """Whether the mapper has the state after the current scan and can map that scan again."""
         return self._step is not None and not self._broken
 
     def approach(self, index: int) -> None:
-        """Return to a state from which mapping on leads to a scan by the shortest way; `standing` is before
-        the scan afterwards. `index` is at most one more than the scans that were read, or is ahead."""
+        """Restore the state from which the fewest scans must be mapped to reach a scan. Afterwards `current`
+        is less than `index`.
+
+        Args:
+            index: Index of the scan; if it was not read yet, the scans from the last one that was read
+                onwards are mapped.
+        """
         scans, state = self._map.snapshots.newest(min(index, self._cursor.known))
-        if not self._broken and self.standing < index and scans <= self.standing + 1:
+        if not self._broken and self.current < index and scans <= self.current + 1:
             return
         self._broken = True  # until all of it has worked
         self._cursor.go_to(scans)
         self._map.mapper.restore(state)
-        self.standing, self._step, self._broken = scans - 1, None, False
+        self.current, self._step, self._broken = scans - 1, None, False
 
     def use(self, parameters: Parameters, index: int) -> bool:
-        """Map with other parameters from a scan onwards. Returns whether that changes anything."""
+        """Use other parameters from the scan with an index onwards. Return whether any value changes."""
         changes = self._map.parameters.set_from(index, parameters)
         if changes:
             self._map.snapshots.forget_after(index)
@@ -315,7 +325,7 @@ class Run:
 
     def close(self) -> None:
         """Close the source and the scan caches."""
-        self.stay()
+        self.cancel_remapping()
         self._caches.close()
         self.source.close()
 
@@ -327,17 +337,17 @@ _LARGE = FilePath("/var/tmp")  # noqa: S108 - the default may be in memory; the 
 
 
 def unnamed_caches(_source: Source | LiveSource, _odometry: str, _seed: int) -> ScanCaches:
-    """Scan caches for as long as the run is open."""
+    """Return temporary scan caches, which are deleted when the run is closed. The arguments are not used."""
     return ScanCaches(_LARGE if _LARGE.is_dir() else None)
 
 
 def caches_in(folder: FilePath) -> OpenCaches:
-    """Opens scan caches that the next opening of a recording finds again.
+    """Return a function that opens scan caches which the next opening of a recording uses again.
 
-    A live source, and a source without a digest, get caches for as long as the run is open.
+    For a live source, and for a source without a digest, that function returns `unnamed_caches`.
 
     Args:
-        folder: Folder of all recordings; it is made when it is needed.
+        folder: Folder of the caches of all recordings; it is created when it is needed.
     """
 
     def open_caches(source: Source | LiveSource, odometry: str, seed: int) -> ScanCaches:
@@ -351,12 +361,12 @@ def caches_in(folder: FilePath) -> OpenCaches:
 
 @dataclass(frozen=True, slots=True)
 class RunFactory:
-    """Makes runs.
+    """Makes runs of sources.
 
     Attributes:
-        make_mapper: Returns a fresh mapper for a source, from parameters, seed and a stopwatch.
+        make_mapper: Returns a new mapper for a source, parameters, seed and stopwatch.
         make_synchroniser: Returns the synchroniser for a choice of odometry.
-        open_caches: Opens the scan caches of a source, for its odometry and seed.
+        open_caches: Opens the scan caches of a source for its odometry and seed.
     """
 
     make_mapper: MakeMapper
@@ -366,10 +376,16 @@ class RunFactory:
     def __call__(
         self, source: Source | LiveSource, odometry: str, seed: int, parameters: Parameters
     ) -> tuple[Run, tuple[str, ...]]:
-        """A run before its first scan, and warnings.
+        """Return a run before its first scan, and warnings.
+
+        Args:
+            source: The source; the run closes it.
+            odometry: Choice of the odometry, see `SourceRequest`.
+            seed: Random seed.
+            parameters: Parameters from the first scan onwards.
 
         Raises:
-            SourceError: There is no such odometry; the source is closed.
+            SourceError: The odometry is not available for this source; the source is closed.
         """
         try:
             moving, chosen = with_odometry(source, odometry)
@@ -395,10 +411,11 @@ class RunFactory:
 
 
 def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Parameters], ...]:
-    """The sets of parameters that a recorded live run was mapped with, each with its first scan, in order.
+    """Return the parameter sets with which a recorded live run was mapped, each with the index of its first
+    scan, ascending.
 
-    A set that the whole run was mapped again with replaces those before it. The result is empty where no
-    parameters are recorded, or parameters of another version of stemmap.
+    A set with which the whole run was mapped again replaces those before it. The result is empty if no
+    parameters were recorded, or if they are of another version of stemmap.
     """
     sets: list[tuple[int, Parameters]] = []
     try:

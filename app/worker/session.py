@@ -1,6 +1,6 @@
 """Session: a run that a person controls (play, pause, step, seek, tune).
 
-It has no thread, no socket and no clock; the loop of the worker reads `pace` and calls `work`.
+It has no thread, socket or clock; the loop of the worker reads `pace` and calls `work`.
 """
 
 from __future__ import annotations
@@ -37,21 +37,21 @@ _MOST_WARNINGS = 20
 class Session:
     """Owns the source and the mapper.
 
-    After `SourceError` or any other exception out of `open` or `work`, call `fail`; another source
-    can be opened, and `play` starts from the beginning.
+    After an exception of `open` or `work`, call `fail`; another source can then be opened, and `play` starts
+    from the beginning.
 
     Args:
-        open_source: From a URI, and what is chosen about it.
-        make_mapper: A fresh mapper for a source, from parameters, seed and a stopwatch.
-        make_synchroniser: From the choice of odometry.
-        parameters: In force at the beginning.
+        open_source: Opens a source by its URI and options.
+        make_mapper: Returns a new mapper for a source, parameters, seed and stopwatch.
+        make_synchroniser: Returns the synchroniser for a choice of odometry.
+        parameters: Parameters at the beginning.
         open_caches: Opens the scan caches of a source.
-        compile_ahead: Compiles what is not compiled on this machine yet, faster than the first scan would.
-        warm_up: Loads the kernels, while a robot is already received and recorded.
+        compile_ahead: Compiles the kernels that are not compiled on this machine yet.
+        warm_up: Loads the kernels; called while a robot is already received and recorded.
 
     Attributes:
-        on_preview: Receives the preview of a rerun (see `Run.preview`) and the revision of its parameters,
-            before any scan is mapped with them.
+        on_preview: Called with the revision of the parameters and the preview trees of a rerun, before any
+            scan is mapped again.
     """
 
     def __init__(
@@ -243,7 +243,7 @@ class Session:
         """Pause and step forward by a number of scans, or back if it is negative."""
         if self._run is None or self._is_live():
             return
-        here = self._run.standing if self._target.index is None else self._target.index
+        here = self._run.current if self._target.index is None else self._target.index
         self._settle()
         self._target.to_scan(max(0, here + scans))
 
@@ -274,16 +274,16 @@ class Session:
         run = self._run
         if run is None:
             return None
-        run.stay()
+        run.cancel_remapping()
         if self._target.sought:  # see `_arrive`
             self._remaps_on_arrival = whole
             return None
-        paused = self._state != "playing" and run.standing >= 0
-        from_scan = run.standing + (0 if paused else 1)
+        paused = self._state != "playing" and run.current >= 0
+        from_scan = run.current + (0 if paused else 1)
         run.use(parameters, from_scan)
         if self._robot is not None:
             self._robot.use_parameters(revision, from_scan, parameters)
-        if whole and run.standing >= 0:
+        if whole and run.current >= 0:
             run.remap(parameters)
             self._send_preview(run)
         return run.map_again() if paused and self._state != "failed" else None
@@ -331,10 +331,11 @@ class Session:
         self._state, self._detail = "failed", detail
         self._target.forget()
         if self._run is not None:
-            self._run.stay()
+            self._run.cancel_remapping()
 
     def status(self) -> Status:
-        """Return the status of the run; speed, rate and scans behind remain 0."""
+        """Return the status of the run. Its speed, scan rate and number of scans behind are those of a new
+        `Status`, because the loop knows them."""
         run, robot = self._run, self._robot
         status = Status(
             state=self._state,
@@ -370,9 +371,10 @@ class Session:
         self._state, self._detail = "paused", ""
 
     def _arrive(self, run: Run) -> Frame | None:
-        """Stop at the sought scan. Parameters that were changed on the way apply from this scan onwards."""
+        """Stop at the sought scan and return its frame. Parameters that were changed during the seek apply
+        from this scan onwards."""
         self._target.forget()
-        changed = run.use(self._parameters, run.standing)
+        changed = run.use(self._parameters, run.current)
         if self._remaps_on_arrival:
             self._remaps_on_arrival = False
             run.remap(self._parameters)
@@ -401,7 +403,8 @@ class Session:
 
 
 def with_robot(status: Status, robot: LiveSource) -> Status:
-    """Return the status with that of the robot of a live run."""
+    """Return the status with the fields of a live run: state, namespaces, waiting scans and recording of its
+    robot."""
     # While scans wait the robot is not silent, even if its link had no time to note it during a compilation.
     is_asked = status.state in ("playing", "waiting") and not robot.scans_waiting
     silent = robot.waiting_for() if is_asked else ""
@@ -418,7 +421,7 @@ def with_robot(status: Status, robot: LiveSource) -> Status:
 
 
 def _with_run(status: Status, run: Run) -> Status:
-    """Return the status with the figures of a run."""
+    """Return the status with the fields that the run and its source determine."""
     description = run.source.description
     losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
     frame = run.frame
@@ -459,7 +462,7 @@ def opened_of(run: Run) -> Opened:
 
 
 class SeekTarget:
-    """The scan to which a run goes: given by its number, by a time that it is not later than, or none."""
+    """The scan that is sought: given by its index, or as the last scan not later than a time; or none."""
 
     def __init__(self) -> None:
         self._index: int | None = None
@@ -473,15 +476,15 @@ class SeekTarget:
 
     @property
     def index(self) -> int | None:
-        """Number of the sought scan; None where a time is sought."""
+        """Index of the sought scan; None if a time is sought."""
         return self._index
 
     def to_scan(self, index: int) -> None:
-        """Seek a scan by its number."""
+        """Seek the scan with this index."""
         self._index, self._stamp_ns, self._under_way = index, None, False
 
     def to_time(self, run: Run, stamp_ns: int) -> None:
-        """Seek the last scan not later than a time."""
+        """Seek the last scan of the run not later than a time [ns]."""
         index = run.index_at(stamp_ns)
         if index is not None:
             self.to_scan(index)
@@ -489,38 +492,39 @@ class SeekTarget:
             self._index, self._stamp_ns, self._under_way = None, stamp_ns, False
 
     def forget(self) -> None:
-        """Seek nothing."""
+        """End the seek."""
         self._index, self._stamp_ns, self._under_way = None, None, False
 
     def set_out(self, run: Run) -> None:
-        """Return to a state before the target, once. This happens when work begins, so that targets that
-        another one replaces while the timeline is dragged cost nothing."""
+        """Restore a state of the run before the target, once for each target. This happens when mapping
+        begins, so that targets that are replaced while the timeline is dragged cost nothing."""
         if self._under_way or not self.sought:
             return
         self._under_way = True
         if self._index is None:
             run.approach(run.known)
-        elif self._index != run.standing or not run.is_whole:
+        elif self._index != run.current or not run.is_whole:
             run.approach(self._index)
 
     def is_at_end(self, run: Run) -> bool:
-        """Whether the run has reached the sought scan."""
+        """Return whether the run has reached the sought scan."""
         if self._index is not None:
-            return run.standing >= self._index
-        if self._stamp_ns is None or run.standing < 0:
+            return run.current >= self._index
+        if self._stamp_ns is None or run.current < 0:
             return False
         following = run.peek_ns()
         return following is not None and following > self._stamp_ns
 
     def words(self, run: Run | None) -> str:
-        """The sought scan in words; empty without one."""
+        """Return a description of the sought scan, for example "scan 12" or "1:05"; empty without one."""
         if run is None or not self.sought:
             return ""
         time_s = self.time_s(run)
         return f"scan {self._index}" if time_s is None else clock(time_s)
 
     def time_s(self, run: Run | None) -> float | None:
-        """Time of the sought scan [s since the first scan]; None without one, or where it is not known."""
+        """Return the time of the sought scan [s since the first scan]; None without one, or if it is
+        unknown."""
         if run is None:
             return None
         if self._stamp_ns is not None:
@@ -531,6 +535,6 @@ class SeekTarget:
 
 
 def clock(seconds: float) -> str:
-    """A time in minutes and seconds."""
+    """Return a time [s] as minutes and seconds, for example "1:05"."""
     whole = int(seconds)
     return f"{whole // 60}:{whole % 60:02d}"

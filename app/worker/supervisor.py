@@ -55,17 +55,17 @@ class WorkerProcess:
     """A worker process that is restarted when it ends.
 
     A restart repeats parameters, speed and source; the owner receives `Opened` again and decides how the run
-    goes on. After five ends within a minute, or when a source does not finish opening, the worker stays down
-    until the next `Play` or `Open`.
+    continues. After five ends within a minute, or when a source does not finish opening, the worker is not
+    restarted until the next `Play` or `Open`.
 
     Args:
         on_message: Awaited on the event loop for each message in turn; must not block it.
-        command: The program and its arguments.
-        clock: Seconds from any start.
-        opening_limit_s: Longest time without a message while a source is being opened.
+        command: Program and arguments of the process.
+        clock: Returns the time [s] from any origin.
+        opening_limit_s: Maximum time without a message while a source is being opened [s].
 
     Attributes:
-        restarts: How often the worker ended unexpectedly and was restarted.
+        restarts: Number of restarts after an unexpected end.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class WorkerProcess:
         self._on_message = on_message
         self._command = command
         self._clock = clock
-        self._channel_in, self._channel_out = from_worker(), to_worker()
+        self._codec_in, self._codec_out = from_worker(), to_worker()
         self._process: asyncio.subprocess.Process | None = None
         self._task: asyncio.Task[None] | None = None
         self._closing = False
@@ -98,7 +98,7 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process number of the worker; None while it is down."""
+        """Process number of the worker; None while it does not run."""
         return self._process.pid if self._process else None
 
     async def start(self) -> None:
@@ -107,10 +107,11 @@ class WorkerProcess:
         self._task = asyncio.create_task(self._watch(), name="worker")
 
     async def send(self, command: ToWorker) -> None:
-        """Send a command. Parameters, speed and source are remembered and repeated after a restart.
+        """Send a command. Parameters, speed and source are stored and sent again after a restart.
 
         Raises:
-            WorkerBusyError: The worker is down or takes no commands, and this command is not remembered.
+            WorkerBusyError: The worker does not run or accepts no commands, and this command is not sent
+                again later.
         """
         if isinstance(command, SetParameters | SetSpeed):
             self._settings[type(command)] = command
@@ -157,7 +158,7 @@ class WorkerProcess:
         if process is None or process.stdin is None or process.stdin.is_closing():
             return False
         try:
-            process.stdin.write(self._channel_out.encode(command))
+            process.stdin.write(self._codec_out.encode(command))
             async with asyncio.timeout(_WRITE_LIMIT_S):
                 await process.stdin.drain()
         except (ConnectionError, TimeoutError):
@@ -187,7 +188,7 @@ class WorkerProcess:
     # --- a source that does not finish opening ---------------------------------------------------
 
     def _await_opening(self) -> None:
-        """Expect that the source is open, or refused, before the time limit."""
+        """Start the time limit within which the source must be opened or refused."""
         self._opening, self._opening_since = "asked", self._clock()
         self._restart_opening_timer()
 
@@ -204,7 +205,7 @@ class WorkerProcess:
             self._opening_timer = None
 
     def _note_opening(self, message: FromWorker) -> None:
-        """Follow from the messages of the worker whether the source is still being opened."""
+        """Update from a message of the worker whether the source is still being opened."""
         if not self._opening or self._open is None:
             return
         if isinstance(message, Opened) and message.asked in ("", self._open.uri):
@@ -235,7 +236,7 @@ class WorkerProcess:
     # --- messages ---------------------------------------------------------------------------------
 
     async def _listen(self) -> str:
-        """Hand on messages until the worker ends; returns why it ended, as a phrase."""
+        """Pass messages on until the worker ends; return the reason of the end."""
         process = self._process
         if process is None or process.stdout is None:
             return "it could not be started"
@@ -243,7 +244,7 @@ class WorkerProcess:
             while True:
                 size = int.from_bytes(await process.stdout.readexactly(LENGTH_BYTES), "little")
                 check_size(size)
-                await self._hand_on(self._channel_in.decode(await process.stdout.readexactly(size)))
+                await self._hand_on(self._codec_in.decode(await process.stdout.readexactly(size)))
         except asyncio.IncompleteReadError:
             return exit_reason(await process.wait())
         except WireError as error:
@@ -264,7 +265,8 @@ class WorkerProcess:
                 )
 
     async def _pause(self, reason: str) -> None:
-        """Wait before the next start, longer each time; after several ends until a person acts."""
+        """Report the end and wait before the next start, longer each time; after several ends, wait for a
+        command."""
         what = f"The mapping process ended ({reason})"
         if self._ends_without_result >= _SUSPICIOUS_ENDS and SetSpeed in self._settings:
             del self._settings[SetSpeed]
@@ -280,7 +282,7 @@ class WorkerProcess:
         self._deaths.clear()
 
     async def _wait_for_a_person(self, detail: str) -> None:
-        """Report why the worker is down, and wait until somebody plays or opens a source."""
+        """Report why the worker does not run, and wait for `Play` or `Open`."""
         self._wanted.clear()
         await self._tell(detail)
         await self._wanted.wait()

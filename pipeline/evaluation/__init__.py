@@ -2,7 +2,7 @@
 
 from pipeline.evaluation.matching import match, matched_rows
 from pipeline.evaluation.score import (
-    Evaluation,
+    MapScores,
     PairErrors,
     Rate,
     evaluate,
@@ -12,7 +12,7 @@ from pipeline.evaluation.score import (
 from pipeline.evaluation.trajectory import PathError, path_error
 
 __all__ = [
-    "Evaluation",
+    "MapScores",
     "PairErrors",
     "PathError",
     "Rate",

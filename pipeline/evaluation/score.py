@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.config.stages import Evaluation as Parameters
+from pipeline.config.stages import Evaluation
 from pipeline.evaluation.matching import match
 from pipeline.geometry.poses import Float
 from pipeline.types.records import Bool, Trees, TruthTrees
@@ -30,7 +30,7 @@ class Rate:
 
 
 @dataclass(frozen=True, slots=True)
-class Evaluation:
+class MapScores:
     """Scores of a map against the ground truth within reach of the path. Lengths are in metres; a score
     without matched trees is None.
 
@@ -74,9 +74,7 @@ class Evaluation:
         return fewer >= _DOUBTFUL_TREES and self.TA.count < _DOUBTFUL_SHARE * fewer
 
 
-def evaluate(
-    trees: Trees, truth: TruthTrees, parameters: Parameters, path: Float | None = None
-) -> Evaluation:
+def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Float | None = None) -> MapScores:
     """Return the scores of the confirmed trees.
 
     Args:
@@ -105,7 +103,7 @@ def evaluate(
     dbh_error = trees.dbh[confirmed][right] - truth.dbh[truth_of[right]]
     dbh_error = dbh_error[np.isfinite(dbh_error)]
     pairs = pair_errors(found[right], position[truth_of[right]])
-    return Evaluation(
+    return MapScores(
         TA=completeness,
         TR=Rate(_count(~hit & in_reach & ~is_tree), _count(in_reach & ~is_tree)),
         FA=Rate(_count(hit & in_reach & ~is_tree), _count(in_reach & ~is_tree)),

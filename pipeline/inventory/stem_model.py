@@ -14,7 +14,7 @@ LOCAL = 1.2  # m above and below breast height in which the taper is nearly cons
 CLOSE = 0.5  # m; largest distance of a slice from breast height for a diameter
 MODEL = 0.003  # m; deviation of a trunk from a circle
 LEAST_HIGH, LEAST_SLICES = 1.2, 8  # least height of a stem [m], and least number of slices
-HANGS = 2.2  # m; stems begin below
+BEGINS_BELOW = 2.2  # m; a stem begins below this height
 FILLED = 0.7  # least share of the slices between the lowest and the highest with a circle
 # Largest scatter of the points and unevenness of the slices, as shares of the radius, and offset of the
 # centres from the # axis, as a share of the radius and in m. They apply to a stem of `USUAL` slices and grow
@@ -103,7 +103,7 @@ def classify_stems(stems: Float, r_min: float, r_max: float) -> Int32:
         (stems[:, EVEN] > often * np.maximum(UNEVEN * r, 0.008), Verdict.NOT_ROUND),
         (stems[:, SCATTER] > often * np.maximum(ROUGH * r, 0.01), Verdict.NOT_ROUND),
         (slices < FILLED * (span / 0.2 + 1.0), Verdict.BUSH),
-        (stems[:, FIRST] > HANGS, Verdict.OTHER),
+        (stems[:, FIRST] > BEGINS_BELOW, Verdict.OTHER),
         ((span < LEAST_HIGH) | (slices < LEAST_SLICES), Verdict.TOO_LOW),
         (r > r_max, Verdict.TOO_THICK),
         (r < r_min, Verdict.TOO_THIN),

@@ -218,7 +218,7 @@ class _Path(msgspec.Struct, frozen=True):
     yaw: Rows
 
 
-class _File(msgspec.Struct, frozen=True):
+class _TruthFile(msgspec.Struct, frozen=True):
     version: Literal[1]
     sensor: _Sensor | None = None
     trees: _Trees | None = None
@@ -232,7 +232,7 @@ def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
         SourceError: It is not JSON of this form, a number is beyond 1e8, or columns differ in length.
     """
     try:
-        file = msgspec.json.decode(content, type=_File)
+        file = msgspec.json.decode(content, type=_TruthFile)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise SourceError(f"the attached ground truth cannot be read: {error}", where=where) from error
     for columns in (file.trees, file.path):

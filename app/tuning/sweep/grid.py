@@ -30,20 +30,20 @@ _EXAMPLE = "E.g. --param-grid clustering.eps=0.1,0.15,0.2 or clustering.eps=0.1.
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class GridAxis:
     """A parameter, by its dotted name or PRESET, and the values that it takes."""
 
     name: str
     values: tuple[Value, ...]
 
 
-def read_axes(words: Iterable[str]) -> tuple[Axis, ...]:
+def read_axes(words: Iterable[str]) -> tuple[GridAxis, ...]:
     """Return the axes that `--param-grid` names: `NAME=VALUES`, or the name of a TOML file.
 
     Raises:
         ParameterError: A name, a value or a file is invalid, or there are too many sets.
     """
-    axes: dict[str, Axis] = {}
+    axes: dict[str, GridAxis] = {}
     for word in words:
         name, equals, text = (part.strip() for part in word.partition("="))
         found = [_axis(name, [text])] if equals else _axes_of(Path(word))
@@ -61,7 +61,7 @@ def read_axes(words: Iterable[str]) -> tuple[Axis, ...]:
     return tuple(axes.values())
 
 
-def combinations(axes: Sequence[Axis]) -> list[dict[str, Value]]:
+def combinations(axes: Sequence[GridAxis]) -> list[dict[str, Value]]:
     """Return every combination of the values; the last axis changes fastest."""
     return [
         dict(zip((axis.name for axis in axes), values, strict=True))
@@ -81,7 +81,7 @@ def shown(value: Value) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _axes_of(file: Path) -> list[Axis]:
+def _axes_of(file: Path) -> list[GridAxis]:
     try:
         if file.stat().st_size > _LARGEST_FILE:
             raise ParameterError("the file is larger than 1 MB", where=str(file))
@@ -109,7 +109,7 @@ def _axes_of(file: Path) -> list[Axis]:
     return axes
 
 
-def _axis(name: str, entries: Sequence[Any]) -> Axis:
+def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
     if name == PRESET:
         values: list[Value] = [word for entry in entries for word in _parts(str(entry))]
         unknown = [value for value in values if value not in PRESETS]
@@ -117,7 +117,7 @@ def _axis(name: str, entries: Sequence[Any]) -> Axis:
             raise ParameterError(
                 f"there is no preset {unknown[0]!r}", remedy=f"Presets: {', '.join(PRESETS)}"
             )
-        return Axis(PRESET, tuple(dict.fromkeys(values)))
+        return GridAxis(PRESET, tuple(dict.fromkeys(values)))
     spec = next((spec for spec in field_specs() if spec.name == name), None)
     if spec is None:
         Parameters().replace({name: None})  # says which name is near
@@ -127,7 +127,7 @@ def _axis(name: str, entries: Sequence[Any]) -> Axis:
         raise ParameterError(f"{name} has {len(values):,} values, not 1 to {MOST_VALUES:,}", remedy=_EXAMPLE)
     for value in values:
         _check(spec, value)
-    return Axis(name, tuple(dict.fromkeys(values)))
+    return GridAxis(name, tuple(dict.fromkeys(values)))
 
 
 def _text(entry: object) -> str:

@@ -67,11 +67,11 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return hashlib.sha256(msgspec.json.encode(placeless, order="sorted")).hexdigest()
 
 
-class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The result of a job.
 
     Attributes:
-        scores: Fields of `pipeline.evaluation.Evaluation`, with the numbers of scans and trees; None for a
+        scores: Fields of `pipeline.evaluation.MapScores`, with the numbers of scans and trees; None for a
             failure.
         seconds: Computing time [s].
         looked: Whether the front end ran; False where its cached results were used.

@@ -17,7 +17,7 @@ from typing import Any
 
 from app.common.text import count, version
 from app.tuning.sweep.grid import shown, words_of
-from app.tuning.sweep.jobs import Answer, SweepPlan
+from app.tuning.sweep.jobs import JobResult, SweepPlan
 from pipeline.io.atomic_files import write_beside
 
 Figures = dict[str, float | int | None]
@@ -120,7 +120,7 @@ CRITERIA = (
 )
 
 
-def compare_answers(plan: SweepPlan, answers: dict[tuple[int, int], Answer]) -> Comparison:
+def compare_results(plan: SweepPlan, answers: dict[tuple[int, int], JobResult]) -> Comparison:
     """Return rows, means and the best sets."""
     rows, means = [], []
     for s in range(len(plan.sets)):
@@ -132,7 +132,7 @@ def compare_answers(plan: SweepPlan, answers: dict[tuple[int, int], Answer]) -> 
     )
 
 
-def _row(plan: SweepPlan, answers: dict[tuple[int, int], Answer], s: int, r: int) -> Row:
+def _row(plan: SweepPlan, answers: dict[tuple[int, int], JobResult], s: int, r: int) -> Row:
     if (s, r) in plan.left_out:
         return Row(s + 1, r + 1, {}, error=plan.left_out[s, r])
     answer = answers[s, r]
@@ -187,7 +187,7 @@ def figure_words(figures: Figures, name: str, scale: float) -> str:
     return str(value) if isinstance(value, int) and scale == 1.0 else f"{scale * value:.2f}"
 
 
-def is_valid(answer: Answer) -> bool:
+def is_valid(answer: JobResult) -> bool:
     """Whether the scores of an answer have all figures, each a finite number or None; for a failure, whether
     it has a reason."""
     if answer.scores is None:

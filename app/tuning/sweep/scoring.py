@@ -23,7 +23,7 @@ from app.batch.summary import far_truth
 from app.common.child_process import ParentConnection, run_child
 from app.training.learned_forests import kept_forests
 from app.tuning.scored_runs import OpenRun, open_run
-from app.tuning.sweep.jobs import Answer, Fault, Job, RunWithTruth, code_digest
+from app.tuning.sweep.jobs import Fault, Job, JobResult, RunWithTruth, code_digest
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, StemmapError
@@ -41,11 +41,11 @@ class Scorer:
         self._asked: RunWithTruth | None = None
         self._run: OpenRun | None = None
 
-    def score(self, job: Job) -> Answer:
+    def score(self, job: Job) -> JobResult:
         """Map and score; an error becomes part of the answer."""
         if job.code != code_digest():
             other = f"this worker has stemmap {code_digest()}, the job comes from {job.code}"
-            return Answer(None, error=f"{other}. Install the same version on both", fault="version")
+            return JobResult(None, error=f"{other}. Install the same version on both", fault="version")
         begun = time.perf_counter()
         try:
             parameters = validated(job.parameters)
@@ -59,7 +59,7 @@ class Scorer:
             return _failed("this needs more memory than the machine has")
         except Exception as error:  # a fault with one set must not end the others
             return _failed(f"this is a fault in stemmap: {type(error).__name__}: {error}")
-        return Answer(scores, time.perf_counter() - begun, front_end_ran)
+        return JobResult(scores, time.perf_counter() - begun, front_end_ran)
 
     def close(self) -> None:
         """Close the run."""
@@ -141,12 +141,12 @@ def _check_forest(parameters: Parameters) -> None:
         raise NotHereError(error.what, where=error.where, remedy=error.remedy) from None
 
 
-def _failed(error: str, fault: Fault = "job") -> Answer:
-    return Answer(None, error=error, fault=fault)
+def _failed(error: str, fault: Fault = "job") -> JobResult:
+    return JobResult(None, error=error, fault=fault)
 
 
 def work(parent: ParentConnection) -> None:
-    """Answer jobs until the parent ends."""
+    """JobResult jobs until the parent ends."""
     while True:
         parent.send(msgspec.Raw(score_json(bytes(parent.receive(msgspec.Raw)))))
 

@@ -13,7 +13,7 @@ from typing import Any
 from app.common.child_process import ChildProcess, ProtocolError, python_module
 from app.sources.request import SourceRequest
 from app.tuning.plan import TruthTable
-from app.tuning.sweep.jobs import Answer, Job, RunWithTruth, code_digest
+from app.tuning.sweep.jobs import Job, JobResult, RunWithTruth, code_digest
 from app.worker.protocol import Status
 from pipeline.config import Parameters, field_specs
 from pipeline.config.model import Value
@@ -96,8 +96,8 @@ class Sensitivity:
         self._task: asyncio.Task[None] | None = None
         self._process: ChildProcess | None = None
         self._turn = asyncio.Lock()
-        self._known: dict[str, Answer] = {}
-        self._scorings: set[asyncio.Task[Answer]] = set()
+        self._known: dict[str, JobResult] = {}
+        self._scorings: set[asyncio.Task[JobResult]] = set()
         self._lefts = self._asked = 0
 
     def ask(self, question: Question) -> None:
@@ -173,7 +173,7 @@ class Sensitivity:
             raise StemmapError(answer.error)
         return {"value": value, **_figures(answer)}
 
-    async def _scored(self, job: Job, key: str, asked: tuple[int, int]) -> Answer:
+    async def _scored(self, job: Job, key: str, asked: tuple[int, int]) -> JobResult:
         """The answer of the process, which is restarted once if it ends.
 
         Raises:
@@ -197,7 +197,7 @@ class Sensitivity:
                 await self._end()
         raise StemmapError("the process that maps the run ended twice", remedy="The terminal may show why")
 
-    def _is_scored(self, scoring: asyncio.Task[Answer]) -> None:
+    def _is_scored(self, scoring: asyncio.Task[JobResult]) -> None:
         self._scorings.discard(scoring)
         if not scoring.cancelled():
             scoring.exception()  # retrieved, because no task may wait for it any more
@@ -215,16 +215,16 @@ class Sensitivity:
             await process.end()
 
 
-async def _ask(process: ChildProcess, job: Job) -> Answer | None:
+async def _ask(process: ChildProcess, job: Job) -> JobResult | None:
     """The answer to a job; None where the process ends or sends something else."""
     await process.send(job)
     try:
-        return await process.receive(Answer)
+        return await process.receive(JobResult)
     except ProtocolError:
         return None
 
 
-def _figures(answer: Answer) -> dict[str, Any]:
+def _figures(answer: JobResult) -> dict[str, Any]:
     """The figures of a point, with units in the names."""
     s = answer.scores
     if s is None:

@@ -15,7 +15,7 @@ import msgspec
 
 from app.common.child_process import BlockingChildProcess, exit_reason, python_module
 from app.common.text import count
-from app.tuning.sweep.jobs import Answer, Job
+from app.tuning.sweep.jobs import Job, JobResult
 from app.tuning.sweep.report import is_valid
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, StemmapError
@@ -28,7 +28,7 @@ _LARGEST_FILE = 1 << 20
 _WAIT_S = 1.0
 
 
-class AnswerStore:
+class ResultStore:
     """Answers on disk by the key of their job, so that no job is computed twice.
 
     Args:
@@ -44,14 +44,14 @@ class AnswerStore:
         self.damaged = 0
         self.refusal = ""
 
-    def get(self, key: str) -> Answer | None:
+    def get(self, key: str) -> JobResult | None:
         """Return the answer to the job with this key, None where it is not stored."""
         file = self._file(key)
         if file is None:
             return None
         try:
             if file.stat().st_size <= _LARGEST_FILE:
-                answer = msgspec.json.decode(file.read_bytes(), type=Answer)
+                answer = msgspec.json.decode(file.read_bytes(), type=JobResult)
                 if answer.scores is not None and is_valid(answer):
                     return answer
         except FileNotFoundError:
@@ -61,7 +61,7 @@ class AnswerStore:
         self.damaged += 1
         return None
 
-    def put(self, key: str, answer: Answer) -> None:
+    def put(self, key: str, answer: JobResult) -> None:
         """Store an answer that has scores. Failures are not stored, because they may not happen again. After
         an error of the disk nothing more is written."""
         file = self._file(key)
@@ -90,7 +90,7 @@ class SweepResult:
         warnings: Text for people.
     """
 
-    answers: list[Answer]
+    answers: list[JobResult]
     known: int = 0
     lost: Counter[str] = field(default_factory=Counter)
     warnings: list[str] = field(default_factory=list)
@@ -99,7 +99,7 @@ class SweepResult:
 def sweep(
     jobs: Sequence[Job],
     workers: Workers,
-    kept: AnswerStore,
+    kept: ResultStore,
     progress: Callable[[int], object] = lambda _jobs: None,
     nobody_s: float = NOBODY_S,
 ) -> SweepResult:
@@ -120,14 +120,14 @@ class _Sweep:
         self,
         jobs: Sequence[Job],
         workers: Workers,
-        kept: AnswerStore,
+        kept: ResultStore,
         progress: Callable[[int], object],
         nobody_s: float,
     ) -> None:
         self._jobs, self._workers, self._kept = jobs, workers, kept
         self._progress, self._nobody_s = progress, nobody_s
         self._keys = [job.key() for job in jobs]
-        self._answers: dict[int, Answer] = {}
+        self._answers: dict[int, JobResult] = {}
         self._waiting: dict[bytes, deque[int]] = {}  # by group: jobs that share front-end results
         self._doing: dict[str, int] = {}
         self._groups: dict[str, bytes] = {}  # the last group of each worker
@@ -206,11 +206,11 @@ class _Sweep:
         self._losses[number] += 1
         if self._losses[number] >= MOST_LOSSES:
             ended = f"{count(MOST_LOSSES, 'worker')} were lost during this job; the last one: {reason}"
-            self._finish(number, Answer(None, error=ended, fault="job"))
+            self._finish(number, JobResult(None, error=ended, fault="job"))
         else:
             self._again(number)
 
-    def _is_unfit(self, worker: str, number: int, answer: Answer) -> None:
+    def _is_unfit(self, worker: str, number: int, answer: JobResult) -> None:
         """Give the job to other workers. Where no worker fits, all jobs of its run fail."""
         warning = f"{worker}: {answer.error}"
         if warning not in self._outcome.warnings:
@@ -231,12 +231,12 @@ class _Sweep:
         self._waiting.setdefault(_group(self._jobs[number]), deque()).appendleft(number)
 
     def _give_up(self) -> None:
-        gone = Answer(None, error=f"no worker was available for {self._nobody_s:.0f} s", fault="worker")
+        gone = JobResult(None, error=f"no worker was available for {self._nobody_s:.0f} s", fault="worker")
         for number in [n for jobs in self._waiting.values() for n in jobs]:
             self._finish(number, gone)
         self._waiting.clear()
 
-    def _finish(self, number: int, answer: Answer) -> None:
+    def _finish(self, number: int, answer: JobResult) -> None:
         self._answers[number] = answer
         self._kept.put(self._keys[number], answer)
         self._progress(1)
@@ -266,7 +266,7 @@ class Done:
     """A worker has answered."""
 
     worker: str
-    answer: Answer
+    answer: JobResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +309,7 @@ class Processes:
         self._children: dict[str, BlockingChildProcess] = {}
         self._names = [f"process {k + 1}" for k in range(count)]
         self._pool = ThreadPoolExecutor(count)
-        self._jobs: dict[Future[Answer | str], str] = {}
+        self._jobs: dict[Future[JobResult | str], str] = {}
 
     def free(self) -> list[str]:
         """Return the names of the processes without a job."""
@@ -345,11 +345,11 @@ class Processes:
         self._pool.shutdown()
 
 
-def _ask(child: BlockingChildProcess, job: Job) -> Answer | str:
+def _ask(child: BlockingChildProcess, job: Job) -> JobResult | str:
     """The answer to a job, or why the process was lost."""
     try:
         child.send(job)
-        answer = child.receive(Answer)
+        answer = child.receive(JobResult)
     except StemmapError as error:
         child.end()
         return error.what
@@ -474,7 +474,7 @@ class DaskWorkers:
 
 def _answered(worker: str, text: bytes) -> Event:
     try:
-        return Done(worker, msgspec.json.decode(text, type=Answer))
+        return Done(worker, msgspec.json.decode(text, type=JobResult))
     except msgspec.MsgspecError:
         return Lost(worker, "it sent an invalid answer")
 

@@ -67,7 +67,7 @@ class _Import(_Edit):
     dbh_unit: Literal["m", "cm", "mm"] | None = None
 
 
-class _Choice(Body):
+class _TruthChoice(Body):
     """The ground truth that the map is scored against."""
 
     against: Against
@@ -78,15 +78,15 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
     """Return the annotations of the run, and how many edits this browser can undo and redo."""
     steps = None
     if re.fullmatch(_BROWSER, browser):
-        steps = await dashboard.annotating.read(lambda store, run: store.steps(run, browser))
+        steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, browser))
     undo, redo = steps or (0, 0)
-    return json_reply({**dashboard.annotating.as_plain(), "undo": undo, "redo": redo})
+    return json_reply({**dashboard.annotation_editor.as_plain(), "undo": undo, "redo": redo})
 
 
 @router.post("/annotations")
 async def add(body: _Add, dashboard: Dash) -> Response:
     """Add an annotation."""
-    (added,) = await dashboard.annotating.edit(
+    (added,) = await dashboard.annotation_editor.edit(
         body.run, lambda store: store.add(body.run, body.author, [body.content])
     )
     return await _done(dashboard, body, {"id": added}, 201)
@@ -95,7 +95,7 @@ async def add(body: _Add, dashboard: Dash) -> Response:
 @router.patch("/annotations/{number}")
 async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
     """Change an annotation; 409 if it does not have this version any more."""
-    await dashboard.annotating.edit(
+    await dashboard.annotation_editor.edit(
         body.run, lambda store: store.change(body.run, body.author, number, body.version, body.content)
     )
     return await _done(dashboard, body, {"id": number})
@@ -104,7 +104,7 @@ async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
 @router.delete("/annotations/{number}")
 async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
     """Delete an annotation; 409 if it does not have this version any more."""
-    await dashboard.annotating.edit(
+    await dashboard.annotation_editor.edit(
         body.run, lambda store: store.delete(body.run, body.author, number, body.version)
     )
     return await _done(dashboard, body, {"id": number})
@@ -113,14 +113,14 @@ async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
 @router.post("/annotations/undo")
 async def undo(body: _Edit, dashboard: Dash) -> Response:
     """Undo the last edit of the browser."""
-    await dashboard.annotating.edit(body.run, lambda store: store.undo(body.run, body.author))
+    await dashboard.annotation_editor.edit(body.run, lambda store: store.undo(body.run, body.author))
     return await _done(dashboard, body, {})
 
 
 @router.post("/annotations/redo")
 async def redo(body: _Edit, dashboard: Dash) -> Response:
     """Repeat the edit that the browser undid last."""
-    await dashboard.annotating.edit(body.run, lambda store: store.redo(body.run, body.author))
+    await dashboard.annotation_editor.edit(body.run, lambda store: store.redo(body.run, body.author))
     return await _done(dashboard, body, {})
 
 
@@ -128,18 +128,18 @@ async def redo(body: _Edit, dashboard: Dash) -> Response:
 async def import_table(body: _Import, dashboard: Dash) -> Response:
     """Add the rows of a CSV table in one edit; rows that exist already are skipped and counted."""
     contents = await asyncio.to_thread(_imported, body)
-    existing = {_key(row.content) for row in dashboard.annotating.rows}
+    existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new = [content for content in contents if _key(content) not in existing]
     if new:
-        await dashboard.annotating.edit(body.run, lambda store: store.add(body.run, body.author, new))
+        await dashboard.annotation_editor.edit(body.run, lambda store: store.add(body.run, body.author, new))
     return await _done(dashboard, body, {"added": len(new), "left_out": len(contents) - len(new)})
 
 
 @router.put("/annotations/against")
-async def score_against(body: _Choice, dashboard: Dash) -> Response:
+async def score_against(body: _TruthChoice, dashboard: Dash) -> Response:
     """Choose the ground truth that the map is scored against; neither of the two is changed."""
-    dashboard.annotating.score_against(body.against)
-    return json_reply(dashboard.annotating.as_plain())
+    dashboard.annotation_editor.score_against(body.against)
+    return json_reply(dashboard.annotation_editor.as_plain())
 
 
 @router.get("/annotations.csv")
@@ -165,14 +165,14 @@ async def export_geojson(dashboard: Dash) -> Response:
 
 
 async def _done(dashboard: Dashboard, edit: _Edit, payload: dict[str, Any], status: int = 200) -> Response:
-    serial = dashboard.annotating.serial
-    steps = await dashboard.annotating.read(lambda store, run: store.steps(run, edit.browser))
+    serial = dashboard.annotation_editor.serial
+    steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, edit.browser))
     undo_count, redo_count = steps or (0, 0)
     return json_reply({**payload, "serial": serial, "undo": undo_count, "redo": redo_count}, status)
 
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
-    return [row_payload(row) for row in dashboard.annotating.rows]
+    return [row_payload(row) for row in dashboard.annotation_editor.rows]
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:

@@ -42,12 +42,12 @@ class _Reset(Body):
     names: list[Word] = Field(default_factory=list, max_length=500)
 
 
-class _Choice(Body):
+class _ViewChoice(Body):
     name: Word
     value: bool | Word
 
 
-class _Save(Body):
+class SaveSet(Body):
     name: SetName
     who: UserName = "somebody"
 
@@ -56,7 +56,7 @@ class _SetName(Body):
     name: SetName
 
 
-class _File(Body):
+class _ParameterFile(Body):
     file: Word
     text: Annotated[str, Field(max_length=_LONGEST_FILE)]
 
@@ -110,7 +110,7 @@ async def reset(body: _Reset, dashboard: Dash) -> Response:
 
 
 @router.patch("/view")
-async def choose_view(body: _Choice, dashboard: Dash) -> Response:
+async def choose_view(body: _ViewChoice, dashboard: Dash) -> Response:
     """Show or hide a layer of the scene, or choose its colours, labels or the camera that follows."""
     await dashboard.choose_view(body.name, body.value)
     return json_reply(dashboard.scene.view)
@@ -130,7 +130,7 @@ async def saved_sets(dashboard: Dash) -> Response:
 
 
 @router.post("/sets")
-async def save_set(body: _Save, dashboard: Dash) -> Response:
+async def save_set(body: SaveSet, dashboard: Dash) -> Response:
     """Save the values in force under a name; a set of that name is replaced."""
     state = dashboard.parameters
     await dashboard.sets.save(body.name, state.preset, state.parameters, body.who)
@@ -153,7 +153,7 @@ async def delete_set(body: _SetName, dashboard: Dash) -> Response:
 
 
 @router.post("/sets/upload")
-async def upload_set(body: _File, dashboard: Dash) -> Response:
+async def upload_set(body: _ParameterFile, dashboard: Dash) -> Response:
     """Use the values of a file as `--config` does."""
     preset_name, values = await asyncio.to_thread(
         read_file, body.text, body.file, dashboard.parameters.preset

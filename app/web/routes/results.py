@@ -101,7 +101,7 @@ async def doubts(dashboard: Dash) -> Response:
 async def cluster_story(number: Number, dashboard: Dash, scan: _Scan = None) -> Response:
     """Return verdict, checks and fit of a cluster of a recently shown scan, by default the newest."""
     try:
-        return json_reply(await dashboard.selecting.story(scan, number))
+        return json_reply(await dashboard.selector.story(scan, number))
     except NoStoryError as error:
         return failure_reply(404, error)
 
@@ -110,7 +110,7 @@ async def cluster_story(number: Number, dashboard: Dash, scan: _Scan = None) -> 
 async def tree_story(number: Number, dashboard: Dash) -> Response:
     """Return votes, DBH, coverage and history of a tree."""
     try:
-        return json_reply(await dashboard.asking.tree(number))
+        return json_reply(await dashboard.worker_client.tree(number))
     except NoStoryError as error:
         return failure_reply(404, error)
 
@@ -145,7 +145,7 @@ async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
     """Return the current scan under two parameter sets."""
     sets = [_parameters_of(dashboard, name) for name in (body.a, body.b)]
     async with bounds.comparisons.turn():
-        frames = await dashboard.asking.compare(sets)
+        frames = await dashboard.worker_client.compare(sets)
     first, second = (each.flat() for each in sets)
     differences = [[name, value, second[name]] for name, value in first.items() if second[name] != value]
     distance = dashboard.parameters.parameters.evaluation.match_distance

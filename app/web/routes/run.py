@@ -71,7 +71,7 @@ class _SetSpeed(Body):
 _AnyCommand = Annotated[_Play | _Pause | _Advance | _Seek | _SetSpeed, Field(discriminator="type")]
 
 
-class _Span(Body):
+class _LoopSpan(Body):
     """The part of the run that is repeated [s since the first scan]; null for both ends the repetition."""
 
     from_s: _Seconds | None
@@ -114,7 +114,7 @@ async def command(body: _AnyCommand, dashboard: Dash) -> Response:
 
 
 @router.post("/loop")
-async def loop(body: _Span, dashboard: Dash) -> Response:
+async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
     """Repeat a part of the run, or end the repetition."""
     if body.from_s is None or body.to_s is None:
         dashboard.loop.choose(None)
@@ -161,7 +161,7 @@ async def sources(dashboard: Dash, settings: Deployment) -> Response:
     from pipeline.io.readers.simulated import scenarios
 
     try:
-        uploaded = await dashboard.keeper.ask(lambda store: store.book.uploads())
+        uploaded = await dashboard.store.ask(lambda store: store.book.uploads())
     except StemmapError:  # they are listed under their file names then
         uploaded = {}
     found = await asyncio.to_thread(recordings, settings.data_folders)

@@ -37,7 +37,7 @@ class _Name(Body):
 @router.get("")
 async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
     """Return all runs without their maps, the newest first, finished folders, and partial outputs."""
-    rows = await dashboard.keeper.ask(lambda store: store.book.listed())
+    rows = await dashboard.store.ask(lambda store: store.book.listed())
     folders, changed, remains = await asyncio.to_thread(_folders, settings)
     return json_reply(
         {
@@ -46,7 +46,7 @@ async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
                 {"key": f"{_FOLDER}{name}", "name": name, "changed_s": changed[name]} for name in folders
             ],
             "unfinished": remains,
-            "open": dashboard.logbook.record,
+            "open": dashboard.run_recorder.record,
         }
     )
 
@@ -85,7 +85,7 @@ async def delete_remains(name: _KeyInQuery, settings: Deployment) -> Response:
 async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
     """Delete a run; `restore` brings it back."""
     if number in request.app.state.open_records():
-        here = number == dashboard.logbook.record
+        here = number == dashboard.run_recorder.record
         what = "this run is open" if here else "this run is open in the dashboard of another robot"
         remedy = (
             "Open another one first, then delete it" if here else "Open another one there, then delete it"
@@ -117,7 +117,7 @@ async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: Any
 
 
 async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], None]) -> Response:
-    await dashboard.keeper.ask(lambda store: work(store.book))
+    await dashboard.store.ask(lambda store: work(store.book))
     return json_reply({"id": number})
 
 
@@ -127,7 +127,7 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
         return {"key": key, "revisions": [], **await read_folder(name, settings)}
     if not key.isdecimal() or int(key) > LARGEST_NUMBER:
         raise UnknownError("there is no such run", where=key[:100])
-    row = await dashboard.keeper.ask(lambda store: store.book.whole(int(key)))
+    row = await dashboard.store.ask(lambda store: store.book.whole(int(key)))
     return {**_row(row), "map": row["map"], "revisions": [_revision(each) for each in row["revisions"]]}
 
 

@@ -65,9 +65,9 @@ async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool
         if not may_select:  # the selection is shared by everybody
             continue
         if isinstance(wanted, _SelectCluster):
-            dashboard.selecting.cluster_soon(wanted.scan, wanted.cluster)
+            dashboard.selector.cluster_soon(wanted.scan, wanted.cluster)
         else:
-            dashboard.selecting.tree(wanted.tree)
+            dashboard.selector.tree(wanted.tree)
 
 
 @router.websocket("/viser")

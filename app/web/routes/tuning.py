@@ -24,7 +24,7 @@ from pipeline.errors import StemmapError
 router = APIRouter(prefix="/api")
 
 
-class _Save(Body):
+class _SavedName(Body):
     name: SetName
     who: UserName = "somebody"
 
@@ -85,7 +85,7 @@ async def use_found(dashboard: Dash) -> Response:
 
 
 @router.post("/search/save")
-async def save_found(body: _Save, dashboard: Dash) -> Response:
+async def save_found(body: _SavedName, dashboard: Dash) -> Response:
     """Save the best set under a name, with its provenance."""
     preset_name, values, text = dashboard.search.found()
     await dashboard.sets.save(body.name, preset_name, values, body.who, text)
@@ -155,7 +155,7 @@ async def _others(dashboard: Dashboard, settings: Settings, any_file: bool) -> l
     Raises:
         StemmapError: The store cannot be read.
     """
-    rows, annotated = await dashboard.keeper.ask(lambda s: (s.book.listed(), s.annotated_sources()))
+    rows, annotated = await dashboard.store.ask(lambda s: (s.book.listed(), s.annotated_sources()))
     digest = dashboard.digest
     return await asyncio.to_thread(
         lambda: other_runs(rows, annotated, digest, lambda uri: permitted_uri(uri, settings, any_file))

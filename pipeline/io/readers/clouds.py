@@ -62,7 +62,7 @@ def open_cloud(uri: str) -> WholeCloud:
         return LasCloud(uri, path) if is_las else TableCloud(uri, path)
     except MemoryError:
         raise SourceError("it is too large for the memory of this machine", where=uri) from None
-    except (OSError, ValueError, RuntimeError) as error:  # a path with a zero byte, a home of nobody
+    except (OSError, ValueError, RuntimeError) as error:  # a path with a zero byte, an unknown home
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise SourceError(
             f"cannot open: {reason}", where=uri, remedy="Look at the path and its rights"

@@ -307,7 +307,7 @@ _MOST_NOTES = 1_000_000
 _MOST_SKIPPED = 10_000_000
 
 
-class RunRecord(msgspec.Struct, frozen=True):
+class LiveRunHeader(msgspec.Struct, frozen=True):
     """Settings of a live run, attached to its recording.
 
     Attributes:
@@ -327,7 +327,7 @@ class RunRecord(msgspec.Struct, frozen=True):
     camera: list[str] = []
 
 
-def read_run_record(container: McapFile, where: str) -> RunRecord | None:
+def read_live_header(container: McapFile, where: str) -> LiveRunHeader | None:
     """Read the settings of a live run; None when the file is not the recording of a live run.
 
     Raises:
@@ -337,7 +337,7 @@ def read_run_record(container: McapFile, where: str) -> RunRecord | None:
     if content is None:
         return None
     try:
-        run = msgspec.json.decode(content, type=RunRecord)
+        run = msgspec.json.decode(content, type=LiveRunHeader)
     except (msgspec.DecodeError, RecursionError) as error:
         raise SourceError(f"the settings of the live run cannot be read: {error}", where=where) from error
     if run.version != VERSION or not 0 < len(run.topics) + len(run.camera) <= _MOST_TOPICS:
@@ -360,7 +360,7 @@ class LiveRecording:
     """
 
     def __init__(
-        self, uri: str, container: McapFile, run: RunRecord, path: Path, options: SourceOptions
+        self, uri: str, container: McapFile, run: LiveRunHeader, path: Path, options: SourceOptions
     ) -> None:
         self._uri, self._container, self._run = uri, container, run
         self._options = replace(options, topics={"scan": run.topics[0], **options.topics})
@@ -525,7 +525,7 @@ def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
     return tuple(RecordedTopic(c.topic, c.msgtype, c.count, "camera", "") for c in channels)
 
 
-def _channels(container: McapFile, run: RunRecord, where: str) -> list[Channel]:
+def _channels(container: McapFile, run: LiveRunHeader, where: str) -> list[Channel]:
     """Return the channels of the robot in the order of the live run."""
     by_topic = {channel.topic: channel for channel in container.channels}
     missing = [topic for topic in run.topics if topic not in by_topic]
@@ -546,7 +546,7 @@ def open_live_recording(uri: str, path: Path, options: SourceOptions) -> LiveRec
     """
     container = McapFile(path)
     try:
-        run = read_run_record(container, uri)
+        run = read_live_header(container, uri)
         if run is not None:
             return LiveRecording(uri, container, run, path, options)
     except BaseException:

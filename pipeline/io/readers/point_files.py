@@ -474,7 +474,7 @@ _HEADER_DAMAGE = (
 
 
 @dataclass(frozen=True, slots=True)
-class _Array:
+class _NumpyArray:
     """An array of an .npy file or of a member of an .npz file.
 
     Attributes:
@@ -550,7 +550,7 @@ def _open_npy(path: Path) -> PointTable:
 
 def _open_npz(path: Path) -> PointTable:
     """Open the array with a usual name, else the first table, else arrays x, y and z."""
-    arrays: dict[str, _Array] = {}
+    arrays: dict[str, _NumpyArray] = {}
     reason = "it holds no arrays"
     try:
         with zipfile.ZipFile(path) as archive:
@@ -581,7 +581,7 @@ def _open_npz(path: Path) -> PointTable:
     raise ScanFileError(f"no array of it holds points; {reason}")
 
 
-def _numpy_table(path: Path, kind: str, arrays: dict[_Array, np.dtype[Any]]) -> PointTable:
+def _numpy_table(path: Path, kind: str, arrays: dict[_NumpyArray, np.dtype[Any]]) -> PointTable:
     """Return the table of arrays that are read side by side, each with its record type."""
     usable = _usable([name for dtype in arrays.values() for name in dtype.names or ()])
     points = next(iter(arrays)).shape[0]
@@ -608,7 +608,7 @@ def _numpy_table(path: Path, kind: str, arrays: dict[_Array, np.dtype[Any]]) -> 
     return PointTable(kind, points, usable, parts)
 
 
-def _npy_header(file: IO[bytes], member: str | None, size: int) -> _Array:
+def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
     """Parse the header of an array.
 
     Raises:
@@ -626,7 +626,7 @@ def _npy_header(file: IO[bytes], member: str | None, size: int) -> _Array:
         raise ScanFileError("an array of Python objects is not read, because it could run code")
     if not shape or not all(0 <= n <= MOST_POINTS for n in shape) or dtype.subdtype:
         raise ScanFileError(f"the header of the array promises the shape {shape}"[:120])
-    return _Array(member, head.tell(), size, tuple(shape), dtype, fortran)
+    return _NumpyArray(member, head.tell(), size, tuple(shape), dtype, fortran)
 
 
 def _is_number(dtype: np.dtype[Any]) -> bool:

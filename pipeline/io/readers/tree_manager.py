@@ -331,8 +331,8 @@ def _rows(number: Int, count: int, uri: str) -> tuple[Int, tuple[str, ...]]:
     files = len(number)
     if int(number[-1]) < count and len(np.unique(number)) == files:
         unseen = count - files
-        said = f"{unseen} rows of {TRAJECTORY} have no TreeManagerState file: no stems are seen there"
-        return number, (said,) if unseen else ()
+        warning = f"{unseen} rows of {TRAJECTORY} have no TreeManagerState file: no stems are seen there"
+        return number, (warning,) if unseen else ()
     if files == count:
         return np.arange(count, dtype=np.int64), ()
     raise SourceError(

@@ -18,12 +18,12 @@ function plain(value, unit) {
 
 export function clusterStory(story) {
   return [verdict(story), drawing(story), story.circle ? residuals(story) : "", checks(story),
-    columnFigure(story.gathered, "Accumulated scans at this place")];
+    columnFigure(story.column, "Accumulated scans at this place")];
 }
 
 // Where the accumulated scans reject a stem of this scan, both verdicts are named and that of the map counts.
 function verdict(story) {
-  const ofMap = story.verdict === "tree" ? (story.gathered?.verdict ?? "tree") : story.verdict;
+  const ofMap = story.verdict === "tree" ? (story.column?.verdict ?? "tree") : story.verdict;
   const title = ofMap === story.verdict ? ofMap : `A stem in this scan; not a tree in the map: ${ofMap}`;
   return el("div", { class: "verdict", "data-verdict": ofMap }, letterOf(verdictOf(ofMap)),
     el("div", {}, el("b", { text: title }), el("p", { text: why(story) || verdictOf(story.verdict)[2] })));

@@ -46,7 +46,7 @@ export function columnFigure(story, title) {
     el("ul", { class: "vote-list" }, ...votes.map(([name, share]) => el("li", {},
       el("i", { style: { background: `var(--${verdictOf(name)[1]})` }, "aria-hidden": "true" }), `${name} ${percent(share)}`))),
     el("p", { class: "note", text: reason(story) }),
-    story.told.length ? influence(story.told) : "");
+    story.effects.length ? influence(story.effects) : "");
 }
 
 function reason(story) {

@@ -9,11 +9,11 @@ import { columnFigure } from "./columns.js";
 const TURN = 2 * Math.PI;
 
 export function treeStory(story, showCluster) {
-  return [verdict(story), overview(story, showCluster), positions(story), columnFigure(story.gathered, "Verdict on the accumulated scans")];
+  return [verdict(story), overview(story, showCluster), positions(story), columnFigure(story.column, "Verdict on the accumulated scans")];
 }
 
 function verdict(story) {
-  const label = story.gathered?.verdict ?? (story.confirmed ? "tree" : "other");
+  const label = story.column?.verdict ?? (story.confirmed ? "tree" : "other");
   return el("div", { class: "verdict", "data-verdict": label }, letterOf(verdictOf(label)),
     el("div", {}, el("b", { text: story.confirmed ? "tree" : `not in the map: ${label}` }),
       el("p", { text: seen(story) })));

@@ -74,7 +74,7 @@ function draw() {
   const trees = marks.filter(({ kind }) => kind === "tree").length;
   setText(byId("camera-lead"), seen.why ? `Scan ${seen.index}${late}. No marks: ${seen.why}.`
     : `Scan ${seen.index}${late}. Trees of the map in view: ${trees}; clusters: ${marks.length - trees}. Click one for its story.`);
-  setText(byId("camera-told"), seen.told && `Live: ${seen.told}.`);
+  setText(byId("camera-told"), seen.received && `Live: ${seen.received}.`);
   byId("over-camera").dataset.scan = String(seen.index);
   choose();
 }

@@ -45,7 +45,7 @@ async def play(
     await dashboard.receive(opened(uri, truth=truth, run=run))
     await show(dashboard, scan, n_trees, run)
     async with asyncio.timeout(20):
-        while dashboard.logbook.record is None:
+        while dashboard.run_recorder.record is None:
             await asyncio.sleep(0.01)
 
 
@@ -100,7 +100,7 @@ async def test_what_the_database_refused_is_written_when_it_answers_again(
         raise StemmapError("the disk is full")
 
     with monkeypatch.context() as full:
-        full.setattr(dashboard.keeper, "ask", refuse)
+        full.setattr(dashboard.store, "ask", refuse)
         await show(dashboard, 4, 6)
         await asyncio.wait_for(refused.wait(), 20)
     async with asyncio.timeout(20):
@@ -121,7 +121,7 @@ async def test_who_changed_which_parameter_when(both: Running) -> None:
     for eps in (0.2, 0.3):  # a slider that moves
         await client.patch("/api/parameters", json={"changes": {"clustering.eps": eps}}, headers=NAMED)
     await client.patch("/api/parameters", json={"changes": {"clustering.min_points": 9}})
-    await dashboard.logbook.close()
+    await dashboard.run_recorder.close()
     (row,) = await runs(client)
     changes = (await client.get(f"/api/runs/{row['key']}")).json()["revisions"]
     assert [(each["who"], each["changes"]) for each in changes] == [
@@ -210,10 +210,10 @@ async def test_learning_uses_topics_mounting_seed_and_odometry_of_the_mapped_run
     _, dashboard = both
     wanted = Open("fake:", "static", 7, {"scan": "/other"}, (0.0, 0.1, 2.0, 0.0, 0.0, 0.5))
     await play(dashboard, wanted=wanted)
-    run, author = dashboard.annotating.run, Author("b" * 16, "Ann")
+    run, author = dashboard.annotation_editor.run, Author("b" * 16, "Ann")
     assert run is not None
-    await dashboard.keeper.ask(lambda store: store.add(run, author, [Content(1.0, 2.0)]))
-    (source,) = await dashboard.keeper.ask(lambda store: store.annotated_sources())
+    await dashboard.store.ask(lambda store: store.add(run, author, [Content(1.0, 2.0)]))
+    (source,) = await dashboard.store.ask(lambda store: store.annotated_sources())
     state = dashboard.parameters
     expected = msgspec.structs.replace(
         wanted.request(), preset=state.preset, parameters=state.parameters.flat()

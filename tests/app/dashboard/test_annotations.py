@@ -114,13 +114,13 @@ async def test_a_stale_edit_is_refused_and_says_who_changed_it_when(both: Runnin
 
 async def test_an_edit_for_a_run_that_was_left_does_not_land_in_the_next(both: Running) -> None:
     client, dashboard = both
-    run = dashboard.annotating.run
+    run = dashboard.annotation_editor.run
     await dashboard.receive(opened("other:", run=2))
     refused = await client.post("/api/annotations", json={"run": run, **ANN, "x": 0.0, "y": 0.0})
     assert refused.status_code == 409
     assert "another run" in refused.json()["error"]["what"]
     await dashboard.receive(opened(run=3))
-    assert dashboard.annotating.run == run, "the same source is the same run"
+    assert dashboard.annotation_editor.run == run, "the same source is the same run"
 
 
 @pytest.mark.parametrize(
@@ -229,13 +229,13 @@ async def test_annotations_lie_over_the_truth_of_the_source() -> None:
     async with running() as (client, dashboard):
         client.headers.update(BEARER)
         await show(dashboard, truth=True)
-        assert dashboard.annotating.as_plain()["used"] == "source"
+        assert dashboard.annotation_editor.as_plain()["used"] == "source"
         # The source has trees at 0.05 and 2 m and a pole at 9 m.
         await edit(client, "POST", x=2.2, y=0.1, kind="pole")
         assert dashboard.truth is not None
         assert dashboard.truth.x.tolist() == [0.05, 9.0, 2.2]
         assert dashboard.truth.kind == ("tree", "pole", "pole")
-        assert dashboard.annotating.as_plain()["used"] == "both"
+        assert dashboard.annotation_editor.as_plain()["used"] == "both"
         await edit(client, "POST", "/undo")
         assert dashboard.truth.x.tolist() == [0.05, 2.0, 9.0]
 
@@ -256,7 +256,7 @@ async def test_what_agrees_leaves_the_truth_of_the_source_exact_and_a_person_cho
         await edit(client, "POST", x=2.2, y=0.1)  # the tree that was found there is one
         assert dashboard.truth is not None
         assert sorted(dashboard.truth.x.tolist()) == sorted(exact.x.tolist())
-        assert dashboard.annotating.as_plain()["contradicting"] == 0
+        assert dashboard.annotation_editor.as_plain()["contradicting"] == 0
         await edit(client, "POST", x=0.1, y=0.0, kind="pole")
         await edit(client, "POST", x=30.0, y=0.0, kind="pole")  # nobody knew of it
         assert (await client.get("/api/annotations")).json()["contradicting"] == 1
@@ -270,8 +270,8 @@ async def test_what_agrees_leaves_the_truth_of_the_source_exact_and_a_person_cho
         assert dashboard.truth.x.tolist() == [2.2]
         await edit(client, "POST", "/undo")
         # Who asked for annotations alone is not told the source's truth.
-        assert dashboard.annotating.as_plain()["used"] == "none"
-        assert dashboard.annotating.truth is None
+        assert dashboard.annotation_editor.as_plain()["used"] == "none"
+        assert dashboard.annotation_editor.truth is None
         assert (await choose("both"))["used"] == "source"
         assert dashboard.truth is exact
         refused = await client.put("/api/annotations/against", json={"against": "nothing"})
@@ -353,14 +353,14 @@ async def test_a_store_that_cannot_be_used_is_said_and_the_map_goes_on(tmp_path:
 async def test_the_store_works_beside_the_event_loop() -> None:
     import threading
 
-    keeper = AsyncStore(None)
-    annotating = AnnotationEditor(keeper)
-    await annotating.begin("d", "u", None)
-    assert annotating.run is not None
-    name = await annotating.edit(annotating.run, lambda _: threading.current_thread().name)
+    store = AsyncStore(None)
+    annotation_editor = AnnotationEditor(store)
+    await annotation_editor.begin("d", "u", None)
+    assert annotation_editor.run is not None
+    name = await annotation_editor.edit(annotation_editor.run, lambda _: threading.current_thread().name)
     assert name.startswith("store")
     assert threading.current_thread().name != name
-    await keeper.close()
+    await store.close()
 
 
 def test_who_asks_for_one_of_two_truths_is_not_told_the_other() -> None:

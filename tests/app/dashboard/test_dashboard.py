@@ -231,7 +231,7 @@ async def test_a_cluster_is_selected_with_its_tree_and_stands_while_the_run_goes
 ) -> None:
     await dashboard.receive(opened())
     await dashboard.receive(Shown(1, 0.0, frame(231, 0), 0, path([0.0])))
-    dashboard.selecting.cluster_soon(231, 4)
+    dashboard.selector.cluster_soon(231, 4)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     (question,) = [m for m in worker(dashboard).commands if isinstance(m, AskCluster)]
@@ -243,7 +243,7 @@ async def test_a_cluster_is_selected_with_its_tree_and_stands_while_the_run_goes
     assert told["tree"] == 12
     assert told["cluster"] == {"scan": 231, "cluster": 4, "verdict": "too long", "x": 3.0, "y": 4.0}
     await dashboard.receive(Shown(1, 9.0, frame(900, 9), 0, path([0.0])))
-    assert await dashboard.selecting.story(231, 4) == cluster_story()  # the worker is not asked again
+    assert await dashboard.selector.story(231, 4) == cluster_story()  # the worker is not asked again
     await dashboard.select_tree(None)
     assert browser_knows(dashboard)["selection"]["cluster"] is None
 
@@ -254,7 +254,7 @@ async def test_a_cluster_that_is_not_known_any_more_selects_nothing_and_says_so(
     await dashboard.receive(opened())
     await dashboard.receive(Shown(1, 0.0, frame(231, 0), 0, path([0.0])))
     await dashboard.select_tree(4)
-    dashboard.selecting.cluster_soon(2, 4)
+    dashboard.selector.cluster_soon(2, 4)
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     (question,) = [m for m in worker(dashboard).commands if isinstance(m, AskCluster)]
@@ -262,7 +262,7 @@ async def test_a_cluster_that_is_not_known_any_more_selects_nothing_and_says_so(
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert browser_knows(dashboard)["missing"]["detail"] == "scan 2 was shown too long ago"
-    assert dashboard.selecting.selection.tree == 4
+    assert dashboard.selector.selection.tree == 4
 
 
 async def test_a_loop_goes_round_once_at_its_end_and_again_after_its_beginning(dashboard: Dashboard) -> None:

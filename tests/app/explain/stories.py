@@ -29,7 +29,7 @@ GATHERED = ColumnStory(
     present=9,
     absent=1,
     viewed=4.0,
-    told=[FeatureEffect("tilt", 0.01, 0.2)],
+    effects=[FeatureEffect("tilt", 0.01, 0.2)],
 )
 
 
@@ -55,7 +55,7 @@ def cluster_story(**fields: Any) -> ClusterStory:
         axes=[(0.1, 0.0), (0.0, 0.01)],
         tree=12,
         tree_distance=0.05,
-        gathered=GATHERED,
+        column=GATHERED,
     )
     return msgspec.structs.replace(story, **fields)
 
@@ -78,6 +78,6 @@ def tree_story(number: int) -> TreeStory:
         first_seen_s=0.5,
         last_seen_s=23.0,
         cluster=None,
-        gathered=None,
+        column=None,
         history=History([0.5], [1.0], [2.0], [0.02], [0.01], [0.3], [0.3], [0.01]),
     )

@@ -67,12 +67,12 @@ def test_a_tree_tells_its_votes_its_sides_and_how_it_became_sure(session: Sessio
     for row in rows:
         story = tree_story(session.run, int(trees.number[row]))
         assert 10 * sum(story.sides) == pytest.approx(story.coverage_deg)
-        assert story.gathered is not None
-        assert story.gathered.verdict == "tree"
-        assert sum(story.gathered.votes.values()) == pytest.approx(1.0, abs=0.01)  # leaves are rounded
-        assert story.gathered.by_votes
-        assert story.gathered.votes["tree"] >= story.gathered.tree_share
-        sizes = [abs(told.effect) for told in story.gathered.told]
+        assert story.column is not None
+        assert story.column.verdict == "tree"
+        assert sum(story.column.votes.values()) == pytest.approx(1.0, abs=0.01)  # leaves are rounded
+        assert story.column.by_votes
+        assert story.column.votes["tree"] >= story.column.tree_share
+        sizes = [abs(each.effect) for each in story.column.effects]
         assert sizes == sorted(sizes, reverse=True)
         assert len(story.history.x) == story.observations
         assert story.history.major[-1] == pytest.approx(story.ellipse[0])
@@ -104,7 +104,7 @@ def test_a_preset_that_fits_no_circle_is_told_without_one(session: Session):
         story = cluster_story(mapped.run, frame, row)
         assert story.circle is None
         assert story.residual == []
-        assert story.gathered is None
+        assert story.column is None
         # The axes are those of the eccentricity.
         (a, b), (c, d) = story.axes
         if np.isfinite(story.eccentricity):

@@ -58,6 +58,6 @@ def test_a_pole_in_free_air_is_told_by_the_trees_that_took_it_for_one(
     story = build.column_story(frame, np.zeros(2), preset("forest"), SENSOR)
     assert story is not None
     assert (story.tree_in_free_air, story.verdict) == (share, verdict)
-    assert [figure.figure for figure in story.told] == told
-    assert all(figure.effect < 0.0 for figure in story.told)
+    assert [figure.figure for figure in story.effects] == told
+    assert all(figure.effect < 0.0 for figure in story.effects)
     assert story.verdict == Verdict.POLE.label or story.votes["tree"] == 1.0

@@ -245,7 +245,7 @@ async def test_a_task_that_had_failed_hinders_no_end(caplog: pytest.LogCaptureFi
 async def test_a_run_that_is_open_in_any_dashboard_is_not_deleted():
     async with served("red", "blue") as (_, fleet), httpx.AsyncClient() as client:
         red, blue = fleet.members.values()
-        blue.dashboard.logbook._page = _Page(
+        blue.dashboard.run_recorder._page = _Page(
             NewRun(0, "run", "fake", SourceRequest("fake:blue")), 3, record=7
         )
         for member, words in ((red, "of another robot"), (blue, "is open")):

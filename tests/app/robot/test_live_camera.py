@@ -115,7 +115,7 @@ def test_the_picture_beside_a_live_scan_is_that_of_its_recordings(run: Path, tmp
             assert (found.picture.stamp_ns, found.picture.data) == (stamp_ns, wanted.data)
             np.testing.assert_allclose(found.camera.K, CAMERA.K)
             np.testing.assert_allclose(found.camera.T_base_camera.t, CAMERA.T_base_camera.t)
-            assert found.told.startswith(f"of {len(stamps)} pictures {len(stamps)} were taken in")
+            assert found.received.startswith(f"of {len(stamps)} pictures {len(stamps)} were taken in")
         with pytest.raises(StemmapError, match="no picture was taken"):
             camera_picture(live, stamps[-1] + SHOWN_NS + 1)
         assert camera_picture(live, stamps[-1] + SHOWN_NS).picture.stamp_ns == stamps[-1]
@@ -127,7 +127,7 @@ def test_the_picture_beside_a_live_scan_is_that_of_its_recordings(run: Path, tmp
         again = camera_picture(replay, stamps[1])
         assert again.camera is not None
         assert again.picture.data == next(replay.pictures({stamps[1]})).data
-        assert again.told == ""
+        assert again.received == ""
 
 
 def test_the_map_is_made_of_the_same_with_pictures_and_without(run: Path):
@@ -305,7 +305,7 @@ def test_pictures_arrived_over_plain_dds(run: Path):
         camera, _ = source.camera()
         assert camera is not None
         np.testing.assert_allclose(camera.K, CAMERA.K)
-        until(lambda: "of 0 pictures" not in source.pictures_told, lambda: source.pictures_told)
+        until(lambda: "of 0 pictures" not in source.picture_counts, lambda: source.picture_counts)
         writers.clear()
         del participant
 

@@ -12,11 +12,11 @@ from app.dashboard.parameters import read_file
 from app.sources.request import SourceRequest
 from app.tuning.plan import (
     SENSIBLE,
-    Axis,
     Goal,
     Plan,
     PlannedRun,
     RunScore,
+    SearchAxis,
     Trial,
     axes_of,
     check,
@@ -160,7 +160,7 @@ def test_bounds_that_leave_no_set_are_told_by_their_contradiction():
 @given(st.data())
 @pytest.mark.parametrize("spec", [s for s in field_specs() if s.kind == "float"][:20], ids=lambda s: s.name)
 def test_what_is_tried_lies_within_the_bounds(spec, data):
-    axis = Axis(spec.name, "float", spec.minimum or 0.0, spec.maximum or 1.0)
+    axis = SearchAxis(spec.name, "float", spec.minimum or 0.0, spec.maximum or 1.0)
     suggested = data.draw(st.floats(axis.low, axis.high))
     value = axis.value_of(suggested)
     assert axis.holds(value)

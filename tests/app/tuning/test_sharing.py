@@ -112,7 +112,7 @@ def test_the_last_trial_is_begun_by_one_of_two_that_ask_at_once(told: Plan):
 
         def asked() -> Any:
             one.study.ask = ask
-            assert other.step() is not None  # between the look at what is left and the asking
+            assert other.step() is not None  # between the look at what is left and the worker_client
             return ask()
 
         one.study.ask = asked

@@ -287,7 +287,7 @@ async def test_runs_of_the_list_are_searched_over_or_held_out_where_they_can_be_
         if known:
             await until(lambda: dashboard.scores.latest is not None)
     await dashboard.open(Open("fake:"))
-    await dashboard.logbook.close()
+    await dashboard.run_recorder.close()
     await dashboard.receive(msgspec.structs.replace(opened(run=9), truth=truth_trees()))
     listed = {run["name"]: run for run in (await client.get("/api/search")).json()["runs"]}
     assert {name: run["why_not"] for name, run in listed.items()} == {

@@ -238,7 +238,7 @@ async def test_who_may_look_hears_and_selects_nothing() -> None:
                     if message["type"] == "selection":
                         chosen.append(message["tree"])
         assert 3 not in chosen
-        assert dashboard.selecting.selection.tree == 5
+        assert dashboard.selector.selection.tree == 5
 
 
 async def test_the_link_becomes_a_cookie_and_a_clean_address(client: httpx.AsyncClient) -> None:

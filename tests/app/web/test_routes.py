@@ -183,14 +183,14 @@ async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: R
     rough = json.loads(dashboard.live._messages["rough"][1])
     assert (rough["revision"], len(rough["places"])) == (1, len(frame.trees.number))
     await dashboard.receive(Remapped(7, changes))  # of a run that was left
-    assert dashboard.selecting.selection.tree == 2
+    assert dashboard.selector.selection.tree == 2
     await dashboard.receive(Remapped(1, changes))
-    assert dashboard.selecting.selection.tree == 5
+    assert dashboard.selector.selection.tree == 5
     marks = [e for e in dashboard.events.as_plain()["events"] if e["kind"] == "tree"]
     assert [(e["t"], e["text"]) for e in marks] == [(0.1, "Tree 1 confirmed"), (0.2, "Tree 5 confirmed")]
     assert (await client.get("/api/trees")).status_code == 200
     await dashboard.receive(Remapped(1, msgspec.structs.replace(changes, followed=[(1, 1)])))
-    assert dashboard.selecting.selection.tree is None
+    assert dashboard.selector.selection.tree is None
 
 
 @pytest.mark.parametrize(
@@ -420,12 +420,12 @@ async def test_stories_are_told_and_refused_in_words(both: Running) -> None:
     assert refused.status_code == 404
     assert "nothing is mapped yet" in refused.json()["error"]["what"]
     await show(dashboard)
-    asking = asyncio.create_task(client.get("/api/story/cluster/4?scan=231"))
+    worker_client = asyncio.create_task(client.get("/api/story/cluster/4?scan=231"))
     while not (asked := [m for m in told(dashboard) if isinstance(m, AskCluster)]):
         await asyncio.sleep(0.01)
     assert (asked[0].scan, asked[0].cluster) == (231, 4)
     await dashboard.receive(Answer(asked[0].ticket, cluster=cluster_story(eccentricity=float("inf"))))
-    story = (await asking).json()
+    story = (await worker_client).json()
     assert story["verdict"] == "too long"
     assert story["eccentricity"] is None
     assert story["checks"][0]["title"] == "Eccentricity max"

@@ -46,7 +46,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosSource]:
     opened_again.close()
 
 
-def standing(*trees: tuple[float, float]) -> Frame:
+def current(*trees: tuple[float, float]) -> Frame:
     """A scan at (2, 1) of the map, looking along x, with a cluster 4 m ahead and trees in the base frame."""
     seen = frame(3, 5_200_000_000)
     pose = replace(seen.estimate, T_map_base=Pose2(2.0, 1.0, 0.0))
@@ -59,7 +59,7 @@ def standing(*trees: tuple[float, float]) -> Frame:
 
 
 def test_marks_stand_where_the_things_are():
-    marks = marks_of(standing((5.0, 0.0), (8.0, 1.0), (-5.0, 0.0), (5.0, 40.0)), CAMERA, Pose2())
+    marks = marks_of(current((5.0, 0.0), (8.0, 1.0), (-5.0, 0.0), (5.0, 40.0)), CAMERA, Pose2())
     cluster, far, near = marks  # trees lie on top, the nearest last
     assert [(mark["kind"], mark["number"]) for mark in marks] == [("cluster", 0), ("tree", 2), ("tree", 1)]
     assert near["left"] + near["width"] / 2 == pytest.approx(0.5, abs=1e-3)
@@ -78,14 +78,14 @@ def test_the_box_of_a_tree_is_on_the_stem_that_was_rendered():
     truth = TruthTrees(np.array([5.0]), np.array([0.4]), np.array([0.3]), ("tree",))
     picture = np.asarray(Image.open(io.BytesIO(rendered(truth, (0.0, 0.0, 0.0)))).convert("RGB")).astype(int)
     brown = np.flatnonzero(np.abs(picture[150] - [104, 78, 52]).sum(axis=1) < 60)
-    mark = next(m for m in marks_of(standing((5.0, 0.4)), CAMERA, Pose2()) if m["kind"] == "tree")
+    mark = next(m for m in marks_of(current((5.0, 0.4)), CAMERA, Pose2()) if m["kind"] == "tree")
     assert abs(brown[0] - mark["left"] * CAMERA.width) < 4
     assert abs(brown[-1] - (mark["left"] + mark["width"]) * CAMERA.width) < 4
 
 
 def test_marks_stand_as_seen_from_where_the_robot_was_when_the_picture_was_taken():
     moved = Pose2(-0.5, 0.1, 0.2)
-    there = standing((5.0, 0.0), (8.0, 1.0))
+    there = current((5.0, 0.0), (8.0, 1.0))
     # The same trees and points, told from the place of the picture.
     pose = there.estimate.T_map_base @ moved
     points = there.filtered.astype(np.float64) + there.sensor_offset
@@ -165,7 +165,7 @@ async def test_the_page_asks_for_the_picture_and_its_marks(both: Running) -> Non
     client, dashboard = both
     assert (await client.get("/api/camera")).status_code == 409
     await dashboard.receive(opened())
-    await dashboard.receive(Shown(1, 0.2, standing((5.0, 0.0)), 0, path([0.0, 0.5, 1.0])))
+    await dashboard.receive(Shown(1, 0.2, current((5.0, 0.0)), 0, path([0.0, 0.5, 1.0])))
     raw = Picture(5_250_000_000, "rgb8", 1920, 1080, 1920 * 3, bytes(1920 * 1080 * 3))
     damaged = Picture(5_260_000_000, "", 0, 0, 0, bomb())
     lost = CameraPicture(replace(raw, stamp_ns=5_270_000_000), None, "no CameraInfo")
@@ -196,13 +196,13 @@ async def test_the_page_asks_for_the_picture_and_its_marks(both: Running) -> Non
     assert (await client.get("/api/camera/5250000000.jpg")).status_code == 404
     # Another run may have a picture of the same time.
     assert (await client.get("/api/camera")).json()["of"] != unplaced["of"]
-    camera = dashboard.asking.camera
+    camera = dashboard.worker_client.camera
 
     async def left_meanwhile(stamp_ns: int) -> CameraPicture:
         found = await camera(stamp_ns)
         dashboard.camera.forget()
         return found
 
-    dashboard.asking.camera = left_meanwhile  # type: ignore[method-assign]
+    dashboard.worker_client.camera = left_meanwhile  # type: ignore[method-assign]
     assert "another run was opened" in (await client.get("/api/camera")).text
     assert (await client.get("/api/camera/5270000000.jpg")).status_code == 404

@@ -89,13 +89,13 @@ def remapped(session: Session, scans: int = 7) -> tuple[Frame, MapChanges]:
 
 @pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER, JUDGED])
 def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters):
-    standing = session.status().scan_index
+    current = session.status().scan_index
     session.set_parameters(parameters, 1, whole=True)
     assert session.is_remapping
     frame, changes = remapped(session)
-    assert (told(frame), told(session.path)) == mapped_with(parameters, standing)
+    assert (told(frame), told(session.path)) == mapped_with(parameters, current)
     assert changes.revision == 1
-    assert changes.scans == standing + 1
+    assert changes.scans == current + 1
     assert session.status().remapped is None
     assert not any(thread.name.startswith("segment") for thread in threading.enumerate()), "none is left"
 

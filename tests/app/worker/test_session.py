@@ -129,17 +129,17 @@ class Model:
 
     eps_of: dict[int, float] = field(default_factory=dict)
     eps: float = 0.15
-    standing: int = -1
+    current: int = -1
 
     def stand(self, index: int) -> None:
         index = min(max(index, 0), SCANS - 1)
-        if index <= self.standing and index != self.standing:
+        if index <= self.current and index != self.current:
             self._from(index)
-        self.standing = index
+        self.current = index
 
     def change(self, eps: float) -> None:
         self.eps = eps
-        self._from(max(self.standing, 0))
+        self._from(max(self.current, 0))
 
     def _from(self, index: int) -> None:
         self.eps_of = {k: v for k, v in self.eps_of.items() if k < index}
@@ -166,10 +166,10 @@ def test_whatever_is_done_the_picture_is_that_of_a_plain_run(done: list[tuple[st
             model.stand(int(value))
         elif name == "advance":
             session.advance(int(value))
-            model.stand(model.standing + int(value))
+            model.stand(model.current + int(value))
         elif name == "play":
             if session.status().state == "finished":
-                model.standing = SCANS  # playing begins anew: it goes back to the first scan
+                model.current = SCANS  # playing begins anew: it goes back to the first scan
                 model.stand(0)
             session.play()
             settle(session)
@@ -178,14 +178,14 @@ def test_whatever_is_done_the_picture_is_that_of_a_plain_run(done: list[tuple[st
                 if session.status().state == "playing":
                     assert session.frame is not None
             session.pause()
-            model.standing = session.status().scan_index
+            model.current = session.status().scan_index
         else:
             session.set_parameters(parameters(value), 1)
             model.change(value)
         settle(session)
-        assert session.status().scan_index == model.standing
-        if model.standing >= 0:
-            assert checksum(session) == played(model.eps_of, model.standing)
+        assert session.status().scan_index == model.current
+        if model.current >= 0:
+            assert checksum(session) == played(model.eps_of, model.current)
 
 
 impatient = st.lists(

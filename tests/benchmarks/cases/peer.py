@@ -16,7 +16,7 @@ from tests.benchmarks.timing import middle, quantile
 from tests.benchmarks.turns import STAGES
 
 if TYPE_CHECKING:
-    from pipeline.evaluation import Evaluation
+    from pipeline.evaluation import MapScores
 
 NAME = "peer"
 LINE = "The whole pipeline beside one written with Open3D, NumPy, filterpy and plain Python"
@@ -153,7 +153,7 @@ def _map_rows(
     return rows
 
 
-def _judged(uri: str, parameters: Any, result: dict[str, Any]) -> Evaluation:
+def _judged(uri: str, parameters: Any, result: dict[str, Any]) -> MapScores:
     import numpy as np
 
     from pipeline.evaluation import evaluate

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from app.cli import main
-from app.tuning.sweep.sweep import AnswerStore, sweep
+from app.tuning.sweep.sweep import ResultStore, sweep
 from pipeline.errors import StemmapError
 from tests.app.tuning.sweep.jobs import job
 
@@ -67,7 +67,7 @@ def test_a_worker_of_a_cluster_that_is_killed_is_survived_and_counted(tmp_path, 
 
     jobs = [job(0.1), job(0.2, particles=7), job(0.3), job(0.4)]
     with closing(DaskWorkers(cluster, dies_once_for_nothing)) as workers:
-        outcome = sweep(jobs, workers, AnswerStore(None))
+        outcome = sweep(jobs, workers, ResultStore(None))
     assert [answer.scores and answer.scores["f1"] for answer in outcome.answers] == [0.1, 0.2, 0.3, 0.4]
     assert (tmp_path / "died").exists()
     assert sum(outcome.lost.values()) == 1

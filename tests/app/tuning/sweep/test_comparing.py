@@ -10,12 +10,12 @@ from html.parser import HTMLParser
 
 import pytest
 
-from app.tuning.sweep.jobs import Answer, PreparedRun, SweepPlan
+from app.tuning.sweep.jobs import JobResult, PreparedRun, SweepPlan
 from app.tuning.sweep.report import (
     CRITERIA,
     Comparison,
     best_of,
-    compare_answers,
+    compare_results,
     files,
     json_text,
     lines,
@@ -35,14 +35,14 @@ def comparison() -> Comparison:
     runs = (PreparedRun("first", job(0.1).run, "forest"), PreparedRun(EVIL, job(0.1).run, "forest"))
     jobs = {(s, r): job(values[s], seed=r) for s in range(3) for r in range(2)}
     answers = {
-        (0, 0): Answer(scores(0.8, found=3), 2.0, True),
-        (0, 1): Answer(scores(0.6, found=2), 1.0),
-        (1, 0): Answer(scores(0.9, found=4, wrong=2), 2.0),
-        (1, 1): Answer(scores(None, found=4), 2.0),
-        (2, 0): Answer(scores(1.0), 2.0),
-        (2, 1): Answer(None, error="the disk is full", fault="job"),
+        (0, 0): JobResult(scores(0.8, found=3), 2.0, True),
+        (0, 1): JobResult(scores(0.6, found=2), 1.0),
+        (1, 0): JobResult(scores(0.9, found=4, wrong=2), 2.0),
+        (1, 1): JobResult(scores(None, found=4), 2.0),
+        (2, 0): JobResult(scores(1.0), 2.0),
+        (2, 1): JobResult(None, error="the disk is full", fault="job"),
     }
-    return compare_answers(SweepPlan(runs, sets, jobs, {}), answers)
+    return compare_results(SweepPlan(runs, sets, jobs, {}), answers)
 
 
 def test_counts_are_added_up_and_all_else_is_the_mean(comparison):

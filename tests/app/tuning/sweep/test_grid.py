@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.tuning.sweep.grid import Axis, combinations, read_axes, spread, words_of
+from app.tuning.sweep.grid import GridAxis, combinations, read_axes, spread, words_of
 from pipeline.config import assign, preset
 from pipeline.errors import ParameterError
 
@@ -98,9 +98,9 @@ def test_a_span_has_its_ends_and_even_steps(low, high, count, ratio):
 
 def test_every_combination_is_there_once_and_reads_as_set_takes_it():
     axes = (
-        Axis("clustering.eps", (0.1, 0.2)),
-        Axis("slam.particles", (5, 7, 9)),
-        Axis("preset", ("forest",)),
+        GridAxis("clustering.eps", (0.1, 0.2)),
+        GridAxis("slam.particles", (5, 7, 9)),
+        GridAxis("preset", ("forest",)),
     )
     sets = combinations(axes)
     assert len({words_of(changes) for changes in sets}) == len(sets) == 6

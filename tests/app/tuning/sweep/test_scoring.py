@@ -10,7 +10,7 @@ import pytest
 
 from app.cli import main
 from app.sources.request import SourceRequest
-from app.tuning.sweep.jobs import Answer, Job, PreparedRun, code_digest, prepare_run
+from app.tuning.sweep.jobs import Job, JobResult, PreparedRun, code_digest, prepare_run
 from app.tuning.sweep.scoring import Scorer, score_json
 from pipeline.config import preset
 
@@ -77,14 +77,14 @@ def test_a_worker_of_another_version_or_with_another_recording_says_so():
         (other, "worker", "another"),
         (gone, "worker", "gone"),
     ):
-        answer = msgspec.json.decode(score_json(msgspec.json.encode(job)), type=Answer)
+        answer = msgspec.json.decode(score_json(msgspec.json.encode(job)), type=JobResult)
         assert (answer.scores, answer.fault) == (None, fault)
         assert says in answer.error
 
 
 @pytest.mark.parametrize("text", [b"", b"{}", b"[1]", b'{"run": 3}', b"\xff"])
 def test_what_is_no_job_is_answered(text):
-    assert msgspec.json.decode(score_json(text), type=Answer).error.startswith("this is not a job")
+    assert msgspec.json.decode(score_json(text), type=JobResult).error.startswith("this is not a job")
 
 
 def test_truth_far_from_the_path_is_no_score():

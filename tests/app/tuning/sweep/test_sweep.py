@@ -11,17 +11,17 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from app.tuning.sweep.jobs import Answer, Job, code_digest
-from app.tuning.sweep.sweep import MOST_LOSSES, AnswerStore, Done, Event, Lost, Processes, sweep
+from app.tuning.sweep.jobs import Job, JobResult, code_digest
+from app.tuning.sweep.sweep import MOST_LOSSES, Done, Event, Lost, Processes, ResultStore, sweep
 from tests.app.tuning.sweep.jobs import job, scores
 
-NOTHING = AnswerStore(None)
-Does = Callable[[str, Job], Answer | str]
+NOTHING = ResultStore(None)
+Does = Callable[[str, Job], JobResult | str]
 
 
-def fine(_worker: str, asked: Job) -> Answer:
+def fine(_worker: str, asked: Job) -> JobResult:
     """Every job works."""
-    return Answer(scores(asked.parameters["clustering"]["eps"]), 1.0)
+    return JobResult(scores(asked.parameters["clustering"]["eps"]), 1.0)
 
 
 class InMemory:
@@ -62,7 +62,7 @@ def processes(count: int, folder: Path) -> Iterator[Processes]:
         workers.close()
 
 
-def f1_of(answers: list[Answer]) -> list[float | None]:
+def f1_of(answers: list[JobResult]) -> list[float | None]:
     return [None if answer.scores is None else answer.scores["f1"] for answer in answers]
 
 
@@ -95,15 +95,15 @@ def test_processes_that_are_killed_in_the_middle_are_replaced_and_counted(tmp_pa
 def test_what_a_killed_sweep_had_done_is_not_done_again(tmp_path):
     jobs = [job(eps) for eps in (0.1, 0.2, 0.3)]
 
-    def stopped(worker: str, asked: Job) -> Answer:
+    def stopped(worker: str, asked: Job) -> JobResult:
         if asked == jobs[2]:
             raise KeyboardInterrupt
         return fine(worker, asked)
 
     with pytest.raises(KeyboardInterrupt):
-        sweep(jobs, InMemory(["a"], stopped), AnswerStore(tmp_path))
+        sweep(jobs, InMemory(["a"], stopped), ResultStore(tmp_path))
     workers = InMemory(["a"], fine)
-    outcome = sweep(jobs, workers, AnswerStore(tmp_path))
+    outcome = sweep(jobs, workers, ResultStore(tmp_path))
     # Of the second no answer was heard: the program was killed before.
     assert outcome.known + len(workers.done) == len(jobs)
     assert outcome.known >= 1
@@ -112,30 +112,30 @@ def test_what_a_killed_sweep_had_done_is_not_done_again(tmp_path):
 
 def test_damaged_and_foreign_files_are_computed_again_and_failures_are_not_kept(tmp_path):
     jobs = [job(0.1), job(0.2)]
-    fails = InMemory(["a"], lambda *_: Answer(None, error="no", fault="job"))
-    assert f1_of(sweep(jobs, fails, AnswerStore(tmp_path)).answers) == [None, None]
-    sweep(jobs, InMemory(["a"], fine), AnswerStore(tmp_path))
+    fails = InMemory(["a"], lambda *_: JobResult(None, error="no", fault="job"))
+    assert f1_of(sweep(jobs, fails, ResultStore(tmp_path)).answers) == [None, None]
+    sweep(jobs, InMemory(["a"], fine), ResultStore(tmp_path))
     files = sorted(tmp_path.rglob("*.json"))
     assert len(files) == 2
     files[0].write_bytes(files[0].read_bytes()[:-5])
-    outcome = sweep(jobs, InMemory(["a"], fine), AnswerStore(tmp_path))
+    outcome = sweep(jobs, InMemory(["a"], fine), ResultStore(tmp_path))
     assert outcome.known == 1
     assert any("1 stored result could not be read" in warning for warning in outcome.warnings)
-    assert sweep(jobs, InMemory(["a"], fine), AnswerStore(tmp_path)).known == 2
+    assert sweep(jobs, InMemory(["a"], fine), ResultStore(tmp_path)).known == 2
 
 
 @pytest.mark.parametrize(
     "harm", [{"TA": 3}, {"TA": {"count": None, "of": 4}}, {"f1": "0.5"}, {"f1": [1]}, {"scans": True}, None]
 )
 def test_an_answer_without_the_figures_is_none_wherever_it_comes_from(harm, tmp_path):
-    def odd(worker: str, asked: Job) -> Answer:
+    def odd(worker: str, asked: Job) -> JobResult:
         told = fine(worker, asked)
-        return told if worker == "b" else Answer({} if harm is None else {**(told.scores or {}), **harm})
+        return told if worker == "b" else JobResult({} if harm is None else {**(told.scores or {}), **harm})
 
     outcome = sweep([job(0.1)], InMemory(["a", "b"], odd), NOTHING)
     assert f1_of(outcome.answers) == [0.1]
     assert outcome.lost == {"it sent an invalid answer": 1}
-    kept = AnswerStore(tmp_path)
+    kept = ResultStore(tmp_path)
     kept.put(job(0.1).key(), odd("a", job(0.1)))
     outcome = sweep([job(0.1)], InMemory(["b"], fine), kept)
     assert (outcome.known, f1_of(outcome.answers)) == (0, [0.1])
@@ -144,7 +144,7 @@ def test_an_answer_without_the_figures_is_none_wherever_it_comes_from(harm, tmp_
 
 def test_where_nothing_can_be_written_the_results_come_all_the_same(tmp_path):
     (tmp_path / "file").touch()
-    outcome = sweep([job(0.1)], InMemory(["a"], fine), AnswerStore(tmp_path / "file"))
+    outcome = sweep([job(0.1)], InMemory(["a"], fine), ResultStore(tmp_path / "file"))
     assert f1_of(outcome.answers) == [0.1]
     assert any("not stored" in warning for warning in outcome.warnings)
 
@@ -168,8 +168,8 @@ def test_another_run_or_set_has_another_key(change):
 
 
 def test_a_worker_without_the_recording_leaves_it_to_others_and_is_told():
-    def there_alone(worker: str, asked: Job) -> Answer:
-        return fine(worker, asked) if worker == "b" else Answer(None, error="no such file", fault="worker")
+    def there_alone(worker: str, asked: Job) -> JobResult:
+        return fine(worker, asked) if worker == "b" else JobResult(None, error="no such file", fault="worker")
 
     outcome = sweep([job(0.1), job(0.2)], InMemory(["a", "b"], there_alone), NOTHING)
     assert f1_of(outcome.answers) == [0.1, 0.2]
@@ -177,9 +177,9 @@ def test_a_worker_without_the_recording_leaves_it_to_others_and_is_told():
 
 
 def test_where_no_worker_has_the_recording_its_jobs_fail_and_others_go_on():
-    def lacking(worker: str, asked: Job) -> Answer:
+    def lacking(worker: str, asked: Job) -> JobResult:
         return (
-            Answer(None, error="no such file", fault="worker")
+            JobResult(None, error="no such file", fault="worker")
             if asked.run.digest == "x"
             else fine(worker, asked)
         )
