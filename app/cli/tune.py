@@ -87,7 +87,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     place = parser.add_mutually_exclusive_group()
     place.add_argument(
         "--journal", metavar="FILE", type=Path,
-        help="file with the trials; the same command continues with it (default: beside --out)",
+        help="file with the trials; the same command continues with it (default: next to --out)",
     )  # fmt: skip
     place.add_argument(
         "--storage", metavar="ADDRESS", nargs="?", const="",

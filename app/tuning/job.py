@@ -1,8 +1,8 @@
 """The parameter search of the page: its process, its state, and what the browsers show of it.
 
-A search maps the open run and other runs of the list, with the true trees and the parameters of the moment in
-which it begins, in a process of its own. A stopped search can continue from its journal. The process and the
-journal are removed when the run is left, another search begins or stemmap ends.
+A search maps the open run and other runs of the list in a child process, with the true trees and parameters
+at its start. A stopped search can continue from its journal. Process and journal are removed when the run is
+closed, another search begins or stemmap ends.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class TuneSearch:
 
     Args:
         tell: Called with the state for the browsers whenever it changes.
-        command: The program of the search.
+        command: Program and arguments of the child process.
 
     Attributes:
-        plan, asked: What is searched for, and the request of the browser.
+        plan, request: The search, and the request of the browser from which it was made.
         result: The result, once the search has ended.
     """
 
@@ -57,7 +57,7 @@ class TuneSearch:
         self._error = ""
         self.plan: Plan | None = None
         self.result: Result | None = None
-        self.asked: SearchRequest | None = None
+        self.request: SearchRequest | None = None
         self._start: Trial | None = None
         self._trials: dict[int, Trial] = {}
         # Deletes the journal, at the latest when this process ends.
@@ -66,12 +66,12 @@ class TuneSearch:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether a process searches."""
+        """Whether the child process runs."""
         return self._task is not None and not self._task.done()
 
     @property
     def can_go_on(self) -> bool:
-        """Whether a search ended before its last trial."""
+        """Whether the search was stopped before its last trial."""
         made = len(self._trials)
         return self._folder is not None and not self.is_under_way and bool(self.plan) and made < self._wanted
 
@@ -79,15 +79,15 @@ class TuneSearch:
     def _wanted(self) -> int:
         return 0 if self.plan is None else self.plan.trials
 
-    async def start(self, plan: Plan, asked: SearchRequest | None = None) -> None:
-        """Begin a search. A stopped search is removed.
+    async def start(self, plan: Plan, request: SearchRequest | None = None) -> None:
+        """Start a search. A stopped search is removed.
 
         Args:
-            plan: What is searched for; the storage is chosen here.
-            asked: The request from which the plan was made.
+            plan: The search; its storage is set here.
+            request: The request from which the plan was made.
 
         Raises:
-            StemmapError: A search is under way, or no process can be started.
+            StemmapError: Another search runs, or no process can be started.
         """
         self._check_idle()
         async with self._turn:
@@ -95,13 +95,13 @@ class TuneSearch:
             folder = _folder()
             self._folder = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
             plan = msgspec.structs.replace(plan, storage=str(folder / "journal"))
-            await self._run(plan, asked)
+            await self._run(plan, request)
 
     async def go_on(self, now: Plan) -> None:
         """Continue the stopped search from its journal.
 
         Args:
-            now: The plan that the same request makes now.
+            now: The plan that the same request gives now.
 
         Raises:
             StemmapError: No search was stopped, or true trees or parameters have changed since it began.
@@ -111,17 +111,17 @@ class TuneSearch:
             raise StemmapError("there is no stopped search", remedy="Search")
         check_same(self.plan, now)
         async with self._turn:
-            await self._run(self.plan, self.asked)
+            await self._run(self.plan, self.request)
 
     async def stop(self) -> None:
-        """Stop the search. Its result stays."""
+        """Ask the process to stop; it then sends the result."""
         if self._process is not None and self.is_under_way:
             self._state = "stopping"
             self.show()
             await self._process.send("stop")
 
     async def leave(self) -> None:
-        """End the search and remove its result, because its run is left."""
+        """End the search and remove its result, because the run is closed."""
         async with self._turn:
             task, self._task = self._task, None
             await cancel(task)
@@ -132,9 +132,9 @@ class TuneSearch:
         if self.is_under_way or self._turn.locked():
             raise StemmapError("a search is under way", remedy="Stop it first")
 
-    async def _run(self, plan: Plan, asked: SearchRequest | None) -> None:
+    async def _run(self, plan: Plan, request: SearchRequest | None) -> None:
         process = self._process = await ChildProcess.start(self._command)
-        self.plan, self.asked, self._state, self._error = plan, asked, "looking", ""
+        self.plan, self.request, self._state, self._error = plan, request, "looking", ""
         self._began = False
         self._task = asyncio.create_task(self._listen(process), name="search")
         self._task.add_done_callback(lambda _: self.show())  # from now on it can continue
@@ -157,7 +157,7 @@ class TuneSearch:
         self._tell(self.as_plain())
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state for the browsers."""
+        """Return the state and the progress for the browsers."""
         if self.plan is None:
             return {"state": "none"}
         return {
@@ -169,7 +169,7 @@ class TuneSearch:
 
     def _forget(self) -> None:
         self._state, self._error = "none", ""
-        self.plan = self.result = self._start = self.asked = None
+        self.plan = self.result = self._start = self.request = None
         self._trials = {}
         if self._folder is not None:
             self._folder()
@@ -249,15 +249,15 @@ class SearchRequest(BaseModel):
 
 
 class OtherRun(msgspec.Struct, frozen=True):
-    """A run of the list that is not open.
+    """A run in the list of runs that is not open.
 
     Attributes:
         records: Numbers of its records, the newest first.
-        name: Its name in the list.
+        name: Name in the list.
         digest: Digest of its source.
-        opened: How it was opened last.
+        opened: Request with which it was opened last.
         annotations: Its annotations.
-        why_not: Why it cannot be scored; empty where it can.
+        why_not: Reason why it cannot be scored; empty if it can.
     """
 
     records: list[int]
@@ -268,7 +268,7 @@ class OtherRun(msgspec.Struct, frozen=True):
     why_not: str
 
     def as_plain(self) -> dict[str, Any]:
-        """For the browsers."""
+        """Return the run for the browsers."""
         truth = count(len(self.annotations.x), "annotation") if self.annotations.x else "its own true trees"
         return {"record": self.records[0], "name": self.name, "truth": truth, "why_not": self.why_not}
 
@@ -282,10 +282,10 @@ def other_runs(
     """Return the runs of the list except the open one, one per source. Checks whether their files exist.
 
     Args:
-        rows: Records, the newest first.
+        rows: Records of the store, the newest first.
         annotated: Sources with annotations.
         open_digest: Digest of the open run.
-        may_be_opened: Returns what is opened for a URI, or None where that is not allowed.
+        may_be_opened: Returns the URI that is opened for a URI, or None if that is not allowed.
     """
     contents = {each.source: each.annotations for each in annotated}
     found: dict[str, OtherRun] = {}
@@ -316,7 +316,7 @@ def other_runs(
 
 
 def plan_of(
-    asked: SearchRequest,
+    request: SearchRequest,
     source: SourceRequest,
     digest: str,
     truth: TruthTrees | None,
@@ -327,7 +327,7 @@ def plan_of(
     """Return the plan of a search.
 
     Args:
-        asked: The request.
+        request: The request.
         source, digest, truth: The open run; the digest is empty where none is open.
         parameters, preset: Those in force.
         others: The other runs of the list.
@@ -341,21 +341,21 @@ def plan_of(
         raise StemmapError("a live run cannot be mapped again", where=source.uri, remedy="Open its recording")
     if truth is None or "tree" not in truth.kind:
         raise StemmapError("no true trees are known of this run", remedy="Annotate some in the tab Annotate")
-    axes = axes_of(asked.over)
+    axes = axes_of(request.over)
     check(axes, parameters)
     shown = PlannedRun(source.request(), TruthTable.of(truth), "annotations")
     return Plan(
-        runs=(shown, *_planned(asked, others)),
+        runs=(shown, *_planned(request, others)),
         axes=axes,
         start=parameters.model_dump(),
         storage="",
         preset=preset,
-        goal=asked.goal,
-        false_max=asked.false_max,
+        goal=request.goal,
+        false_max=request.false_max,
         seed=source.seed,
         odometry=source.odometry,
-        trials=asked.trials,
-        seconds=60.0 * asked.minutes,
+        trials=request.trials,
+        seconds=60.0 * request.minutes,
     )
 
 
@@ -384,11 +384,11 @@ def check_same(stopped: Plan, now: Plan) -> None:
         )
 
 
-def _planned(asked: SearchRequest, others: Sequence[OtherRun]) -> list[PlannedRun]:
+def _planned(request: SearchRequest, others: Sequence[OtherRun]) -> list[PlannedRun]:
     by_record = {record: run for run in others for record in run.records}
     planned: list[PlannedRun] = []
     named: set[str] = set()
-    for record, held_out in [(r, False) for r in asked.also] + [(r, True) for r in asked.held_out]:
+    for record, held_out in [(r, False) for r in request.also] + [(r, True) for r in request.held_out]:
         run = by_record.get(record)
         if run is None:
             raise StemmapError(

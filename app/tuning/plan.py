@@ -12,7 +12,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from app.common.text import version
+from app.common.text import value_text, version
 from app.sources.request import SourceRequest
 from pipeline.config import FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value, validated
@@ -87,13 +87,14 @@ class Goal:
     false_max: float = 0.1
 
     def loss(self, pooled: Pooled, start: Pooled) -> float:
-        """The value that the search minimises. A set that breaks the goal's bound is worse than every set
-        that keeps it, and the more so the larger the violation; otherwise an empty map would have the
-        smallest errors.
+        """Return the loss that the search minimises.
+
+        A set that violates the bound of the goal has a larger loss than every set that satisfies it, and the
+        loss grows with the violation. Without the bound an empty map would have the smallest errors.
 
         Args:
             pooled: Scores of the set.
-            start: Scores of the parameters with which the search began.
+            start: Scores of the parameters with which the search begins.
         """
         if self.name == "f1":
             return 1.0 - pooled.f1
@@ -105,17 +106,17 @@ class Goal:
         return _BROKEN[self.name] + max(short, 0.0) if error is None or short > 1e-12 else error
 
     def is_kept(self, loss: float) -> bool:
-        """Whether a loss is that of a set that keeps the goal's bound."""
+        """Return whether a loss is that of a set that satisfies the bound of the goal."""
         return self.name == "f1" or loss < _BROKEN[self.name]
 
     def figure(self, loss: float) -> float:
-        """A loss as the goal's figure, in `unit`."""
+        """Return the score, in `unit`, of a loss that satisfies the bound."""
         if self.name in ("f1", "ta"):
             return 1.0 - loss
         return 100.0 * loss if self.name == "position" else loss
 
     def figure_of(self, pooled: Pooled) -> float | None:
-        """The goal's figure of pooled scores, in `unit`; None where it is unknown."""
+        """Return the score of the goal, in `unit`, from pooled scores; None if it is unknown."""
         value = {
             "f1": pooled.f1,
             "ta": pooled.ta,
@@ -126,7 +127,7 @@ class Goal:
         return 100.0 * figure if self.name == "position" and figure is not None else figure
 
     def shown(self, loss: float) -> str:
-        """A loss as text: the figure with its unit."""
+        """Return a loss as text, for example "RMSE 3.20 cm"."""
         if not self.is_kept(loss):
             return "outside the bound"
         digits = 2 if self.name == "position" else 3
@@ -134,23 +135,23 @@ class Goal:
 
     @property
     def label(self) -> str:
-        """The figure's short name."""
+        """Short name of the score."""
         return {"f1": "F1", "ta": "TA", "position": "RMSE", "pairs": "pair error"}[self.name]
 
     @property
     def unit(self) -> str:
-        """The figure's unit."""
+        """Unit of the score; empty for F1 and TA."""
         return {"position": "cm", "pairs": "%"}.get(self.name, "")
 
     @property
     def words(self) -> str:
-        """The goal as text."""
+        """Description of the goal with its bound."""
         bound = f" (at most {100.0 * self.false_max:g} % of the mapped trees)" if self.name == "ta" else ""
         return GOALS[self.name] + bound
 
 
 def score_of(e: MapScores) -> RunScore:
-    """Return the scores that a search stores of an evaluation."""
+    """Return the scores of a run that a search stores."""
     return RunScore(
         e.TA.count,
         e.FR.count,
@@ -163,7 +164,7 @@ def score_of(e: MapScores) -> RunScore:
 
 
 def pool(scores: Sequence[RunScore]) -> Pooled:
-    """Pool the scores of several runs, see `Pooled`."""
+    """Return the scores of several runs together, see `Pooled`."""
     ta, fr = sum(s.TA for s in scores), sum(s.FR for s in scores)
     wrong = sum(s.FA + s.spurious for s in scores)
     squares = [(s.TA, s.position_rmse**2) for s in scores if s.position_rmse is not None]
@@ -206,11 +207,13 @@ _CORNERS = 4096
 
 
 class SearchAxis(msgspec.Struct, frozen=True):
-    """A parameter of a search.
+    """A parameter that a search varies.
 
     Attributes:
-        low, high: Of a number.
-        choices: Of a choice or a switch.
+        name: Dotted name.
+        kind: Kind of its values; a switch is a choice.
+        low, high: Bounds of a number.
+        choices: Values of a choice.
     """
 
     name: str
@@ -220,7 +223,8 @@ class SearchAxis(msgspec.Struct, frozen=True):
     choices: tuple[str | bool, ...] = ()
 
     def suggest(self, trial: Any) -> None:  # noqa: ANN401 - Optuna has no types
-        """Let a trial of Optuna choose a value; it is in the trial's `params` afterwards."""
+        """Let a trial of Optuna choose a value, which it stores in its `params` under the name of the
+        axis."""
         log = self.low > 0.0 and self.high >= _LOG_FROM * self.low
         if self.kind == "choice":
             trial.suggest_categorical(self.name, self.choices)
@@ -230,7 +234,8 @@ class SearchAxis(msgspec.Struct, frozen=True):
             trial.suggest_float(self.name, self.low, self.high, log=log)
 
     def value_of(self, suggested: Any) -> Value:  # noqa: ANN401
-        """Return the parameter's value for a suggestion of Optuna: few digits, within the bounds."""
+        """Return the parameter value for a value of Optuna: rounded to `_DIGITS` significant digits, within
+        the bounds."""
         if self.kind == "choice":
             return suggested if isinstance(suggested, bool) else str(suggested)
         if self.kind == "int":
@@ -238,24 +243,27 @@ class SearchAxis(msgspec.Struct, frozen=True):
         return min(max(float(f"{suggested:.{_DIGITS}g}"), self.low), self.high)
 
     def holds(self, value: Value) -> bool:
-        """Whether a value is within the bounds."""
+        """Return whether a value is within the bounds."""
         if self.kind == "choice":
             return any(type(c) is type(value) and c == value for c in self.choices)
         return not isinstance(value, str) and self.low <= value <= self.high
 
     @property
     def words(self) -> str:
-        """The axis in the syntax of --over."""
+        """The axis in the syntax of `--over`, for example "clustering.eps=0.1..0.4"."""
         if self.kind == "choice":
-            return f"{self.name}={','.join(_word(c) for c in self.choices)}"
+            return f"{self.name}={','.join(value_text(c) for c in self.choices)}"
         return f"{self.name}={self.low:g}..{self.high:g}"
 
 
 def axes_of(texts: Sequence[str]) -> tuple[SearchAxis, ...]:
-    """Return the axes of `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`.
+    """Return the axes of a search.
+
+    Args:
+        texts: `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`; without bounds those of the declaration are used.
 
     Raises:
-        ParameterError: A name is unknown or named twice, or its bounds contradict its declaration.
+        ParameterError: A name is unknown or given twice, or bounds contradict the declaration.
     """
     axes = tuple(_axis(text) for text in texts)
     names = [axis.name for axis in axes]
@@ -266,7 +274,11 @@ def axes_of(texts: Sequence[str]) -> tuple[SearchAxis, ...]:
 
 
 def check(axes: Iterable[SearchAxis], start: Parameters) -> None:
-    """Check that the bounds contain a set without contradictions.
+    """Check that the search space contains a set without contradictions.
+
+    Args:
+        axes: The search space.
+        start: Values of all other parameters.
 
     Raises:
         ParameterError: All corners of the space contradict themselves; the message names the contradiction.
@@ -290,7 +302,12 @@ def check(axes: Iterable[SearchAxis], start: Parameters) -> None:
 
 
 def values_of(axes: Iterable[SearchAxis], suggested: Mapping[str, Any]) -> dict[str, Value]:
-    """Return the values of the parameters by name."""
+    """Return the parameter values of a trial by name.
+
+    Args:
+        axes: The search space.
+        suggested: Values of Optuna by name.
+    """
     return {axis.name: axis.value_of(suggested[axis.name]) for axis in axes}
 
 
@@ -336,7 +353,7 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
 
 
 def _choice(spec: FieldSpec, words: str) -> SearchAxis:
-    known = {_word(choice): choice for choice in _all_choices(spec)}
+    known = {value_text(choice): choice for choice in _all_choices(spec)}
     asked = [word.strip() for word in words.split(",")]
     unknown = [word for word in asked if word not in known]
     if unknown or len(set(asked)) < 2:
@@ -366,10 +383,6 @@ def _ends(axis: SearchAxis) -> tuple[Value, ...]:
     return axis.value_of(axis.low), axis.value_of(axis.high)
 
 
-def _word(choice: str | bool) -> str:
-    return str(choice).lower() if isinstance(choice, bool) else choice
-
-
 def _example(spec: FieldSpec) -> str:
     return f"{spec.name}={spec.minimum:g}..{spec.maximum:g}"
 
@@ -391,12 +404,12 @@ class TruthTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, trees: TruthTrees) -> TruthTable:
-        """Convert arrays to a table."""
+        """Return the table of true trees given as arrays."""
         dbh = [value if math.isfinite(value) else None for value in trees.dbh.tolist()]
         return cls(trees.x.tolist(), trees.y.tolist(), dbh, list(trees.kind))
 
     def trees(self) -> TruthTrees:
-        """Convert the table to arrays."""
+        """Return the true trees as arrays."""
         dbh = [math.nan if value is None else value for value in self.dbh]
         x, y, diameter = (np.array(column, np.float64) for column in (self.x, self.y, dbh))
         return TruthTrees(x, y, diameter, tuple(self.kind))
@@ -406,11 +419,11 @@ class PlannedRun(msgspec.Struct, frozen=True):
     """A run of a search.
 
     Attributes:
-        source: What is mapped, and how.
-        truth: True trees; None for those that the source brings.
-        truth_name: Name of the file that the true trees were read from, for the provenance.
+        source: Source, and how it is mapped.
+        truth: True trees; None for those of the source.
+        truth_name: Name of the file of the true trees, for the provenance.
         held_out: Whether the run is only scored, and does not guide the search.
-        annotations: Annotations of a run of the page's list, which replace and extend the source's own trees.
+        annotations: Annotations from the list of runs, which replace and extend the true trees of the source.
         digest: Digest of the recording to which the annotations belong; empty for any.
     """
 
@@ -499,7 +512,15 @@ def identity(plan: Plan, digests: list[str]) -> dict[str, Any]:
 
 
 def digest_with_truth(plan: Plan, source: SourceRequest, digest: str, truth: TruthTrees) -> str:
-    """Return one SHA-256 of a source, its true trees, and its choices where they differ from the plan's."""
+    """Return a SHA-256 (hex) of a source, its true trees, and the choices with which it is opened if they
+    differ from those of the plan.
+
+    Args:
+        plan: The search.
+        source: How the run is opened.
+        digest: Digest of the source.
+        truth: The true trees.
+    """
     default = SourceRequest(source.uri, plan.odometry, plan.seed)
     chosen = [source.seed, source.odometry, source.topics, source.mount]
     differs = chosen != [default.seed, default.odometry, default.topics, default.mount]

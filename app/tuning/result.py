@@ -1,20 +1,18 @@
-"""The result of a search: as a parameter file with its provenance, as text for a terminal, and as JSON for
-the page."""
+"""Result of a search: as a parameter file with its provenance, as text for a terminal, and as JSON for the
+page."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import tomli_w
 
-from app.common.text import count, version
+from app.common.text import count, value_text, version
 from app.dashboard.parameters import file_of
 from app.tuning.plan import Goal, Plan, RunScore, Trial, pool
 from pipeline.config import Parameters
-from pipeline.config.model import Value
 
 if TYPE_CHECKING:
     from app.tuning.search import Search
@@ -44,12 +42,12 @@ class Result(msgspec.Struct, frozen=True):
 
 
 class SearchMessage(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Progress of a search in another process. A message without any field says that the search was stopped
+    """Progress of a search in another process. A message without any field means that the search was stopped
     before it had a score.
 
     Attributes:
         start: Scores of the parameters with which the search begins.
-        trials: Trials since the last message; with `start`, those from before the search was stopped.
+        trials: Trials since the last message; with `start`, those of the search before it was stopped.
         result: The result; the last message.
         error: What happened, where, and what to do; the last message.
     """
@@ -82,8 +80,14 @@ def result_of(search: Search) -> Result:
 
 
 def toml_of(plan: Plan, result: Result, date: str) -> str:
-    """Return the best set as a parameter file for `--config`. Comments at its top hold the provenance as
-    TOML."""
+    """Return the best set as the text of a file for `--config`. Comments at its top contain the provenance as
+    TOML.
+
+    Args:
+        plan: The search.
+        result: Its result.
+        date: Date of the search.
+    """
     parameters = best_parameters(plan, result)
     head, _, rest = file_of(plan.preset, parameters).partition("\n")
     # Not splitlines: a name may contain U+2028, which does not end a line of TOML.
@@ -150,7 +154,7 @@ def lines_of(plan: Plan, result: Result) -> list[str]:
     for name, value in result.best.values.items():
         share = result.importance.get(name)
         suffix = "" if share is None else f"   importance {100.0 * share:.0f} %"
-        lines.append(f"  {name}: {_word(flat[name])} -> {_word(value)}{suffix}")
+        lines.append(f"  {name}: {value_text(flat[name])} -> {value_text(value)}{suffix}")
     return lines
 
 
@@ -209,15 +213,16 @@ def _decimal(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def _word(value: Value) -> str:
-    return f"{value:g}" if isinstance(value, float) else json.dumps(value).strip('"')
-
-
 # --- for the page ------------------------------------------------------------------
 
 
 def best_of(trials: Sequence[Trial], start: Trial | None) -> Trial | None:
-    """The trial with the smallest loss, the start included; the earliest of equals."""
+    """Return the trial with the smallest loss, the earliest of equals; None without a scored trial.
+
+    Args:
+        trials: Trials of the search.
+        start: Scored start of the search, which is included; None excludes it.
+    """
     made = [t for t in (*trials, *([start] if start else [])) if t.loss is not None]
     return min(made, key=lambda t: (t.loss, t.number), default=None)
 
@@ -225,10 +230,10 @@ def best_of(trials: Sequence[Trial], start: Trial | None) -> Trial | None:
 def for_page(
     plan: Plan, trials: Sequence[Trial], start: Trial | None, result: Result | None
 ) -> dict[str, Any]:
-    """Return a search for the page, without its state.
+    """Return the progress of a search for the page, without its state.
 
     Args:
-        plan: What is searched for.
+        plan: The search.
         trials: The trials so far.
         start: The start of the search, once it is scored.
         result: The result, once the search has ended.
@@ -277,7 +282,7 @@ def _figures(scores: Sequence[RunScore]) -> dict[str, Any]:
 
 
 def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str, Any]]:
-    """Scores of the search runs and of the held-out runs, at the start and with the best set."""
+    """Return the scores of the search runs and of the held-out runs, at the start and with the best set."""
     if start is None or best is None:
         return []
     counts = {held_out: sum(run.held_out is held_out for run in plan.runs) for held_out in (False, True)}
@@ -294,7 +299,7 @@ def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str,
 
 
 def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float | None]]:
-    """Number and held-out figure of each trial that was the best when it was made."""
+    """Return number and held-out score of each trial that was the best when it was made."""
     held, best = [], float("inf")
     for trial in trials:
         if trial.held_out and trial.loss is not None and trial.loss < best and goal.is_kept(trial.loss):

@@ -1,7 +1,7 @@
-"""Runs that are opened once with their true trees, then mapped and scored with one set of parameters after
-another. Grid comparisons, sensitivity curves and searches all use this engine.
+"""Runs that are opened once, then mapped and scored with one parameter set after another. Grid comparisons,
+sensitivity curves and searches use them.
 
-The front end of the mapper depends on few parameters. Its results are cached on disk, by a key of those
+The front end of the mapper depends on few parameters. Its results are cached on disk under a key of those
 parameters, so that most sets need neither the recording nor the points again.
 """
 
@@ -56,17 +56,22 @@ class MappedRun:
     front_end_ran: bool
 
     def evaluate(self, truth: TruthTrees, parameters: Parameters) -> MapScores:
-        """Score the map, as `stemmap map` and `stemmap evaluate` do."""
+        """Return the scores of the map, as `stemmap map` and `stemmap evaluate` compute them.
+
+        Args:
+            truth: True trees in the frame of the map.
+            parameters: Parameters, of which those of the stage `evaluation` are used.
+        """
         path = np.stack([self.path.x, self.path.y], axis=1) if self.scans else None
         return evaluate(self.trees, truth, parameters.evaluation, path)
 
 
 class OpenRun(Protocol):
-    """A run that can be mapped again and again.
+    """A run that can be mapped repeatedly.
 
     Attributes:
         digest: Digest of the source with its odometry; recording_digest: without.
-        own_truth: True trees that the source brings; None where it has none.
+        own_truth: True trees of the source; None if it has none.
     """
 
     digest: str
@@ -187,7 +192,7 @@ class OpenDrive:
 
 
 class OpenCloud:
-    """A whole cloud of a plot, which has no path: all of its truth counts.
+    """A whole cloud of a plot. It has no path, so all true trees count.
 
     Args:
         source: The file.
@@ -214,7 +219,7 @@ class OpenCloud:
         return MappedRun(trees, path, 0, True)
 
     def close(self) -> None:
-        """Nothing is open between two maps."""
+        """Do nothing: no file is open."""
 
 
 class _DamagedCacheError(Exception):

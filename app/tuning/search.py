@@ -1,7 +1,7 @@
-"""The search: asks Optuna for a set of parameters, maps the runs with it, and stores the scores.
+"""The search: Optuna suggests a parameter set, the runs are mapped with it, and the scores are stored.
 
-A trial depends only on the trials before it, its number and the seed. A search that was stopped therefore
-continues with the trials that it would have made, and with one worker the same input gives the same result.
+A trial depends only on the trials before it, its number and the seed. A stopped search therefore continues
+with the trials that it would have made, and with one worker the same input gives the same result.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from app.tuning.plan import (
     score_of,
     values_of,
 )
-from app.tuning.result import SearchMessage, result_of
+from app.tuning.result import SearchMessage, best_of, result_of
 from app.tuning.scored_runs import OpenRun, Tick, open_run
 from app.tuning.storage import OtherSearchError, close_storage, open_study
 from pipeline.config import Parameters
@@ -54,8 +54,7 @@ _FIXED = "fixed_params"  # Optuna's attribute of a trial whose values were given
 
 
 class StoppedError(Exception):
-    """The search was asked to stop in the middle of a trial. The trial is repeated when the search goes
-    on."""
+    """The search was stopped during a trial. The trial is repeated when the search continues."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +75,12 @@ class SearchRun:
     truth: TruthTrees
 
     def evaluate(self, parameters: Parameters, tick: Tick) -> MapScores:
-        """Map the run and score the map."""
+        """Return the scores of the run, mapped with these parameters.
+
+        Args:
+            parameters: All parameters.
+            tick: Called after each scan; may raise an exception to stop.
+        """
         return self.run.map(parameters, tick).evaluate(self.truth, parameters)
 
 
@@ -98,7 +102,7 @@ def open_runs(plan: Plan) -> list[SearchRun]:
 
 
 def scores_of(runs: Sequence[SearchRun], parameters: Parameters, tick: Tick = lambda: None) -> list[RunScore]:
-    """Map each run and return its score."""
+    """Return the score of each run, mapped with these parameters; `tick` as in `SearchRun.evaluate`."""
     return [score_of(run.evaluate(parameters, tick)) for run in runs]
 
 
@@ -161,15 +165,17 @@ class Search:
     """A search whose trials are kept in a storage.
 
     Args:
-        plan: What is searched for.
-        worker: Number of this process among those of the search, from 0 on.
+        plan: The search.
+        worker: Number of this process among those of the search, from 0.
         stop: Called often; the search stops at once when it returns True.
 
     Attributes:
         sources: URI, digest of the source and whether it is held out, by run.
+        study: Study of Optuna.
+        start: Scored start of the search, after `begin`.
 
     Raises:
-        StemmapError: A run cannot be read or scored, or the storage is of another search.
+        StemmapError: A run cannot be read or scored, or the storage belongs to another search.
     """
 
     def __init__(self, plan: Plan, *, worker: int = 0, stop: Callable[[], bool] = lambda: False) -> None:
@@ -210,11 +216,12 @@ class Search:
         return [run for run in self._runs if run.held_out]
 
     def begin(self) -> Trial:
-        """Score the parameters with which the search begins. This also fills the caches of the runs.
+        """Score the parameters with which the search begins, and return them as a trial. This also fills the
+        caches of the runs.
 
         Raises:
             StemmapError: A run cannot be scored.
-            StoppedError: It was asked to stop.
+            StoppedError: The search was stopped.
         """
         scores: dict[bool, list[RunScore]] = {False: [], True: []}
         for run in self._runs:
@@ -228,10 +235,11 @@ class Search:
         return self.start
 
     def step(self) -> Trial | None:
-        """Make the next trial. Returns None when all are made, or are under way in other processes.
+        """Make the next trial and return it; None when all trials are made, or are being made by other
+        processes.
 
         Raises:
-            StoppedError: It was asked to stop. The trial is repeated when the search goes on.
+            StoppedError: The search was stopped.
         """
         left = self._abandoned()
         if left is not None:
@@ -254,19 +262,18 @@ class Search:
         return any(trial.state.name == "RUNNING" for trial in self._all())
 
     def trials(self) -> list[Trial]:
-        """All trials that are complete."""
+        """Return all completed trials, by number."""
         for trial in self._all():
             if trial.number not in self._known and trial.state.name in ("COMPLETE", "PRUNED"):
                 self._known[trial.number] = self._trial(trial)
         return [self._known[number] for number in sorted(self._known)]
 
     def best(self) -> Trial | None:
-        """The trial with the smallest loss, the earliest of equals; None before the first."""
-        made = [trial for trial in self.trials() if trial.loss is not None]
-        return min(made, key=lambda trial: (trial.loss, trial.number), default=None)
+        """Return the trial with the smallest loss, the earliest of equals; None before the first."""
+        return best_of(self.trials(), None)
 
     def with_held_out(self, trial: Trial) -> Trial:
-        """Return a trial with the scores of the held-out runs, which are computed where they are missing."""
+        """Return a trial with the scores of the held-out runs, which are computed if they are missing."""
         if len(trial.held_out) == len(self.held_out):
             return trial
         scores = scores_of(self.held_out, self.parameters_of(trial), self._tick)
@@ -283,9 +290,12 @@ class Search:
     # --- one trial ---------------------------------------------------------------------------------
 
     def _is_surplus(self, number: int) -> bool:
-        """Whether a trial that begins exceeds the number of the plan, or is the second one with the start.
+        """Return whether a trial that begins exceeds the number of the plan, or is the second one with the
+        values of the start.
+
         Numbers are given in sequence, so that of two processes only one sees the other's number before its
-        own."""
+        own.
+        """
         before = [trial for trial in self._all() if trial.number <= number]
         starts = [t.number for t in before if _FIXED in t.system_attrs and t.state.name != "FAIL"]
         return _counted(before) > self.plan.trials or number in starts[1:]
@@ -337,7 +347,7 @@ class Search:
         return trial
 
     def _same(self, values: dict[str, Value], number: int) -> Trial | None:
-        """A complete trial with the same values, under a new number; None where there is none."""
+        """Return a completed trial with the same values under a new number; None if there is none."""
         for trial in self.trials():
             if trial.values == values:
                 return msgspec.structs.replace(trial, number=number)
@@ -364,7 +374,8 @@ class Search:
         return TPESampler(seed=int(seed))
 
     def _abandoned(self) -> Any | None:  # noqa: ANN401
-        """A trial whose process has ended; this process takes it over."""
+        """Return a trial whose process has ended, after this process has taken it over; None if there is
+        none."""
         for trial in self._all():
             if trial.state.name != "RUNNING" or not self._is_gone(trial):
                 continue
@@ -398,13 +409,17 @@ class Search:
 
 
 def _counted(trials: list[Any]) -> int:
-    """How many are complete or under way."""
+    """Return the number of trials of Optuna that are complete or being made."""
     return sum(trial.state.name in ("COMPLETE", "PRUNED", "RUNNING") for trial in trials)
 
 
 def importances(study: Any) -> dict[str, float]:  # noqa: ANN401 - Optuna has no types
-    """Share of the variance of the loss that each parameter explains (fANOVA, Hutter et al. 2014), largest
-    first. Empty where there are too few trials or all have the same loss."""
+    """Return the share of the variance of the loss that each parameter explains (fANOVA, Hutter et al. 2014),
+    the largest first. Empty if there are too few trials or all have the same loss.
+
+    Args:
+        study: Study of Optuna.
+    """
     from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 
     try:
@@ -433,14 +448,14 @@ _MESSAGE_INTERVAL_S = 0.25
 
 
 class SearchWorkers:
-    """Processes that make trials of the same search.
+    """Child processes that make trials of the same search.
 
     Args:
         plan: The search; the processes share its storage.
-        number: How many.
+        number: Number of processes.
 
     Attributes:
-        lost: How many ended too early.
+        lost: Number of processes that ended too early.
     """
 
     def __init__(self, plan: Plan, number: int) -> None:
@@ -451,11 +466,11 @@ class SearchWorkers:
 
     @property
     def pids(self) -> list[int]:
-        """Process numbers of those that run."""
+        """Process numbers of the running processes."""
         return [process.pid for process in self._processes if process.returncode is None]
 
     def watch(self) -> None:
-        """Restart processes that ended too early, a few times at most."""
+        """Restart processes that ended too early, each at most `_STARTS_LIMIT` times."""
         for k, process in enumerate(self._processes):
             if process.returncode in (None, 0) or self._starts[k] >= _STARTS_LIMIT:
                 continue
@@ -465,7 +480,7 @@ class SearchWorkers:
             self._processes[k] = self._start(k)
 
     def close(self) -> None:
-        """End them."""
+        """End all processes."""
         for process in self._processes:
             process.end(_GRACE_S)
 
@@ -476,7 +491,14 @@ class SearchWorkers:
 
 
 def make_trials(parent: ParentConnection, worker: int, stopped: threading.Event) -> None:
-    """Make trials until none is left or the parent ends."""
+    """Make trials until all are made, the search is stopped or the parent ends; the program of a child
+    process.
+
+    Args:
+        parent: Connection that sends the plan.
+        worker: Number of this process.
+        stopped: Set when the search is stopped.
+    """
     try:
         search = Search(parent.receive(Plan), worker=worker, stop=stopped.is_set)
         search.begin()
@@ -490,14 +512,14 @@ def make_trials(parent: ParentConnection, worker: int, stopped: threading.Event)
 
 
 class PageSearch:
-    """The search of the page, in a process of its own. Its journal is in a folder that belongs to the parent:
-    it stays when the search is stopped, and is deleted when the parent ends."""
+    """The search of the page, in a child process. Its journal is in a folder that the parent deletes after
+    the search; if the parent ends first, this process deletes it."""
 
     def __init__(self) -> None:
         self._folder = Path()
 
     def run(self, parent: ParentConnection) -> None:
-        """Search and report."""
+        """Receive the plan, search, and send `SearchMessage`s."""
         plan = parent.receive(Plan)
         self._folder = Path(plan.storage).parent
         try:
@@ -514,7 +536,7 @@ class PageSearch:
             parent.send(SearchMessage(error=("the search needs more memory than this machine has", "", "")))
 
     def parent_ended(self) -> None:
-        """Delete the journal and end."""
+        """Delete the journal and end the process."""
         if self._folder.name.startswith(JOURNAL_FOLDER):
             shutil.rmtree(self._folder, ignore_errors=True)
         os._exit(1)
@@ -546,7 +568,11 @@ class PageSearch:
 
 
 def main(arguments: list[str]) -> None:
-    """Run one of the two programs."""
+    """Run one of the two child programs.
+
+    Args:
+        arguments: "page", or "worker" and the number of the process.
+    """
     if arguments[0] == "page":
         page = PageSearch()
         run_child(page.run, low_priority=True, on_close=page.parent_ended)

@@ -104,7 +104,7 @@ def _journal(path: Path, identity: dict[str, Any]) -> Any:  # noqa: ANN401
 
 
 def _mended(path: Path) -> bool:
-    """Whether there is a journal that is not empty. Removes an incomplete last line.
+    """Return whether the journal exists and is not empty, after the removal of an incomplete last line.
 
     Raises:
         StemmapError: The file is not a journal.
@@ -200,13 +200,13 @@ def _damaged(path: Path, error: Exception) -> StemmapError:
 
 
 def unwritable(storage: str, error: OSError) -> StemmapError:
-    """The error of a disk that cannot be written."""
+    """Return the error of trials that cannot be written to a storage."""
     reason = (error.strerror or str(error)).lower()
     return StemmapError(f"the trials cannot be kept: {reason}", where=storage)
 
 
 def unreadable(storage: str, error: OSError) -> StemmapError:
-    """The error of trials that cannot be read."""
+    """Return the error of trials that cannot be read from a storage."""
     reason = (error.strerror or str(error)).lower()
     return StemmapError(f"the trials cannot be read: {reason}", where=storage)
 
@@ -228,7 +228,7 @@ class Journal(JournalFileBackend):  # type: ignore[misc]
         self._file = Path(path)
 
     def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:
-        """Return the lines from a number on.
+        """Yield the log entries from number `log_number_from` onwards.
 
         Raises:
             StemmapError: The file cannot be read.
@@ -239,7 +239,7 @@ class Journal(JournalFileBackend):  # type: ignore[misc]
             raise unreadable(str(self._file), error) from None
 
     def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Append all lines or none.
+        """Append all entries or none.
 
         Raises:
             StemmapError: The file cannot be written, for example on a full disk.
@@ -254,8 +254,7 @@ class Journal(JournalFileBackend):  # type: ignore[misc]
 
 
 def cut_half_line(path: Path) -> None:
-    """Remove an incomplete last line, which a process leaves that is killed while it writes. The trial is
-    repeated."""
+    """Remove an incomplete last line, which a process leaves that is killed while it writes."""
     with path.open("rb") as file:
         if _is_whole(file):
             return

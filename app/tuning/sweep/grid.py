@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from app.common.text import value_text
 from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value
 from pipeline.config.text import parsed
@@ -62,7 +63,7 @@ def read_axes(words: Iterable[str]) -> tuple[GridAxis, ...]:
 
 
 def combinations(axes: Sequence[GridAxis]) -> list[dict[str, Value]]:
-    """Return every combination of the values; the last axis changes fastest."""
+    """Return every combination of the values as dicts by parameter name; the last axis changes fastest."""
     return [
         dict(zip((axis.name for axis in axes), values, strict=True))
         for values in itertools.product(*(axis.values for axis in axes))
@@ -70,15 +71,8 @@ def combinations(axes: Sequence[GridAxis]) -> list[dict[str, Value]]:
 
 
 def words_of(changes: Mapping[str, Value]) -> str:
-    """A combination as text, in the syntax of `--set`."""
-    return " ".join(f"{name}={shown(value)}" for name, value in changes.items()) or "unchanged"
-
-
-def shown(value: Value) -> str:
-    """A value in the syntax of `--set`."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    """Return a combination as text in the syntax of `--set`; "unchanged" for an empty one."""
+    return " ".join(f"{name}={value_text(value)}" for name, value in changes.items()) or "unchanged"
 
 
 def _axes_of(file: Path) -> list[GridAxis]:
@@ -131,7 +125,7 @@ def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
 
 
 def _text(entry: object) -> str:
-    """An entry of a TOML file in the syntax of the command line."""
+    """Return an entry of a TOML file in the syntax of the command line."""
     return str(entry).lower() if isinstance(entry, bool) else str(entry)
 
 
@@ -162,7 +156,13 @@ def _values(spec: FieldSpec, text: str) -> list[Value]:
 
 
 def spread(low: float, high: float, count: int, *, ratio: bool) -> list[float]:
-    """Return `count` values from low to high, ends included, with equal steps or equal ratios."""
+    """Return values from low to high, ends included.
+
+    Args:
+        low, high: The ends.
+        count: Number of values, at least 2.
+        ratio: Whether neighbouring values have equal ratios; otherwise equal differences.
+    """
     shares = [k / (count - 1) for k in range(count)]
     if ratio:
         between = [low * (high / low) ** share for share in shares]
@@ -189,7 +189,7 @@ def _check(spec: FieldSpec, value: Value) -> None:
     if spec.kind in ("int", "float") and spec.minimum is not None and spec.maximum is not None:
         if not spec.minimum <= float(value) <= spec.maximum:
             raise ParameterError(
-                f"{spec.name} = {shown(value)} is not within {spec.minimum:g} to {spec.maximum:g}"
+                f"{spec.name} = {value_text(value)} is not within {spec.minimum:g} to {spec.maximum:g}"
             )
     elif (spec.kind == "choice" and value not in spec.choices) or (
         spec.kind == "bool" and not isinstance(value, bool)

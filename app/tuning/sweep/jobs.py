@@ -1,6 +1,6 @@
-"""The jobs of a comparison: runs with their true trees, each under many sets of parameters.
+"""Jobs of a comparison: runs with their true trees, each with many parameter sets.
 
-Jobs and answers travel to the workers and back as JSON: paths, parameters and scores, never point clouds.
+Jobs and results are sent to the workers and back as JSON: paths, parameters and scores, never point clouds.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class RunWithTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A run that is mapped and scored.
 
     Attributes:
-        source: What is mapped, and how. A path is absolute and leads every worker to the same recording.
-        digest: SHA-256 of the source, with which a worker recognises another recording.
+        source: Source, and how it is mapped. A path is absolute and names the same recording on every worker.
+        digest: SHA-256 of the source, by which a worker recognises another recording.
         truth: True trees in the frame of the map.
     """
 
@@ -49,11 +49,12 @@ class RunWithTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A run under one set of parameters.
+    """A run with one parameter set.
 
     Attributes:
+        run: The run.
         parameters: All values, by stage and name.
-        code: Digest of the code that asks, see `code_digest`; other code may give other scores.
+        code: Digest of the code that made the job, see `code_digest`; other code may give other scores.
     """
 
     run: RunWithTruth
@@ -61,7 +62,7 @@ class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     code: str
 
     def key(self) -> str:
-        """SHA-256 (hex) of everything that decides the scores, without the place of the recording."""
+        """Return a SHA-256 (hex) of all that determines the scores, without the path of the recording."""
         source = msgspec.structs.replace(self.run.source, uri="")
         placeless = msgspec.structs.replace(self, run=msgspec.structs.replace(self.run, source=source))
         return hashlib.sha256(msgspec.json.encode(placeless, order="sorted")).hexdigest()
@@ -71,10 +72,10 @@ class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The result of a job.
 
     Attributes:
-        scores: Fields of `pipeline.evaluation.MapScores`, with the numbers of scans and trees; None for a
+        scores: Fields of `pipeline.evaluation.MapScores`, with the numbers of scans and trees; None after a
             failure.
         seconds: Computing time [s].
-        looked: Whether the front end ran; False where its cached results were used.
+        looked: Whether the front end ran; False if its cached results were used.
         error: Reason of the failure.
         fault: Kind of the failure.
     """
@@ -88,7 +89,7 @@ class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @cache
 def code_digest() -> str:
-    """The version and a SHA-256 of the sources of the pipeline. Results of other code are not used."""
+    """Return the version and a SHA-256 of the sources of the pipeline."""
     assert pipeline.__file__ is not None  # noqa: S101 - the package has an __init__.py
     folder = Path(pipeline.__file__).parent
     state = hashlib.sha256()
@@ -191,7 +192,8 @@ def plan_jobs(
 
 
 def _source_of(source: SourceRequest) -> SourceRequest:
-    """The source itself; of a folder that `stemmap map` wrote the source with its choices."""
+    """Return the request of a run; for a folder that `stemmap map` wrote, that of its source with its
+    choices."""
     folder = Path(source.uri)
     if not (folder / "run.json").is_file():
         return source
@@ -207,7 +209,7 @@ def _source_of(source: SourceRequest) -> SourceRequest:
 
 
 def _absolute(uri: str) -> str:
-    """A path as workers in other folders find it; other URIs unchanged."""
+    """Return a path as an absolute path, because workers run in other folders; other URIs unchanged."""
     try:
         path = Path(uri).expanduser()
         return str(path.absolute()) if path.exists() else uri

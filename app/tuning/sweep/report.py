@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.common.text import count, version
-from app.tuning.sweep.grid import shown, words_of
+from app.common.text import count, value_text, version
+from app.tuning.sweep.grid import words_of
 from app.tuning.sweep.jobs import JobResult, SweepPlan
 from pipeline.io.atomic_files import write_beside
 
@@ -121,7 +121,12 @@ CRITERIA = (
 
 
 def compare_results(plan: SweepPlan, answers: dict[tuple[int, int], JobResult]) -> Comparison:
-    """Return rows, means and the best sets."""
+    """Return the rows, the means and the best sets of a comparison.
+
+    Args:
+        plan: The comparison.
+        answers: Results by number of the set and of the run.
+    """
     rows, means = [], []
     for s in range(len(plan.sets)):
         of_set = [_row(plan, answers, s, r) for r in range(len(plan.runs))]
@@ -142,7 +147,7 @@ def _row(plan: SweepPlan, answers: dict[tuple[int, int], JobResult], s: int, r: 
 
 
 def figures(scores: dict[str, Any]) -> Figures:
-    """Return the columns of a worker's scores."""
+    """Return the scores of a job by the names in COLUMNS."""
     columns: Figures = {name: scores[name]["count"] for name in ("TA", "FR", "TR", "FA")}
     columns["TA_of"], columns["TR_of"] = scores["TA"]["of"], scores["TR"]["of"]
     for name in COLUMNS:
@@ -169,7 +174,12 @@ def _mean(set_number: int, rows: Sequence[Row]) -> Row:
 
 
 def best_of(means: Sequence[Row], goal: Criterion) -> int:
-    """Return the number of the best set, the first of equals; 0 where no value is known or all are equal."""
+    """Return the number of the best set, the first of equals; 0 if no value is known or all are equal.
+
+    Args:
+        means: One row per set.
+        goal: Criterion of the best set.
+    """
     values = [
         (value, -m.set_number) for m in means if m.figures and (value := goal.value(m.figures)) is not None
     ]
@@ -178,7 +188,13 @@ def best_of(means: Sequence[Row], goal: Criterion) -> int:
 
 
 def figure_words(figures: Figures, name: str, scale: float) -> str:
-    """A figure as text; TA and TR with their totals."""
+    """Return a score as text; TA and TR with their totals, "-" if it is unknown.
+
+    Args:
+        figures: Scores of a row.
+        name: Name of the score.
+        scale: Factor from the stored value to the shown one.
+    """
     value = figures[name]
     if value is None:
         return "-"
@@ -188,8 +204,7 @@ def figure_words(figures: Figures, name: str, scale: float) -> str:
 
 
 def is_valid(answer: JobResult) -> bool:
-    """Whether the scores of an answer have all figures, each a finite number or None; for a failure, whether
-    it has a reason."""
+    """Return whether a result is complete: all scores are finite or None, and a failure has a reason."""
     if answer.scores is None:
         return bool(answer.error)
     try:
@@ -210,8 +225,8 @@ _COMPUTED = ("=", "+", "-", "@", "\t", "\r")
 
 
 def lines(comparison: Comparison) -> list[str]:
-    """Return a table with a row per set, preceded by the rows of its runs if they are few, and the best
-    sets."""
+    """Return the comparison as text: a table with a row per set, preceded by the rows of its runs if they are
+    few, and the best sets."""
     plan = comparison.plan
     one = len(plan.runs) == 1
     rows: list[Row] = []
@@ -316,8 +331,8 @@ def _csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def _cell(cell: object) -> object:
-    """A cell as it is written. A text that a spreadsheet would compute, such as a file name `=1+1.mcap`, gets
-    an apostrophe in front."""
+    """Return a cell as it is written: empty for None, and with an apostrophe in front of a text that a
+    spreadsheet would compute, such as a file name `=1+1.mcap`."""
     if cell is None:
         return ""
     if isinstance(cell, bool):
@@ -373,7 +388,7 @@ _LEAST = {"FR", "FA", "spurious", "position_rmse_m", "position_bias_m", "mean_pa
 
 
 def page(comparison: Comparison) -> str:
-    """Return the comparison as one HTML file without scripts or links."""
+    """Return the comparison as the text of one HTML file without scripts or links."""
     from jinja2 import Environment, PackageLoader
 
     environment = Environment(
@@ -397,13 +412,13 @@ def page(comparison: Comparison) -> str:
         tables=[(heading, note, rows, _best(rows)) for heading, note, rows in tables],
         shown=SHOWN,
         words_of=words_of,
-        value_words=shown,
+        value_words=value_text,
         figure_words=figure_words,
     )
 
 
 def _best(rows: list[Row]) -> dict[str, float | None]:
-    """The best value of each figure; None where there is nothing to compare."""
+    """Return the best value of each score; None if fewer than two rows have it."""
     best: dict[str, float | None] = {}
     for name, _, _, _ in SHOWN:
         known = [value for row in rows if not row.error and (value := row.figures[name]) is not None]

@@ -1,8 +1,8 @@
-"""The worker of a comparison: maps and scores one job after the other.
+"""Worker of a comparison: maps and scores one job after the other.
 
-Runs as `python -m app.tuning.sweep.scoring`, with a job per line and an answer per line, or as a function on
-the workers of a Dask cluster. The last run stays open, so that its front end runs once for all sets that do
-not change it.
+It runs as `python -m app.tuning.sweep.scoring`, with a job per line and a result per line, or as a function
+on the workers of a Dask cluster. The last run stays open, so that its front end runs once for all sets that
+do not change it.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class NotHereError(StemmapError):
 
 
 class Scorer:
-    """Scores jobs and keeps the run of the last job open."""
+    """Scores jobs; the run of the last job stays open."""
 
     def __init__(self) -> None:
         self._asked: RunWithTruth | None = None
         self._run: OpenRun | None = None
 
     def score(self, job: Job) -> JobResult:
-        """Map and score; an error becomes part of the answer."""
+        """Return the result of a job; an exception becomes its `error`."""
         if job.code != code_digest():
             other = f"this worker has stemmap {code_digest()}, the job comes from {job.code}"
             return JobResult(None, error=f"{other}. Install the same version on both", fault="version")
@@ -84,7 +84,7 @@ _scorer_lock = threading.Lock()  # a worker of a cluster may have several thread
 
 
 def score_json(text: bytes) -> bytes:
-    """Return the answer to a job, both as JSON."""
+    """Return the result of a job, both as JSON."""
     try:
         job = msgspec.json.decode(text, type=Job)
     except msgspec.MsgspecError as error:
@@ -146,7 +146,7 @@ def _failed(error: str, fault: Fault = "job") -> JobResult:
 
 
 def work(parent: ParentConnection) -> None:
-    """JobResult jobs until the parent ends."""
+    """Receive jobs and send their results until the parent ends."""
     while True:
         parent.send(msgspec.Raw(score_json(bytes(parent.receive(msgspec.Raw)))))
 

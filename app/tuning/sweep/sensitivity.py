@@ -1,6 +1,6 @@
 """Sensitivity of the score to a parameter: the score of the whole run over the range of the parameter.
 
-The points are computed one by one in a process of low priority, while the run goes on.
+The points are computed one by one in a child process of low priority, while the run continues.
 """
 
 from __future__ import annotations
@@ -53,13 +53,14 @@ def question_of(
     name: str,
     values: list[Value],
 ) -> Question:
-    """Return the question about the open run.
+    """Return the sensitivity curve of the open run that is to be computed.
 
     Args:
-        source, digest, status: The open run; the digest is empty where none is open.
+        source, digest, status: The open run; the digest is empty if none is open.
         truth: True trees, with the annotations.
         parameters: The parameters in force.
-        name, values: The parameter and its values.
+        name: Dotted name of the parameter.
+        values: Its values, in the order in which they are computed.
 
     Raises:
         StemmapError: The run cannot be read again, or has no true trees.
@@ -78,12 +79,12 @@ def question_of(
 
 
 class Sensitivity:
-    """Computes the newest question, point by point.
+    """Computes the newest sensitivity curve, point by point.
 
     Args:
-        tell: Called with the points so far after each point, and with {} when no question is left.
-        command: The program of the process.
-        idle_s: The process ends after this time without a question [s].
+        tell: Called with the points so far after each point, and with {} when the curve is removed.
+        command: Program and arguments of the child process.
+        idle_s: Time without a new curve after which the process ends [s].
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class Sensitivity:
         self._lefts = self._asked = 0
 
     def ask(self, question: Question) -> None:
-        """Begin a question. The one before is cancelled.
+        """Start a curve; the one before is cancelled.
 
         Raises:
             ParameterError: There is no such parameter, or there are too many values.
@@ -115,7 +116,7 @@ class Sensitivity:
         self._task = asyncio.create_task(self._answer(question), name="sensitivity")
 
     async def leave(self) -> None:
-        """Cancel the question and end the process, because the run is left or the curve is closed."""
+        """Cancel the curve and end the process, because the run or the curve is closed."""
         self._lefts += 1
         task, scorings = self._stop(), set(self._scorings)
         if task is not None:
@@ -174,10 +175,15 @@ class Sensitivity:
         return {"value": value, **_figures(answer)}
 
     async def _scored(self, job: Job, key: str, asked: tuple[int, int]) -> JobResult:
-        """The answer of the process, which is restarted once if it ends.
+        """Return the result of a job from the child process, which is restarted once if it ends.
+
+        Args:
+            job: The job.
+            key: Its key.
+            asked: Numbers of calls of `leave` and `ask` when the job was requested; other numbers cancel it.
 
         Raises:
-            StemmapError: It ends again, or the question was cancelled.
+            StemmapError: The process ended twice, or the job was cancelled.
         """
         async with self._turn:
             if asked != (self._lefts, self._asked):  # not begun yet
@@ -216,7 +222,7 @@ class Sensitivity:
 
 
 async def _ask(process: ChildProcess, job: Job) -> JobResult | None:
-    """The answer to a job; None where the process ends or sends something else."""
+    """Return the result of a job; None if the process ends or sends something else."""
     await process.send(job)
     try:
         return await process.receive(JobResult)
@@ -225,7 +231,7 @@ async def _ask(process: ChildProcess, job: Job) -> JobResult | None:
 
 
 def _figures(answer: JobResult) -> dict[str, Any]:
-    """The figures of a point, with units in the names."""
+    """Return the scores of a point for the page, with units in the names."""
     s = answer.scores
     if s is None:
         return {"error": answer.error}

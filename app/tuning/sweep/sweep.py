@@ -1,4 +1,4 @@
-"""Distributes the jobs of a comparison to workers, replaces lost workers, and stores the answers."""
+"""Distributes the jobs of a comparison to workers, replaces lost workers, and stores the results."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _WAIT_S = 1.0
 
 
 class ResultStore:
-    """Answers on disk by the key of their job, so that no job is computed twice.
+    """Results on disk, each under the key of its job, so that no job is computed twice.
 
     Args:
-        folder: One file per answer; None stores nothing.
+        folder: Folder with one file per result; None stores nothing.
 
     Attributes:
-        damaged: Number of files that could not be read; their answers are computed again.
-        refusal: Why nothing more is written; empty while answers are written.
+        damaged: Number of files that could not be read; their results are computed again.
+        refusal: Reason why nothing is written any more; empty otherwise.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -45,7 +45,7 @@ class ResultStore:
         self.refusal = ""
 
     def get(self, key: str) -> JobResult | None:
-        """Return the answer to the job with this key, None where it is not stored."""
+        """Return the result of the job with this key, None if it is not stored."""
         file = self._file(key)
         if file is None:
             return None
@@ -62,8 +62,8 @@ class ResultStore:
         return None
 
     def put(self, key: str, answer: JobResult) -> None:
-        """Store an answer that has scores. Failures are not stored, because they may not happen again. After
-        an error of the disk nothing more is written."""
+        """Store a result that has scores. Failures are not stored, because they may not happen again. After a
+        disk error nothing is written any more."""
         file = self._file(key)
         if file is None or answer.scores is None or self.refusal:
             return
@@ -84,10 +84,10 @@ class SweepResult:
     """The results of all jobs.
 
     Attributes:
-        answers: One per job, in their order.
-        known: Number of answers that were stored before.
+        answers: One result per job, in their order.
+        known: Number of results that were stored before.
         lost: Number of workers that were lost during a job, by reason.
-        warnings: Text for people.
+        warnings: Messages for people.
     """
 
     answers: list[JobResult]
@@ -103,14 +103,14 @@ def sweep(
     progress: Callable[[int], object] = lambda _jobs: None,
     nobody_s: float = NOBODY_S,
 ) -> SweepResult:
-    """Have all jobs computed.
+    """Compute all jobs, or read their stored results.
 
     Args:
-        jobs: The jobs; the answers have the same order.
+        jobs: The jobs; the results have the same order.
         workers: Compute the jobs; the caller closes them.
-        kept: Stored answers; each new answer is added at once.
-        progress: Called with the number of jobs that were completed.
-        nobody_s: After this time without any worker the remaining jobs fail [s].
+        kept: Stored results; each new result is added at once.
+        progress: Called with the number of jobs that were completed since the last call.
+        nobody_s: Time without any worker after which the remaining jobs fail [s].
     """
     return _Sweep(jobs, workers, kept, progress, nobody_s).run()
 
@@ -173,7 +173,8 @@ class _Sweep:
             self._workers.give(worker, self._jobs[number])
 
     def _best_group(self, worker: str) -> bytes | None:
-        """The group of its last job; else one that no other worker has; else the largest."""
+        """Return the group for a free worker: that of its last job; else one that no other worker has; else
+        the largest; None if no remaining job suits the worker."""
         if self._groups.get(worker) in self._waiting:
             return self._groups[worker]
         fit = [g for g, jobs in self._waiting.items() if worker not in self._unfit_for(jobs[0])]
@@ -211,7 +212,7 @@ class _Sweep:
             self._again(number)
 
     def _is_unfit(self, worker: str, number: int, answer: JobResult) -> None:
-        """Give the job to other workers. Where no worker fits, all jobs of its run fail."""
+        """Give the job to other workers. If no worker is suitable, all jobs of its run fail."""
         warning = f"{worker}: {answer.error}"
         if warning not in self._outcome.warnings:
             self._outcome.warnings.append(warning)
@@ -251,7 +252,7 @@ class _Sweep:
 
 
 def _group(job: Job) -> bytes:
-    """Equal for jobs that share the results of the front end."""
+    """Return a key that is equal for jobs that share the results of the front end."""
     return msgspec.json.encode(job.run) + segmentation_key(validated(job.parameters))
 
 
@@ -263,7 +264,7 @@ _CHECK_S = 0.5  # between two looks at the members of a cluster
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """A worker has answered."""
+    """A worker has sent a result."""
 
     worker: str
     answer: JobResult
@@ -271,7 +272,7 @@ class Done:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """A worker ended or left before it answered."""
+    """A worker ended or left before it sent a result."""
 
     worker: str
     reason: str
@@ -287,13 +288,13 @@ class Workers(Protocol):
         """Return the names of the workers without a job."""
 
     def give(self, worker: str, job: Job) -> None:
-        """Give a free worker a job."""
+        """Start a job on a free worker."""
 
     def events(self, timeout_s: float, /) -> list[Event]:
-        """Return the answers and losses since the last call; waits up to `timeout_s` for the first."""
+        """Return results and losses since the last call; wait at most `timeout_s` for the first."""
 
     def close(self) -> None:
-        """End all jobs."""
+        """End all jobs and release the workers."""
 
 
 class Processes:
@@ -317,7 +318,7 @@ class Processes:
         return [name for name in self._names if name not in busy]
 
     def give(self, worker: str, job: Job) -> None:
-        """Give a process a job; start the process if necessary."""
+        """Start a job on a process; start the process if necessary."""
         child = self._children.get(worker)
         if child is None or child.returncode is not None:
             if child is not None:
@@ -326,7 +327,7 @@ class Processes:
         self._jobs[self._pool.submit(_ask, child, job)] = worker
 
     def events(self, timeout_s: float) -> list[Event]:
-        """Return the answers and losses since the last call."""
+        """Return results and losses since the last call; wait at most `timeout_s` for the first."""
         if not self._jobs:
             time.sleep(timeout_s)
             return []
@@ -346,7 +347,7 @@ class Processes:
 
 
 def _ask(child: BlockingChildProcess, job: Job) -> JobResult | str:
-    """The answer to a job, or why the process was lost."""
+    """Return the result of a job, or the reason why the process was lost."""
     try:
         child.send(job)
         answer = child.receive(JobResult)
@@ -406,7 +407,8 @@ class DaskWorkers:
         return sorted(self._present() - set(self._doing))
 
     def give(self, worker: str, job: Job) -> None:
-        """Give a worker a job. No other worker may take it, because the front-end cache is on this one."""
+        """Start a job on a worker. No other worker may take it, because the cached front-end results are on
+        this one."""
         self._doing[worker] = self._client.submit(
             self._score,
             msgspec.json.encode(job),
@@ -417,7 +419,7 @@ class DaskWorkers:
         )
 
     def events(self, timeout_s: float) -> list[Event]:
-        """Return the answers and losses since the last call."""
+        """Return results and losses since the last call; wait at most `timeout_s` for the first."""
         until = time.monotonic() + timeout_s
         while True:
             events = self._events()

@@ -48,6 +48,8 @@ class _ViewChoice(Body):
 
 
 class SaveSet(Body):
+    """Name of a saved parameter set, and the person who saves it."""
+
     name: SetName
     who: UserName = "somebody"
 

@@ -15,18 +15,13 @@ from app.dashboard.learning import Learning
 from app.tuning.job import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
 from app.tuning.plan import GOALS, SENSIBLE, Plan
 from app.tuning.sweep.sensitivity import MOST_VALUES
-from app.web.responses import Body, UserName, Value, Word, json_reply
+from app.web.responses import Body, Value, Word, json_reply
 from app.web.routes.access import AnyFile, Dash, Deployment
-from app.web.routes.parameters import SetName
+from app.web.routes.parameters import SaveSet
 from app.web.routes.run import permitted_uri
 from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api")
-
-
-class _SavedName(Body):
-    name: SetName
-    who: UserName = "somebody"
 
 
 class _Sensitivity(Body):
@@ -70,9 +65,9 @@ async def stop_search(dashboard: Dash) -> Response:
 async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
     """Continue the search that was stopped, with the same choices."""
     search = dashboard.search
-    if search.asked is None:
+    if search.request is None:
         raise StemmapError("there is no stopped search", remedy="Start a search")
-    await search.go_on(await _plan(dashboard, settings, any_file, search.asked))
+    await search.go_on(await _plan(dashboard, settings, any_file, search.request))
     return json_reply(search.as_plain(), 202)
 
 
@@ -85,7 +80,7 @@ async def use_found(dashboard: Dash) -> Response:
 
 
 @router.post("/search/save")
-async def save_found(body: _SavedName, dashboard: Dash) -> Response:
+async def save_found(body: SaveSet, dashboard: Dash) -> Response:
     """Save the best set under a name, with its provenance."""
     preset_name, values, text = dashboard.search.found()
     await dashboard.sets.save(body.name, preset_name, values, body.who, text)
